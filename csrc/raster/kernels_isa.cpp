@@ -1,0 +1,17 @@
+// Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
+#include "blend.h"
+#include "kernels.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+#define GS_STRING2(x) #x
+#define GS_STRING(x) GS_STRING2(x)
+
+extern const Kernels table;
+const Kernels table = {
+    GS_STRING(GS_ISA),
+    {blend_tile<float>, blend_tile_backward<float>},
+    {blend_tile<double>, blend_tile_backward<double>},
+};
+
+}  // namespace globalsplat::raster::GS_ISA

@@ -1,0 +1,84 @@
+#include "parallel.h"
+
+#include <atomic>
+#include <condition_variable>
+#include <exception>
+#include <mutex>
+#include <thread>
+#include <utility>
+
+namespace globalsplat::raster {
+namespace {
+
+// Threads that sleep between calls. They live as long as the process: joining at exit could wait for ever on a
+// thread that the operating system has already ended.
+class Pool {
+ public:
+  bool try_run(int threads, int64_t count, const std::function<void(int64_t)>& task) {
+    std::unique_lock<std::mutex> owner(in_use_, std::try_to_lock);
+    if (!owner.owns_lock()) return false;
+    const int helpers = threads - 1;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      while (workers_ < helpers) std::thread([this, id = workers_++] { work(id); }).detach();
+      task_ = &task;
+      count_ = count;
+      next_ = 0;
+      active_ = helpers;
+      running_ = helpers;
+      ++generation_;
+    }
+    wake_.notify_all();
+    drain(task, count);
+    std::unique_lock<std::mutex> lock(mutex_);
+    done_.wait(lock, [this] { return running_ == 0; });
+    if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
+    return true;
+  }
+
+ private:
+  void drain(const std::function<void(int64_t)>& task, int64_t count) {
+    try {
+      for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
+    } catch (...) {
+      next_ = count;  // nobody starts another task
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (!failure_) failure_ = std::current_exception();
+    }
+  }
+
+  void work(int id) {
+    uint64_t seen = 0;
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (;;) {
+      wake_.wait(lock, [&] { return generation_ != seen; });
+      seen = generation_;
+      if (id >= active_) continue;
+      const auto* task = task_;
+      const int64_t count = count_;
+      lock.unlock();
+      drain(*task, count);
+      lock.lock();
+      if (--running_ == 0) done_.notify_one();
+    }
+  }
+
+  std::mutex in_use_, mutex_;
+  std::condition_variable wake_, done_;
+  const std::function<void(int64_t)>* task_ = nullptr;
+  int64_t count_ = 0;
+  std::atomic<int64_t> next_{0};
+  int workers_ = 0, active_ = 0, running_ = 0;
+  uint64_t generation_ = 0;
+  std::exception_ptr failure_;  // the first one, rethrown to the caller
+};
+
+}  // namespace
+
+void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task) {
+  static Pool* pool = new Pool;  // never destroyed: its threads outlive main
+  if (threads > 1 && count > 1 && pool->try_run(threads, count, task)) return;
+  for (int64_t i = 0; i < count; ++i) task(i);
+}
+
+}  // namespace globalsplat::raster

@@ -1,0 +1,85 @@
+//! What can go wrong, told in one sentence.
+
+use std::path::{Path, PathBuf};
+
+/// The library's result.
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// Every failure of the library. [`Error::is_request`] tells a wrong request from work that failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file holds something that can't be used.
+    #[error("{}: {field} is {found}, expected {expected}", .file.display())]
+    Input {
+        /// The file.
+        file: PathBuf,
+        /// Where in the file, in the file's own words.
+        field: String,
+        /// What stands there.
+        found: String,
+        /// What could stand there.
+        expected: String,
+    },
+    /// An argument, or a combination of arguments, that can't be met.
+    #[error("{0}")]
+    Request(String),
+    /// The operating system refused to read.
+    #[error("{} can't be read: {source}", .path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's own words.
+        source: std::io::Error,
+    },
+    /// The operating system refused to write.
+    #[error("{} can't be written: {source}", .path.display())]
+    Write {
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's own words.
+        source: std::io::Error,
+    },
+    /// Work that was under way failed.
+    #[error("{0}")]
+    Failed(String),
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+    /// The C++ side refused an operation.
+    #[error("{0}")]
+    Cpp(#[from] cxx::Exception),
+}
+
+impl Error {
+    /// `file`: `field` is `found`, expected `expected`.
+    pub fn input(
+        file: impl AsRef<Path>,
+        field: impl Into<String>,
+        found: impl std::fmt::Display,
+        expected: impl Into<String>,
+    ) -> Self {
+        Error::Input {
+            file: file.as_ref().to_owned(),
+            field: field.into(),
+            found: found.to_string(),
+            expected: expected.into(),
+        }
+    }
+
+    /// For `map_err` on reading.
+    pub fn read(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_owned();
+        move |source| Error::Read { path, source }
+    }
+
+    /// For `map_err` on writing.
+    pub fn write(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_owned();
+        move |source| Error::Write { path, source }
+    }
+
+    /// Whether the request was wrong (exit code 2) rather than the work having failed (exit code 1).
+    pub fn is_request(&self) -> bool {
+        matches!(self, Error::Input { .. } | Error::Request(_) | Error::Read { .. })
+    }
+}

@@ -1,0 +1,112 @@
+//! Files and folders that appear whole or not at all.
+
+use crate::error::{Error, Result};
+use std::fs::{self, File};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Writes `path` by way of a temporary file beside it: a reader sees the older file or the new one, never a part, and a
+/// full disk leaves the older one as it was.
+///
+/// # Errors
+/// What `fill` returns, or the system's refusal to write.
+pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
+    let temporary = sibling(path, "partial");
+    let attempt = || {
+        let file = File::create(&temporary).map_err(Error::write(path))?;
+        let mut writer = BufWriter::new(file);
+        fill(&mut writer)?;
+        let file = writer.into_inner().map_err(|e| Error::write(path)(e.into_error()))?;
+        file.sync_all().map_err(Error::write(path))?;
+        fs::rename(&temporary, path).map_err(Error::write(path))
+    };
+    let result = attempt();
+    if result.is_err() {
+        let _ = fs::remove_file(&temporary);
+        return result;
+    }
+    sync_parent(path);
+    Ok(())
+}
+
+/// Puts the folder that `fill` makes at `path`, whole: it is filled under another name and then renamed.
+///
+/// # Errors
+/// What `fill` returns, or the system's refusal to write.
+pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let (temporary, retired) = (sibling(path, "partial"), sibling(path, "old"));
+    let attempt = || {
+        remove_dir_if_there(&temporary)?;
+        fs::create_dir_all(&temporary).map_err(Error::write(&temporary))?;
+        fill(&temporary)?;
+        sync_dir(&temporary);
+        remove_dir_if_there(&retired)?;
+        if path.exists() {
+            fs::rename(path, &retired).map_err(Error::write(path))?;
+        }
+        fs::rename(&temporary, path).map_err(Error::write(path))?;
+        remove_dir_if_there(&retired)
+    };
+    let result = attempt();
+    if result.is_err() {
+        let _ = fs::remove_dir_all(&temporary);
+        return result;
+    }
+    sync_parent(path);
+    Ok(())
+}
+
+/// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
+///
+/// # Errors
+/// A request error that names the path.
+pub fn check_writable_file(path: &Path) -> Result<()> {
+    if path.is_dir() {
+        return Err(Error::input(path, "the output", "a folder", "the name of a file"));
+    }
+    let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    probe(parent, path)
+}
+
+/// Whether files could be written under the folder `path`, which is made if need be.
+///
+/// # Errors
+/// A request error that names the path.
+pub fn check_writable_dir(path: &Path) -> Result<()> {
+    if path.is_file() {
+        return Err(Error::input(path, "the output", "a file", "the name of a folder"));
+    }
+    probe(path, path)
+}
+
+fn probe(dir: &Path, named: &Path) -> Result<()> {
+    let refused = |e: std::io::Error| Error::Request(format!("{} can't be written: {e}", named.display()));
+    fs::create_dir_all(dir).map_err(refused)?;
+    let file = dir.join(format!(".globalsplat-{}", std::process::id()));
+    File::create(&file).map_err(refused)?;
+    fs::remove_file(&file).map_err(refused)
+}
+
+/// `.name.suffix` beside `path`.
+fn sibling(path: &Path, suffix: &str) -> PathBuf {
+    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    path.with_file_name(format!(".{name}.{suffix}"))
+}
+
+fn remove_dir_if_there(path: &Path) -> Result<()> {
+    match fs::remove_dir_all(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::write(path)(e)),
+        _ => Ok(()),
+    }
+}
+
+/// A rename is only safe from a power cut once its folder is on the disk. Not every file system can; then it is best effort.
+fn sync_parent(path: &Path) {
+    sync_dir(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")));
+}
+
+fn sync_dir(path: &Path) {
+    if let Ok(dir) = File::open(path) {
+        let _ = dir.sync_all();
+    }
+}

@@ -1,0 +1,99 @@
+//! Images between files and tensors, and pictures for people.
+
+use super::write_atomically;
+use crate::error::{Error, Result};
+use image::{ImageFormat, RgbImage};
+use std::path::Path;
+use tch::{Kind, Tensor};
+
+/// Reads any image as 8-bit RGB; alpha is dropped and grey repeated.
+///
+/// # Errors
+/// A file that is missing or can't be decoded.
+pub fn read_image(path: &Path) -> Result<RgbImage> {
+    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    let image = image::load_from_memory(&bytes)
+        .map_err(|e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG"))?;
+    Ok(image.to_rgb8())
+}
+
+/// [3, H, W] in [0, 1].
+pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
+    let (width, height) = (i64::from(image.width()), i64::from(image.height()));
+    Tensor::from_slice(image.as_raw()).view([height, width, 3]).permute([2, 0, 1]).to_kind(Kind::Float) / 255.
+}
+
+/// From [3, H, W] or [H, W] (grey); values are clamped to [0, 1] and rounded.
+///
+/// # Errors
+/// libtorch's refusal, as for another shape.
+pub(super) fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
+    let planes = if picture.dim() == 2 { picture.unsqueeze(0).f_expand([3, -1, -1], false)? } else { picture.shallow_clone() };
+    let (height, width) = (planes.size()[1], planes.size()[2]);
+    let bytes = (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
+    let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
+    RgbImage::from_raw(width as u32, height as u32, bytes)
+        .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
+}
+
+/// Writes [3, H, W] or [H, W] (grey), values in [0, 1].
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
+    let image = rgb_from_tensor(picture)?;
+    let mut bytes = std::io::Cursor::new(vec![]);
+    image
+        .write_to(&mut bytes, ImageFormat::Png)
+        .map_err(|e| Error::Failed(format!("{}: the image can't be encoded: {e}", path.display())))?;
+    write_atomically(path, |writer| writer.write_all(bytes.get_ref()).map_err(Error::write(path)))
+}
+
+/// Depth [H, W] as colours [3, H, W]: near is bright, far dark, by inverse depth between the picture's own 2nd and 98th
+/// percentiles; nothing (`alpha` below ½) is black.
+pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
+    // From far to near: dark blue, violet, orange, pale yellow.
+    const STOPS: [[f32; 3]; 5] =
+        [[0.05, 0.03, 0.30], [0.45, 0.05, 0.60], [0.80, 0.25, 0.45], [0.97, 0.60, 0.20], [0.98, 0.97, 0.70]];
+    let seen = alpha.ge(0.5).logical_and(&depth.gt(0.));
+    let inverse = depth.clamp_min(1e-6).reciprocal();
+    let values = inverse.masked_select(&seen);
+    if values.numel() == 0 {
+        return Tensor::zeros([3, depth.size()[0], depth.size()[1]], (Kind::Float, depth.device()));
+    }
+    let bound = |q: f64| values.quantile_scalar(q, None::<i64>, false, "linear").double_value(&[]);
+    let (far, near) = (bound(0.02), bound(0.98));
+    let position = ((inverse - far) / (near - far).max(1e-9)).clamp(0., 1.) * (STOPS.len() - 1) as f64;
+    let below = position.floor().clamp_max((STOPS.len() - 2) as f64);
+    let share = (&position - &below).unsqueeze(-1);
+    let stops = Tensor::from_slice2(&STOPS).to_device(depth.device());
+    let index = below.to_kind(Kind::Int64).flatten(0, -1);
+    let at = |i: &Tensor| stops.index_select(0, i).view([depth.size()[0], depth.size()[1], 3]);
+    let colour = Tensor::lerp_tensor(&at(&index), &at(&(&index + 1)), &share);
+    colour.permute([2, 0, 1]) * seen.to_kind(Kind::Float)
+}
+
+const GAP: i64 = 4;
+
+/// Pictures [3, H, W] of one height side by side, with a white gap.
+pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
+    tile(pictures, 2)
+}
+
+/// Pictures [3, H, W] of one width one below the other, with a white gap.
+pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
+    tile(pictures, 1)
+}
+
+fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
+    let mut parts = vec![];
+    for (i, picture) in pictures.iter().enumerate() {
+        if i > 0 {
+            let mut gap = picture.size();
+            gap[dim as usize] = GAP;
+            parts.push(Tensor::ones(gap, (picture.kind(), picture.device())));
+        }
+        parts.push(picture.shallow_clone());
+    }
+    Tensor::cat(&parts, dim)
+}

@@ -1,0 +1,125 @@
+//! The model's shape.
+
+use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// One or two streams of scene tokens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Streams {
+    /// Geometry and appearance apart, joined by a mixer after every round: the full model.
+    Dual,
+    /// One stream, no mixer: an ablation.
+    Single,
+}
+
+/// The numbers of SPEC sections 3 to 5. The default is the main 16K model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelConfig {
+    /// Patch edge in pixels, p.
+    pub patch_size: i64,
+    /// Scene tokens, M.
+    pub latents: i64,
+    /// Width of a scene token, d.
+    pub width: i64,
+    /// Width of the RGB half of an image token.
+    pub rgb_width: i64,
+    /// Width of the ray half of an image token.
+    pub ray_width: i64,
+    /// Encoder rounds.
+    pub rounds: i64,
+    /// Self-attention blocks in each stream and round.
+    pub self_attention_blocks: i64,
+    /// Attention heads.
+    pub heads: i64,
+    /// Candidate Gaussians per scene token, K: a power of two.
+    pub candidates: i64,
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: i64,
+    /// Dual, or the single-stream ablation.
+    pub streams: Streams,
+    /// Whether ray tokens carry the camera code; without it, the "Plücker only" ablation.
+    pub camera_code: bool,
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        ModelConfig {
+            patch_size: 8,
+            latents: 2048,
+            width: 512,
+            rgb_width: 512,
+            ray_width: 256,
+            rounds: 4,
+            self_attention_blocks: 2,
+            heads: 8,
+            candidates: 16,
+            sh_degree: 3,
+            streams: Streams::Dual,
+            camera_code: true,
+        }
+    }
+}
+
+impl ModelConfig {
+    /// Spherical harmonics per colour channel.
+    pub fn sh_bases(&self) -> i64 {
+        (self.sh_degree + 1).pow(2)
+    }
+
+    /// Width of an image token.
+    pub fn token_width(&self) -> i64 {
+        self.ray_width + self.rgb_width
+    }
+
+    /// The last stage that the candidates allow: log2 K.
+    pub fn max_stage(&self) -> u32 {
+        self.candidates.ilog2()
+    }
+
+    /// Whether the numbers fit together.
+    ///
+    /// # Errors
+    /// Names the first field that doesn't.
+    pub fn check(&self) -> Result<()> {
+        let fields = [
+            ("patch_size", self.patch_size, 1),
+            ("latents", self.latents, 1),
+            ("width", self.width, 1),
+            ("rgb_width", self.rgb_width, 1),
+            ("ray_width", self.ray_width, 1),
+            ("rounds", self.rounds, 0),
+            ("self_attention_blocks", self.self_attention_blocks, 0),
+            ("heads", self.heads, 1),
+            ("candidates", self.candidates, 1),
+            ("sh_degree", self.sh_degree, 0),
+        ];
+        for (name, value, least) in fields {
+            if value < least {
+                return Err(Error::Request(format!("model.{name} is {value}, expected {least} or more")));
+            }
+        }
+        let expect = |holds: bool, field: &str, value: i64, expected: String| match holds {
+            true => Ok(()),
+            false => Err(Error::Request(format!("model.{field} is {value}, expected {expected}"))),
+        };
+        expect(self.width % self.heads == 0, "width", self.width, format!("a multiple of the {} heads", self.heads))?;
+        expect((self.candidates as u64).is_power_of_two(), "candidates", self.candidates, "a power of two".into())?;
+        expect(self.sh_degree <= 3, "sh_degree", self.sh_degree, "0 to 3".into())
+    }
+
+    /// Whether images of this size can be cut into patches.
+    ///
+    /// # Errors
+    /// Names the side that can't.
+    pub fn check_image(&self, height: i64, width: i64) -> Result<()> {
+        for (name, size) in [("height", height), ("width", width)] {
+            if size <= 0 || size % self.patch_size != 0 {
+                let p = self.patch_size;
+                return Err(Error::Request(format!("the image {name} is {size}, expected a multiple of the patch size {p}")));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,125 @@
+//! Two linear heads, and what makes Gaussians of their numbers (SPEC section 5).
+
+use super::config::ModelConfig;
+use super::encoder::Encoded;
+use super::gaussians::Gaussians;
+use super::layers::linear;
+use super::merge::{Candidates, Stage};
+use super::rotation::{normalize, quaternion_from_6d};
+use std::f64::consts::LN_2;
+use tch::{Tensor, nn, nn::Module};
+
+/// Weights of the geometry heads at the start.
+const GEOMETRY_STD: f64 = 1e-2;
+/// Weights of the SH head at the start.
+const SH_STD: f64 = 1e-3;
+/// Numbers per candidate in the parameter head: 3 log-scales, 6 of rotation, 1 opacity logit.
+const PARAMETERS: i64 = 10;
+
+/// Added to every position: the scene starts in front of the mean camera.
+const MEAN_OFFSET: [f32; 3] = [0., 0., 1.5];
+const LOG_SCALE_OFFSET: f64 = -2.;
+const OPACITY_OFFSET: f64 = -5.;
+const MAX_OPACITY: f64 = 0.99;
+/// Of opacity logits.
+const LOGIT_RANGE: [f64; 2] = [-13., 6.];
+const MIN_SCALE: f64 = 1e-4;
+/// Scales above it are penalized (the clamp lies further out).
+pub(crate) const MAX_SCALE: f64 = 0.05;
+
+/// What the heads said before any clamp, for the regularizers of `loss`.
+#[derive(Debug)]
+pub struct RawOutputs {
+    /// Log-scales with their offset, [B, M, K, 3].
+    pub log_scales: Tensor,
+    /// Rotation residuals, [B, M, K, 6].
+    pub rotations: Tensor,
+    /// Spherical harmonics, [B, M, K, bases · 3].
+    pub sh: Tensor,
+    /// Logits of the opacities that are shown, [B, N].
+    pub opacity_logits: Tensor,
+}
+
+/// Gaussians, and what the losses need beside them.
+#[derive(Debug)]
+pub struct Decoded {
+    /// N = M · 2^s of them.
+    pub gaussians: Gaussians,
+    /// The two normalized vectors that each quaternion came from, [B, N, 6].
+    pub rotations_6d: Tensor,
+    /// Before clamps.
+    pub raw: RawOutputs,
+}
+
+/// Scene tokens to Gaussians.
+#[derive(Debug)]
+pub struct Decoder {
+    mean_offset: Tensor,
+    positions: nn::Linear,
+    parameters: nn::Linear,
+    gate: nn::Linear,
+    sh: nn::Linear,
+    candidates: i64,
+    sh_bases: i64,
+}
+
+impl Decoder {
+    /// `vs` is the decoder's own path.
+    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
+        let (d, k) = (config.width, config.candidates);
+        let mut mean_offset = vs.zeros_no_train("patch_center_bias", &[1, 1, 3]);
+        tch::no_grad(|| mean_offset.copy_(&Tensor::from_slice(&MEAN_OFFSET).view([1, 1, 3])));
+        Decoder {
+            mean_offset,
+            positions: linear(vs / "geo_pos_readout", d, 3 * k, GEOMETRY_STD),
+            parameters: linear(vs / "geo_param_readout", d, PARAMETERS * k, GEOMETRY_STD),
+            gate: linear(vs / "gate_readout", d, k, GEOMETRY_STD),
+            sh: linear(vs / "sh_readout", d, 3 * config.sh_bases() * k, SH_STD),
+            candidates: k,
+            sh_bases: config.sh_bases(),
+        }
+    }
+
+    /// The heads, then the Gaussians of `stage`.
+    pub fn forward(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+        let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
+        let k = self.candidates;
+        let positions = self.positions.forward(&encoded.geometry).view([b, m, k, 3]);
+        let parameters = self.parameters.forward(&encoded.geometry).view([b, m, k, PARAMETERS]);
+        let log_scales = parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET;
+        let rotations = parameters.narrow(-1, 3, 6);
+        // Half the opacity at the start of a transition, which doubles the number of Gaussians.
+        let opacity_logits = parameters.narrow(-1, 9, 1) + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
+        let gate = self.gate.forward(&encoded.geometry); // [B, M, K]
+        let sh = self.sh.forward(&encoded.appearance).view([b, m, k, self.sh_bases * 3]);
+
+        let candidates = Candidates {
+            positions,
+            log_scales: log_scales.clamp(MIN_SCALE.ln() - 1., MAX_SCALE.ln() + 2.),
+            rotations: rotations.shallow_clone(),
+            opacity_logits: opacity_logits.clamp(LOGIT_RANGE[0], LOGIT_RANGE[1]),
+            sh: sh.shallow_clone(),
+        };
+        let shown = candidates.at_stage(&gate, stage); // [B, M, G, ..]
+
+        let n = m << stage.index;
+        let rotations_6d = self.activate_rotations(&shown.rotations.view([b, n, 6]));
+        let logits = shown.opacity_logits.view([b, n]);
+        let gaussians = Gaussians {
+            means: shown.positions.view([b, n, 3]) + &self.mean_offset,
+            scales: shown.log_scales.view([b, n, 3]).exp(),
+            quaternions: quaternion_from_6d(&rotations_6d),
+            opacities: logits.sigmoid().clamp(0., MAX_OPACITY),
+            sh: shown.sh.view([b, n, self.sh_bases, 3]),
+        };
+        let raw = RawOutputs { log_scales, rotations, sh, opacity_logits: logits };
+        Decoded { gaussians, rotations_6d, raw }
+    }
+
+    /// Residuals to two unit vectors, [B, N, 6].
+    fn activate_rotations(&self, residuals: &Tensor) -> Tensor {
+        let identity = Tensor::from_slice(&[1f32, 0., 0., 0., 1., 0.]).to_device(residuals.device());
+        let vectors = (residuals + identity.to_kind(residuals.kind())).unflatten(-1, [2, 3]);
+        normalize(&vectors).flatten(-2, -1)
+    }
+}

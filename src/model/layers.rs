@@ -1,0 +1,79 @@
+//! The pieces that streams and mixer are made of, with the initializations of SPEC section 4.
+
+use tch::{Tensor, nn, nn::Module};
+
+/// Of encoder linears and learnable tokens.
+pub(super) const ENCODER_STD: f64 = 0.02;
+
+/// Normal with mean 0. Where SPEC says truncated normal the cut is at ±2, as in torch's `trunc_normal_`: a hundred
+/// standard deviations away, so it is the plain normal.
+pub(super) fn randn(stdev: f64) -> nn::Init {
+    nn::Init::Randn { mean: 0., stdev }
+}
+
+/// A linear layer with normal weights and zero bias.
+pub(super) fn linear(vs: nn::Path, inputs: i64, outputs: i64, stdev: f64) -> nn::Linear {
+    let config = nn::LinearConfig { ws_init: randn(stdev), bs_init: Some(nn::Init::Const(0.)), bias: true };
+    nn::linear(vs, inputs, outputs, config)
+}
+
+/// A linear layer with libtorch's own initialization, uniform in ±1/√inputs for weights and bias. (tch's default for
+/// weights is another one.)
+pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool) -> nn::Linear {
+    let bound = 1. / (inputs as f64).sqrt();
+    let uniform = nn::Init::Uniform { lo: -bound, up: bound };
+    nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
+}
+
+/// Layer normalization over the last dimension, ε = 1e-5.
+pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
+    nn::layer_norm(vs, vec![width], Default::default())
+}
+
+/// x ↦ γ ⊙ x.
+#[derive(Debug)]
+pub(super) struct LayerScale {
+    gamma: Tensor,
+}
+
+impl LayerScale {
+    pub fn new(vs: nn::Path, width: i64, init: f64) -> Self {
+        LayerScale { gamma: vs.var("gamma", &[width], nn::Init::Const(init)) }
+    }
+
+    pub fn forward(&self, xs: &Tensor) -> Tensor {
+        xs * &self.gamma
+    }
+}
+
+/// W2 · GELU(W1 · x), the exact GELU.
+#[derive(Debug)]
+pub(super) struct Mlp {
+    expand: nn::Linear,
+    contract: nn::Linear,
+}
+
+impl Mlp {
+    /// `names` are those of the two layers in the published weights.
+    pub fn new(vs: nn::Path, inputs: i64, hidden: i64, outputs: i64, names: [&str; 2]) -> Self {
+        Mlp {
+            expand: linear(&vs / names[0], inputs, hidden, ENCODER_STD),
+            contract: linear(&vs / names[1], hidden, outputs, ENCODER_STD),
+        }
+    }
+
+    pub fn forward(&self, xs: &Tensor) -> Tensor {
+        self.contract.forward(&self.expand.forward(xs).gelu("none"))
+    }
+}
+
+/// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d].
+pub(super) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+    let split = |t: &Tensor| {
+        let (b, n, d) = t.size3().expect("[B, n, d]");
+        t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
+    };
+    Tensor::scaled_dot_product_attention(&split(q), &split(k), &split(v), None::<&Tensor>, 0., false, None, false)
+        .transpose(1, 2)
+        .flatten(2, 3)
+}

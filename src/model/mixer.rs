@@ -1,0 +1,38 @@
+//! Where the two streams meet, once per round (SPEC section 4).
+
+use super::layers::{LayerScale, Mlp, layer_norm};
+use tch::{Tensor, nn, nn::Module};
+
+const MIXER_LAYER_SCALE: f64 = 1e-3;
+
+/// An MLP over both streams, side by side, whose halves are added to them.
+#[derive(Debug)]
+pub(super) struct Mixer {
+    geometry_norm: nn::LayerNorm,
+    appearance_norm: nn::LayerNorm,
+    mlp: Mlp,
+    geometry_scale: LayerScale,
+    appearance_scale: LayerScale,
+}
+
+impl Mixer {
+    pub fn new(vs: nn::Path, d: i64) -> Self {
+        Mixer {
+            geometry_norm: layer_norm(&vs / "ln_g", d),
+            appearance_norm: layer_norm(&vs / "ln_t", d),
+            mlp: Mlp::new(&vs / "mlp", 2 * d, d, 2 * d, ["0", "2"]),
+            geometry_scale: LayerScale::new(&vs / "ls_g", d, MIXER_LAYER_SCALE),
+            appearance_scale: LayerScale::new(&vs / "ls_t", d, MIXER_LAYER_SCALE),
+        }
+    }
+
+    /// Both streams [B, S, d], and so the results.
+    pub fn forward(&self, geometry: &Tensor, appearance: &Tensor) -> (Tensor, Tensor) {
+        let both = [self.geometry_norm.forward(geometry), self.appearance_norm.forward(appearance)];
+        let mixed = self.mlp.forward(&Tensor::cat(&both, -1)).chunk(2, -1);
+        (
+            geometry + self.geometry_scale.forward(&mixed[0]),
+            appearance + self.appearance_scale.forward(&mixed[1]),
+        )
+    }
+}

@@ -1,0 +1,90 @@
+//! The network: posed images to Gaussians (SPEC sections 3 to 5, the paper's figure 2), in the order data flows.
+//!
+//! Parameters carry the names of the published weights, so that a model trained here and one published by the authors
+//! are the same file after a change of container.
+
+mod camera_code;
+mod config;
+pub(crate) use decoder::MAX_SCALE;
+mod decoder;
+mod encoder;
+mod gaussians;
+mod layers;
+mod merge;
+mod mixer;
+mod rotation;
+mod stream;
+mod tokens;
+
+pub use config::{ModelConfig, Streams};
+pub use decoder::{Decoded, Decoder, RawOutputs};
+pub use encoder::{Encoded, Encoder};
+pub use gaussians::Gaussians;
+pub use merge::Stage;
+pub use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
+pub use tokens::{Tokenizer, patchify};
+
+use crate::error::Result;
+use layers::randn;
+use tch::{Tensor, nn};
+
+/// The whole model.
+#[derive(Debug)]
+pub struct GlobalSplat {
+    config: ModelConfig,
+    tokenizer: Tokenizer,
+    scene_tokens: Tensor,
+    encoder: Encoder,
+    decoder: Decoder,
+}
+
+impl GlobalSplat {
+    /// Builds the model with fresh weights under `vs`.
+    ///
+    /// # Errors
+    /// A configuration whose numbers don't fit together.
+    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Result<Self> {
+        config.check()?;
+        // Orthogonal tokens start as different from each other as they can be; that needs no more of them than dimensions.
+        let scene_tokens = if config.latents <= config.width {
+            vs.var("scene_tokens", &[config.latents, config.width], nn::Init::Orthogonal { gain: 0.02 })
+        } else {
+            vs.var("scene_tokens", &[config.latents, config.width], randn(0.02))
+        };
+        Ok(GlobalSplat {
+            tokenizer: Tokenizer::new(vs, config),
+            scene_tokens,
+            encoder: Encoder::new(&(vs / "slot_encoder"), config),
+            decoder: Decoder::new(&(vs / "gaussian_decoder"), config),
+            config: config.clone(),
+        })
+    }
+
+    /// One pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics`
+    /// [B, V, 3, 3] in pixels; H and W multiples of the patch size.
+    pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
+        let tokens = self.tokens(images, c2w, intrinsics); // [B, V, P, 768]
+        let encoded = self.encode(&tokens);
+        self.decoder.forward(&encoded, stage)
+    }
+
+    /// The first third of [`GlobalSplat::forward`]: [B, V, P, ray width + RGB width].
+    pub fn tokens(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
+        self.tokenizer.forward(images, c2w, intrinsics)
+    }
+
+    /// The second third: scene tokens that have seen every view.
+    pub fn encode(&self, tokens: &Tensor) -> Encoded {
+        self.encoder.forward(&self.scene_tokens, &tokens.flatten(1, 2))
+    }
+
+    /// The last third.
+    pub fn decode(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+        self.decoder.forward(encoded, stage)
+    }
+
+    /// What the model was built from.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+}

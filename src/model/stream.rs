@@ -1,0 +1,101 @@
+//! One stream's part of an encoder round: look at the images, think, then talk among the scene tokens (SPEC section 4).
+
+use super::config::ModelConfig;
+use super::encoder::REGISTERS;
+use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear};
+use tch::{Tensor, nn, nn::Module};
+
+const MLP_RATIO: i64 = 4;
+const CROSS_LAYER_SCALE: f64 = 1e-3;
+const SELF_LAYER_SCALE: f64 = 1e-2;
+
+/// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
+#[derive(Debug)]
+pub(super) struct StreamRound {
+    slots_norm: nn::LayerNorm,
+    memory_norm: nn::LayerNorm,
+    query: nn::Linear,
+    key: nn::Linear,
+    value: nn::Linear,
+    output: nn::Linear,
+    attention_scale: LayerScale,
+    mlp_norm: nn::LayerNorm,
+    mlp: Mlp,
+    mlp_scale: LayerScale,
+    blocks: Vec<SelfAttentionBlock>,
+    heads: i64,
+}
+
+impl StreamRound {
+    pub fn new(vs: nn::Path, config: &ModelConfig) -> Self {
+        let (d, memory) = (config.width, config.token_width());
+        StreamRound {
+            slots_norm: layer_norm(&vs / "slots_ln", d),
+            memory_norm: layer_norm(&vs / "mem_ln", memory),
+            query: linear(&vs / "lat_q", d, d, ENCODER_STD),
+            key: linear(&vs / "mem_k", memory, d, ENCODER_STD),
+            value: linear(&vs / "mem_v", memory, d, ENCODER_STD),
+            output: linear(&vs / "out_proj", d, d, ENCODER_STD),
+            attention_scale: LayerScale::new(&vs / "attn_ls", d, CROSS_LAYER_SCALE),
+            mlp_norm: layer_norm(&vs / "post_ln", d),
+            mlp: Mlp::new(&vs / "mlp", d, MLP_RATIO * d, d, ["0", "2"]),
+            mlp_scale: LayerScale::new(&vs / "mlp_ls", d, CROSS_LAYER_SCALE),
+            blocks: (0..config.self_attention_blocks)
+                .map(|i| SelfAttentionBlock::new(&vs / "tower" / i, d, config.heads))
+                .collect(),
+            heads: config.heads,
+        }
+    }
+
+    /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width]; result [B, S, d].
+    pub fn forward(&self, slots: &Tensor, memory: &Tensor) -> Tensor {
+        // Registers neither look at the images nor pass the MLP: they only change in self-attention.
+        let reading = slots.size()[1] - REGISTERS;
+        let registers = slots.narrow(1, reading, REGISTERS);
+        let slots = slots.narrow(1, 0, reading);
+
+        let memory = self.memory_norm.forward(memory);
+        let query = self.query.forward(&self.slots_norm.forward(&slots));
+        let seen = attention(&query, &self.key.forward(&memory), &self.value.forward(&memory), self.heads);
+        let slots = slots + self.attention_scale.forward(&self.output.forward(&seen));
+        let slots = &slots + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&slots)));
+
+        let slots = Tensor::cat(&[slots, registers], 1);
+        self.blocks.iter().fold(slots, |slots, block| block.forward(&slots))
+    }
+}
+
+/// A pre-norm transformer block.
+#[derive(Debug)]
+struct SelfAttentionBlock {
+    attention_norm: nn::LayerNorm,
+    qkv: nn::Linear,
+    project: nn::Linear,
+    attention_scale: LayerScale,
+    mlp_norm: nn::LayerNorm,
+    mlp: Mlp,
+    mlp_scale: LayerScale,
+    heads: i64,
+}
+
+impl SelfAttentionBlock {
+    fn new(vs: nn::Path, d: i64, heads: i64) -> Self {
+        SelfAttentionBlock {
+            attention_norm: layer_norm(&vs / "norm1", d),
+            qkv: linear(&vs / "attn" / "qkv", d, 3 * d, ENCODER_STD),
+            project: linear(&vs / "attn" / "proj", d, d, ENCODER_STD),
+            attention_scale: LayerScale::new(&vs / "ls1", d, SELF_LAYER_SCALE),
+            mlp_norm: layer_norm(&vs / "norm2", d),
+            mlp: Mlp::new(&vs / "mlp", d, MLP_RATIO * d, d, ["fc1", "fc2"]),
+            mlp_scale: LayerScale::new(&vs / "ls2", d, SELF_LAYER_SCALE),
+            heads,
+        }
+    }
+
+    fn forward(&self, xs: &Tensor) -> Tensor {
+        let qkv = self.qkv.forward(&self.attention_norm.forward(xs)).chunk(3, -1);
+        let mixed = attention(&qkv[0], &qkv[1], &qkv[2], self.heads);
+        let xs = xs + self.attention_scale.forward(&self.project.forward(&mixed));
+        &xs + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&xs)))
+    }
+}

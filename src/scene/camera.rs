@@ -1,0 +1,112 @@
+//! Intrinsics and poses.
+
+use glam::{DMat4, DVec3};
+
+/// How far RᵀR may be from the identity, per entry: captures store poses with 3 to 7 digits.
+const RIGID_TOLERANCE: f64 = 5e-3;
+
+/// A pinhole camera's intrinsics, in pixels of the image they travel with. Pixel (i, j) has its centre at (j + ½, i + ½).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Principal point, x.
+    pub cx: f64,
+    /// Principal point, y.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// After resizing the image by the factors `x` and `y`.
+    pub fn resized(&self, x: f64, y: f64) -> Self {
+        Intrinsics { fx: self.fx * x, fy: self.fy * y, cx: self.cx * x, cy: self.cy * y }
+    }
+
+    /// After cutting `left` columns and `top` rows away.
+    pub fn cropped(&self, left: f64, top: f64) -> Self {
+        Intrinsics { cx: self.cx - left, cy: self.cy - top, ..*self }
+    }
+
+    /// The 3×3 matrix, row by row.
+    pub fn to_rows(&self) -> [f64; 9] {
+        [self.fx, 0., self.cx, 0., self.fy, self.cy, 0., 0., 1.]
+    }
+
+    /// Checks them against an image of `width` × `height`: positive focal lengths, and a principal point that is at most
+    /// one pixel outside the image.
+    ///
+    /// # Errors
+    /// (field, what was found, what was expected).
+    pub fn check(&self, width: u32, height: u32) -> Result<(), (String, String, String)> {
+        for (name, focal) in [("fx", self.fx), ("fy", self.fy)] {
+            if !(focal > 0. && focal.is_finite()) {
+                return Err((format!("focal length {name}"), focal.to_string(), "a number above 0".into()));
+            }
+        }
+        for (name, point, size) in [("cx", self.cx, width), ("cy", self.cy, height)] {
+            if !(point >= -1. && point <= f64::from(size) + 1.) {
+                let expected = format!("one inside the image, 0 to {size} pixels");
+                return Err((format!("principal point {name}"), point.to_string(), expected));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where a picture is taken from, and how.
+#[derive(Debug, Clone, Copy)]
+pub struct Camera {
+    /// In pixels of `width` × `height`.
+    pub intrinsics: Intrinsics,
+    /// Camera-to-world.
+    pub c2w: DMat4,
+    /// Picture width in pixels.
+    pub width: u32,
+    /// Picture height in pixels.
+    pub height: u32,
+}
+
+/// Checks that `c2w` is a rigid motion: finite, last row (0, 0, 0, 1), an orthonormal right-handed rotation.
+///
+/// # Errors
+/// (what was found, what was expected).
+pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
+    if !c2w.is_finite() {
+        return Err(("a matrix with NaN or infinite entries".into(), "finite numbers".into()));
+    }
+    let last = c2w.row(3);
+    if (last - glam::DVec4::W).abs().max_element() > RIGID_TOLERANCE {
+        return Err((format!("a matrix with last row {last}"), "a last row of 0, 0, 0, 1".into()));
+    }
+    let rotation = glam::DMat3::from_mat4(*c2w);
+    let determinant = rotation.determinant();
+    if determinant.abs() < 1e-9 {
+        return Err(("a singular matrix".into(), "a rotation and a translation".into()));
+    }
+    let gram = rotation.transpose() * rotation;
+    let off = (gram - glam::DMat3::IDENTITY).to_cols_array().iter().fold(0f64, |m, v| m.max(v.abs()));
+    if off > RIGID_TOLERANCE || determinant < 0. {
+        let found = if determinant < 0. {
+            "a matrix that mirrors (determinant below 0)".to_string()
+        } else {
+            format!("a matrix that isn't rigid (RᵀR is {off:.3} off the identity)")
+        };
+        return Err((found, "a rotation and a translation".into()));
+    }
+    Ok(())
+}
+
+/// The 4×4 matrix, row by row.
+pub fn pose_to_rows(pose: &DMat4) -> [f64; 16] {
+    pose.transpose().to_cols_array()
+}
+
+/// A camera at `eye` that looks at `target`, with `down` as near to its y axis as can be.
+pub(super) fn look_at(eye: DVec3, target: DVec3, down: DVec3) -> DMat4 {
+    let forward = (target - eye).normalize();
+    let right = down.cross(forward).normalize();
+    let down = forward.cross(right);
+    DMat4::from_cols(right.extend(0.), down.extend(0.), forward.extend(0.), eye.extend(1.))
+}

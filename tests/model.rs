@@ -1,0 +1,167 @@
+//! The model's parameters, variants and image sizes.
+
+mod common;
+
+use globalsplat::model::{GlobalSplat, ModelConfig, Stage, Streams};
+use std::collections::BTreeMap;
+use tch::{Device, Kind, Tensor, nn};
+
+fn build(config: &ModelConfig) -> (nn::VarStore, GlobalSplat) {
+    let vs = nn::VarStore::new(Device::Cpu);
+    let model = GlobalSplat::new(&vs.root(), config).expect("a valid configuration");
+    (vs, model)
+}
+
+fn small() -> ModelConfig {
+    ModelConfig { latents: 12, width: 32, rgb_width: 24, ray_width: 16, rounds: 2, heads: 4, ..Default::default() }
+}
+
+/// `views` images of noise from cameras in a row.
+fn inputs(views: i64, height: i64, width: i64) -> [Tensor; 3] {
+    let options = (Kind::Float, Device::Cpu);
+    let images = Tensor::rand([1, views, 3, height, width], options);
+    let c2w = Tensor::eye(4, options).repeat([1, views, 1, 1]);
+    let _ = c2w.select(3, 3).select(2, 0).copy_(&Tensor::linspace(-0.5, 0.5, views, options).unsqueeze(0));
+    let (w, h) = (width as f32, height as f32);
+    let intrinsics = Tensor::from_slice(&[w, 0., w / 2., 0., w, h / 2., 0., 0., 1.]).view([3, 3]);
+    [images, c2w, intrinsics.repeat([1, views, 1, 1])]
+}
+
+#[test]
+fn the_main_model_has_the_published_names_and_shapes() {
+    let Some(golden) = common::golden() else { return };
+    let table = golden.join("../spec/state_dict_16k.tsv");
+    let Ok(table) = std::fs::read_to_string(&table) else {
+        println!("skipped: {} is not there", table.display());
+        return;
+    };
+    let expected: BTreeMap<String, Vec<i64>> = table
+        .lines()
+        .map(|line| {
+            let (name, shape) = line.split_once('\t').expect("name and shape");
+            (name.to_string(), shape.split(',').map(|s| s.parse().expect("a size")).collect())
+        })
+        .collect();
+    let (vs, _) = build(&ModelConfig::default());
+    let ours: BTreeMap<String, Vec<i64>> = vs.variables().into_iter().map(|(name, t)| (name, t.size())).collect();
+    assert_eq!(expected.len(), 454);
+    assert_eq!(ours, expected);
+}
+
+#[test]
+fn the_main_model_has_84_million_trained_parameters() {
+    let (vs, _) = build(&ModelConfig::default());
+    let trained: usize = vs.trainable_variables().iter().map(Tensor::numel).sum();
+    assert_eq!(trained, 84_321_120);
+}
+
+#[test]
+fn the_single_stream_has_90_million_parameters() {
+    let config = ModelConfig { streams: Streams::Single, width: 776, ..Default::default() };
+    let (vs, _) = build(&config);
+    let trained: usize = vs.trainable_variables().iter().map(Tensor::numel).sum();
+    let off = trained as f64 / 90e6 - 1.;
+    assert!(off.abs() <= 0.01, "{trained} parameters");
+    assert!(vs.variables().keys().all(|name| !name.contains("tex") && !name.contains("pair_adapters")));
+}
+
+#[test]
+fn plucker_only_has_no_camera_code() {
+    let (vs, _) = build(&ModelConfig { camera_code: false, ..small() });
+    assert!(vs.variables().keys().all(|name| !name.starts_with("view_pe")));
+}
+
+#[test]
+fn every_variant_decodes_as_many_gaussians_as_it_says() {
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let variants = [
+        (small(), 3, 12 * 8),
+        (small(), 4, 12 * 16),
+        (ModelConfig { candidates: 2, ..small() }, 0, 12),
+        (ModelConfig { streams: Streams::Single, ..small() }, 3, 12 * 8),
+        (ModelConfig { camera_code: false, ..small() }, 3, 12 * 8),
+        (ModelConfig { sh_degree: 0, ..small() }, 1, 12 * 2),
+        (ModelConfig { latents: 48, ..small() }, 3, 48 * 8), // more tokens than dimensions
+    ];
+    for (config, stage, count) in variants {
+        let (_vs, model) = build(&config);
+        for mix in [0., 0.3, 1.] {
+            let decoded = model.forward(&images, &c2w, &intrinsics, Stage { index: stage, mix });
+            let g = &decoded.gaussians;
+            assert_eq!(g.means.size(), [1, count, 3], "{config:?}");
+            assert_eq!(g.sh.size(), [1, count, config.sh_bases(), 3]);
+            for t in [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh] {
+                assert_eq!(t.isfinite().all().int64_value(&[]), 1);
+            }
+            let norms = g.quaternions.norm_scalaropt_dim(2, [-1i64], false);
+            assert!((norms - 1.).abs().max().double_value(&[]) < 1e-5);
+            assert!(g.quaternions.select(-1, 0).min().double_value(&[]) >= 0.);
+        }
+    }
+}
+
+#[test]
+fn the_number_of_gaussians_does_not_depend_on_the_number_of_views() {
+    let (_vs, model) = build(&small());
+    for views in [2, 5] {
+        let [images, c2w, intrinsics] = inputs(views, 16, 16);
+        let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+        assert_eq!(decoded.gaussians.count(), 12 * 8);
+    }
+}
+
+#[test]
+fn a_transition_starts_where_the_stage_before_ended() {
+    // At λ = 0 every parent is there twice, its optical depth split between the two.
+    let (_vs, model) = build(&small());
+    let [images, c2w, intrinsics] = inputs(2, 16, 16);
+    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics));
+    let after = model.decode(&encoded, Stage { index: 2, mix: 0. }).gaussians;
+    let before = model.decode(&encoded, Stage { index: 1, mix: 1. }).gaussians;
+    let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 1, None);
+    assert!(common::largest_error(&after.means, &twice(&before.means)) < 1e-6);
+    assert!(common::largest_error(&after.sh, &twice(&before.sh)) < 1e-6);
+    let ratio = after.scales / twice(&before.scales);
+    assert!((ratio - 0.5f64.cbrt()).abs().max().double_value(&[]) < 1e-6);
+}
+
+#[test]
+fn initial_weights_are_as_specified() {
+    tch::manual_seed(0);
+    let (vs, _) = build(&ModelConfig { rounds: 1, ..Default::default() });
+    let variables = vs.variables();
+    let std = |name: &str| variables[name].std(false).double_value(&[]);
+    let near = |value: f64, expected: f64| assert!((value / expected - 1.).abs() < 0.05, "{value} for {expected}");
+    near(std("slot_encoder.geo_rounds.0.lat_q.weight"), 0.02);
+    near(std("slot_encoder.mem_regs"), 0.02);
+    near(std("scene_tokens"), 0.02);
+    near(std("gaussian_decoder.geo_pos_readout.weight"), 1e-2);
+    near(std("gaussian_decoder.sh_readout.weight"), 1e-3);
+    near(std("rgb_patch_embeds.1.weight"), 1. / (3f64 * 192.).sqrt()); // uniform ±1/√192
+    near(variables["slot_encoder.geo_rounds.0.attn_ls.gamma"].mean(Kind::Float).double_value(&[]), 1e-3);
+    near(variables["slot_encoder.geo_rounds.0.tower.1.ls2.gamma"].mean(Kind::Float).double_value(&[]), 1e-2);
+    for name in ["slot_encoder.geo_rounds.0.lat_q.bias", "gaussian_decoder.gate_readout.bias"] {
+        assert_eq!(variables[name].abs().max().double_value(&[]), 0.);
+    }
+    // M ≤ d: orthogonal rows of length 0.02.
+    let (vs, _) = build(&small());
+    let tokens = &vs.variables()["scene_tokens"];
+    let gram = tokens.matmul(&tokens.tr()) / (0.02 * 0.02);
+    assert!(common::largest_error(&gram, &Tensor::eye(12, (Kind::Float, Device::Cpu))) < 1e-5);
+}
+
+#[test]
+fn configurations_that_do_not_fit_are_refused() {
+    let refused = [
+        (ModelConfig { width: 30, heads: 4, ..small() }, "model.width is 30"),
+        (ModelConfig { candidates: 6, ..small() }, "model.candidates is 6"),
+        (ModelConfig { sh_degree: 4, ..small() }, "model.sh_degree is 4"),
+        (ModelConfig { patch_size: 0, ..small() }, "model.patch_size is 0"),
+    ];
+    for (config, message) in refused {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let error = GlobalSplat::new(&vs.root(), &config).expect_err("a refusal").to_string();
+        assert!(error.starts_with(message), "{error}");
+    }
+    assert!(small().check_image(20, 16).unwrap_err().to_string().contains("height is 20"));
+}

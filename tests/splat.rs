@@ -1,0 +1,295 @@
+//! The splat op against finite differences and against brute force.
+
+mod common;
+
+use common::{Random, largest_error};
+use globalsplat::model::Gaussians;
+use globalsplat::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
+use tch::{Device, Kind, Tensor};
+
+/// Gaussians in front of the cameras of [`cameras`], of sizes and opacities as a trained scene has them, every one a
+/// full random rotation and SH of `degree`.
+fn gaussians(scenes: i64, count: i64, degree: i64, kind: Kind, seed: u64) -> Gaussians {
+    let mut random = Random::new(seed);
+    let means = random.uniform(&[scenes, count, 3]) * 2. - 1.;
+    Gaussians {
+        means: means + Tensor::from_slice(&[0f32, 0., 2.2]),
+        scales: (random.uniform(&[scenes, count, 3]) * 2. - 3.5).exp(),
+        quaternions: random.symmetric(&[scenes, count, 4]),
+        opacities: random.uniform(&[scenes, count]) * 0.9 + 0.05,
+        sh: random.symmetric(&[scenes, count, (degree + 1) * (degree + 1), 3]) * 0.5,
+    }
+    .map(|t| t.to_kind(kind))
+}
+
+/// Cameras side by side, the last ones turned inwards.
+fn cameras(scenes: i64, count: i64, width: i64, height: i64, kind: Kind) -> Cameras {
+    let (mut w2c, mut intrinsics) = (vec![], vec![]);
+    for i in 0..scenes * count {
+        let (sin, cos) = (0.12 * i as f64).sin_cos();
+        w2c.extend([cos, 0., sin, -0.1 * i as f64, 0., 1., 0., 0.05, -sin, 0., cos, 0.1, 0., 0., 0., 1.]);
+        let focal = 0.9 * width as f64;
+        intrinsics.extend([focal, 0., width as f64 / 2. + 0.3, 0., focal * 1.1, height as f64 / 2., 0., 0., 1.]);
+    }
+    Cameras {
+        w2c: Tensor::from_slice(&w2c).view([scenes, count, 4, 4]).to_kind(kind),
+        intrinsics: Tensor::from_slice(&intrinsics).view([scenes, count, 3, 3]).to_kind(kind),
+        width,
+        height,
+    }
+}
+
+fn draw(g: &Gaussians, c: &Cameras) -> Pictures {
+    render(g, c, DEFAULT_EPS2D).expect("shapes that fit")
+}
+
+/// A number that weighs every pixel of every picture differently, the same on every call.
+fn objective(p: &Pictures) -> Tensor {
+    let weigh = |t: &Tensor, phase: f64| {
+        let n = t.numel() as i64;
+        let weights = (Tensor::arange(n, (Kind::Double, Device::Cpu)) * 0.7 + phase).sin().view_as(t);
+        (t.to_kind(Kind::Double) * weights).sum(Kind::Double)
+    };
+    weigh(&p.rgb, 0.1) + weigh(&p.alpha, 0.9) + weigh(&p.depth, 1.7)
+}
+
+/// [`Gaussians`] that record gradients.
+fn leaves(g: &Gaussians) -> Gaussians {
+    g.map(|t| t.detach().copy().set_requires_grad(true))
+}
+
+fn fields(g: &Gaussians) -> [(&'static str, &Tensor); 5] {
+    [
+        ("means", &g.means),
+        ("scales", &g.scales),
+        ("quaternions", &g.quaternions),
+        ("opacities", &g.opacities),
+        ("sh", &g.sh),
+    ]
+}
+
+#[test]
+fn gradients_are_those_of_finite_differences() {
+    // Central differences in float64 along random directions, one input at a time and all of its entries at once. The
+    // picture jumps where some α crosses 1/255: a direction whose difference quotient changes with the step met such a
+    // jump and is drawn again.
+    const DIRECTIONS: u64 = 4;
+    for (degree, seed) in [(0, 1), (1, 2), (2, 3), (3, 4)] {
+        let (scenes, views) = (2, 3);
+        let base = gaussians(scenes, 40, degree, Kind::Double, seed);
+        let c = cameras(scenes, views, 37, 29, Kind::Double);
+        let g = leaves(&base);
+        objective(&draw(&g, &c)).backward();
+        for (index, (name, leaf)) in fields(&g).into_iter().enumerate() {
+            let gradient = leaf.grad();
+            let (mut compared, mut drawn) = (0, 0);
+            while compared < DIRECTIONS {
+                assert!(drawn < 4 * DIRECTIONS, "degree {degree} {name}: no direction without a jump");
+                let direction = Random::new(1000 * seed + 100 * index as u64 + drawn).symmetric(&leaf.size());
+                drawn += 1;
+                let quotient = |h: f64| {
+                    let at = |step: f64| {
+                        let moved = leaf.detach() + &direction * step;
+                        let mut g = base.map(Tensor::shallow_clone);
+                        *[&mut g.means, &mut g.scales, &mut g.quaternions, &mut g.opacities, &mut g.sh][index] = moved;
+                        objective(&draw(&g, &c)).double_value(&[])
+                    };
+                    (at(h) - at(-h)) / (2. * h)
+                };
+                let (numeric, coarse) = (quotient(1e-7), quotient(2e-7));
+                if (numeric - coarse).abs() > 1e-3 * numeric.abs().max(1.) {
+                    continue;
+                }
+                let analytic = (&gradient * &direction).sum(Kind::Double).double_value(&[]);
+                let error = (analytic - numeric).abs() / numeric.abs().max(1.);
+                assert!(error <= 1e-6, "degree {degree} {name}: {analytic} against {numeric}");
+                compared += 1;
+            }
+        }
+    }
+}
+
+/// SPEC section 6, pixel by pixel over every Gaussian, in float64 and without any culling.
+fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
+    let values = |t: &Tensor| Vec::<f64>::try_from(t.to_kind(Kind::Double).flatten(0, -1)).expect("numbers");
+    let [means, scales, quaternions, opacities, sh] = fields(g).map(|(_, t)| values(t));
+    let (w2c, intrinsics) = (values(&c.w2c), values(&c.intrinsics));
+    let (scenes, n, bases) = (g.sh.size()[0] as usize, g.sh.size()[1] as usize, g.sh.size()[2] as usize);
+    assert_eq!(bases, 1, "brute force knows degree 0 alone; gradients prove the others");
+    let views = c.w2c.size()[1] as usize;
+    let (w, h) = (c.width as usize, c.height as usize);
+    let (mut rgb, mut alpha, mut depth) = (vec![], vec![], vec![]);
+    for scene in 0..scenes {
+        for view in 0..views {
+            let m = &w2c[(scene * views + view) * 16..][..16];
+            let k = &intrinsics[(scene * views + view) * 9..][..9];
+            let (fx, fy, cx, cy) = (k[0], k[4], k[2], k[5]);
+            let mut seen = vec![];
+            for i in scene * n..(scene + 1) * n {
+                let t: Vec<f64> =
+                    (0..3).map(|r| (0..3).map(|j| m[4 * r + j] * means[3 * i + j]).sum::<f64>() + m[4 * r + 3]).collect();
+                if t[2] <= 0.01 {
+                    continue;
+                }
+                let q = &quaternions[4 * i..][..4];
+                let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+                let q = glam::DQuat::from_xyzw(q[1] / norm, q[2] / norm, q[3] / norm, q[0] / norm);
+                let world = glam::DMat3::from_quat(q)
+                    * glam::DMat3::from_diagonal(glam::DVec3::from_slice(&scales[3 * i..][..3]));
+                let view = glam::DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
+                let (wf, hf) = (w as f64, h as f64);
+                let a = (t[0] / t[2]).clamp(-cx / fx - 0.15 * wf / fx, (wf - cx) / fx + 0.15 * wf / fx);
+                let b = (t[1] / t[2]).clamp(-cy / fy - 0.15 * hf / fy, (hf - cy) / fy + 0.15 * hf / fy);
+                let j = [
+                    glam::DVec3::new(fx / t[2], 0., -fx * a / t[2]),
+                    glam::DVec3::new(0., fy / t[2], -fy * b / t[2]),
+                ];
+                let factor = (view * world).transpose();
+                let rows = [factor * j[0], factor * j[1]];
+                let cov = [
+                    rows[0].dot(rows[0]) + DEFAULT_EPS2D,
+                    rows[0].dot(rows[1]),
+                    rows[1].dot(rows[1]) + DEFAULT_EPS2D,
+                ];
+                let det = cov[0] * cov[2] - cov[1] * cov[1];
+                let colour: Vec<f64> = (0..3).map(|ch| (0.28209479177387814 * sh[3 * i + ch] + 0.5).max(0.)).collect();
+                let mean = [fx * t[0] / t[2] + cx, fy * t[1] / t[2] + cy];
+                seen.push((t[2], mean, [cov[2] / det, -cov[1] / det, cov[0] / det], opacities[i], colour));
+            }
+            seen.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let mut planes = vec![vec![0f64; w * h]; 3];
+            for pixel in 0..w * h {
+                let (x, y) = ((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5);
+                let (mut transmittance, mut z_sum) = (1f64, 0f64);
+                for (z, mean, conic, opacity, colour) in &seen {
+                    let (dx, dy) = (mean[0] - x, mean[1] - y);
+                    let sigma = 0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) + conic[1] * dx * dy;
+                    let a = (opacity * (-sigma).exp()).min(0.999);
+                    if a < 1. / 255. {
+                        continue;
+                    }
+                    if transmittance * (1. - a) <= 1e-4 {
+                        break;
+                    }
+                    let weight = transmittance * a;
+                    for channel in 0..3 {
+                        planes[channel][pixel] += weight * colour[channel];
+                    }
+                    z_sum += weight * z;
+                    transmittance *= 1. - a;
+                }
+                let a = 1. - transmittance;
+                alpha.push(a);
+                depth.push(if a > 1e-10 { z_sum / a } else { 0. });
+            }
+            rgb.extend(planes.concat());
+        }
+    }
+    let (s, v, w, h) = (scenes as i64, views as i64, w as i64, h as i64);
+    Pictures {
+        rgb: Tensor::from_slice(&rgb).view([s, v, 3, h, w]),
+        alpha: Tensor::from_slice(&alpha).view([s, v, h, w]),
+        depth: Tensor::from_slice(&depth).view([s, v, h, w]),
+    }
+}
+
+#[test]
+fn pictures_are_those_of_brute_force() {
+    for (seed, width, height, count) in [(5, 1, 1, 30), (6, 17, 3, 60), (7, 64, 48, 300), (8, 131, 67, 800)] {
+        let g = gaussians(2, count, 0, Kind::Double, seed);
+        let c = cameras(2, 2, width, height, Kind::Double);
+        let (ours, expected) = (draw(&g, &c), brute_force(&g, &c));
+        assert!(expected.alpha.max().double_value(&[]) > 0.3, "an empty picture proves nothing");
+        assert!(largest_error(&ours.rgb, &expected.rgb) < 1e-9);
+        assert!(largest_error(&ours.alpha, &expected.alpha) < 1e-9);
+        assert!(largest_error(&ours.depth, &expected.depth) < 1e-9);
+
+        let single = draw(&g.map(|t| t.to_kind(Kind::Float)), &cameras(2, 2, width, height, Kind::Float));
+        assert!(largest_error(&single.rgb, &expected.rgb) < 1e-4);
+        assert!(largest_error(&single.alpha, &expected.alpha) < 1e-4);
+    }
+}
+
+#[test]
+fn bits_do_not_depend_on_threads() {
+    let c = cameras(2, 3, 150, 90, Kind::Float);
+    let run = |threads: i32| {
+        tch::set_num_threads(threads);
+        let g = leaves(&gaussians(2, 3000, 3, Kind::Float, 9));
+        let p = draw(&g, &c);
+        objective(&p).backward();
+        let gradients = fields(&g).map(|(_, leaf)| leaf.grad());
+        (p, gradients)
+    };
+    let before = tch::get_num_threads();
+    let ((p, gradients), (q, others)) = (run(1), run(2));
+    tch::set_num_threads(before);
+    assert!(p.rgb.equal(&q.rgb) && p.alpha.equal(&q.alpha) && p.depth.equal(&q.depth));
+    for (a, b) in gradients.iter().zip(&others) {
+        assert!(a.equal(b));
+    }
+}
+
+#[test]
+fn float32_gradients_are_near_those_of_float64() {
+    let run = |kind: Kind| {
+        let g = leaves(&gaussians(1, 500, 3, Kind::Double, 10).map(|t| t.to_kind(kind)));
+        objective(&draw(&g, &cameras(1, 3, 80, 60, kind))).backward();
+        fields(&g).map(|(name, leaf)| (name, leaf.grad()))
+    };
+    for ((name, single), (_, double)) in run(Kind::Float).iter().zip(&run(Kind::Double)) {
+        let error = common::relative_error(single, double);
+        assert!(error < 1e-4, "{name}: {error:.2e}");
+    }
+}
+
+#[test]
+fn extreme_gaussians_leave_everything_finite() {
+    let mut g = gaussians(1, 64, 3, Kind::Float, 11);
+    let set = |t: &mut Tensor, row: i64, values: &[f32]| {
+        let _ = t.select(0, 0).select(0, row).copy_(&Tensor::from_slice(values));
+    };
+    set(&mut g.means, 0, &[0., 0., -1.]); // behind
+    set(&mut g.means, 1, &[0., 0., 0.01]); // on the near plane
+    set(&mut g.means, 2, &[0.02, 0., 0.0101]); // just beyond it
+    set(&mut g.means, 3, &[1e6, 0., 1.]); // far outside
+    set(&mut g.scales, 4, &[1e3, 1e3, 1e3]); // huge
+    set(&mut g.scales, 5, &[1e-8, 1e-8, 3.]); // a needle
+    set(&mut g.scales, 6, &[0., 0., 0.]);
+    for (row, opacity) in [(7, 0f32), (8, 1.)] {
+        let _ = g.opacities.select(0, 0).select(0, row).fill_(f64::from(opacity));
+    }
+    let first = g.means.select(0, 0).select(0, 10).copy();
+    let _ = g.means.select(0, 0).select(0, 9).copy_(&first); // equal depths
+    let g = leaves(&g);
+    let p = draw(&g, &cameras(1, 2, 70, 50, Kind::Float));
+    objective(&p).backward();
+    for t in [&p.rgb, &p.alpha, &p.depth] {
+        assert_eq!(t.isfinite().all().int64_value(&[]), 1);
+    }
+    assert!(p.alpha.min().double_value(&[]) >= 0. && p.alpha.max().double_value(&[]) <= 1.);
+    for (name, leaf) in fields(&g) {
+        assert_eq!(leaf.grad().isfinite().all().int64_value(&[]), 1, "{name}");
+    }
+}
+
+#[test]
+fn nothing_to_see_is_black() {
+    let g = leaves(&gaussians(1, 0, 3, Kind::Float, 12));
+    let p = draw(&g, &cameras(1, 1, 20, 10, Kind::Float));
+    assert_eq!(p.rgb.abs().max().double_value(&[]) + p.alpha.max().double_value(&[]), 0.);
+    objective(&p).backward();
+    assert_eq!(g.sh.grad().size(), [1, 0, 16, 3]);
+}
+
+#[test]
+fn shapes_that_do_not_fit_are_refused() {
+    let c = cameras(1, 1, 20, 10, Kind::Float);
+    let good = || gaussians(1, 4, 1, Kind::Float, 13);
+    let bad_scales = Gaussians { scales: Tensor::zeros([1, 3, 3], (Kind::Float, Device::Cpu)), ..good() };
+    let error = render(&bad_scales, &c, DEFAULT_EPS2D).unwrap_err().to_string();
+    assert!(error.contains("scales has shape"), "{error}");
+    let bad_sh = Gaussians { sh: Tensor::zeros([1, 4, 5, 3], (Kind::Float, Device::Cpu)), ..good() };
+    let error = render(&bad_sh, &c, DEFAULT_EPS2D).unwrap_err().to_string();
+    assert!(error.contains("5 basis functions"), "{error}");
+}
