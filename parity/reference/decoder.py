@@ -1,0 +1,134 @@
+"""The decoder: latent tokens to Gaussians. K candidates per token, merged to G = 2^stage."""
+
+import math
+
+import torch
+
+from .layers import linear
+from .rotation import matrix_from_6d, normalize, quaternion_from_matrix
+
+LOG_SCALE_OFFSET = -2.0
+LOG_SCALE_RANGE = (math.log(1e-4) - 1.0, math.log(0.05) + 2.0)
+OPACITY_OFFSET = -5.0
+OPACITY_LOGIT_RANGE = (-13.0, 6.0)
+LARGEST_OPACITY = 0.99
+LARGEST_LOG_U = -1e-12
+ROTATION_OFFSET = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def heads(config, params, geo, app):
+    """geo, app [B, M, d] -> the raw linear outputs, candidate axis K third."""
+    k = config["M_max"]
+    coefficients = (config["sh_degree"] + 1) ** 2
+    shape = (geo.shape[0], geo.shape[1], k)
+    parameters = linear(params, "gaussian_decoder.geo_param_readout", geo).reshape(*shape, 10)
+    return {
+        "position": linear(params, "gaussian_decoder.geo_pos_readout", geo).reshape(*shape, 3),
+        "log_scale": parameters[..., 0:3],
+        "rotation": parameters[..., 3:9],
+        "opacity": parameters[..., 9:10],
+        "sh": linear(params, "gaussian_decoder.sh_readout", app).reshape(*shape, coefficients, 3),
+        "gate": linear(params, "gaussian_decoder.gate_readout", geo),
+    }
+
+
+def candidates(raw, mix):
+    """Offsets and clamps. mix is the transition coefficient lambda: while it is below 1 opacity starts lower,
+    by ln 2 in the logit at lambda = 0."""
+    opacity = raw["opacity"] + OPACITY_OFFSET - (1.0 - mix) * math.log(2.0)
+    return {
+        "position": raw["position"],
+        "log_scale": (raw["log_scale"] + LOG_SCALE_OFFSET).clamp(*LOG_SCALE_RANGE),
+        "rotation": raw["rotation"],
+        "opacity": opacity.clamp(*OPACITY_LOGIT_RANGE),
+        "sh": raw["sh"],
+    }
+
+
+def log_transparency(logit):
+    """log u = log(1 - sigmoid(o)) = log sigmoid(-o), never above -1e-12 so that the way back stays finite."""
+    return torch.nn.functional.logsigmoid(-logit).clamp(max=LARGEST_LOG_U)
+
+
+def logit_of_transparency(log_u):
+    """The logit of 1 - u: log(1 - e^(log u)) - log u.
+
+    log(1 - e^x) is log(-expm1(x)) near zero and log1p(-e^x) elsewhere. Near zero the latter is log 0, so there it is
+    given another argument: a gradient that is not chosen must still be finite.
+    """
+    near = log_u > -math.log(2.0)
+    log_alpha_near = torch.log(-torch.expm1(log_u))
+    log_alpha_far = torch.log1p(-torch.exp(torch.where(near, -1.0, log_u)))
+    return torch.where(near, log_alpha_near, log_alpha_far) - log_u
+
+
+def merge(full, gate, stage):
+    """Candidates [B, M, K, ...] -> [B, M, G, ...] with G = 2^stage, over groups of b = K / G consecutive candidates.
+
+    Weighted sums with w = softmax(gate) inside the group, except
+      log-scales:  sum w log s + ln(b) / 3        (the volume of b Gaussians)
+      opacities:   log u = sum w log u_i,  u = 1 - alpha
+    """
+    exposed = 2**stage
+    b = gate.shape[-1] // exposed
+    weights = torch.softmax(gate.unflatten(-1, (exposed, b)), dim=-1)  # [B, M, G, b]
+
+    def weighted_sum(x):  # [B, M, K, ...] -> [B, M, G, ...]
+        x = x.unflatten(2, (exposed, b))
+        return (weights.reshape(weights.shape + (1,) * (x.dim() - 4)) * x).sum(3)
+
+    log_u = weighted_sum(log_transparency(full["opacity"])).clamp(max=LARGEST_LOG_U)
+    return {
+        "position": weighted_sum(full["position"]),
+        "log_scale": weighted_sum(full["log_scale"]) + math.log(b) / 3.0,
+        "rotation": weighted_sum(full["rotation"]),
+        "opacity": logit_of_transparency(log_u),
+        "sh": weighted_sum(full["sh"]),
+    }
+
+
+def expand(parent):
+    """[B, M, G, ...] -> [B, M, 2 G, ...]: every parent twice, in place, with half its volume and half its log u."""
+    child = {key: value.repeat_interleave(2, dim=2) for key, value in parent.items()}
+    child["log_scale"] = child["log_scale"] - math.log(2.0) / 3.0
+    child["opacity"] = logit_of_transparency(0.5 * log_transparency(child["opacity"]))
+    return child
+
+
+def merge_with_transition(full, gate, stage, mix):
+    """(1 - lambda) expand(merge at stage - 1) + lambda (merge at stage), in the space of the merged values."""
+    merged = merge(full, gate, stage)
+    if stage == 0:
+        return merged
+    coarse = expand(merge(full, gate, stage - 1))
+    return {key: (1.0 - mix) * coarse[key] + mix * merged[key] for key in merged}
+
+
+def decode(config, params, geo, app, stage, mix):
+    """geo, app [B, M, d] -> dict of Gaussians, N = M G, token-major:
+
+    means [B, N, 3], scales [B, N, 3], rotations_6d [B, N, 6], quats_wxyz [B, N, 4], opacities [B, N, 1],
+    sh [B, N, C, 3], and "raw": what the regularizers read, per candidate (before clamps and merging), with the
+    opacity logits "opacity_logit" [B, M, K, 1] after offset and clamp.
+    """
+    raw = heads(config, params, geo, app)
+    full = candidates(raw, mix)
+    merged = merge_with_transition(full, raw["gate"], stage, mix)
+    flat = {key: value.flatten(1, 2) for key, value in merged.items()}
+
+    six = flat["rotation"] + torch.tensor(ROTATION_OFFSET, dtype=geo.dtype, device=geo.device)
+    six = torch.cat([normalize(six[..., :3], 1e-8), normalize(six[..., 3:], 1e-8)], dim=-1)
+    return {
+        "means": flat["position"] + params["gaussian_decoder.patch_center_bias"],  # the constant (0, 0, 1.5)
+        "scales": torch.exp(flat["log_scale"]),
+        "rotations_6d": six,
+        "quats_wxyz": quaternion_from_matrix(matrix_from_6d(six)),
+        "opacities": torch.sigmoid(flat["opacity"]).clamp(0.0, LARGEST_OPACITY),
+        "sh": flat["sh"],
+        "raw": {
+            "log_scale": raw["log_scale"] + LOG_SCALE_OFFSET,
+            "rotation": raw["rotation"],
+            "sh": raw["sh"],
+            "opacity_logit": full["opacity"],
+        },
+    }

@@ -1,0 +1,47 @@
+"""The layers everything else is made of. `params` maps published names to tensors; `name` is a prefix in it."""
+
+import math
+
+import torch
+
+LAYER_NORM_EPS = 1e-5
+
+
+def linear(params, name, x):
+    """x W^T + b, with weight [out, in]; the bias is left out where the file has none."""
+    y = x @ params[f"{name}.weight"].T
+    bias = params.get(f"{name}.bias")
+    return y if bias is None else y + bias
+
+
+def layer_norm(params, name, x):
+    """(x - mean) / sqrt(var + eps) * weight + bias over the last axis; the variance divides by its length."""
+    centred = x - x.mean(-1, keepdim=True)
+    variance = (centred * centred).mean(-1, keepdim=True)
+    return centred / torch.sqrt(variance + LAYER_NORM_EPS) * params[f"{name}.weight"] + params[f"{name}.bias"]
+
+
+def gelu(x):
+    """The exact one: x Phi(x)."""
+    return 0.5 * x * (1.0 + torch.erf(x / math.sqrt(2.0)))
+
+
+def mlp(params, first, second, x):
+    """W2 GELU(W1 x + b1) + b2."""
+    return linear(params, second, gelu(linear(params, first, x)))
+
+
+def attention(q, k, v, heads):
+    """q [B, Lq, d], k and v [B, Lk, d] -> [B, Lq, d]; per head softmax(q k^T / sqrt(d / heads)) v."""
+
+    def split(x):  # [B, L, d] -> [B, heads, L, d / heads]
+        return x.reshape(x.shape[0], x.shape[1], heads, -1).transpose(1, 2)
+
+    q, k, v = split(q), split(k), split(v)
+    scores = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])
+    mixed = torch.softmax(scores, dim=-1) @ v
+    return mixed.transpose(1, 2).flatten(2)
+
+
+def layer_scale(params, name, x):
+    return params[f"{name}.gamma"] * x

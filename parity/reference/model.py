@@ -1,0 +1,17 @@
+"""The whole forward pass: posed views to Gaussians."""
+
+from .decoder import decode
+from .encoder import encode
+from .tokens import view_tokens
+
+
+def forward(config, params, images, c2w, intrinsic, stage, mix):
+    """images [B, V, 3, H, W] in [0, 1], normalized c2w [B, V, 4, 4], intrinsic [B, V, 3, 3] in pixels.
+
+    `config` has the keys of a golden's config.json, and two optional ones for ablations: camera_code (true, false)
+    and streams ("dual", "single"). `stage` s exposes 2^s Gaussians per token, `mix` is lambda in [0, 1].
+    Returns the dict of `decoder.decode`.
+    """
+    tokens = view_tokens(config, params, images, c2w, intrinsic)
+    geo, app = encode(config, params, tokens)
+    return decode(config, params, geo, app, stage, mix)

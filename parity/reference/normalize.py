@@ -1,0 +1,57 @@
+"""Scene normalization: one canonical frame and scale for all cameras of a scene."""
+
+import torch
+
+SMALLEST_SCALE = 1e-12  # a camera constellation no wider than this keeps its scale
+METRIC_FAR = 4.0 * 10.0  # far bound of the frustum loss before division by the scene scale
+
+
+def unit(v):
+    return v / v.norm()
+
+
+def average_pose(c2w):
+    """c2w [C, 4, 4] -> the mean camera [4, 4]: columns (right, down, forward), origin at the mean centre."""
+    forward = unit(c2w[:, :3, 2].mean(0))
+    down = c2w[:, :3, 1].mean(0)
+    right = unit(torch.linalg.cross(down, forward))
+    down = unit(torch.linalg.cross(forward, right))
+
+    pose = torch.eye(4, dtype=c2w.dtype, device=c2w.device)
+    pose[:3, 0] = right
+    pose[:3, 1] = down
+    pose[:3, 2] = forward
+    pose[:3, 3] = c2w[:, :3, 3].mean(0)
+    return pose
+
+
+def invert_rigid(pose):
+    """[..., 4, 4] -> its inverse: (R, t) -> (R^T, -R^T t)."""
+    rotation_t = pose[..., :3, :3].transpose(-1, -2)
+    inverse = torch.zeros_like(pose)
+    inverse[..., :3, :3] = rotation_t
+    inverse[..., :3, 3:] = -rotation_t @ pose[..., :3, 3:]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def normalize_scene(c2w):
+    """c2w [C, 4, 4], all context and target cameras of one scene.
+
+    Returns the normalized c2w [C, 4, 4], its inverse w2c [C, 4, 4] and the scale s:
+        T'_i = T_avg^-1 T_i,   s = max_ab |o'_a - o'_b|,   o'_i <- o'_i / s.
+    """
+    aligned = invert_rigid(average_pose(c2w)) @ c2w
+    centres = aligned[:, :3, 3]
+    scale = (centres[:, None] - centres[None, :]).norm(dim=-1).max()
+    if not torch.isfinite(scale) or scale <= SMALLEST_SCALE:
+        scale = torch.ones_like(scale)
+
+    normalized = aligned.clone()
+    normalized[:, :3, 3] = centres / scale
+    return normalized, invert_rigid(normalized), scale
+
+
+def frustum_far(scale):
+    """Far bound of the frustum loss, in normalized units."""
+    return METRIC_FAR / scale

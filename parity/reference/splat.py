@@ -1,0 +1,151 @@
+"""The rasterizer, dense: every Gaussian at every pixel. Slow, differentiable by autograd, every rule in one place."""
+
+import torch
+
+from .rotation import matrix_from_quaternion
+
+NEAR = 0.01
+EPS_2D = 0.05
+JACOBIAN_MARGIN = 0.15  # of the image size, on each side
+SMALLEST_ALPHA = 1.0 / 255.0
+LARGEST_ALPHA = 0.999
+SMALLEST_TRANSMITTANCE = 1e-4
+SMALLEST_ACCUMULATION = 1e-10
+
+
+def covariance(scales, quaternions):
+    """scales [N, 3], quaternions [N, 4] of any length -> R S S^T R^T [N, 3, 3]."""
+    rs = matrix_from_quaternion(quaternions) * scales[:, None, :]
+    return rs @ rs.transpose(-1, -2)
+
+
+def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS_2D):
+    """means [N, 3], scales [N, 3], quaternions [N, 4], w2c [4, 4], intrinsic [3, 3] ->
+
+    dict of mean2d [N, 2], cov2d [N, 2, 2] (with eps2d), conic [N, 3] = (a, b, c) of [[a, b], [b, c]] = cov2d^-1,
+    depth [N], visible [N]. Values of a Gaussian that is not visible are finite and mean nothing.
+    """
+    rotation, translation = w2c[:3, :3], w2c[:3, 3]
+    fx, fy, cx, cy = intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]
+    x, y, depth = (means @ rotation.T + translation).unbind(-1)
+    in_front = depth > NEAR
+    z = torch.where(in_front, depth, 1.0)  # keeps the division finite where nothing will be drawn
+    x_z, y_z = x / z, y / z
+    mean2d = torch.stack([fx * x_z + cx, fy * y_z + cy], dim=-1)
+
+    # J = [[fx / z, 0, -fx (x/z) / z], [0, fy / z, -fy (y/z) / z]], at x/z and y/z held near the image.
+    margin_x, margin_y = JACOBIAN_MARGIN * width / fx, JACOBIAN_MARGIN * height / fy
+    x_z = torch.clamp(x_z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    y_z = torch.clamp(y_z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * x_z / z], dim=-1), torch.stack([zero, fy / z, -fy * y_z / z], dim=-1)],
+        dim=-2,
+    )  # [N, 2, 3]
+    jw = jacobian @ rotation
+    cov2d = jw @ covariance(scales, quaternions) @ jw.transpose(-1, -2)
+    cov2d = cov2d + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+
+    det = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] * cov2d[:, 1, 0]
+    invertible = det > 0
+    det = torch.where(invertible, det, 1.0)
+    conic = torch.stack([cov2d[:, 1, 1] / det, -cov2d[:, 0, 1] / det, cov2d[:, 0, 0] / det], dim=-1)
+    return {
+        "mean2d": mean2d,
+        "cov2d": cov2d,
+        "conic": conic,
+        "depth": depth,
+        "visible": in_front & invertible,
+    }
+
+
+def sh_basis(direction, coefficients):
+    """direction [N, 3], unit -> [N, C], C in (1, 4, 9, 16): real spherical harmonics as 3DGS orders and signs them."""
+    x, y, z = direction.unbind(-1)
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if coefficients > 1:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if coefficients > 4:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if coefficients > 9:
+        basis += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def sh_colour(means, sh, w2c):
+    """means [N, 3], sh [N, C, 3], w2c [4, 4] -> [N, 3]: max(0, 0.5 + sum of basis(direction) sh)."""
+    centre = -w2c[:3, :3].T @ w2c[:3, 3]
+    direction = means - centre
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    colour = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
+    return torch.where(colour > 0, colour, 0.0)
+
+
+def pixel_centres(width, height, dtype=torch.float32, device=None):
+    """[H W, 2] as (j + 0.5, i + 0.5), row-major."""
+    i, j = torch.meshgrid(
+        torch.arange(height, dtype=dtype, device=device), torch.arange(width, dtype=dtype, device=device), indexing="ij"
+    )
+    return torch.stack([j + 0.5, i + 0.5], dim=-1).reshape(-1, 2)
+
+
+def composite(projected, opacities, colours, pixels):
+    """projected: the dict of project(). opacities [N], colours [N, 3], pixels [Q, 2] ->
+    RGB [Q, 3], accumulated opacity [Q], expected depth [Q].
+
+    In order of depth (ties: lower index first), for the Gaussians that count at a pixel:
+        w_i = T_i alpha_i,   T_i = prod_{j<i} (1 - alpha_j)
+        RGB = sum w c,   A = sum w = 1 - T,   D = sum w z / A
+    """
+    order = torch.argsort(projected["depth"], stable=True)
+    order = order[projected["visible"][order]]
+    mean2d, conic, depth = projected["mean2d"][order], projected["conic"][order], projected["depth"][order]
+    opacities, colours = opacities[order], colours[order]
+
+    delta = mean2d[:, None] - pixels[None]  # [N, Q, 2]
+    dx, dy = delta.unbind(-1)
+    a, b, c = (conic[:, k, None] for k in range(3))
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = opacities[:, None] * torch.exp(-sigma)
+    alpha = alpha.masked_fill(alpha > LARGEST_ALPHA, LARGEST_ALPHA)  # no gradient through the cap
+
+    # Which Gaussians count is a choice, not a differentiable value. T falls along the list, so the first Gaussian that
+    # would bring it to 1e-4 or below is also the first of all those after it that would.
+    with torch.no_grad():
+        counts = alpha >= SMALLEST_ALPHA
+        transmittance = torch.cumprod(torch.where(counts, 1.0 - alpha, 1.0), dim=0)
+        counts = counts & (transmittance > SMALLEST_TRANSMITTANCE)
+    alpha = torch.where(counts, alpha, 0.0)
+    after = torch.cumprod(1.0 - alpha, dim=0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]], dim=0)
+    weight = before * alpha  # [N, Q]
+
+    rgb = weight.T @ colours
+    accumulated = weight.sum(0)
+    covered = accumulated > SMALLEST_ACCUMULATION
+    expected = torch.where(covered, (weight.T @ depth) / torch.where(covered, accumulated, 1.0), 0.0)
+    return rgb, accumulated, expected
+
+
+def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d=EPS_2D):
+    """One scene, one camera -> RGB [H, W, 3], accumulated opacity [H, W], expected depth [H, W]. Background black."""
+    projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d)
+    colours = sh_colour(means, sh, w2c)
+    pixels = pixel_centres(width, height, means.dtype, means.device)
+    rgb, accumulated, depth = composite(projected, opacities, colours, pixels)
+    return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)

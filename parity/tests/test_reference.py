@@ -1,0 +1,707 @@
+"""Holds the torch reference against the goldens, and the parts without a golden against independent arithmetic.
+
+Goldens are read from $GLOBALSPLAT_GOLDEN, else from ../shared/golden beside the repository.
+"""
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY / "parity"))
+
+from reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens  # noqa: E402
+from reference.loss import consistency, decoder_regularization, frustum, mse, subsets  # noqa: E402
+
+torch.set_num_threads(1)
+
+GOLDEN = Path(os.environ.get("GLOBALSPLAT_GOLDEN", REPOSITORY.parent / "shared" / "golden"))
+OUTPUT_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 1e-4
+# The gradient of mem_k.bias is zero in exact arithmetic: a float32 residue is all there is to see, and it is measured
+# against the largest gradient of the case.
+ZERO_TOLERANCE = 1e-5
+DTYPES = [torch.float32, torch.float64]
+
+
+def golden(name):
+    path = GOLDEN / name
+    if not path.exists():
+        pytest.skip(f"golden {path} is absent: set GLOBALSPLAT_GOLDEN to the folder of goldens")
+    return path
+
+
+def load(name, dtype=torch.float32):
+    return {key: value.to(dtype) for key, value in load_file(golden(name)).items()}
+
+
+def relative(ours, theirs):
+    """Relative L2 distance, in float64. NaN never passes a comparison with it."""
+    ours, theirs = ours.detach().double().flatten(), theirs.double().flatten()
+    assert ours.shape == theirs.shape, f"{tuple(ours.shape)} values, expected {tuple(theirs.shape)}"
+    return ((ours - theirs).norm() / theirs.norm().clamp(min=1e-30)).item()
+
+
+def hold(what, ours, theirs, tolerance, record):
+    error = relative(ours, theirs)
+    record(what, f"{error:.2e}")
+    assert error <= tolerance, f"{what}: relative L2 error {error:.2e}, tolerance {tolerance:.0e}"
+
+
+# ---- scene normalization ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_scene_normalization(dtype, record_property):
+    g = load("scene_normalization.safetensors", dtype)
+    c2w, w2c, scale = normalize.normalize_scene(g["c2w"])
+    hold("norm_c2w", c2w, g["norm_c2w"], OUTPUT_TOLERANCE, record_property)
+    hold("norm_w2c", w2c, g["norm_w2c"], OUTPUT_TOLERANCE, record_property)
+    hold("scene_scale", scale, g["scene_scale"], OUTPUT_TOLERANCE, record_property)
+    c2w, _, scale = normalize.normalize_scene(g["c2w"][:1])
+    hold("single_norm_c2w", c2w, g["single_norm_c2w"], OUTPUT_TOLERANCE, record_property)
+    hold("single_scene_scale", scale, g["single_scene_scale"], OUTPUT_TOLERANCE, record_property)
+
+
+def test_scene_normalization_is_canonical():
+    """The mean camera of a normalized scene is the identity, and its two most distant cameras are 1 apart."""
+    c2w = load("scene_normalization.safetensors", torch.float64)["c2w"]
+    normalized, inverse, scale = normalize.normalize_scene(c2w)
+    identity = torch.eye(4, dtype=torch.float64)
+    # the file holds float32 rotations, orthogonal to about 1e-7
+    assert torch.allclose(normalize.average_pose(normalized), identity, atol=1e-6)
+    assert torch.allclose(inverse @ normalized, identity.expand_as(normalized), atol=1e-6)
+    centres = normalized[:, :3, 3]
+    assert (centres[:, None] - centres[None]).norm(dim=-1).max().item() == pytest.approx(1.0)
+    assert normalize.frustum_far(scale).item() == pytest.approx(40.0 / scale.item())
+
+
+def test_average_pose_is_a_rotation():
+    """Cameras that look all over: the mean down is then not square to the mean forward, and the frame still is."""
+    generator = torch.Generator().manual_seed(3)
+    c2w = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
+    q = torch.tensor([1.0, 0, 0, 0]) + 0.6 * torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    c2w[:, :3, :3] = rotation.matrix_from_quaternion(q)
+    average = normalize.average_pose(c2w)[:3, :3]
+    forward, down = c2w[:, :3, 2].mean(0), c2w[:, :3, 1].mean(0)
+    assert (forward @ down).abs() > 0.01
+    assert torch.allclose(average.T @ average, torch.eye(3, dtype=torch.float64), atol=1e-12)
+    assert torch.linalg.det(average).item() == pytest.approx(1.0)
+    assert torch.allclose(average[:, 2], forward / forward.norm())
+    assert (average[:, 0] @ down).abs() < 1e-12 and average[:, 1] @ down > 0
+
+
+# ---- losses ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_frustum_loss(dtype, record_property):
+    g = load("frustum_loss.safetensors", dtype)
+    means = g["means"].requires_grad_()
+    size = 2.0 * g["intrinsic"][0, 0, :2, 2]  # the file has no image size; its principal points are central
+    width, height = int(size[0]), int(size[1])
+    loss = frustum.frustum(means, g["w2c"], g["intrinsic"], height, width, g["max_depth"])
+    loss.backward()
+    hold("loss", loss, g["loss"], OUTPUT_TOLERANCE, record_property)
+    hold("grad_means", means.grad, g["grad_means"], GRADIENT_TOLERANCE, record_property)
+
+
+def test_frustum_depth_bounds():
+    """On the axis of a camera, where only depth can be violated; then a second camera that sees the point."""
+    intrinsic = torch.tensor([[[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]]], dtype=torch.float64)
+    w2c = torch.eye(4, dtype=torch.float64)[None, None]
+    far = torch.tensor([5.0], dtype=torch.float64)
+    for z, violation in [(0.004, 0.006), (0.01, 0.0), (5.0, 0.0), (7.5, 2.5)]:
+        means = torch.tensor([[[0.0, 0.0, z]]], dtype=torch.float64)
+        loss = frustum.frustum(means, w2c, intrinsic, 48, 64, far).item()
+        assert loss == pytest.approx(math.log(1 + violation / 10))
+    back = w2c.clone()
+    back[..., 2, 3] = -3.0
+    both = frustum.frustum(means, torch.cat([w2c, back], 1), intrinsic.expand(1, 2, 3, 3), 48, 64, far)
+    assert both.item() == 0.0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sh_soft_cap(dtype, record_property):
+    g = load("sh_softcap.safetensors", dtype)
+    sh = g["sh"].requires_grad_()
+    loss = decoder_regularization.sh_soft_cap(sh)
+    loss.backward()
+    hold("reg", loss, g["reg"], OUTPUT_TOLERANCE, record_property)
+    hold("grad", sh.grad, g["grad"], GRADIENT_TOLERANCE, record_property)
+
+
+def test_opacity_term_is_a_switch():
+    raw = {
+        "log_scale": torch.tensor([-4.0, 0.0]),
+        "rotation": torch.tensor([0.5]),
+        "sh": torch.tensor([0.0]),
+        "opacity_logit": torch.tensor([-3.0, 1.0]),
+    }
+    sigmoid = [1 / (1 + math.exp(3.0)), 1 / (1 + math.exp(-1.0))]
+    opacity = sum(sigmoid) / 2 + (1.0 - math.log(0.25)) ** 2 / 2
+    others = math.log(20.0) ** 2 / 2 + 0.25 + math.log1p(math.exp(-5.0)) ** 2
+    without = decoder_regularization.decoder_regularization(raw, with_opacity=False).item()
+    with_it = decoder_regularization.decoder_regularization(raw).item()
+    assert without == pytest.approx(1e-2 * others)
+    assert with_it == pytest.approx(1e-2 * (others + opacity))
+
+
+def test_mse():
+    assert mse.mse(torch.tensor([[0.0, 1.0]]), torch.tensor([[1.0, 3.0]])).item() == 2.5
+
+
+def test_consistency():
+    opacity_a = torch.tensor([0.9, 0.5, 0.005], requires_grad=True)
+    opacity_b = torch.tensor([0.8, 0.7, 0.9], requires_grad=True)
+    depth_a = torch.tensor([2.0, 1.0, 9.0], requires_grad=True)
+    depth_b = torch.tensor([2.5, 4.0, 1.0], requires_grad=True)
+    loss = consistency.consistency(opacity_a, opacity_b, depth_a, depth_b)
+    assert loss.item() == pytest.approx(1e-3 * (0.1 + 0.2 + 0.895) / 3 + 1e-2 * (0.5 + 3.0) / 2)
+    loss.backward()
+    assert opacity_a.grad.tolist() == pytest.approx([0.5e-3 / 3, -0.5e-3 / 3, -0.5e-3 / 3])
+    assert depth_a.grad.tolist() == pytest.approx([-0.5e-2 / 2, -0.5e-2 / 2, 0.0])
+    assert depth_b.grad.tolist() == pytest.approx([0.5e-2 / 2, 0.5e-2 / 2, 0.0])
+    nothing = torch.zeros(3)
+    assert consistency.consistency(nothing, nothing, depth_a, depth_b).item() == 0.0
+
+
+def test_subsets():
+    assert subsets.subsets([5], 0) is None
+    assert subsets.subsets([5, 3], 0) == ([1, 0], [1, 0])
+    assert subsets.subsets([0, 1, 2, 3, 4, 5], 0) == ([0, 1, 3, 5], [0, 2, 4, 5])
+    assert subsets.subsets([0, 1, 2, 3, 4, 5], 7) == ([0, 2, 4, 5], [0, 1, 3, 5])
+    assert subsets.subsets([40, 0, 30, 10, 20], 0) == ([1, 3, 2, 0], [1, 4, 0, 0])
+    a, b = subsets.subsets(list(range(24)), 0)
+    assert len(a) == len(b) == 13 and len(set(a)) == len(set(b)) == 13
+
+
+# ---- model -----------------------------------------------------------------------------------------------------------
+
+
+def model_cases():
+    found = sorted(path.parent.name for path in GOLDEN.glob("model_*/config.json"))
+    return found or ["model_small"]  # which then skips, with its line
+
+
+def stage_cases():
+    cases = []
+    for case in model_cases():
+        path = GOLDEN / case / "config.json"
+        stages = json.loads(path.read_text())["stages"] if path.exists() else [[0, 1.0]]
+        cases += [(case, int(s), float(mix)) for s, mix in stages]
+    return cases
+
+
+def load_model(case, dtype):
+    config = json.loads(golden(f"{case}/config.json").read_text())
+    return config, load(f"{case}/state.safetensors", dtype), load(f"{case}/inputs.safetensors", dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("case", model_cases())
+def test_encoder(case, dtype, record_property):
+    config, params, inputs = load_model(case, dtype)
+    g = load(f"{case}/encoder.safetensors", dtype)
+    content = tokens.view_tokens(config, params, inputs["images"], inputs["c2w"], inputs["intrinsic"])
+    geo, app = encoder.encode(config, params, content)
+    hold("content_tokens", content, g["content_tokens"], OUTPUT_TOLERANCE, record_property)
+    hold("encoded_geo", geo, g["encoded_geo"], OUTPUT_TOLERANCE, record_property)
+    hold("encoded_tex", app, g["encoded_tex"], OUTPUT_TOLERANCE, record_property)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("case, stage, mix", stage_cases())
+def test_model(case, stage, mix, dtype, record_property):
+    config, params, inputs = load_model(case, dtype)
+    g = load(f"{case}/stage{stage}_mix{round(100 * mix):03d}.safetensors", dtype)
+    constant = "gaussian_decoder.patch_center_bias"
+    for name in params.keys() - {constant}:
+        params[name].requires_grad_()
+    images = inputs["images"].requires_grad_()
+
+    out = model.forward(config, params, images, inputs["c2w"], inputs["intrinsic"], stage, mix)
+    out["reg"] = decoder_regularization.decoder_regularization(out["raw"], with_opacity=False).reshape(1)
+    expected = {key.removeprefix("out."): value for key, value in g.items() if key.startswith("out.")}
+    assert expected.keys() == out.keys() - {"raw"}
+    for key, value in expected.items():
+        hold(f"out.{key}", out[key], value, OUTPUT_TOLERANCE, record_property)
+
+    cotangents = {key.removeprefix("cotangent."): value for key, value in g.items() if key.startswith("cotangent.")}
+    sum((value * out[key]).sum() for key, value in cotangents.items()).backward()
+
+    gradients = {key.removeprefix("grad."): value for key, value in g.items() if key.startswith("grad.")}
+    assert gradients.keys() == params.keys() - {constant}
+    hold("grad images", images.grad, g["grad_input.images"], GRADIENT_TOLERANCE, record_property)
+    largest = max(value.norm().item() for value in gradients.values())
+    for name, value in gradients.items():
+        if name.endswith("mem_k.bias"):
+            ours = params[name].grad.norm().item() / largest
+            record_property(f"grad {name}", f"{ours:.2e}")
+            assert ours <= ZERO_TOLERANCE, f"grad {name}: {ours:.2e} of the largest gradient, expected 0"
+        else:
+            hold(f"grad {name}", params[name].grad, value, GRADIENT_TOLERANCE, record_property)
+
+
+def test_ablations():
+    """Without the camera code only the ray part of the tokens changes; a single stream uses no appearance weights."""
+    config, params, inputs = load_model("model_small", torch.float32)
+    full = tokens.view_tokens(config, params, inputs["images"], inputs["c2w"], inputs["intrinsic"])
+    plucker_only = {name: value for name, value in params.items() if not name.startswith("view_pe.")}
+    bare = tokens.view_tokens(
+        config | {"camera_code": False}, plucker_only, inputs["images"], inputs["c2w"], inputs["intrinsic"]
+    )
+    width = config["dim_rays"]
+    code = full[..., :width] - bare[..., :width]
+    assert torch.equal(full[..., width:], bare[..., width:])
+    assert torch.allclose(code, code[:, :, :1].expand_as(code), atol=1e-5) and code.abs().max() > 1e-3
+
+    appearance = ("slot_encoder.slot_to_tex", "slot_encoder.tex_rounds", "slot_encoder.pair_adapters")
+    one_stream = {name: value for name, value in params.items() if not name.startswith(appearance)}
+    geo, app = encoder.encode(config | {"streams": "single"}, one_stream, full)
+    assert torch.equal(geo, app) and geo.shape == (2, config["latent_rep_token_amount"], config["dim_latents"])
+
+
+IMPOSSIBLE = [((0, 0), 0.0), ((1, 1), -3.0), ((0, 0), math.nan), ((1, 2), math.nan)]
+IMPOSSIBLE += [((0, 2), 9.1), ((0, 2), -1.1), ((1, 2), 9.1), ((1, 2), -1.1)]
+
+
+@pytest.mark.parametrize("at, value", IMPOSSIBLE)
+def test_impossible_intrinsics_are_an_error(at, value):
+    intrinsic = torch.tensor([[4.0, 0.0, 4.0], [0.0, 4.0, 4.0], [0.0, 0.0, 1.0]])
+    for x, y in [(4.0, 4.0), (-1.0, 9.0), (9.0, -1.0)]:  # up to one pixel outside is allowed
+        intrinsic[0, 2], intrinsic[1, 2] = x, y
+        rays.check_intrinsics(intrinsic, 8, 8)
+    intrinsic[at] = value
+    with pytest.raises(ValueError):
+        rays.check_intrinsics(intrinsic, 8, 8)
+
+
+def test_plucker_ray_of_one_pixel():
+    c2w = torch.eye(4)
+    c2w[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # z forward becomes world x
+    c2w[:3, 3] = torch.tensor([0.0, 2.0, 0.0])
+    intrinsic = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
+    ray = rays.plucker_rays(c2w[None, None], intrinsic[None, None], 2, 3)[0, 0, :, 0, 1]
+    # pixel (0, 1) looks straight ahead: direction (1, 0, 0), moment (0, 2, 0) x (1, 0, 0) = (0, 0, -2)
+    assert torch.allclose(ray, torch.tensor([0.0, 0.0, -2.0, 1.0, 0.0, 0.0]))
+
+
+def test_opacity_merge_is_stable():
+    """Both branches of log(1 - e^x), to the clamps' ends: there and back is the identity, with finite gradients."""
+    logit = torch.tensor([-13.0, -9.0, -1.0, 0.0, 1e-3, 1.0, 6.0], requires_grad=True)
+    back = decoder.logit_of_transparency(decoder.log_transparency(logit))
+    assert torch.allclose(back, logit, rtol=2e-6, atol=2e-6)
+    back.sum().backward()
+    assert torch.allclose(logit.grad, torch.ones(7), rtol=1e-4)
+    tiny = torch.tensor([-20.0], requires_grad=True)  # u rounds to 1
+    decoder.logit_of_transparency(decoder.log_transparency(tiny)).backward()
+    assert tiny.grad.item() == pytest.approx(1.0, rel=1e-4)
+    vanishing = torch.tensor([-60.0], requires_grad=True)
+    back = decoder.logit_of_transparency(decoder.log_transparency(vanishing))
+    back.backward()
+    assert back.item() == pytest.approx(math.log(1e-12), rel=1e-5) and torch.isfinite(vanishing.grad).all()
+
+
+def small_decoder(log_scale, opacity):
+    """A decoder of one token and two candidates whose raw outputs are its biases."""
+    config = {"M_max": 2, "sh_degree": 0}
+    sizes = {"geo_pos_readout": 6, "geo_param_readout": 20, "sh_readout": 6, "gate_readout": 2}
+    params = {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
+    for head, size in sizes.items():
+        params[f"gaussian_decoder.{head}.weight"] = torch.zeros(size, 2)
+        params[f"gaussian_decoder.{head}.bias"] = torch.zeros(size)
+    bias = torch.tensor([[log_scale] * 3 + [0.0] * 6 + [opacity]] * 2).flatten().requires_grad_()
+    params["gaussian_decoder.geo_param_readout.bias"] = bias
+    return config, params, bias
+
+
+@pytest.mark.parametrize(
+    "log_scale, opacity, scale, alpha",
+    [
+        (0.0, 0.0, math.exp(-2.0), 1 / (1 + math.exp(5.0))),
+        (0.0, 10.0, math.exp(-2.0), 0.99),  # sigmoid(5) is above the largest opacity
+        (9.0, 50.0, 0.05 * math.exp(2.0), 0.99),
+        (-20.0, -50.0, 1e-4 * math.exp(-1.0), 1 / (1 + math.exp(13.0))),
+    ],
+)
+def test_decoder_clamps(log_scale, opacity, scale, alpha):
+    config, params, bias = small_decoder(log_scale, opacity)
+    out = decoder.decode(config, params, torch.zeros(1, 1, 2), torch.zeros(1, 1, 2), 1, 1.0)
+    assert out["means"][0].tolist() == [[0.0, 0.0, 1.5]] * 2
+    assert out["scales"].flatten().tolist() == pytest.approx([scale] * 6, rel=1e-5)
+    assert out["opacities"].flatten().tolist() == pytest.approx([alpha] * 2, rel=1e-5)
+    assert out["quats_wxyz"][0].tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
+    assert torch.allclose(out["raw"]["log_scale"], torch.tensor(log_scale - 2.0))  # before the clamp
+    out["opacities"].sum().backward()
+    assert (bias.grad[9].item() == 0.0) == (opacity != 0.0)  # a clamp passes no gradient
+    assert torch.isfinite(bias.grad).all()
+
+
+def test_opacity_logit_clamp():
+    """The upper end of the logit is hidden behind the largest opacity, and shows in what the regularizer reads."""
+    for raw, expected in [(-50.0, -13.0), (0.0, -5.0 - 0.25 * math.log(2.0)), (50.0, 6.0)]:
+        config, params, _ = small_decoder(0.0, raw)
+        out = decoder.decode(config, params, torch.zeros(1, 1, 2), torch.zeros(1, 1, 2), 1, 0.75)
+        assert out["raw"]["opacity_logit"].flatten().tolist() == pytest.approx([expected] * 2)
+
+
+def test_rotations():
+    """6D -> matrix -> quaternion -> matrix, through all four branches of the quaternion."""
+    generator = torch.Generator().manual_seed(1)
+    six = torch.randn(500, 6, generator=generator, dtype=torch.float64)
+    half_turns = torch.tensor(
+        [[1, 0, 0, 0, -1, 0], [-1, 0, 0, 0, 1, 0], [-1, 0, 0, 0, -1, 0]], dtype=torch.float64
+    )
+    matrix = rotation.matrix_from_6d(torch.cat([six, half_turns]))
+    assert torch.allclose(matrix @ matrix.transpose(-1, -2), torch.eye(3, dtype=torch.float64).expand_as(matrix))
+    assert torch.allclose(torch.linalg.det(matrix), torch.ones(len(matrix), dtype=torch.float64))
+    assert torch.allclose(matrix[:500, 0], six[:, :3] / six[:, :3].norm(dim=-1, keepdim=True))  # b1 is a row
+    q = rotation.quaternion_from_matrix(matrix)
+    assert torch.allclose(q.norm(dim=-1), torch.ones(len(q), dtype=torch.float64))
+    assert (q[:, 0] >= 0).all()
+    assert torch.allclose(rotation.matrix_from_quaternion(q), matrix)
+    assert set(q.abs().argmax(-1).tolist()) == {0, 1, 2, 3}
+    quarter = rotation.matrix_from_quaternion(torch.tensor([2.0, 0.0, 0.0, 2.0]))  # 90 degrees about z, not unit
+    assert torch.allclose(quarter @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), atol=1e-7)
+
+
+# ---- schedule --------------------------------------------------------------------------------------------------------
+
+
+def test_learning_rate():
+    rate = [schedule.learning_rate(step, 220_000, 5e-4) for step in range(220_001)]
+    assert rate[0] == pytest.approx(5e-7)
+    assert rate[3300] == pytest.approx(5e-4 * (1e-3 + 0.999 / 2))
+    assert rate[6600] == pytest.approx(5e-4) and max(rate) == rate[6600]
+    assert rate[(6600 + 220_000) // 2] == pytest.approx((5e-4 + 1e-5) / 2)
+    assert rate[220_000] == pytest.approx(1e-5)
+    assert schedule.learning_rate(220_000, 220_000, 2e-5) == pytest.approx(1e-6)
+
+
+def test_stage():
+    table = {0: (0, 1.0), 9_999: (0, 1.0), 10_000: (1, 0.0), 11_000: (1, 0.5), 12_000: (1, 1.0), 19_999: (1, 1.0)}
+    table |= {20_000: (2, 0.0), 49_999: (2, 1.0), 50_500: (3, 0.25), 52_000: (3, 1.0), 219_999: (3, 1.0)}
+    for step, expected in table.items():
+        assert schedule.stage(step, final_stage=3) == expected
+    assert schedule.stage(60_000, final_stage=0) == (0, 1.0)
+    assert schedule.stage(50_500, final_stage=2) == (2, 1.0)
+
+
+def test_adamw_and_clipping_against_torch():
+    generator = torch.Generator().manual_seed(0)
+    start = {"layer.weight": torch.randn(4, 3, generator=generator), "layer.bias": torch.randn(4, generator=generator)}
+    start["scene_tokens"] = torch.randn(5, 3, generator=generator)
+    assert [schedule.is_decayed(name, p) for name, p in start.items()] == [True, False, False]
+    theirs = {name: torch.nn.Parameter(p.clone()) for name, p in start.items()}
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": [p], "weight_decay": 0.1 if schedule.is_decayed(name, p) else 0.0}
+            for name, p in theirs.items()
+        ],
+        lr=1e-2,
+    )
+    ours = {name: (p, torch.zeros_like(p), torch.zeros_like(p)) for name, p in start.items()}
+    for count in range(1, 6):
+        gradients = {name: 3.0 * torch.randn(p.shape, generator=generator) for name, p in start.items()}
+        for name, p in theirs.items():
+            p.grad = gradients[name].clone()
+        torch.nn.utils.clip_grad_norm_(theirs.values(), 1.0)
+        optimizer.step()
+        clipped, _ = schedule.clip_gradients(gradients)
+        for name, (p, first, second) in ours.items():
+            decay = 0.1 if schedule.is_decayed(name, p) else 0.0
+            ours[name] = schedule.adamw_step(p, clipped[name], first, second, count, 1e-2, decay)
+    for name in start:
+        assert torch.allclose(ours[name][0], theirs[name], atol=1e-6)
+
+
+def test_clipping():
+    gradients = {"a": torch.tensor([3.0, 0.0]), "b": torch.tensor([[4.0]])}
+    clipped, norm = schedule.clip_gradients(gradients)
+    assert norm.item() == 5.0
+    assert clipped["a"].tolist() == pytest.approx([0.6, 0.0]) and clipped["b"].item() == pytest.approx(0.8)
+    clipped, _ = schedule.clip_gradients(gradients, largest_norm=6.0)
+    assert clipped["b"].item() == 4.0
+
+
+# ---- rasterizer ------------------------------------------------------------------------------------------------------
+
+WIDTH, HEIGHT = 9, 7
+
+
+def camera(dtype=torch.float64):
+    """A camera turned and moved away from the origin, with unequal focal lengths and an off-centre principal point."""
+    q = torch.tensor([0.95, 0.10, -0.25, 0.05], dtype=dtype)
+    w2c = torch.eye(4, dtype=dtype)
+    w2c[:3, :3] = rotation.matrix_from_quaternion(q)
+    w2c[:3, 3] = torch.tensor([0.2, -0.1, 0.4], dtype=dtype)
+    intrinsic = torch.tensor([[8.0, 0.0, 4.2], [0.0, 7.5, 3.1], [0.0, 0.0, 1.0]], dtype=dtype)
+    return w2c, intrinsic
+
+
+def scene(in_camera, scales, opacities, w2c, coefficients=16, seed=0):
+    """Gaussians at given camera-space positions, with random unnormalized quaternions and SH."""
+    generator = torch.Generator().manual_seed(seed)
+    in_camera = torch.tensor(in_camera, dtype=torch.float64)
+    n = len(in_camera)
+    means = (in_camera - w2c[:3, 3]) @ w2c[:3, :3]
+    scales = torch.tensor(scales, dtype=torch.float64)
+    quaternions = 1.7 * torch.randn(n, 4, generator=generator, dtype=torch.float64)
+    sh = 0.15 * torch.randn(n, coefficients, 3, generator=generator, dtype=torch.float64)
+    return means, scales, quaternions, torch.tensor(opacities, dtype=torch.float64), sh
+
+
+def smooth_scene(w2c, coefficients=16):
+    """Every Gaussian is above 1/255 at every pixel, none saturates. The last two lie outside of the image, where the
+    Jacobian is evaluated at a clamped position."""
+    in_camera = [[0.1, -0.1, 2.0], [-0.3, 0.2, 2.5], [0.2, 0.3, 3.0], [2.9, 0.1, 3.2], [0.3, -3.0, 3.6]]
+    scales = [[1.5, 2.0, 1.8], [1.9, 1.6, 2.2], [2.1, 1.7, 2.0], [2.9, 3.3, 3.1], [3.2, 2.9, 3.4]]
+    return scene(in_camera, scales, [0.4, 0.55, 0.3, 0.6, 0.5], w2c, coefficients)
+
+
+def test_smooth_scene_is_what_it_says():
+    w2c, intrinsic = camera()
+    means, scales, quaternions, opacities, sh = smooth_scene(w2c)
+    p = splat.project(means, scales, quaternions, w2c, intrinsic, WIDTH, HEIGHT)
+    delta = p["mean2d"][:, None] - splat.pixel_centres(WIDTH, HEIGHT, torch.float64)
+    sigma = 0.5 * torch.einsum("nqi,nij,nqj->nq", delta, torch.linalg.inv(p["cov2d"]), delta)
+    alpha = opacities[:, None] * torch.exp(-sigma)
+    assert alpha.min() > 1.02 / 255 and alpha.max() < 0.99
+    assert torch.cumprod(1 - alpha, 0).min() > 1e-3
+    assert splat.sh_colour(means, sh, w2c).min() > 0.01
+    assert p["mean2d"][3, 0] > 1.15 * WIDTH + 1 and p["mean2d"][4, 1] < -0.15 * HEIGHT - 1
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_splat_gradients(coefficients):
+    """gradcheck of each of the three outputs against all five inputs."""
+    w2c, intrinsic = camera()
+    inputs = [value.requires_grad_() for value in smooth_scene(w2c, coefficients)]
+
+    def render(*values):
+        return splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT)
+
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+def test_splat_parts_gradients():
+    w2c, intrinsic = camera()
+    means, scales, quaternions, opacities, sh = (value.requires_grad_() for value in smooth_scene(w2c))
+
+    def project(*values):
+        p = splat.project(*values, w2c, intrinsic, WIDTH, HEIGHT)
+        return p["mean2d"], p["cov2d"], p["conic"], p["depth"]
+
+    assert torch.autograd.gradcheck(project, (means, scales, quaternions), eps=1e-6, atol=1e-7, rtol=1e-5)
+    colour = lambda m, c: splat.sh_colour(m, c, w2c)  # noqa: E731
+    assert torch.autograd.gradcheck(colour, (means, sh), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d):
+    """The rasterizer once more, with Python numbers and loops: one pixel and one Gaussian at a time."""
+    n = len(means)
+    means, scales, quaternions = means.tolist(), scales.tolist(), quaternions.tolist()
+    opacities, sh, w2c, k = opacities.tolist(), sh.tolist(), w2c.tolist(), intrinsic.tolist()
+    fx, fy, cx, cy = k[0][0], k[1][1], k[0][2], k[1][2]
+    centre = [-sum(w2c[r][c] * w2c[r][3] for r in range(3)) for c in range(3)]
+
+    def product(a, b):
+        return [[sum(a[i][t] * b[t][j] for t in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
+
+    def transpose(a):
+        return [list(column) for column in zip(*a)]
+
+    def hamilton(p, q):
+        return (
+            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+        )
+
+    def rotate(q, v):  # q v q*, so that no formula is shared with the code under test
+        length = math.sqrt(sum(c * c for c in q))
+        q = [c / length for c in q]
+        return hamilton(hamilton(q, (0.0, *v)), (q[0], -q[1], -q[2], -q[3]))[1:]
+
+    def basis(x, y, z):  # from the definition: real harmonics, 3DGS order and signs
+        pi = math.pi
+        first = math.sqrt(3 / (4 * pi))
+        second = 0.5 * math.sqrt(15 / pi)
+        return [
+            0.5 * math.sqrt(1 / pi),
+            -first * y, first * z, -first * x,
+            second * x * y, -second * y * z, 0.25 * math.sqrt(5 / pi) * (3 * z * z - 1),
+            -second * x * z, 0.5 * second * (x * x - y * y),
+            -0.25 * math.sqrt(35 / (2 * pi)) * y * (3 * x * x - y * y), 0.5 * math.sqrt(105 / pi) * x * y * z,
+            -0.25 * math.sqrt(21 / (2 * pi)) * y * (5 * z * z - 1), 0.25 * math.sqrt(7 / pi) * z * (5 * z * z - 3),
+            -0.25 * math.sqrt(21 / (2 * pi)) * x * (5 * z * z - 1), 0.25 * math.sqrt(105 / pi) * z * (x * x - y * y),
+            -0.25 * math.sqrt(35 / (2 * pi)) * x * (x * x - 3 * y * y),
+        ]  # fmt: skip
+
+    drawn = []
+    for g in range(n):
+        x, y, z = (sum(w2c[r][c] * means[g][c] for c in range(3)) + w2c[r][3] for r in range(3))
+        if z <= 0.01:
+            continue
+        axes = transpose([rotate(quaternions[g], e) for e in ((1, 0, 0), (0, 1, 0), (0, 0, 1))])  # columns
+        sigma3 = [
+            [sum(axes[i][t] * scales[g][t] ** 2 * axes[j][t] for t in range(3)) for j in range(3)] for i in range(3)
+        ]
+        px = min(max(x / z, (-cx - 0.15 * width) / fx), (width - cx + 0.15 * width) / fx)
+        py = min(max(y / z, (-cy - 0.15 * height) / fy), (height - cy + 0.15 * height) / fy)
+        j = [[fx / z, 0.0, -fx * px / z], [0.0, fy / z, -fy * py / z]]
+        jw = product(j, [row[:3] for row in w2c[:3]])
+        cov = product(product(jw, sigma3), transpose(jw))
+        a, b, c = cov[0][0] + eps2d, cov[0][1], cov[1][1] + eps2d
+        det = a * c - b * b
+        if det <= 0:
+            continue
+        d = [means[g][t] - centre[t] for t in range(3)]
+        length = math.sqrt(sum(t * t for t in d))
+        values = basis(*(t / length for t in d))
+        colour = [max(0.0, 0.5 + sum(values[t] * sh[g][t][ch] for t in range(len(sh[g])))) for ch in range(3)]
+        drawn.append((z, g, fx * x / z + cx, fy * y / z + cy, (c / det, -b / det, a / det), colour))
+    drawn.sort(key=lambda item: item[:2])
+
+    images = torch.zeros(height, width, 5, dtype=torch.float64)
+    for i in range(height):
+        for column in range(width):
+            remaining, rgb, depth = 1.0, [0.0, 0.0, 0.0], 0.0
+            for z, g, u, v, (ca, cb, cc), colour in drawn:
+                dx, dy = u - (column + 0.5), v - (i + 0.5)
+                alpha = min(0.999, opacities[g] * math.exp(-0.5 * (ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy)))
+                if alpha < 1 / 255:
+                    continue
+                if remaining * (1 - alpha) <= 1e-4:
+                    break
+                for ch in range(3):
+                    rgb[ch] += remaining * alpha * colour[ch]
+                depth += remaining * alpha * z
+                remaining *= 1 - alpha
+            accumulated = 1 - remaining
+            expected = depth / accumulated if accumulated > 1e-10 else 0.0
+            images[i, column] = torch.tensor([*rgb, accumulated, expected], dtype=torch.float64)
+    return images[..., :3], images[..., 3], images[..., 4]
+
+
+def crowded_scene(w2c, seed):
+    """Every rule at work: Gaussians behind the camera and before the near plane, equal depths, opaque ones in front of
+    others, thin ones under a pixel, colours below zero, positions far outside of the image."""
+    generator = torch.Generator().manual_seed(seed)
+    n = 60
+    z = 0.2 + 4.0 * torch.rand(n, generator=generator, dtype=torch.float64)
+    xy = 0.9 * (2.0 * torch.rand(n, 2, generator=generator, dtype=torch.float64) - 1.0) * z[:, None]
+    in_camera = torch.cat([xy, z[:, None]], dim=-1)
+    in_camera[:3, 2] = torch.tensor([-1.0, 0.0099, 0.0101], dtype=torch.float64)
+    scales = torch.exp(torch.rand(n, 3, generator=generator, dtype=torch.float64) * 4.0 - 5.0)
+    opacities = torch.rand(n, generator=generator, dtype=torch.float64)
+    opacities[3:20] = 1.0
+    scales[3:12] *= 4.0
+    means, scales, quaternions, opacities, sh = scene(in_camera.tolist(), scales.tolist(), opacities.tolist(), w2c)
+    means[30] = means[31]  # equal depth: the lower index is in front
+    means[40] = means[39]
+    return means, scales, quaternions, opacities, 4.0 * sh
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_splat_against_scalar_loops(seed):
+    w2c, intrinsic = camera()
+    values = crowded_scene(w2c, seed)
+    ours = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT)
+    theirs = scalar_render(*values, w2c, intrinsic, WIDTH, HEIGHT, splat.EPS_2D)
+    for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs):
+        assert (a - b).abs().max().item() < 1e-10, name
+    single = splat.render(*(v.float() for v in values), w2c.float(), intrinsic.float(), WIDTH, HEIGHT)
+    assert single[0].dtype == torch.float32
+    close = (single[0].double() - theirs[0]).abs().amax(-1) < 1e-4  # a threshold may fall the other way at a pixel
+    assert close.double().mean() > 0.95
+
+
+def flat(opacities, depths, dtype=torch.float64):
+    """Gaussians in one pixel's very centre, as project() would give them."""
+    n = len(opacities)
+    return {
+        "mean2d": torch.full((n, 2), 0.5, dtype=dtype),
+        "conic": torch.tensor([[1.0, 0.0, 1.0]], dtype=dtype).repeat(n, 1),
+        "depth": torch.tensor(depths, dtype=dtype),
+        "visible": torch.ones(n, dtype=torch.bool),
+    }, torch.tensor(opacities, dtype=dtype).requires_grad_()
+
+
+def blend(opacities, depths, pixel=(0.5, 0.5)):
+    projected, opacities = flat(opacities, depths)
+    colours = torch.eye(len(opacities), dtype=torch.float64)  # the "colour" of a Gaussian is its own weight
+    rgb, accumulated, depth = splat.composite(
+        projected, opacities, colours, torch.tensor([pixel], dtype=torch.float64)
+    )
+    return rgb[0], accumulated[0], depth[0], opacities
+
+
+def test_alpha_is_capped_without_gradient():
+    weight, _, _, opacities = blend([1.0], [1.0])
+    assert weight.tolist() == [0.999]
+    weight[0].backward()
+    assert opacities.grad.tolist() == [0.0]
+
+
+def test_small_alpha_contributes_nothing():
+    weight, accumulated, depth, opacities = blend([1 / 255 - 1e-6], [3.0])
+    assert weight.item() == accumulated.item() == depth.item() == 0.0
+    (weight.sum() + accumulated + depth).backward()
+    assert opacities.grad.tolist() == [0.0]
+    weight, _, depth, _ = blend([1 / 255 + 1e-6], [3.0])
+    assert weight.item() == pytest.approx(1 / 255 + 1e-6) and depth.item() == pytest.approx(3.0)
+
+
+def test_a_full_pixel_stops():
+    """After 0.99 the transmittance is 0.01; 0.995 would bring it to 5e-5, so it is not blended and ends the pixel."""
+    weight, _, _, _ = blend([0.99, 0.9895], [1.0, 2.0])  # to 1.05e-4: blended
+    assert weight.tolist() == pytest.approx([0.99, 0.009895])
+    weight, accumulated, depth, opacities = blend([0.99, 0.995, 0.5], [1.0, 2.0, 3.0])
+    assert weight.tolist() == pytest.approx([0.99, 0.0, 0.0])
+    assert accumulated.item() == pytest.approx(0.99) and depth.item() == pytest.approx(1.0)
+    accumulated.backward()
+    assert opacities.grad.tolist() == pytest.approx([1.0, 0.0, 0.0])
+
+
+def test_order_is_by_depth_then_index():
+    weight, _, depth, _ = blend([0.5, 0.5, 0.5], [2.0, 1.0, 2.0])
+    assert weight.tolist() == pytest.approx([0.25, 0.5, 0.125])
+    assert depth.item() == pytest.approx((0.25 * 2 + 0.5 * 1 + 0.125 * 2) / 0.875)
+
+
+def test_colour_below_zero_is_black_without_gradient():
+    w2c, _ = camera()
+    sh = torch.tensor([[[-9.0, 0.3, 9.0]]], dtype=torch.float64, requires_grad=True)
+    means = torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64)
+    colour = splat.sh_colour(means, sh, w2c)
+    assert colour[0, 0].item() == 0.0 and colour[0, 2].item() == pytest.approx(0.5 + 9 * 0.28209479177387814)
+    colour.sum().backward()
+    assert sh.grad[0, 0].tolist() == pytest.approx([0.0, 0.28209479177387814, 0.28209479177387814])
+
+
+def test_near_plane():
+    w2c, intrinsic = torch.eye(4, dtype=torch.float64), camera()[1]
+    means = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.0, 0.010001], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    ones = torch.ones(3, 4, dtype=torch.float64)
+    projected = splat.project(means, ones[:, :3], ones, w2c, intrinsic, WIDTH, HEIGHT)
+    assert projected["visible"].tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("position", [[0.0, 0.0, -2.0], [50.0, 0.0, 2.0]])  # behind the camera; beside the image
+def test_an_empty_view_is_black_with_zero_gradients(position):
+    w2c, intrinsic = camera()
+    inputs = [value.requires_grad_() for value in scene([position], [[0.5, 0.5, 0.5]], [0.9], w2c)]
+    rgb, accumulated, depth = splat.render(*inputs, w2c, intrinsic, WIDTH, HEIGHT)
+    assert rgb.abs().max() == accumulated.abs().max() == depth.abs().max() == 0.0
+    (rgb.sum() + accumulated.sum() + depth.sum()).backward()
+    for value in inputs:
+        assert torch.equal(value.grad, torch.zeros_like(value))
