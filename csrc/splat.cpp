@@ -2,12 +2,14 @@
 
 #include <torch/torch.h>
 
+#include <algorithm>
 #include <memory>
 #include <string>
 #include <vector>
 
 #include "raster/kernels.h"
 #include "raster/raster.h"
+#include "raster/sh.h"
 
 namespace globalsplat {
 namespace {
@@ -150,6 +152,14 @@ void splat(size_t means_, size_t scales_, size_t quaternions_, size_t opacities_
       type == torch::kDouble ? apply(SplatFunction<double>{}) : apply(SplatFunction<float>{});
   for (size_t k = 0; k < 3; ++k) out[k] = reinterpret_cast<size_t>(new Tensor(pictures[k].to(means.device())));
 }
+
+void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
+  double values[raster::kMaxBases];
+  raster::sh_basis(int(out.size()), direction.data(), values);
+  std::copy_n(values, out.size(), out.data());
+}
+
+rust::String libtorch_version() { return TORCH_VERSION; }
 
 rust::String simd_level() { return raster::kernels().name; }
 

@@ -1,6 +1,7 @@
 // The differentiable splat op on torch tensors, and what Rust calls through cxx.
 #pragma once
 
+#include <array>
 #include <cstdint>
 
 #include "rust/cxx.h"
@@ -16,6 +17,12 @@ namespace globalsplat {
 // Throws (a Rust error) on shapes that don't fit.
 void splat(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
            size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out);
+
+// The first out.size() (1, 4, 9 or 16) spherical harmonics of a unit vector, as the rasterizer evaluates them.
+void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out);
+
+// Of the libtorch whose headers this was compiled with.
+rust::String libtorch_version();
 
 // The instruction set of the kernels in use. Throws when GLOBALSPLAT_SIMD names an unknown one.
 rust::String simd_level();

@@ -3,11 +3,16 @@
 //! Data flows down this list; an arrow never points up.
 //! [`data`] → [`scene`] → [`model`] → [`render`] → [`loss`] → [`train`] → [`eval`], with [`io`] for files.
 
+pub mod config;
+pub mod data;
 pub mod error;
+pub mod eval;
 pub mod io;
 pub mod loss;
 pub mod model;
 pub mod render;
 pub mod scene;
+pub mod synth;
+pub mod train;
 
 pub use error::{Error, Result};

@@ -21,6 +21,11 @@ pub(super) mod ffi {
             out: &mut [usize],
         ) -> Result<()>;
 
+        /// The first `out.len()` (1, 4, 9 or 16) spherical harmonics of a unit vector.
+        fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
+
+        fn libtorch_version() -> String;
+
         fn simd_level() -> Result<String>;
     }
 }

@@ -1,11 +1,16 @@
 //! The differentiable splat op (SPEC section 6), safe and typed.
 
 mod bridge;
+mod transform;
 
+pub use transform::transform;
+
+use crate::data::ViewBatch;
 use crate::error::Result;
 use crate::model::Gaussians;
 use bridge::ffi;
-use tch::Tensor;
+use crate::scene::{Camera, pose_to_rows};
+use tch::{Kind, Tensor};
 
 /// Pixels² added to the diagonal of every projected covariance.
 pub const DEFAULT_EPS2D: f64 = 0.05;
@@ -21,6 +26,30 @@ pub struct Cameras {
     pub width: i64,
     /// Picture height in pixels.
     pub height: i64,
+}
+
+impl Cameras {
+    /// Those that took the views of `batch`.
+    pub fn of(batch: &ViewBatch) -> Self {
+        let size = batch.images.size();
+        Cameras {
+            w2c: batch.w2c.shallow_clone(),
+            intrinsics: batch.intrinsics.shallow_clone(),
+            width: size[4],
+            height: size[3],
+        }
+    }
+
+    /// One camera of one scene, B = C = 1.
+    pub fn single(camera: &Camera) -> Self {
+        let matrix = |rows: &[f64], n: i64| Tensor::from_slice(rows).view([1, 1, n, n]).to_kind(Kind::Float);
+        Cameras {
+            w2c: matrix(&pose_to_rows(&camera.c2w.inverse()), 4),
+            intrinsics: matrix(&camera.intrinsics.to_rows(), 3),
+            width: i64::from(camera.width),
+            height: i64::from(camera.height),
+        }
+    }
 }
 
 /// What the cameras see.
@@ -67,4 +96,9 @@ pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pi
 /// A `GLOBALSPLAT_SIMD` that names one which this machine doesn't have.
 pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
+}
+
+/// The version of the libtorch that this program was built with.
+pub fn libtorch_version() -> String {
+    ffi::libtorch_version()
 }

@@ -6,6 +6,9 @@ use glam::{DMat3, DMat4, DVec3};
 /// Below it (or when not finite) the spread of the cameras counts as none, and the scene keeps its size.
 const MIN_SCALE: f64 = 1e-12;
 
+/// A sum of unit vectors shorter than it points nowhere.
+const MIN_DIRECTION: f64 = 1e-6;
+
 /// x ↦ scale · rotation · x + translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Similarity {
@@ -36,8 +39,9 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     }
     let mean = |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;
     let undirected = || Error::Request("the cameras' viewing directions cancel out, so the scene has no front".into());
-    let forward = mean(2).try_normalize().ok_or_else(undirected)?;
-    let right = mean(1).cross(forward).try_normalize().ok_or_else(undirected)?;
+    let direction = |v: DVec3| if v.length() > MIN_DIRECTION { Ok(v.normalize()) } else { Err(undirected()) };
+    let forward = direction(mean(2))?;
+    let right = direction(mean(1).cross(forward))?;
     let down = forward.cross(right).normalize();
     let average = DMat4::from_cols(right.extend(0.), down.extend(0.), forward.extend(0.), mean(3).extend(1.));
 

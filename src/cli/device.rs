@@ -1,0 +1,31 @@
+//! `--device cpu|cuda[:N]`.
+
+use globalsplat::{Error, Result};
+use tch::{Cuda, Device};
+
+/// Parses a device and makes sure that it is there.
+pub fn parse(name: &str) -> Result<Device> {
+    let refused = |why: &str| Error::Request(format!("--device {name}: {why}"));
+    let index = match name.split_once(':') {
+        None if name == "cpu" => return Ok(Device::Cpu),
+        None if name == "cuda" => 0,
+        Some(("cuda", index)) => index.parse::<usize>().map_err(|_| refused("expected cuda:N with a whole number"))?,
+        _ => return Err(refused("expected cpu, cuda or cuda:N")),
+    };
+    load_cuda();
+    let count = Cuda::device_count();
+    if !Cuda::is_available() || index as i64 >= count {
+        return Err(refused(&format!("there are {count} CUDA devices that this libtorch can use")));
+    }
+    Ok(Device::Cuda(index))
+}
+
+/// Loads libtorch's CUDA half where there is one. The program isn't linked to it: loading it takes longer than a small job
+/// on the CPU, and machines without a GPU may not have it.
+pub fn load_cuda() {
+    #[cfg(unix)]
+    // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
+    unsafe {
+        libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL);
+    }
+}

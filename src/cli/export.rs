@@ -1,0 +1,70 @@
+use super::print_json;
+use anyhow::Result;
+use clap::{ArgGroup, Args, ValueEnum};
+use globalsplat::config::Config;
+use globalsplat::io::{ModelDtype, check_writable_file, load_model, save_model};
+use globalsplat::model::GlobalSplat;
+use globalsplat::train::latest_checkpoint;
+use serde_json::json;
+use std::path::PathBuf;
+use tch::{Device, nn};
+
+/// Write a run's newest weights, with their configuration, as one safetensors file.
+#[derive(Args)]
+#[command(group(ArgGroup::new("source").required(true)))]
+#[command(after_help = "Example:\n  globalsplat export --run runs/first_light --out model.safetensors --dtype bf16")]
+pub struct Export {
+    /// Folder of a run
+    #[arg(long, value_name = "RUN", group = "source")]
+    run: Option<PathBuf>,
+    /// Fresh weights of a configuration instead, as training would begin with
+    #[arg(long, value_name = "FILE", group = "source")]
+    config: Option<PathBuf>,
+    /// The file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// How weights are stored
+    #[arg(long, value_enum, default_value = "f32")]
+    dtype: Dtype,
+    /// Print what was written as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Dtype {
+    F32,
+    Bf16,
+}
+
+impl Export {
+    pub fn run(self) -> Result<()> {
+        check_writable_file(&self.out)?;
+        let (vs, config) = match (&self.run, &self.config) {
+            (Some(run), _) => {
+                let loaded = load_model(&latest_checkpoint(run)?.join("model.safetensors"), Device::Cpu)?;
+                (loaded.vs, loaded.config)
+            }
+            (None, config) => {
+                let config = Config::read(config.as_ref().expect("clap asks for one of the two"), &[])?;
+                tch::manual_seed(config.train.seed as i64);
+                let vs = nn::VarStore::new(Device::Cpu);
+                GlobalSplat::new(&vs.root(), &config.model)?;
+                (vs, config)
+            }
+        };
+        let dtype = match self.dtype {
+            Dtype::F32 => ModelDtype::F32,
+            Dtype::Bf16 => ModelDtype::BF16,
+        };
+        save_model(&self.out, &vs, &config, dtype)?;
+        let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
+        let bytes = std::fs::metadata(&self.out)?.len();
+        if self.json {
+            print_json(&json!({ "weights": self.out, "parameters": parameters, "bytes": bytes }));
+        } else {
+            println!("{}: {parameters} parameters, {:.1} MB", self.out.display(), bytes as f64 / 1e6);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,92 @@
+//! The command line: one file per command, which parses, calls the library and prints.
+//!
+//! Exit codes: 0 done, 1 the work failed, 2 the request was wrong. Results go to standard output (with `--json` one
+//! object), everything else to standard error.
+
+mod device;
+mod doctor;
+mod eval;
+mod export;
+mod inspect;
+mod progress;
+mod reconstruct;
+mod render;
+mod synth;
+mod train;
+
+use clap::{Parser, Subcommand};
+use globalsplat::Error;
+use std::panic;
+use std::process::ExitCode;
+
+const DONE: u8 = 0;
+const FAILED: u8 = 1;
+const WRONG_REQUEST: u8 = 2;
+
+/// Posed photos to a compact 3D Gaussian splat in one forward pass.
+#[derive(Parser)]
+#[command(name = "globalsplat", version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Train(train::Train),
+    Eval(eval::Eval),
+    Reconstruct(reconstruct::Reconstruct),
+    Render(render::Render),
+    Export(export::Export),
+    Synth(synth::Synth),
+    Inspect(inspect::Inspect),
+    Doctor(doctor::Doctor),
+}
+
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            let _ = e.print();
+            // --help and --version come as errors too, with exit code 0.
+            return ExitCode::from(e.exit_code() as u8);
+        }
+    };
+    // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
+    panic::set_hook(Box::new(|_| {}));
+    let result = panic::catch_unwind(|| match cli.command {
+        Command::Train(command) => command.run(),
+        Command::Eval(command) => command.run(),
+        Command::Reconstruct(command) => command.run(),
+        Command::Render(command) => command.run(),
+        Command::Export(command) => command.run(),
+        Command::Synth(command) => command.run(),
+        Command::Inspect(command) => command.run(),
+        Command::Doctor(command) => command.run(),
+    });
+    match result {
+        Ok(Ok(())) => ExitCode::from(DONE),
+        Ok(Err(error)) => {
+            eprintln!("globalsplat: {error}");
+            let request = error.downcast_ref::<Error>().is_some_and(Error::is_request);
+            ExitCode::from(if request { WRONG_REQUEST } else { FAILED })
+        }
+        Err(panic) => {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("an unknown reason");
+            eprintln!("globalsplat: the work failed inside: {}", first_sentence(text));
+            ExitCode::from(FAILED)
+        }
+    }
+}
+
+/// libtorch appends stack traces to its messages.
+fn first_sentence(text: &str) -> &str {
+    text.lines().next().unwrap_or(text)
+}
+
+/// Prints a result as one JSON object.
+fn print_json(value: &serde_json::Value) {
+    println!("{value}");
+}

@@ -1,0 +1,158 @@
+use super::{device, print_json, progress};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::config::Config;
+use globalsplat::data::{Capture, Holdout, find_captures};
+use globalsplat::error::Error;
+use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
+use globalsplat::io::{check_writable_dir, load_model};
+use globalsplat::train::{Outcome, Resume, Trainer, run};
+use serde_json::json;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+use tch::Device;
+
+/// Train a model on captures.
+///
+/// Ctrl-C saves a checkpoint and stops; the same command goes on from there. At the end the views that were held out are
+/// rendered and scored, beside the answer "the nearest photo that was shown".
+#[derive(Args)]
+#[command(after_help = "Example:\n  globalsplat train --config configs/first_light.toml --out runs/first_light")]
+pub struct Train {
+    /// Configuration file; see configs/
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Override a key of it, as in train.steps=100
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Folder of the run: checkpoints, the resolved configuration, metrics.jsonl
+    #[arg(long, value_name = "RUN")]
+    out: PathBuf,
+    /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
+    #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
+    resume: String,
+    /// cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Print the result as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Train {
+    pub fn run(self) -> Result<()> {
+        let config = Config::read(&self.config, &self.set)?;
+        let device = device::parse(&self.device)?;
+        let resume = match self.resume.as_str() {
+            "auto" => Resume::Auto,
+            "never" => Resume::Never,
+            path => Resume::From(path.into()),
+        };
+        check_writable_dir(&self.out)?;
+        let mut captures = vec![];
+        for path in config.data.capture_paths()? {
+            captures.extend(find_captures(&path)?);
+        }
+        if captures.is_empty() {
+            return Err(Error::input(&self.config, "data.captures", "empty", "a capture, or a folder of captures").into());
+        }
+        let mut trainer = Trainer::new(&config, &captures, device)?;
+
+        let start = Instant::now();
+        let outcome = self.train(&config, &mut trainer, &resume)?;
+        let seconds = start.elapsed().as_secs_f64();
+        if !outcome.complete {
+            anyhow::bail!("stopped; {} holds all of it, and the same command goes on", outcome.checkpoint.display());
+        }
+        let validation = validate(&outcome, &config, &captures)?;
+        self.report(&outcome, seconds, &validation);
+        Ok(())
+    }
+
+    fn train(&self, config: &Config, trainer: &mut Trainer, resume: &Resume) -> Result<Outcome> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let handler = stop.clone();
+        ctrlc::set_handler(move || handler.store(true, Ordering::Relaxed))?;
+        let bar = progress::bar(config.train.steps, "steps");
+        let mut smooth_mse = None;
+        let mut first = true;
+        let outcome = run(trainer, &self.out, resume, |report| {
+            if first {
+                bar.set_position(report.step);
+                bar.reset_eta();
+                first = false;
+            }
+            bar.set_position(report.step + 1);
+            let mse = smooth_mse.map_or(report.mse, |old: f64| 0.98 * old + 0.02 * report.mse);
+            smooth_mse = Some(mse);
+            bar.set_message(format!(
+                "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e}",
+                report.loss,
+                -10. * mse.log10(),
+                report.stage.index,
+                report.stage.mix,
+                report.learning_rate
+            ));
+            !stop.load(Ordering::Relaxed)
+        })?;
+        bar.abandon();
+        Ok(outcome)
+    }
+
+    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation]) {
+        let mean = |value: fn(&Validation) -> f64| validation.iter().map(value).sum::<f64>() / validation.len() as f64;
+        if self.json {
+            let mut object = json!({
+                "checkpoint": outcome.checkpoint,
+                "seconds": seconds,
+                "skipped_steps": outcome.skipped,
+            });
+            if !validation.is_empty() {
+                object["held_out"] = json!({
+                    "psnr": mean(|v| v.ours.psnr),
+                    "ssim": mean(|v| v.ours.ssim),
+                    "nearest_photo_psnr": mean(|v| v.nearest.psnr),
+                    "nearest_photo_ssim": mean(|v| v.nearest.ssim),
+                    "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
+                });
+            }
+            print_json(&object);
+            return;
+        }
+        println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
+        if outcome.skipped > 0 {
+            println!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
+        }
+        if !validation.is_empty() {
+            println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
+            for v in validation {
+                println!("{:<24} {:>10.2} {:>10.4} {:>14.2}", v.ours.scene, v.ours.psnr, v.ours.ssim, v.nearest.psnr);
+            }
+            let (psnr, nearest) = (mean(|v| v.ours.psnr), mean(|v| v.nearest.psnr));
+            println!("{:<24} {psnr:>10.2} {:>10.4} {nearest:>14.2}   {:+.2} dB", "mean", mean(|v| v.ours.ssim), psnr - nearest);
+        }
+    }
+}
+
+/// One capture's held-out views.
+struct Validation {
+    ours: CaptureScores,
+    nearest: CaptureScores,
+}
+
+fn validate(outcome: &Outcome, config: &Config, captures: &[Capture]) -> Result<Vec<Validation>> {
+    let holdout = config.data.holdout;
+    if holdout == Holdout::None {
+        return Ok(vec![]);
+    }
+    let loaded = load_model(&outcome.checkpoint.join("model.safetensors"), Device::Cpu)?;
+    captures
+        .iter()
+        .map(|capture| {
+            let (ours, ..) = score_model(&loaded, capture, holdout)?;
+            Ok(Validation { ours, nearest: nearest_context_baseline(&loaded, capture, holdout)? })
+        })
+        .collect()
+}

@@ -1,0 +1,279 @@
+//! A run's configuration: one TOML file, every key with the paper's value as its default. Unknown keys are errors.
+
+use crate::data::{Holdout, ImageSize};
+use crate::error::{Error, Result};
+use crate::model::{ModelConfig, Stage};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Everything a run depends on.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The network.
+    pub model: ModelConfig,
+    /// What it looks at.
+    pub data: DataConfig,
+    /// How many Gaussians, when.
+    pub curriculum: CurriculumConfig,
+    /// The factors of the loss.
+    pub loss: LossConfig,
+    /// How it learns.
+    pub train: TrainConfig,
+}
+
+/// Captures and views.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DataConfig {
+    /// Captures, or folders of captures. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    pub captures: Vec<String>,
+    /// [height, width] that images are fitted to.
+    pub image_size: ImageSize,
+    /// Views the model sees in a training step, at most.
+    pub context_views: usize,
+    /// Views it is asked for in a training step, at most.
+    pub target_views: usize,
+    /// Views never shown in training, which validation asks for.
+    pub holdout: Holdout,
+}
+
+impl Default for DataConfig {
+    fn default() -> Self {
+        DataConfig {
+            captures: vec![],
+            image_size: [256, 256].into(),
+            context_views: 24,
+            target_views: 12,
+            holdout: Holdout::None,
+        }
+    }
+}
+
+/// The coarse-to-fine curriculum (SPEC section 8).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CurriculumConfig {
+    /// The stage that training ends in and inference uses: 2^s Gaussians per scene token.
+    pub final_stage: u32,
+    /// Steps at which stages 1, 2, … begin. Those beyond the final stage are ignored.
+    pub boundaries: Vec<u64>,
+    /// Steps over which λ goes from 0 to 1 after a boundary.
+    pub transition: u64,
+    /// The final stage from the first step: an ablation.
+    pub full_capacity: bool,
+}
+
+impl Default for CurriculumConfig {
+    fn default() -> Self {
+        CurriculumConfig {
+            final_stage: 3,
+            boundaries: vec![10_000, 20_000, 50_000],
+            transition: 2_000,
+            full_capacity: false,
+        }
+    }
+}
+
+impl CurriculumConfig {
+    /// The stage of inference.
+    pub fn final_stage(&self) -> Stage {
+        Stage::complete(self.final_stage)
+    }
+}
+
+/// The factors of the loss (SPEC section 7).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LossConfig {
+    /// Mean squared error of the rendered colours.
+    pub mse: f64,
+    /// Frustum constraint on the Gaussians' centres.
+    pub frustum: f64,
+    /// L_dec, which has its own 1e-2 inside.
+    pub decoder: f64,
+    /// Whether L_dec has its opacity term.
+    pub decoder_opacity: bool,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        LossConfig { mse: 2., frustum: 1e-2, decoder: 1., decoder_opacity: false }
+    }
+}
+
+/// Optimizer, schedule and bookkeeping.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Of initial weights and of everything drawn.
+    pub seed: u64,
+    /// Optimizer steps.
+    pub steps: u64,
+    /// Scenes in a step.
+    pub batch: usize,
+    /// Peak learning rate.
+    pub learning_rate: f64,
+    /// Share of the steps over which the learning rate rises.
+    pub warmup: f64,
+    /// Of weights with two or more dimensions.
+    pub weight_decay: f64,
+    /// Largest norm of the gradient.
+    pub gradient_clip: f64,
+    /// Steps between checkpoints.
+    pub checkpoint_every: u64,
+    /// Checkpoints kept.
+    pub keep_checkpoints: usize,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        TrainConfig {
+            seed: 0,
+            steps: 220_000,
+            batch: 16,
+            learning_rate: 5e-4,
+            warmup: 0.03,
+            weight_decay: 1e-6,
+            gradient_clip: 1.,
+            checkpoint_every: 1_000,
+            keep_checkpoints: 2,
+        }
+    }
+}
+
+impl Config {
+    /// Reads `file` and applies `overrides`, each `section.key=value` with a TOML value (a bare word counts as a string).
+    ///
+    /// # Errors
+    /// A file that can't be read, unknown keys, values of the wrong type, numbers that don't fit together.
+    pub fn read(file: &Path, overrides: &[String]) -> Result<Self> {
+        let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+        Self::parse(&text, overrides, file)
+    }
+
+    /// As [`Config::read`], from `text` that came from `origin`.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn parse(text: &str, overrides: &[String], origin: &Path) -> Result<Self> {
+        // The file by itself first, so that its errors tell a line.
+        let mut table: toml::Table = text
+            .parse()
+            .map_err(|e: toml::de::Error| Error::input(origin, "the file", one_line(&e, text), "TOML"))?;
+        let described = |e: toml::de::Error| {
+            Error::input(origin, "a key", one_line(&e, text), "a configuration of globalsplat")
+        };
+        toml::from_str::<Config>(text).map_err(described)?;
+        for assignment in overrides {
+            override_key(&mut table, assignment)?;
+            let config: std::result::Result<Config, _> = table.clone().try_into();
+            config.map_err(|e: toml::de::Error| {
+                Error::Request(format!("--set {assignment}: {}", e.message().replace('\n', " ")))
+            })?;
+        }
+        let config: Config = table.try_into().map_err(described)?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// As TOML, every key written out.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("a configuration is numbers, strings and lists")
+    }
+
+    fn check(&self) -> Result<()> {
+        self.model.check()?;
+        let ImageSize { height, width } = self.data.image_size;
+        self.model.check_image(i64::from(height), i64::from(width))?;
+        let refuse = |field: &str, found: String, expected: String| {
+            Err(Error::Request(format!("{field} is {found}, expected {expected}")))
+        };
+        let CurriculumConfig { final_stage, boundaries, full_capacity, .. } = &self.curriculum;
+        if *final_stage > self.model.max_stage() {
+            let expected = format!("{} at most: model.candidates is {}", self.model.max_stage(), self.model.candidates);
+            return refuse("curriculum.final_stage", final_stage.to_string(), expected);
+        }
+        if !full_capacity && boundaries.len() < *final_stage as usize {
+            let expected = format!("a step for each of the {final_stage} stages after the first");
+            return refuse("curriculum.boundaries", format!("{boundaries:?}"), expected);
+        }
+        if !boundaries.is_sorted() {
+            return refuse("curriculum.boundaries", format!("{boundaries:?}"), "ascending steps".into());
+        }
+        for (field, value) in [
+            ("data.context_views", self.data.context_views),
+            ("data.target_views", self.data.target_views),
+            ("train.batch", self.train.batch),
+            ("train.checkpoint_every", self.train.checkpoint_every as usize),
+            ("train.keep_checkpoints", self.train.keep_checkpoints),
+        ] {
+            if value == 0 {
+                return refuse(field, "0".into(), "1 or more".into());
+            }
+        }
+        for (field, value) in [
+            ("train.learning_rate", self.train.learning_rate),
+            ("train.gradient_clip", self.train.gradient_clip),
+        ] {
+            if !(value > 0. && value.is_finite()) {
+                return refuse(field, value.to_string(), "a number above 0".into());
+            }
+        }
+        if !(0. ..=1.).contains(&self.train.warmup) {
+            return refuse("train.warmup", self.train.warmup.to_string(), "a share from 0 to 1".into());
+        }
+        Ok(())
+    }
+}
+
+impl DataConfig {
+    /// `captures` with environment variables filled in.
+    ///
+    /// # Errors
+    /// A variable that isn't set and has no default.
+    pub fn capture_paths(&self) -> Result<Vec<PathBuf>> {
+        self.captures.iter().map(|path| expand(path).map(PathBuf::from)).collect()
+    }
+}
+
+/// Fills in `${NAME}` and `${NAME:-default}`.
+fn expand(text: &str) -> Result<String> {
+    let Some((before, rest)) = text.split_once("${") else { return Ok(text.to_string()) };
+    let Some((inside, after)) = rest.split_once('}') else { return Ok(text.to_string()) };
+    let (name, default) = match inside.split_once(":-") {
+        Some((name, default)) => (name, Some(default.to_string())),
+        None => (inside, None),
+    };
+    let value = std::env::var(name).ok().filter(|v| !v.is_empty()).or(default);
+    let value = value.ok_or_else(|| Error::Request(format!("{text}: the environment variable {name} is not set")))?;
+    Ok(format!("{before}{value}{}", expand(after)?))
+}
+
+/// Sets `section.key` of `section.key=value`.
+fn override_key(table: &mut toml::Table, assignment: &str) -> Result<()> {
+    let refused = || Error::Request(format!("--set {assignment}: expected section.key=value"));
+    let (key, value) = assignment.split_once('=').ok_or_else(refused)?;
+    let value: toml::Value = match format!("value = {value}").parse::<toml::Table>() {
+        Ok(mut parsed) => parsed.remove("value").ok_or_else(refused)?,
+        Err(_) => toml::Value::String(value.to_string()),
+    };
+    let mut path: Vec<&str> = key.trim().split('.').collect();
+    let last = path.pop().ok_or_else(refused)?;
+    let mut table = table;
+    for section in path {
+        let entry = table.entry(section).or_insert_with(|| toml::Value::Table(Default::default()));
+        table = entry.as_table_mut().ok_or_else(refused)?;
+    }
+    table.insert(last.to_string(), value);
+    Ok(())
+}
+
+/// The parser's message and where, on one line.
+fn one_line(error: &toml::de::Error, text: &str) -> String {
+    let message = error.message().replace('\n', " ");
+    match error.span() {
+        Some(span) => format!("{message} in line {}", text[..span.start.min(text.len())].matches('\n').count() + 1),
+        None => message,
+    }
+}

@@ -1,0 +1,111 @@
+//! Which views are shown to the model and which are kept to ask about.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// `none`, or `every:N` with an optional `+K`: views K, K + N, K + 2N, … are held out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Holdout {
+    /// Every view is shown.
+    None,
+    /// Views `first`, `first + every`, … are not.
+    Every {
+        /// 2 or more.
+        every: usize,
+        /// Below `every`.
+        first: usize,
+    },
+}
+
+impl Holdout {
+    /// Indices of the views shown and of those held out, out of `count`.
+    pub fn split(&self, count: usize) -> (Vec<usize>, Vec<usize>) {
+        (0..count).partition(|i| match self {
+            Holdout::None => true,
+            Holdout::Every { every, first } => i % every != *first,
+        })
+    }
+}
+
+impl FromStr for Holdout {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "none" {
+            return Ok(Holdout::None);
+        }
+        let refused = || format!("holdout is {text:?}, expected none, every:N or every:N+K with K < N and N ≥ 2");
+        let numbers = text.strip_prefix("every:").ok_or_else(refused)?;
+        let (every, first) = numbers.split_once('+').unwrap_or((numbers, "0"));
+        match (every.parse(), first.parse()) {
+            (Ok(every), Ok(first)) if every >= 2 && first < every => Ok(Holdout::Every { every, first }),
+            _ => Err(refused()),
+        }
+    }
+}
+
+impl TryFrom<String> for Holdout {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Holdout> for String {
+    fn from(holdout: Holdout) -> String {
+        holdout.to_string()
+    }
+}
+
+impl fmt::Display for Holdout {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Holdout::None => write!(f, "none"),
+            Holdout::Every { every, first: 0 } => write!(f, "every:{every}"),
+            Holdout::Every { every, first } => write!(f, "every:{every}+{first}"),
+        }
+    }
+}
+
+/// `wanted` of `indices`, first and last among them, evenly spread; all of them when there are no more.
+pub fn spread(indices: &[usize], wanted: usize) -> Vec<usize> {
+    if indices.len() <= wanted {
+        return indices.to_vec();
+    }
+    if wanted == 1 {
+        return vec![indices[indices.len() / 2]];
+    }
+    let last = (indices.len() - 1) as f64;
+    (0..wanted).map(|k| indices[(k as f64 * last / (wanted - 1) as f64).round() as usize]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn holdouts_are_read_and_written() {
+        for text in ["none", "every:8", "every:3+1"] {
+            assert_eq!(text.parse::<Holdout>().unwrap().to_string(), text);
+        }
+        for text in ["", "every:1", "every:3+3", "every:x", "first:2"] {
+            assert!(text.parse::<Holdout>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn every_third_view_is_held_out() {
+        let (shown, held_out) = "every:3+1".parse::<Holdout>().unwrap().split(9);
+        assert_eq!((shown, held_out), (vec![0, 2, 3, 5, 6, 8], vec![1, 4, 7]));
+    }
+
+    #[test]
+    fn views_are_spread_from_first_to_last() {
+        let indices: Vec<usize> = (10..20).collect();
+        assert_eq!(spread(&indices, 4), [10, 13, 16, 19]);
+        assert_eq!(spread(&indices, 20), indices);
+    }
+}

@@ -1,0 +1,163 @@
+//! Pictures against photos, view by view.
+
+use super::metrics::{psnr, ssim};
+use super::reconstruct::reconstruct;
+use crate::data::{Capture, Holdout, View};
+use crate::error::{Error, Result};
+use crate::io::{LoadedModel, read_image, tensor_from_rgb};
+use crate::model::Gaussians;
+use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use crate::scene::Camera;
+use serde::Serialize;
+use std::path::Path;
+use tch::Tensor;
+
+/// What a camera saw of a splat.
+#[derive(Debug)]
+pub struct Rendered {
+    /// [3, H, W].
+    pub rgb: Tensor,
+    /// [H, W].
+    pub alpha: Tensor,
+    /// [H, W].
+    pub depth: Tensor,
+}
+
+/// One view's scores.
+#[derive(Debug, Clone, Serialize)]
+pub struct ViewScore {
+    /// As the capture names it.
+    pub image: String,
+    /// In dB.
+    pub psnr: f64,
+    /// As scikit-image's.
+    pub ssim: f64,
+}
+
+/// A capture's scores: means over its views, and each of them.
+#[derive(Debug, Clone, Serialize)]
+pub struct CaptureScores {
+    /// The capture's name.
+    pub scene: String,
+    /// In dB, mean over the views.
+    pub psnr: f64,
+    /// Mean over the views.
+    pub ssim: f64,
+    /// Number of Gaussians, where a splat was scored.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gaussians: Option<i64>,
+    /// One by one.
+    pub views: Vec<ViewScore>,
+}
+
+/// Scores pictures [3, H, W] against views of the same sizes.
+///
+/// # Errors
+/// A picture of another size than its view.
+pub fn score(scene: &str, pictures: &[Tensor], truth: &[View], gaussians: Option<i64>) -> Result<CaptureScores> {
+    let mut views = vec![];
+    for (picture, view) in pictures.iter().zip(truth) {
+        if picture.size() != view.image.size() {
+            let (found, expected) = (picture.size(), view.image.size());
+            return Err(Error::Request(format!("the picture for {} has shape {found:?}, expected {expected:?}", view.name)));
+        }
+        let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
+        views.push(ViewScore { image: view.name.clone(), psnr, ssim });
+    }
+    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
+    Ok(CaptureScores { scene: scene.to_string(), psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), gaussians, views })
+}
+
+/// Renders a splat from each camera, which may differ in size.
+///
+/// # Errors
+/// Those of [`render`].
+pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Rendered>> {
+    cameras
+        .iter()
+        .map(|camera| {
+            let pictures = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
+            let first = |t: Tensor| t.select(0, 0).select(0, 0);
+            Ok(Rendered { rgb: first(pictures.rgb), alpha: first(pictures.alpha), depth: first(pictures.depth) })
+        })
+        .collect()
+}
+
+/// A splat in the capture's own world against all of its photos.
+///
+/// # Errors
+/// Photos that can't be read.
+pub fn score_splat(gaussians: &Gaussians, capture: &Capture) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
+    let views = capture.load_all(None)?;
+    let rendered = render_views(gaussians, &capture.cameras())?;
+    let pictures: Vec<Tensor> = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
+    let scores = score(&capture.name, &pictures, &views, Some(gaussians.count()))?;
+    Ok((scores, views, rendered))
+}
+
+/// A model on one capture: it sees the views that `holdout` leaves, and is asked for the others.
+///
+/// # Errors
+/// Nothing held out, photos that can't be read, or whatever the reconstruction fails with.
+pub fn score_model(
+    loaded: &LoadedModel,
+    capture: &Capture,
+    holdout: Holdout,
+) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
+    let (context, held_out) = load_split(capture, holdout, loaded)?;
+    let poses: Vec<_> = held_out.iter().map(|view| view.camera.c2w).collect();
+    let reconstruction = reconstruct(loaded, &context, &poses)?;
+    let cameras: Vec<Camera> = held_out
+        .iter()
+        .zip(&reconstruction.target_poses)
+        .map(|(view, &c2w)| Camera { c2w, ..view.camera })
+        .collect();
+    let rendered = render_views(&reconstruction.gaussians, &cameras)?;
+    let pictures: Vec<Tensor> = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
+    let scores = score(&capture.name, &pictures, &held_out, Some(reconstruction.gaussians.count()))?;
+    Ok((scores, held_out, rendered))
+}
+
+/// What answering with the context photo taken nearest (by camera centre) would score for the held-out views.
+///
+/// # Errors
+/// As [`score_model`].
+pub fn nearest_context_baseline(loaded: &LoadedModel, capture: &Capture, holdout: Holdout) -> Result<CaptureScores> {
+    let (context, held_out) = load_split(capture, holdout, loaded)?;
+    let centre = |view: &View| view.camera.c2w.w_axis.truncate();
+    let nearest = |target: &View| {
+        let distance = |view: &&View| centre(view).distance(centre(target));
+        let view = context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a context view");
+        view.image.shallow_clone()
+    };
+    score(&capture.name, &held_out.iter().map(nearest).collect::<Vec<_>>(), &held_out, None)
+}
+
+/// Pictures that somebody else rendered: one in `folder` for every view, found by the name of the photo's file.
+///
+/// # Errors
+/// A picture that is missing or has another size.
+pub fn score_renders(folder: &Path, capture: &Capture) -> Result<(CaptureScores, Vec<View>, Vec<Tensor>)> {
+    let views = capture.load_all(None)?;
+    let mut pictures = vec![];
+    for view in &views {
+        let stem = Path::new(&view.name).file_stem().unwrap_or_default();
+        let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(stem).with_extension(ending));
+        let Some(path) = candidates.iter().find(|path| path.is_file()) else {
+            return Err(Error::input(folder, format!("the picture for {}", view.name), "absent", candidates[0].display().to_string()));
+        };
+        pictures.push(tensor_from_rgb(&read_image(path)?));
+    }
+    let scores = score(&capture.name, &pictures, &views, None)?;
+    Ok((scores, views, pictures))
+}
+
+fn load_split(capture: &Capture, holdout: Holdout, loaded: &LoadedModel) -> Result<(Vec<View>, Vec<View>)> {
+    let (context, held_out) = holdout.split(capture.len());
+    if held_out.is_empty() || context.len() < 2 {
+        let split = format!("{} to show and {} to ask for", context.len(), held_out.len());
+        return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, "2 and 1 at least (--holdout every:N)"));
+    }
+    let size = Some(loaded.config.data.image_size);
+    Ok((capture.load(&context, size)?, capture.load(&held_out, size)?))
+}

@@ -1,0 +1,92 @@
+//! Checkpoints: a folder per step, whole or not there.
+//!
+//! `RUN/checkpoints/step-00001000/`: `model.safetensors` (weights, with the configuration), `optimizer.safetensors`, and
+//! `state.json`. Random numbers need no state: a step's depend on the seed and the step alone.
+
+use super::trainer::Trainer;
+use crate::error::{Error, Result};
+use crate::io::{ModelDtype, read_weights, replace_dir, save_model, write_atomically, write_weights};
+use serde::{Deserialize, Serialize};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const FOLDER: &str = "checkpoints";
+const PREFIX: &str = "step-";
+pub(crate) const MODEL_FILE: &str = "model.safetensors";
+const OPTIMIZER_FILE: &str = "optimizer.safetensors";
+const STATE_FILE: &str = "state.json";
+
+#[derive(Serialize, Deserialize)]
+struct State {
+    /// Steps done.
+    step: u64,
+}
+
+/// The run's checkpoints, oldest first.
+///
+/// # Errors
+/// A folder that can't be read.
+pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
+    let folder = run.join(FOLDER);
+    if !folder.is_dir() {
+        return Ok(vec![]);
+    }
+    let mut found = vec![];
+    for entry in fs::read_dir(&folder).map_err(Error::read(&folder))? {
+        let path = entry.map_err(Error::read(&folder))?.path();
+        let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        if let Some(step) = name.strip_prefix(PREFIX).and_then(|digits| digits.parse::<u64>().ok()) {
+            found.push((step, path));
+        }
+    }
+    found.sort();
+    Ok(found.into_iter().map(|(_, path)| path).collect())
+}
+
+/// The newest one.
+///
+/// # Errors
+/// None there, or a folder that can't be read.
+pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
+    let none = || Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made");
+    list_checkpoints(run)?.pop().ok_or_else(none)
+}
+
+impl Trainer {
+    /// Saves a checkpoint under `run`, drops the oldest beyond those to keep, and returns where it is.
+    ///
+    /// # Errors
+    /// The system's refusal to write; older checkpoints are left whole.
+    pub fn save(&self, run: &Path) -> Result<PathBuf> {
+        let path = run.join(FOLDER).join(format!("{PREFIX}{:08}", self.step));
+        replace_dir(&path, |folder| {
+            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, ModelDtype::F32)?;
+            write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
+            let state = serde_json::to_vec(&State { step: self.step }).expect("a number");
+            let file = folder.join(STATE_FILE);
+            write_atomically(&file, |writer| writer.write_all(&state).map_err(Error::write(&file)))
+        })?;
+        let all = list_checkpoints(run)?;
+        let surplus = all.len().saturating_sub(self.config.train.keep_checkpoints);
+        for old in all.iter().take(surplus).filter(|old| **old != path) {
+            fs::remove_dir_all(old).map_err(Error::write(old))?;
+        }
+        Ok(path)
+    }
+
+    /// Goes on from a checkpoint.
+    ///
+    /// # Errors
+    /// Files that can't be read, or were written for another model.
+    pub fn load(&mut self, checkpoint: &Path) -> Result<()> {
+        let file = checkpoint.join(MODEL_FILE);
+        read_weights(&file)?.load_into(&self.vs, &file)?;
+        self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
+        let file = checkpoint.join(STATE_FILE);
+        let state = fs::read(&file).map_err(Error::read(&file))?;
+        let state: State = serde_json::from_slice(&state)
+            .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), "{\"step\": N}"))?;
+        self.step = state.step;
+        Ok(())
+    }
+}

@@ -1,0 +1,15 @@
+//! Training: what a step does, how the run goes on, and how it survives being stopped.
+
+mod checkpoint;
+mod curriculum;
+mod optimizer;
+mod run;
+mod schedule;
+mod trainer;
+
+pub use checkpoint::{latest_checkpoint, list_checkpoints};
+pub use curriculum::stage_at;
+pub use optimizer::AdamW;
+pub use run::{Outcome, Resume, run};
+pub use schedule::learning_rate;
+pub use trainer::{StepReport, Trainer};
