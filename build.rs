@@ -5,7 +5,13 @@ use std::{env, path::Path};
 /// What every C++ file is compiled with.
 fn cpp() -> cc::Build {
     let mut build = cc::Build::new();
-    build.cpp(true).std("c++17").opt_level(3).warnings(true).flag_if_supported("-fno-math-errno").include("csrc");
+    build
+        .cpp(true)
+        .std("c++17")
+        .opt_level(3)
+        .warnings(true)
+        .flag_if_supported("-fno-math-errno")
+        .include("csrc");
     build
 }
 

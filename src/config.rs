@@ -191,7 +191,8 @@ impl Config {
         };
         let CurriculumConfig { final_stage, boundaries, full_capacity, .. } = &self.curriculum;
         if *final_stage > self.model.max_stage() {
-            let expected = format!("{} at most: model.candidates is {}", self.model.max_stage(), self.model.candidates);
+            let expected =
+                format!("{} at most: model.candidates is {}", self.model.max_stage(), self.model.candidates);
             return refuse("curriculum.final_stage", final_stage.to_string(), expected);
         }
         if !full_capacity && boundaries.len() < *final_stage as usize {
@@ -246,7 +247,8 @@ fn expand(text: &str) -> Result<String> {
         None => (inside, None),
     };
     let value = std::env::var(name).ok().filter(|v| !v.is_empty()).or(default);
-    let value = value.ok_or_else(|| Error::Request(format!("{text}: the environment variable {name} is not set")))?;
+    let value =
+        value.ok_or_else(|| Error::Request(format!("{text}: the environment variable {name} is not set")))?;
     Ok(format!("{before}{value}{}", expand(after)?))
 }
 
@@ -273,7 +275,9 @@ fn override_key(table: &mut toml::Table, assignment: &str) -> Result<()> {
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().replace('\n', " ");
     match error.span() {
-        Some(span) => format!("{message} in line {}", text[..span.start.min(text.len())].matches('\n').count() + 1),
+        Some(span) => {
+            format!("{message} in line {}", text[..span.start.min(text.len())].matches('\n').count() + 1)
+        }
         None => message,
     }
 }

@@ -65,7 +65,13 @@ struct Patch {
 
 fn room(random: &mut impl Rng) -> Gaussians {
     let mut patches = vec![];
-    let mut colour = || DVec3::new(random.random_range(0.2..0.9), random.random_range(0.2..0.9), random.random_range(0.2..0.9));
+    let mut colour = || {
+        DVec3::new(
+            random.random_range(0.2..0.9),
+            random.random_range(0.2..0.9),
+            random.random_range(0.2..0.9),
+        )
+    };
     // Back wall, floor, ceiling and two side walls, each a checkerboard of two colours.
     let walls = [
         (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
@@ -82,7 +88,11 @@ fn room(random: &mut impl Rng) -> Gaussians {
         .map(|i| {
             let colours = [colour(), colour()];
             let x = -1.2 + 0.8 * i as f64;
-            (DVec3::new(x, 0.2 + 0.25 * (i as f64 * 1.7).sin(), 2.4 + 0.5 * (i as f64 * 2.3).cos()), 0.35, colours)
+            (
+                DVec3::new(x, 0.2 + 0.25 * (i as f64 * 1.7).sin(), 2.4 + 0.5 * (i as f64 * 2.3).cos()),
+                0.35,
+                colours,
+            )
         })
         .collect();
     for (centre, radius, colours) in spheres {
@@ -122,8 +132,11 @@ fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colours:
 
 fn gaussians_of(patches: &[Patch]) -> Gaussians {
     let count = patches.len() as i64;
-    let tensor = |values: Vec<f64>, width: i64| Tensor::from_slice(&values).view([1, count, width]).to_kind(Kind::Float);
-    let flatten = |value: fn(&Patch) -> DVec3| patches.iter().flat_map(|p| value(p).to_array()).collect::<Vec<f64>>();
+    let tensor = |values: Vec<f64>, width: i64| {
+        Tensor::from_slice(&values).view([1, count, width]).to_kind(Kind::Float)
+    };
+    let flatten =
+        |value: fn(&Patch) -> DVec3| patches.iter().flat_map(|p| value(p).to_array()).collect::<Vec<f64>>();
     let quaternions = patches
         .iter()
         .flat_map(|p| {

@@ -101,7 +101,7 @@ fn every_stage_matches_in_values_and_gradients() {
             for (output, ours) in &outputs {
                 assert_close(&what(output), ours, &golden[&format!("out.{output}")], OUTPUT_TOLERANCE);
                 if let Some(cotangent) = golden.get(&format!("cotangent.{output}")) {
-                    objective = objective + (ours * cotangent).sum(Kind::Float);
+                    objective = &objective + (ours * cotangent).sum(Kind::Float);
                 }
             }
             vs.trainable_variables().iter_mut().for_each(|v| v.zero_grad());

@@ -13,7 +13,15 @@ fn build(config: &ModelConfig) -> (nn::VarStore, GlobalSplat) {
 }
 
 fn small() -> ModelConfig {
-    ModelConfig { latents: 12, width: 32, rgb_width: 24, ray_width: 16, rounds: 2, heads: 4, ..Default::default() }
+    ModelConfig {
+        latents: 12,
+        width: 32,
+        rgb_width: 24,
+        ray_width: 16,
+        rounds: 2,
+        heads: 4,
+        ..Default::default()
+    }
 }
 
 /// `views` images of noise from cameras in a row.
@@ -21,7 +29,7 @@ fn inputs(views: i64, height: i64, width: i64) -> [Tensor; 3] {
     let options = (Kind::Float, Device::Cpu);
     let images = Tensor::rand([1, views, 3, height, width], options);
     let c2w = Tensor::eye(4, options).repeat([1, views, 1, 1]);
-    let _ = c2w.select(3, 3).select(2, 0).copy_(&Tensor::linspace(-0.5, 0.5, views, options).unsqueeze(0));
+    c2w.select(3, 3).select(2, 0).copy_(&Tensor::linspace(-0.5, 0.5, views, options).unsqueeze(0));
     let (w, h) = (width as f32, height as f32);
     let intrinsics = Tensor::from_slice(&[w, 0., w / 2., 0., w, h / 2., 0., 0., 1.]).view([3, 3]);
     [images, c2w, intrinsics.repeat([1, views, 1, 1])]
@@ -43,7 +51,8 @@ fn the_main_model_has_the_published_names_and_shapes() {
         })
         .collect();
     let (vs, _) = build(&ModelConfig::default());
-    let ours: BTreeMap<String, Vec<i64>> = vs.variables().into_iter().map(|(name, t)| (name, t.size())).collect();
+    let ours: BTreeMap<String, Vec<i64>> =
+        vs.variables().into_iter().map(|(name, t)| (name, t.size())).collect();
     assert_eq!(expected.len(), 454);
     assert_eq!(ours, expected);
 }
@@ -131,7 +140,8 @@ fn initial_weights_are_as_specified() {
     let (vs, _) = build(&ModelConfig { rounds: 1, ..Default::default() });
     let variables = vs.variables();
     let std = |name: &str| variables[name].std(false).double_value(&[]);
-    let near = |value: f64, expected: f64| assert!((value / expected - 1.).abs() < 0.05, "{value} for {expected}");
+    let near =
+        |value: f64, expected: f64| assert!((value / expected - 1.).abs() < 0.05, "{value} for {expected}");
     near(std("slot_encoder.geo_rounds.0.lat_q.weight"), 0.02);
     near(std("slot_encoder.mem_regs"), 0.02);
     near(std("scene_tokens"), 0.02);

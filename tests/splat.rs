@@ -29,7 +29,17 @@ fn cameras(scenes: i64, count: i64, width: i64, height: i64, kind: Kind) -> Came
         let (sin, cos) = (0.12 * i as f64).sin_cos();
         w2c.extend([cos, 0., sin, -0.1 * i as f64, 0., 1., 0., 0.05, -sin, 0., cos, 0.1, 0., 0., 0., 1.]);
         let focal = 0.9 * width as f64;
-        intrinsics.extend([focal, 0., width as f64 / 2. + 0.3, 0., focal * 1.1, height as f64 / 2., 0., 0., 1.]);
+        intrinsics.extend([
+            focal,
+            0.,
+            width as f64 / 2. + 0.3,
+            0.,
+            focal * 1.1,
+            height as f64 / 2.,
+            0.,
+            0.,
+            1.,
+        ]);
     }
     Cameras {
         w2c: Tensor::from_slice(&w2c).view([scenes, count, 4, 4]).to_kind(kind),
@@ -91,7 +101,8 @@ fn gradients_are_those_of_finite_differences() {
                     let at = |step: f64| {
                         let moved = leaf.detach() + &direction * step;
                         let mut g = base.map(Tensor::shallow_clone);
-                        *[&mut g.means, &mut g.scales, &mut g.quaternions, &mut g.opacities, &mut g.sh][index] = moved;
+                        *[&mut g.means, &mut g.scales, &mut g.quaternions, &mut g.opacities, &mut g.sh]
+                            [index] = moved;
                         objective(&draw(&g, &c)).double_value(&[])
                     };
                     (at(h) - at(-h)) / (2. * h)
@@ -126,8 +137,9 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
             let (fx, fy, cx, cy) = (k[0], k[4], k[2], k[5]);
             let mut seen = vec![];
             for i in scene * n..(scene + 1) * n {
-                let t: Vec<f64> =
-                    (0..3).map(|r| (0..3).map(|j| m[4 * r + j] * means[3 * i + j]).sum::<f64>() + m[4 * r + 3]).collect();
+                let t: Vec<f64> = (0..3)
+                    .map(|r| (0..3).map(|j| m[4 * r + j] * means[3 * i + j]).sum::<f64>() + m[4 * r + 3])
+                    .collect();
                 if t[2] <= 0.01 {
                     continue;
                 }
@@ -136,7 +148,8 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
                 let q = glam::DQuat::from_xyzw(q[1] / norm, q[2] / norm, q[3] / norm, q[0] / norm);
                 let world = glam::DMat3::from_quat(q)
                     * glam::DMat3::from_diagonal(glam::DVec3::from_slice(&scales[3 * i..][..3]));
-                let view = glam::DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
+                let view =
+                    glam::DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
                 let (wf, hf) = (w as f64, h as f64);
                 let a = (t[0] / t[2]).clamp(-cx / fx - 0.15 * wf / fx, (wf - cx) / fx + 0.15 * wf / fx);
                 let b = (t[1] / t[2]).clamp(-cy / fy - 0.15 * hf / fy, (hf - cy) / fy + 0.15 * hf / fy);
@@ -152,12 +165,14 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
                     rows[1].dot(rows[1]) + DEFAULT_EPS2D,
                 ];
                 let det = cov[0] * cov[2] - cov[1] * cov[1];
-                let colour: Vec<f64> = (0..3).map(|ch| (0.28209479177387814 * sh[3 * i + ch] + 0.5).max(0.)).collect();
+                let colour: Vec<f64> =
+                    (0..3).map(|ch| (0.28209479177387814 * sh[3 * i + ch] + 0.5).max(0.)).collect();
                 let mean = [fx * t[0] / t[2] + cx, fy * t[1] / t[2] + cy];
                 seen.push((t[2], mean, [cov[2] / det, -cov[1] / det, cov[0] / det], opacities[i], colour));
             }
             seen.sort_by(|a, b| a.0.total_cmp(&b.0));
             let mut planes = vec![vec![0f64; w * h]; 3];
+            #[expect(clippy::needless_range_loop, reason = "a pixel is more than its place in a plane")]
             for pixel in 0..w * h {
                 let (x, y) = ((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5);
                 let (mut transmittance, mut z_sum) = (1f64, 0f64);
@@ -247,7 +262,7 @@ fn float32_gradients_are_near_those_of_float64() {
 fn extreme_gaussians_leave_everything_finite() {
     let mut g = gaussians(1, 64, 3, Kind::Float, 11);
     let set = |t: &mut Tensor, row: i64, values: &[f32]| {
-        let _ = t.select(0, 0).select(0, row).copy_(&Tensor::from_slice(values));
+        t.select(0, 0).select(0, row).copy_(&Tensor::from_slice(values));
     };
     set(&mut g.means, 0, &[0., 0., -1.]); // behind
     set(&mut g.means, 1, &[0., 0., 0.01]); // on the near plane
@@ -260,7 +275,7 @@ fn extreme_gaussians_leave_everything_finite() {
         let _ = g.opacities.select(0, 0).select(0, row).fill_(f64::from(opacity));
     }
     let first = g.means.select(0, 0).select(0, 10).copy();
-    let _ = g.means.select(0, 0).select(0, 9).copy_(&first); // equal depths
+    g.means.select(0, 0).select(0, 9).copy_(&first); // equal depths
     let g = leaves(&g);
     let p = draw(&g, &cameras(1, 2, 70, 50, Kind::Float));
     objective(&p).backward();

@@ -9,7 +9,9 @@ pub fn parse(name: &str) -> Result<Device> {
     let index = match name.split_once(':') {
         None if name == "cpu" => return Ok(Device::Cpu),
         None if name == "cuda" => 0,
-        Some(("cuda", index)) => index.parse::<usize>().map_err(|_| refused("expected cuda:N with a whole number"))?,
+        Some(("cuda", index)) => {
+            index.parse::<usize>().map_err(|_| refused("expected cuda:N with a whole number"))?
+        }
         _ => return Err(refused("expected cpu, cuda or cuda:N")),
     };
     load_cuda();

@@ -1,8 +1,10 @@
 use super::{device, print_json};
 use anyhow::Result;
-use clap::{Args, ArgGroup};
+use clap::{ArgGroup, Args};
 use globalsplat::data::{Holdout, open_capture};
-use globalsplat::eval::{CaptureScores, contact_sheet, peak_memory_bytes, score_model, score_renders, score_splat};
+use globalsplat::eval::{
+    CaptureScores, contact_sheet, peak_memory_bytes, score_model, score_renders, score_splat,
+};
 use globalsplat::io::{check_writable_file, load_model, read_ply, write_png};
 use std::path::PathBuf;
 

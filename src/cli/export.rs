@@ -12,7 +12,9 @@ use tch::{Device, nn};
 /// Write a run's newest weights, with their configuration, as one safetensors file.
 #[derive(Args)]
 #[command(group(ArgGroup::new("source").required(true)))]
-#[command(after_help = "Example:\n  globalsplat export --run runs/first_light --out model.safetensors --dtype bf16")]
+#[command(
+    after_help = "Example:\n  globalsplat export --run runs/first_light --out model.safetensors --dtype bf16"
+)]
 pub struct Export {
     /// Folder of a run
     #[arg(long, value_name = "RUN", group = "source")]

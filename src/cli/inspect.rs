@@ -25,7 +25,9 @@ impl Inspect {
         let object = match self.path.extension().and_then(|e| e.to_str()) {
             Some("ply") => splat(&self.path)?,
             Some("safetensors") => weights(&self.path)?,
-            _ if self.path.is_dir() || self.path.extension().is_some_and(|e| e == "json") => capture(&self.path)?,
+            _ if self.path.is_dir() || self.path.extension().is_some_and(|e| e == "json") => {
+                capture(&self.path)?
+            }
             _ => {
                 let expected = "a .ply, a .safetensors or a capture's folder";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
@@ -36,7 +38,9 @@ impl Inspect {
         } else {
             for (key, value) in object.as_object().expect("an object") {
                 match value {
-                    Value::String(text) => println!("{key:<20} {}", text.replace('\n', &format!("\n{:21}", ""))),
+                    Value::String(text) => {
+                        println!("{key:<20} {}", text.replace('\n', &format!("\n{:21}", "")))
+                    }
                     other => println!("{key:<20} {other}"),
                 }
             }

@@ -12,7 +12,9 @@ use std::path::PathBuf;
 ///
 /// The splat is in the capture's own world, so the capture's cameras see it where the photos show it.
 #[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply")]
+#[command(
+    after_help = "Example:\n  globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply"
+)]
 pub struct Reconstruct {
     /// Weights that `globalsplat export` wrote
     #[arg(long, value_name = "FILE")]

@@ -6,7 +6,8 @@ use globalsplat::data::{open_capture, read_camera_path};
 use globalsplat::error::Error;
 use globalsplat::eval::{Rendered, render_views};
 use globalsplat::io::{
-    Ply, check_writable_dir, check_writable_file, colourize_depth, read_ply, tile_horizontally, write_film, write_png,
+    Ply, check_writable_dir, check_writable_file, colourize_depth, read_ply, tile_horizontally, write_film,
+    write_png,
 };
 use globalsplat::scene::{Camera, Intrinsics, orbit_around_cameras, orbit_around_point};
 use serde_json::json;
@@ -22,8 +23,10 @@ const DEFAULT_SIZE: u32 = 512;
 /// Colour always; --depth and --alpha add those, side by side in a film and as files of their own in a folder.
 #[derive(Args)]
 #[command(group(ArgGroup::new("cameras").required(true).multiple(true)))]
-#[command(after_help = "Examples:\n  globalsplat render --splat room.ply --scene captures/room --out views/\n  \
-    globalsplat render --splat room.ply --scene captures/room --orbit --out orbit.gif")]
+#[command(
+    after_help = "Examples:\n  globalsplat render --splat room.ply --scene captures/room --out views/\n  \
+    globalsplat render --splat room.ply --scene captures/room --orbit --out orbit.gif"
+)]
 pub struct Render {
     /// A 3DGS splat
     #[arg(long, value_name = "FILE.ply")]
@@ -61,7 +64,11 @@ impl Render {
     pub fn run(self) -> Result<()> {
         let ending = self.out.extension().and_then(|e| e.to_str()).unwrap_or_default();
         let film = matches!(ending, "gif" | "mp4" | "png");
-        if film { check_writable_file(&self.out)? } else { check_writable_dir(&self.out)? }
+        if film {
+            check_writable_file(&self.out)?
+        } else {
+            check_writable_dir(&self.out)?
+        }
         let splat = read_ply(&self.splat)?;
         let (names, cameras) = self.cameras(&splat)?;
 
@@ -92,7 +99,9 @@ impl Render {
         }
         bar.finish_and_clear();
         if self.json {
-            print_json(&json!({ "views": cameras.len(), "gaussians": splat.gaussians.count(), "files": written }));
+            print_json(
+                &json!({ "views": cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
+            );
         } else {
             println!("{}: {} views", self.out.display(), cameras.len());
         }
@@ -139,7 +148,8 @@ impl Render {
             let cameras = orbit_around_cameras(&cameras, distance, self.frames)?;
             return Ok((numbered(&cameras), cameras));
         }
-        let stem = |name: &str| Path::new(name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let stem =
+            |name: &str| Path::new(name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok((capture.names().map(stem).collect(), cameras))
     }
 }
@@ -148,7 +158,10 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     match sides {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok((width, height)),
-        _ => Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384")).into()),
+        _ => {
+            Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))
+                .into())
+        }
     }
 }
 
@@ -175,7 +188,8 @@ fn orbit_around_splat(splat: &Ply, width: u32, height: u32, frames: usize) -> Ve
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);
     let total = weights.sum(Kind::Double).clamp_min(1e-12);
     let centre = (&means * &weights).sum_dim_intlist([0i64].as_slice(), false, Kind::Double) / &total;
-    let spread = ((&means - &centre).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double) * &weights)
+    let spread = ((&means - &centre).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double)
+        * &weights)
         .sum(Kind::Double)
         .divide(&total)
         .sqrt()

@@ -19,7 +19,9 @@ use tch::Device;
 /// Ctrl-C saves a checkpoint and stops; the same command goes on from there. At the end the views that were held out are
 /// rendered and scored, beside the answer "the nearest photo that was shown".
 #[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat train --config configs/first_light.toml --out runs/first_light")]
+#[command(
+    after_help = "Example:\n  globalsplat train --config configs/first_light.toml --out runs/first_light"
+)]
 pub struct Train {
     /// Configuration file; see configs/
     #[arg(long, value_name = "FILE")]
@@ -56,7 +58,13 @@ impl Train {
             captures.extend(find_captures(&path)?);
         }
         if captures.is_empty() {
-            return Err(Error::input(&self.config, "data.captures", "empty", "a capture, or a folder of captures").into());
+            return Err(Error::input(
+                &self.config,
+                "data.captures",
+                "empty",
+                "a capture, or a folder of captures",
+            )
+            .into());
         }
         let mut trainer = Trainer::new(&config, &captures, device)?;
 
@@ -64,7 +72,10 @@ impl Train {
         let outcome = self.train(&config, &mut trainer, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         if !outcome.complete {
-            anyhow::bail!("stopped; {} holds all of it, and the same command goes on", outcome.checkpoint.display());
+            anyhow::bail!(
+                "stopped; {} holds all of it, and the same command goes on",
+                outcome.checkpoint.display()
+            );
         }
         let validation = validate(&outcome, &config, &captures)?;
         self.report(&outcome, seconds, &validation);
@@ -102,7 +113,9 @@ impl Train {
     }
 
     fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation]) {
-        let mean = |value: fn(&Validation) -> f64| validation.iter().map(value).sum::<f64>() / validation.len() as f64;
+        let mean = |value: fn(&Validation) -> f64| {
+            validation.iter().map(value).sum::<f64>() / validation.len() as f64
+        };
         if self.json {
             let mut object = json!({
                 "checkpoint": outcome.checkpoint,
@@ -128,10 +141,18 @@ impl Train {
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
             for v in validation {
-                println!("{:<24} {:>10.2} {:>10.4} {:>14.2}", v.ours.scene, v.ours.psnr, v.ours.ssim, v.nearest.psnr);
+                println!(
+                    "{:<24} {:>10.2} {:>10.4} {:>14.2}",
+                    v.ours.scene, v.ours.psnr, v.ours.ssim, v.nearest.psnr
+                );
             }
             let (psnr, nearest) = (mean(|v| v.ours.psnr), mean(|v| v.nearest.psnr));
-            println!("{:<24} {psnr:>10.2} {:>10.4} {nearest:>14.2}   {:+.2} dB", "mean", mean(|v| v.ours.ssim), psnr - nearest);
+            println!(
+                "{:<24} {psnr:>10.2} {:>10.4} {nearest:>14.2}   {:+.2} dB",
+                "mean",
+                mean(|v| v.ours.ssim),
+                psnr - nearest
+            );
         }
     }
 }

@@ -37,7 +37,8 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
 impl ViewBatch {
     /// Scenes with equally many views along the batch.
     pub fn stack(scenes: &[ViewBatch]) -> Self {
-        let cat = |field: fn(&ViewBatch) -> &Tensor| Tensor::cat(&scenes.iter().map(field).collect::<Vec<_>>(), 0);
+        let cat =
+            |field: fn(&ViewBatch) -> &Tensor| Tensor::cat(&scenes.iter().map(field).collect::<Vec<_>>(), 0);
         ViewBatch {
             images: cat(|s| &s.images),
             c2w: cat(|s| &s.c2w),

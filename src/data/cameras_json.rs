@@ -38,7 +38,12 @@ pub(super) fn read(file: &Path) -> Result<Capture> {
         let image = root.join(&view.image);
         if view.image.is_empty() || !image.is_file() {
             let expected = "the path of an image beside it";
-            return Err(Error::input(file, format!("image of view {i}"), format!("{:?}, which is not there", view.image), expected));
+            return Err(Error::input(
+                file,
+                format!("image of view {i}"),
+                format!("{:?}, which is not there", view.image),
+                expected,
+            ));
         }
         frames.push(Frame { image, name: view.image, camera });
     }
@@ -85,11 +90,17 @@ fn parse(file: &Path) -> Result<File> {
 fn cameras(file: &Path, parsed: &File) -> Result<Vec<Camera>> {
     let [height, width] = parsed.image_shape;
     if width == 0 || height == 0 {
-        return Err(Error::input(file, "image_shape", format!("[{height}, {width}]"), "a height and a width"));
+        return Err(Error::input(
+            file,
+            "image_shape",
+            format!("[{height}, {width}]"),
+            "a height and a width",
+        ));
     }
     let matrix = |rows: &[Vec<Number>], size: usize, field: String| -> Result<Vec<f64>> {
         if rows.len() != size || rows.iter().any(|row| row.len() != size) {
-            let found = format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
+            let found =
+                format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
             return Err(Error::input(file, field, found, format!("a {size}×{size} matrix")));
         }
         Ok(rows.iter().flatten().map(|v| v.unwrap_or(f64::NAN)).collect())
@@ -117,7 +128,9 @@ fn null_for_not_a_number(text: &str) -> String {
     let mut rest = text;
     let (mut in_string, mut escaped) = (false, false);
     while let Some(c) = rest.chars().next() {
-        if !in_string && let Some(token) = ["NaN", "Infinity", "-Infinity"].iter().find(|t| rest.starts_with(**t)) {
+        if !in_string
+            && let Some(token) = ["NaN", "Infinity", "-Infinity"].iter().find(|t| rest.starts_with(**t))
+        {
             out.push_str("null");
             rest = &rest[token.len()..];
             continue;

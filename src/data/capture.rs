@@ -144,7 +144,12 @@ impl Capture {
         let Camera { width, height, .. } = frame.camera;
         if image.dimensions() != (width, height) {
             let found = format!("{}×{} pixels", image.width(), image.height());
-            return Err(Error::input(&frame.image, "the image", found, format!("{width}×{height} as in {}", self.file.display())));
+            return Err(Error::input(
+                &frame.image,
+                "the image",
+                found,
+                format!("{width}×{height} as in {}", self.file.display()),
+            ));
         }
         let (image, camera) = match size {
             Some(size) => fit(image, &frame.camera, size),

@@ -36,7 +36,8 @@ impl FromStr for Holdout {
         if text == "none" {
             return Ok(Holdout::None);
         }
-        let refused = || format!("holdout is {text:?}, expected none, every:N or every:N+K with K < N and N ≥ 2");
+        let refused =
+            || format!("holdout is {text:?}, expected none, every:N or every:N+K with K < N and N ≥ 2");
         let numbers = text.strip_prefix("every:").ok_or_else(refused)?;
         let (every, first) = numbers.split_once('+').unwrap_or((numbers, "0"));
         match (every.parse(), first.parse()) {

@@ -44,7 +44,8 @@ pub fn fit(image: RgbImage, camera: &Camera, size: ImageSize) -> (RgbImage, Came
     let intrinsics = camera.intrinsics.resized(width / full_width, height / full_height);
 
     let aspect = f64::from(size.width) / height;
-    let (cut_width, cut_height) = ((height * aspect).min(width).round(), (width / aspect).min(height).round());
+    let (cut_width, cut_height) =
+        ((height * aspect).min(width).round(), (width / aspect).min(height).round());
     let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
     let image =
         imageops::crop_imm(&image, left as u32, top as u32, cut_width as u32, cut_height as u32).to_image();
@@ -112,6 +113,9 @@ mod tests {
         let ray = |k: Intrinsics, u: f64, v: f64| ((u - k.cx) / k.fx, (v - k.cy) / k.fy);
         let found = ray(after.intrinsics, sx / weight, sy / weight);
         let expected = ray(before.intrinsics, f64::from(x) + 4., f64::from(y) + 4.);
-        assert!((found.0 - expected.0).abs() < 2e-3 && (found.1 - expected.1).abs() < 2e-3, "{found:?} {expected:?}");
+        assert!(
+            (found.0 - expected.0).abs() < 2e-3 && (found.1 - expected.1).abs() < 2e-3,
+            "{found:?} {expected:?}"
+        );
     }
 }

@@ -5,7 +5,7 @@ use super::capture::View;
 use crate::error::{Error, Result};
 use crate::scene::normalize;
 use glam::DMat4;
-use rand::seq::{IndexedRandom, index};
+use rand::seq::index;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, Tensor};
@@ -39,7 +39,12 @@ impl Sampler {
     ///
     /// # Errors
     /// No captures, or one with fewer than two views.
-    pub fn new(captures: Vec<Vec<View>>, context_views: usize, target_views: usize, seed: u64) -> Result<Self> {
+    pub fn new(
+        captures: Vec<Vec<View>>,
+        context_views: usize,
+        target_views: usize,
+        seed: u64,
+    ) -> Result<Self> {
         let fewest = captures.iter().map(Vec::len).min().unwrap_or(0);
         if fewest < 2 {
             return Err(Error::Request(format!(
@@ -61,7 +66,14 @@ impl Sampler {
     pub fn sample(&self, step: u64, batch: usize, device: Device) -> Result<Sample> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(step);
-        let scenes = (0..batch).map(|_| self.scene(&mut random, device)).collect::<Result<Vec<_>>>()?;
+        // Different captures as far as there are enough.
+        let count = self.captures.len();
+        let mut drawn = vec![];
+        while drawn.len() < batch {
+            drawn.extend(index::sample(&mut random, count, count.min(batch - drawn.len())));
+        }
+        let scenes = drawn.into_iter().map(|capture| self.scene(capture, &mut random, device));
+        let scenes = scenes.collect::<Result<Vec<_>>>()?;
         let (views, far): (Vec<_>, Vec<f64>) = scenes.into_iter().unzip();
         let (contexts, targets): (Vec<_>, Vec<_>) = views.into_iter().unzip();
         Ok(Sample {
@@ -72,8 +84,13 @@ impl Sampler {
     }
 
     /// (context, target) and the far end of the frusta.
-    fn scene(&self, random: &mut impl Rng, device: Device) -> Result<((ViewBatch, ViewBatch), f64)> {
-        let views = self.captures.choose(random).expect("a capture");
+    fn scene(
+        &self,
+        capture: usize,
+        random: &mut impl Rng,
+        device: Device,
+    ) -> Result<((ViewBatch, ViewBatch), f64)> {
+        let views = &self.captures[capture];
         let mut draw = |count: usize| {
             let mut drawn = index::sample(random, views.len(), count).into_vec();
             drawn.sort_unstable();

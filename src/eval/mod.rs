@@ -10,7 +10,7 @@ pub use contact_sheet::contact_sheet;
 pub use memory::peak_memory_bytes;
 pub use metrics::{psnr, ssim};
 pub use protocol::{
-    CaptureScores, Rendered, ViewScore, nearest_context_baseline, render_views, score, score_model, score_renders,
-    score_splat,
+    CaptureScores, Rendered, ViewScore, nearest_context_baseline, render_views, score, score_model,
+    score_renders, score_splat,
 };
 pub use reconstruct::{Reconstruction, reconstruct};

@@ -54,18 +54,32 @@ pub struct CaptureScores {
 ///
 /// # Errors
 /// A picture of another size than its view.
-pub fn score(scene: &str, pictures: &[Tensor], truth: &[View], gaussians: Option<i64>) -> Result<CaptureScores> {
+pub fn score(
+    scene: &str,
+    pictures: &[Tensor],
+    truth: &[View],
+    gaussians: Option<i64>,
+) -> Result<CaptureScores> {
     let mut views = vec![];
     for (picture, view) in pictures.iter().zip(truth) {
         if picture.size() != view.image.size() {
             let (found, expected) = (picture.size(), view.image.size());
-            return Err(Error::Request(format!("the picture for {} has shape {found:?}, expected {expected:?}", view.name)));
+            return Err(Error::Request(format!(
+                "the picture for {} has shape {found:?}, expected {expected:?}",
+                view.name
+            )));
         }
         let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
         views.push(ViewScore { image: view.name.clone(), psnr, ssim });
     }
     let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
-    Ok(CaptureScores { scene: scene.to_string(), psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), gaussians, views })
+    Ok(CaptureScores {
+        scene: scene.to_string(),
+        psnr: mean(|v| v.psnr),
+        ssim: mean(|v| v.ssim),
+        gaussians,
+        views,
+    })
 }
 
 /// Renders a splat from each camera, which may differ in size.
@@ -78,7 +92,11 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
         .map(|camera| {
             let pictures = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
             let first = |t: Tensor| t.select(0, 0).select(0, 0);
-            Ok(Rendered { rgb: first(pictures.rgb), alpha: first(pictures.alpha), depth: first(pictures.depth) })
+            Ok(Rendered {
+                rgb: first(pictures.rgb),
+                alpha: first(pictures.alpha),
+                depth: first(pictures.depth),
+            })
         })
         .collect()
 }
@@ -87,7 +105,10 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
 ///
 /// # Errors
 /// Photos that can't be read.
-pub fn score_splat(gaussians: &Gaussians, capture: &Capture) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
+pub fn score_splat(
+    gaussians: &Gaussians,
+    capture: &Capture,
+) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
     let views = capture.load_all(None)?;
     let rendered = render_views(gaussians, &capture.cameras())?;
     let pictures: Vec<Tensor> = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
@@ -122,7 +143,11 @@ pub fn score_model(
 ///
 /// # Errors
 /// As [`score_model`].
-pub fn nearest_context_baseline(loaded: &LoadedModel, capture: &Capture, holdout: Holdout) -> Result<CaptureScores> {
+pub fn nearest_context_baseline(
+    loaded: &LoadedModel,
+    capture: &Capture,
+    holdout: Holdout,
+) -> Result<CaptureScores> {
     let (context, held_out) = load_split(capture, holdout, loaded)?;
     let centre = |view: &View| view.camera.c2w.w_axis.truncate();
     let nearest = |target: &View| {
@@ -144,7 +169,12 @@ pub fn score_renders(folder: &Path, capture: &Capture) -> Result<(CaptureScores,
         let stem = Path::new(&view.name).file_stem().unwrap_or_default();
         let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(stem).with_extension(ending));
         let Some(path) = candidates.iter().find(|path| path.is_file()) else {
-            return Err(Error::input(folder, format!("the picture for {}", view.name), "absent", candidates[0].display().to_string()));
+            return Err(Error::input(
+                folder,
+                format!("the picture for {}", view.name),
+                "absent",
+                candidates[0].display().to_string(),
+            ));
         };
         pictures.push(tensor_from_rgb(&read_image(path)?));
     }
@@ -156,7 +186,12 @@ fn load_split(capture: &Capture, holdout: Holdout, loaded: &LoadedModel) -> Resu
     let (context, held_out) = holdout.split(capture.len());
     if held_out.is_empty() || context.len() < 2 {
         let split = format!("{} to show and {} to ask for", context.len(), held_out.len());
-        return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, "2 and 1 at least (--holdout every:N)"));
+        return Err(Error::input(
+            capture.file(),
+            format!("the split by {holdout}"),
+            split,
+            "2 and 1 at least (--holdout every:N)",
+        ));
     }
     let size = Some(loaded.config.data.image_size);
     Ok((capture.load(&context, size)?, capture.load(&held_out, size)?))

@@ -36,9 +36,13 @@ impl Reconstruction {
 /// Fewer than two views, images that the model's patches don't divide, cameras without a mean direction.
 pub fn reconstruct(loaded: &LoadedModel, context: &[View], targets: &[DMat4]) -> Result<Reconstruction> {
     if context.len() < 2 {
-        return Err(Error::Request(format!("a reconstruction needs two views or more, found {}", context.len())));
+        return Err(Error::Request(format!(
+            "a reconstruction needs two views or more, found {}",
+            context.len()
+        )));
     }
-    let poses: Vec<DMat4> = context.iter().map(|view| view.camera.c2w).chain(targets.iter().copied()).collect();
+    let poses: Vec<DMat4> =
+        context.iter().map(|view| view.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
     let (context_poses, target_poses) = normalization.c2w.split_at(context.len());
     let ViewBatch { images, c2w, intrinsics, .. } = view_batch(context, context_poses, loaded.vs.device());

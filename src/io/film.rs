@@ -28,11 +28,13 @@ fn write_gif(path: &Path, frames: Vec<RgbImage>, frames_per_second: u32) -> Resu
     // 1 is the best palette, 30 the fastest.
     const SPEED: i32 = 10;
     let mut bytes = vec![];
-    let failed = |e: image::ImageError| Error::Failed(format!("{}: the film can't be encoded: {e}", path.display()));
+    let failed =
+        |e: image::ImageError| Error::Failed(format!("{}: the film can't be encoded: {e}", path.display()));
     {
         let mut encoder = GifEncoder::new_with_speed(&mut bytes, SPEED);
         encoder.set_repeat(Repeat::Infinite).map_err(failed)?;
-        let delay = Delay::from_saturating_duration(Duration::from_millis(1000 / u64::from(frames_per_second)));
+        let delay =
+            Delay::from_saturating_duration(Duration::from_millis(1000 / u64::from(frames_per_second)));
         for frame in frames {
             let frame = image::DynamicImage::ImageRgb8(frame).into_rgba8();
             encoder.encode_frame(Frame::from_parts(frame, 0, 0, delay)).map_err(failed)?;
@@ -49,16 +51,21 @@ fn write_mp4(path: &Path, frames: &[RgbImage], frames_per_second: u32) -> Result
     let size = format!("{}x{}", first.width(), first.height());
     let rate = frames_per_second.to_string();
     let child = Command::new("ffmpeg")
-        .args(["-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", &size, "-r", &rate, "-i", "-"])
+        .args([
+            "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", &size, "-r", &rate, "-i", "-",
+        ])
         // H.264 in 4:2:0, which every player shows, wants even sides.
         .args(["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p"])
         .arg(&partial)
         .stdin(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn();
-    let mut child = child.map_err(|e| Error::Request(format!(
-        "{} needs ffmpeg, which can't be started ({e}); a path that ends in .gif needs nothing", path.display()
-    )))?;
+    let mut child = child.map_err(|e| {
+        Error::Request(format!(
+            "{} needs ffmpeg, which can't be started ({e}); a path that ends in .gif needs nothing",
+            path.display()
+        ))
+    })?;
     {
         let mut input = child.stdin.take().expect("a pipe was asked for");
         for frame in frames {

@@ -28,9 +28,14 @@ pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
 /// # Errors
 /// libtorch's refusal, as for another shape.
 pub(super) fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
-    let planes = if picture.dim() == 2 { picture.unsqueeze(0).f_expand([3, -1, -1], false)? } else { picture.shallow_clone() };
+    let planes = if picture.dim() == 2 {
+        picture.unsqueeze(0).f_expand([3, -1, -1], false)?
+    } else {
+        picture.shallow_clone()
+    };
     let (height, width) = (planes.size()[1], planes.size()[2]);
-    let bytes = (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
+    let bytes =
+        (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
     let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
         .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))

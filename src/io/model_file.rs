@@ -41,10 +41,8 @@ pub fn save_model(path: &Path, vs: &nn::VarStore, config: &Config, dtype: ModelD
         ModelDtype::BF16 => t.to_kind(Kind::BFloat16),
     };
     let tensors = vs.variables().into_iter().map(|(name, t)| (name, stored(t))).collect();
-    let metadata = HashMap::from([
-        ("format".to_string(), "pt".to_string()),
-        (CONFIG_KEY.to_string(), config.to_toml()),
-    ]);
+    let metadata =
+        HashMap::from([("format".to_string(), "pt".to_string()), (CONFIG_KEY.to_string(), config.to_toml())]);
     write_weights(path, &tensors, metadata)
 }
 
@@ -55,7 +53,12 @@ pub fn save_model(path: &Path, vs: &nn::VarStore, config: &Config, dtype: ModelD
 pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
     let weights = read_weights(path)?;
     let config = weights.metadata.get(CONFIG_KEY).ok_or_else(|| {
-        Error::input(path, format!("metadata {CONFIG_KEY}"), "absent", "weights that `globalsplat export` wrote")
+        Error::input(
+            path,
+            format!("metadata {CONFIG_KEY}"),
+            "absent",
+            "weights that `globalsplat export` wrote",
+        )
     })?;
     let config = Config::parse(config, &[], path)?;
     let vs = nn::VarStore::new(device);

@@ -41,7 +41,14 @@ pub fn read_ply(path: &Path) -> Result<Ply> {
         9 => 1,
         24 => 2,
         45 => 3,
-        _ => return Err(Error::input(path, "f_rest_*", format!("{rest} properties"), "0, 9, 24 or 45 (SH degree 0 to 3)")),
+        _ => {
+            return Err(Error::input(
+                path,
+                "f_rest_*",
+                format!("{rest} properties"),
+                "0, 9, 24 or 45 (SH degree 0 to 3)",
+            ));
+        }
     };
     let bases = (sh_degree + 1) * (sh_degree + 1);
 
@@ -51,7 +58,12 @@ pub fn read_ply(path: &Path) -> Result<Ply> {
             .iter()
             .map(|name| {
                 header.offset_of(name).ok_or_else(|| {
-                    Error::input(path, format!("property {name}"), "absent", "one of a 3D Gaussian splat's properties")
+                    Error::input(
+                        path,
+                        format!("property {name}"),
+                        "absent",
+                        "one of a 3D Gaussian splat's properties",
+                    )
                 })
             })
             .collect::<Result<Vec<_>>>()?;
@@ -61,7 +73,12 @@ pub fn read_ply(path: &Path) -> Result<Ply> {
                 let value = scalar.read(&vertex[*offset..]);
                 if !value.is_finite() {
                     let row = values.len() / names.len();
-                    return Err(Error::input(path, format!("{name} of vertex {row}"), value, "a finite number"));
+                    return Err(Error::input(
+                        path,
+                        format!("{name} of vertex {row}"),
+                        value,
+                        "a finite number",
+                    ));
                 }
                 values.push(value);
             }
@@ -93,7 +110,8 @@ pub fn write_ply(path: &Path, gaussians: &Gaussians) -> Result<()> {
     let g = gaussians.map(|t| t.detach().to_device(Device::Cpu).to_kind(Kind::Float));
     let (n, bases) = (g.count(), g.sh.size()[2]);
     let dc = g.sh.narrow(2, 0, 1).view([n, 3]);
-    let rest = g.sh.narrow(2, 1, bases - 1).view([n, bases - 1, 3]).transpose(1, 2).reshape([n, 3 * (bases - 1)]);
+    let rest =
+        g.sh.narrow(2, 1, bases - 1).view([n, bases - 1, 3]).transpose(1, 2).reshape([n, 3 * (bases - 1)]);
     let logits = g.opacities.view([n, 1]).to_kind(Kind::Double).logit(OPACITY_MARGIN).to_kind(Kind::Float);
     let means = g.means.view([n, 3]);
     let normals = means.zeros_like();
@@ -210,14 +228,15 @@ impl Header {
                     }
                     element = name.to_string();
                     if *name == "vertex" {
-                        header.vertices = count
-                            .parse()
-                            .map_err(|_| Error::input(path, "the number of vertices", count, "a whole number"))?;
+                        header.vertices = count.parse().map_err(|_| {
+                            Error::input(path, "the number of vertices", count, "a whole number")
+                        })?;
                     }
                 }
                 ["property", kind, name] if element == "vertex" => {
-                    let scalar = Scalar::parse(kind)
-                        .ok_or_else(|| Error::input(path, format!("the type of {name}"), kind, "a PLY number type"))?;
+                    let scalar = Scalar::parse(kind).ok_or_else(|| {
+                        Error::input(path, format!("the type of {name}"), kind, "a PLY number type")
+                    })?;
                     header.properties.push((name.to_string(), header.stride, scalar));
                     header.stride += scalar.size();
                 }

@@ -22,7 +22,9 @@ pub struct Weights {
 /// A file that can't be read, isn't safetensors, or holds another type.
 pub fn read_weights(path: &Path) -> Result<Weights> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let broken = |e: safetensors::SafeTensorError| Error::input(path, "the file", format!("broken ({e})"), "safetensors");
+    let broken = |e: safetensors::SafeTensorError| {
+        Error::input(path, "the file", format!("broken ({e})"), "safetensors")
+    };
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(broken)?;
     let metadata = header.metadata().clone().unwrap_or_default();
     let file = SafeTensors::deserialize(&bytes).map_err(broken)?;
@@ -34,7 +36,14 @@ pub fn read_weights(path: &Path) -> Result<Weights> {
             Dtype::BF16 => Kind::BFloat16,
             Dtype::F16 => Kind::Half,
             Dtype::I64 => Kind::Int64,
-            other => return Err(Error::input(path, format!("tensor {name}"), format!("{other:?}"), "F32, BF16 or F16")),
+            other => {
+                return Err(Error::input(
+                    path,
+                    format!("tensor {name}"),
+                    format!("{other:?}"),
+                    "F32, BF16 or F16",
+                ));
+            }
         };
         let shape: Vec<i64> = view.shape().iter().map(|&s| s as i64).collect();
         tensors.insert(name.to_string(), Tensor::f_from_data_size(view.data(), &shape, kind)?);
@@ -46,7 +55,11 @@ pub fn read_weights(path: &Path) -> Result<Weights> {
 ///
 /// # Errors
 /// The system's refusal to write.
-pub fn write_weights(path: &Path, tensors: &BTreeMap<String, Tensor>, metadata: HashMap<String, String>) -> Result<()> {
+pub fn write_weights(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor>,
+    metadata: HashMap<String, String>,
+) -> Result<()> {
     let stored = tensors.iter().map(|(name, t)| Ok((name, Stored::new(t)?))).collect::<Result<Vec<_>>>()?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
     let bytes = safetensors::serialize(views, Some(metadata))

@@ -22,7 +22,8 @@ pub fn frustum(means: &Tensor, views: &ViewBatch, far: &Tensor) -> Tensor {
     let pixel = camera.matmul(&views.intrinsics.transpose(-1, -2)); // (f_x x + c_x z, f_y y + c_y z, z)
     let depth = camera.select(-1, 2);
     let divisor = depth.clamp_min(MIN_DIVISOR);
-    let outside = |coordinate: Tensor, size: i64| (-&coordinate).relu() + (coordinate - (size - 1) as f64).relu();
+    let outside =
+        |coordinate: Tensor, size: i64| (-&coordinate).relu() + (coordinate - (size - 1) as f64).relu();
     let violation = outside(pixel.select(-1, 0) / &divisor, width)
         + outside(pixel.select(-1, 1) / &divisor, height)
         + (-&depth + NEAR).relu()

@@ -33,8 +33,7 @@ impl CameraCode {
     pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let entry = |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column);
         let (w, h) = (width as f64, height as f64);
-        let features =
-            [(entry(0, 0) / w).log(), (entry(1, 1) / h).log(), entry(0, 2) / w, entry(1, 2) / h];
+        let features = [(entry(0, 0) / w).log(), (entry(1, 1) / h).log(), entry(0, 2) / w, entry(1, 2) / h];
         let features = Tensor::stack(&features, -1); // [B, V, 4]
         let intrinsics = self.intrinsics_in.forward(&features).gelu("none");
         let intrinsics = self.intrinsics_out.forward(&intrinsics).gelu("none");

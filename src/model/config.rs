@@ -104,8 +104,18 @@ impl ModelConfig {
             true => Ok(()),
             false => Err(Error::Request(format!("model.{field} is {value}, expected {expected}"))),
         };
-        expect(self.width % self.heads == 0, "width", self.width, format!("a multiple of the {} heads", self.heads))?;
-        expect((self.candidates as u64).is_power_of_two(), "candidates", self.candidates, "a power of two".into())?;
+        expect(
+            self.width % self.heads == 0,
+            "width",
+            self.width,
+            format!("a multiple of the {} heads", self.heads),
+        )?;
+        expect(
+            (self.candidates as u64).is_power_of_two(),
+            "candidates",
+            self.candidates,
+            "a power of two".into(),
+        )?;
         expect(self.sh_degree <= 3, "sh_degree", self.sh_degree, "0 to 3".into())
     }
 
@@ -117,7 +127,9 @@ impl ModelConfig {
         for (name, size) in [("height", height), ("width", width)] {
             if size <= 0 || size % self.patch_size != 0 {
                 let p = self.patch_size;
-                return Err(Error::Request(format!("the image {name} is {size}, expected a multiple of the patch size {p}")));
+                return Err(Error::Request(format!(
+                    "the image {name} is {size}, expected a multiple of the patch size {p}"
+                )));
             }
         }
         Ok(())

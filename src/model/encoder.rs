@@ -47,7 +47,8 @@ impl Encoder {
     /// `vs` is the encoder's own path.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         let d = config.width;
-        let tokens = |name: &str, count: i64, width: i64| vs.var(name, &[1, count, width], randn(ENCODER_STD));
+        let tokens =
+            |name: &str, count: i64, width: i64| vs.var(name, &[1, count, width], randn(ENCODER_STD));
         let rounds = |name: &str| {
             (0..config.rounds).map(|i| StreamRound::new(vs / name / i, config)).collect::<Vec<_>>()
         };

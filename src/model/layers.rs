@@ -73,7 +73,16 @@ pub(super) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
         let (b, n, d) = t.size3().expect("[B, n, d]");
         t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
     };
-    Tensor::scaled_dot_product_attention(&split(q), &split(k), &split(v), None::<&Tensor>, 0., false, None, false)
-        .transpose(1, 2)
-        .flatten(2, 3)
+    Tensor::scaled_dot_product_attention(
+        &split(q),
+        &split(k),
+        &split(v),
+        None::<&Tensor>,
+        0.,
+        false,
+        None,
+        false,
+    )
+    .transpose(1, 2)
+    .flatten(2, 3)
 }

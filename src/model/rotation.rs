@@ -27,7 +27,8 @@ pub fn rotation_matrix_from_6d(rotations: &Tensor) -> Tensor {
 /// (at least 1) is far from zero, so that normalizing it loses nothing.
 pub fn quaternion_from_6d(rotations: &Tensor) -> Tensor {
     let matrix = rotation_matrix_from_6d(rotations).flatten(-2, -1).unbind(-1);
-    let [m00, m01, m02, m10, m11, m12, m20, m21, m22] = <[Tensor; 9]>::try_from(matrix).expect("nine entries");
+    let [m00, m01, m02, m10, m11, m12, m20, m21, m22] =
+        <[Tensor; 9]>::try_from(matrix).expect("nine entries");
     let rows = [
         [&m00 + &m11 + &m22 + 1., &m21 - &m12, &m02 - &m20, &m10 - &m01],
         [&m21 - &m12, &m00 - &m11 - &m22 + 1., &m10 + &m01, &m02 + &m20],

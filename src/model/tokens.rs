@@ -15,9 +15,12 @@ const RAY_CHANNELS: i64 = 6;
 pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
     let size = xs.size();
     let (b, v, h, w, c) = (size[0], size[1], size[2], size[3], size[4]);
-    xs.reshape([b, v, h / patch, patch, w / patch, patch, c])
-        .permute([0, 1, 2, 4, 3, 5, 6])
-        .reshape([b, v, (h / patch) * (w / patch), patch * patch * c])
+    xs.reshape([b, v, h / patch, patch, w / patch, patch, c]).permute([0, 1, 2, 4, 3, 5, 6]).reshape([
+        b,
+        v,
+        (h / patch) * (w / patch),
+        patch * patch * c,
+    ])
 }
 
 /// Images and cameras to tokens.
@@ -36,7 +39,12 @@ impl Tokenizer {
         Tokenizer {
             patch_size: config.patch_size,
             rgb: default_linear(vs / "rgb_patch_embeds" / "1", 3 * pixels, config.rgb_width, false),
-            ray: default_linear(vs / "ray_patch_embeds" / "1", RAY_CHANNELS * pixels, config.ray_width, false),
+            ray: default_linear(
+                vs / "ray_patch_embeds" / "1",
+                RAY_CHANNELS * pixels,
+                config.ray_width,
+                false,
+            ),
             camera_code: config.camera_code.then(|| CameraCode::new(vs / "view_pe", config.ray_width)),
         }
     }
@@ -50,10 +58,11 @@ impl Tokenizer {
         let rgb = self.rgb.forward(&patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size));
 
         let rays = plucker_rays(c2w, intrinsics, height, width);
-        let mut ray = self.ray.forward(&patchify(&rays, self.patch_size));
-        if let Some(camera_code) = &self.camera_code {
-            ray = ray + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2);
-        }
+        let ray = self.ray.forward(&patchify(&rays, self.patch_size));
+        let ray = match &self.camera_code {
+            Some(camera_code) => ray + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
+            None => ray,
+        };
         Tensor::cat(&[ray, rgb], -1)
     }
 }

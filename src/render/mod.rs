@@ -8,8 +8,8 @@ pub use transform::transform;
 use crate::data::ViewBatch;
 use crate::error::Result;
 use crate::model::Gaussians;
-use bridge::ffi;
 use crate::scene::{Camera, pose_to_rows};
+use bridge::ffi;
 use tch::{Kind, Tensor};
 
 /// Pixels² added to the diagonal of every projected covariance.

@@ -10,7 +10,8 @@ use tch::Tensor;
 /// is scaled.
 pub fn transform(gaussians: &Gaussians, to: &Similarity) -> Gaussians {
     let on = |t: Tensor, like: &Tensor| t.to_kind(like.kind()).to_device(like.device());
-    let rotation = on(Tensor::from_slice(&to.rotation.transpose().to_cols_array()).view([3, 3]), &gaussians.means);
+    let rotation =
+        on(Tensor::from_slice(&to.rotation.transpose().to_cols_array()).view([3, 3]), &gaussians.means);
     let translation = on(Tensor::from_slice(&to.translation.to_array()), &gaussians.means);
     Gaussians {
         means: gaussians.means.matmul(&rotation.tr()) * to.scale + translation,
@@ -26,7 +27,8 @@ fn rotate_quaternions(quaternions: &Tensor, by: DQuat) -> Tensor {
     let [x, y, z, w] = by.to_array();
     // Left multiplication by a quaternion is linear.
     let matrix = [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w];
-    let matrix = Tensor::from_slice(&matrix).view([4, 4]).to_kind(quaternions.kind()).to_device(quaternions.device());
+    let matrix =
+        Tensor::from_slice(&matrix).view([4, 4]).to_kind(quaternions.kind()).to_device(quaternions.device());
     quaternions.matmul(&matrix.tr())
 }
 

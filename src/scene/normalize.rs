@@ -37,8 +37,10 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     if c2w.is_empty() {
         return Err(Error::Request("a scene without cameras can't be normalized".into()));
     }
-    let mean = |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;
-    let undirected = || Error::Request("the cameras' viewing directions cancel out, so the scene has no front".into());
+    let mean =
+        |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;
+    let undirected =
+        || Error::Request("the cameras' viewing directions cancel out, so the scene has no front".into());
     let direction = |v: DVec3| if v.length() > MIN_DIRECTION { Ok(v.normalize()) } else { Err(undirected()) };
     let forward = direction(mean(2))?;
     let right = direction(mean(1).cross(forward))?;

@@ -8,7 +8,8 @@ use tch::{Kind, Tensor};
 pub fn plucker_rays(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
     let (c2w, intrinsics) = (c2w.to_kind(Kind::Float), intrinsics.to_kind(Kind::Float));
     let options = (Kind::Float, c2w.device());
-    let entry = |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column).unsqueeze(-1).unsqueeze(-1);
+    let entry =
+        |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column).unsqueeze(-1).unsqueeze(-1);
     // (j + ½ − cx) / fx along a row, (i + ½ − cy) / fy down a column, each [B, V, H, W].
     let j = (Tensor::arange(width, options) + 0.5).view([1, 1, 1, width]);
     let i = (Tensor::arange(height, options) + 0.5).view([1, 1, height, 1]);

@@ -16,11 +16,13 @@ pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) ->
     let to_world = normalization.world_from_normalized;
     let spread = |axis: usize| {
         let n = poses.len() as f64;
-        (normalization.c2w.iter().map(|pose| pose.w_axis[axis].powi(2)).sum::<f64>() / n).sqrt() * to_world.scale
+        (normalization.c2w.iter().map(|pose| pose.w_axis[axis].powi(2)).sum::<f64>() / n).sqrt()
+            * to_world.scale
     };
     // A camera that only moved forward still gives a look around: a tenth of the way to the target at least.
     let (x, y) = (spread(0).max(0.1 * distance), spread(1).max(0.05 * distance));
-    let [right, down, forward] = [to_world.rotation.x_axis, to_world.rotation.y_axis, to_world.rotation.z_axis];
+    let [right, down, forward] =
+        [to_world.rotation.x_axis, to_world.rotation.y_axis, to_world.rotation.z_axis];
     let target = to_world.translation + forward * distance;
     let reference = cameras.first().ok_or_else(|| Error::Request("an orbit needs a camera".into()))?;
     let camera = |frame: usize| {

@@ -48,7 +48,9 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
 /// # Errors
 /// None there, or a folder that can't be read.
 pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
-    let none = || Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made");
+    let none = || {
+        Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made")
+    };
     list_checkpoints(run)?.pop().ok_or_else(none)
 }
 

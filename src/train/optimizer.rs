@@ -30,13 +30,14 @@ impl AdamW {
     /// For all trained variables of `vs`, moments at zero.
     pub fn new(vs: &nn::VarStore, weight_decay: f64) -> Self {
         let variables: BTreeMap<String, Tensor> = vs.variables().into_iter().collect();
-        let parameters = variables.into_iter().filter(|(_, value)| value.requires_grad()).map(|(name, value)| Parameter {
-            decays: name.ends_with(".weight") && value.dim() >= 2,
-            first: value.zeros_like().detach(),
-            second: value.zeros_like().detach(),
-            name,
-            value,
-        });
+        let parameters =
+            variables.into_iter().filter(|(_, value)| value.requires_grad()).map(|(name, value)| Parameter {
+                decays: name.ends_with(".weight") && value.dim() >= 2,
+                first: value.zeros_like().detach(),
+                second: value.zeros_like().detach(),
+                name,
+                value,
+            });
         AdamW { parameters: parameters.collect(), weight_decay, steps: 0 }
     }
 
@@ -47,7 +48,8 @@ impl AdamW {
 
     /// Scales the gradients so that their common norm is at most `largest`, and returns what it was.
     pub fn clip_gradients(&mut self, largest: f64) -> f64 {
-        let gradients: Vec<Tensor> = self.parameters.iter().map(|p| p.value.grad()).filter(Tensor::defined).collect();
+        let gradients: Vec<Tensor> =
+            self.parameters.iter().map(|p| p.value.grad()).filter(Tensor::defined).collect();
         let norms: Vec<Tensor> = gradients.iter().map(Tensor::norm).collect();
         let norm = Tensor::stack(&norms, 0).norm().double_value(&[]);
         if norm > largest {

@@ -57,7 +57,8 @@ impl Trainer {
             capture.load(&shown, Some(config.data.image_size))
         };
         let views = captures.iter().map(training_views).collect::<Result<Vec<_>>>()?;
-        let sampler = Sampler::new(views, config.data.context_views, config.data.target_views, config.train.seed)?;
+        let sampler =
+            Sampler::new(views, config.data.context_views, config.data.target_views, config.train.seed)?;
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);
         let model = GlobalSplat::new(&vs.root(), &config.model)?;

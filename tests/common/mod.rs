@@ -1,8 +1,10 @@
 //! Where real data and golden tensors are found, and how tensors are compared.
 #![allow(dead_code)] // every test binary uses its own part
 
-use std::path::{Path, PathBuf};
+pub mod program;
+
 use rand::{Rng, SeedableRng, rngs::StdRng};
+use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
 /// The folder that `variable` names, else `../shared/<name>`. Where neither is there, says so: the caller returns early.

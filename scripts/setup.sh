@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Finds a Rust toolchain, a C++ compiler, Python and libtorch, in one clear line each where one is missing.
+# libtorch comes in .venv (pinned in requirements.txt), unless LIBTORCH names one already.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+missing() {
+    echo "setup: $1" >&2
+    exit 2
+}
+
+command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.88 or newer"
+command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
+
+python="${PYTHON:-python3}"
+if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+    missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
+fi
+
+if [ ! -x .venv/bin/python ]; then
+    "$python" -m venv .venv || missing "python3 can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
+fi
+if ! cmp -s requirements.txt .venv/requirements.txt; then
+    echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.txt \
+        || missing "requirements.txt can't be installed; pip's message above tells why"
+    cp requirements.txt .venv/requirements.txt
+fi
+# Cargo looks for libtorch here (.cargo/config.toml), whatever the Python version is called.
+ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch

@@ -1,0 +1,418 @@
+//! Bad input: one clear sentence that names file, field, what was found and what was expected; exit code 2, or 1 for work
+//! that fails; and nothing half-written.
+
+mod common;
+
+use common::program::{arg, refuse, room, succeed, tiny_config, tiny_weights};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// The room with its `cameras.json` changed.
+fn broken_room(change: impl FnOnce(&mut Value)) -> (tempfile::TempDir, PathBuf) {
+    let (folder, room) = room();
+    let file = room.join("cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    change(&mut cameras);
+    std::fs::write(&file, cameras.to_string()).unwrap();
+    (folder, room)
+}
+
+/// What scoring the room's own splat against it says.
+fn refuse_room(room: &Path) -> String {
+    let splat = room.join("truth.ply");
+    let error = refuse(&["eval", "--splat", arg(&splat), "--scene", arg(room)]);
+    assert!(error.contains(arg(room)), "names the file: {error}");
+    error
+}
+
+fn assert_says(error: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(error.contains(part), "{part:?} is not in: {error}");
+    }
+}
+
+#[test]
+fn a_missing_image() {
+    let (_folder, room) = room();
+    std::fs::remove_file(room.join("images/003.png")).unwrap();
+    assert_says(&refuse_room(&room), &["image of view 3", "images/003.png", "not there"]);
+}
+
+#[test]
+fn an_undecodable_image() {
+    let (_folder, room) = room();
+    std::fs::write(room.join("images/003.png"), b"no picture").unwrap();
+    assert_says(&refuse_room(&room), &["003.png", "undecodable", "PNG or JPEG"]);
+}
+
+#[test]
+fn an_image_cut_short() {
+    let (_folder, room) = room();
+    let file = room.join("images/003.png");
+    let bytes = std::fs::read(&file).unwrap();
+    std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
+    assert_says(&refuse_room(&room), &["003.png", "undecodable"]);
+}
+
+#[test]
+fn an_image_of_another_size() {
+    let (_folder, room) = room();
+    image::RgbImage::new(40, 30).save(room.join("images/003.png")).unwrap();
+    assert_says(&refuse_room(&room), &["003.png", "40×30 pixels", "expected 40×40"]);
+}
+
+#[test]
+fn a_pose_with_nan() {
+    let (_folder, room) = room();
+    let file = room.join("cameras.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let at = text.rfind("1.0").unwrap(); // the last pose's last entry
+    std::fs::write(&file, format!("{}NaN{}", &text[..at], &text[at + 3..])).unwrap();
+    assert_says(&refuse_room(&room), &["c2w of view 8", "NaN", "finite numbers"]);
+}
+
+#[test]
+fn a_pose_that_is_not_rigid() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"][2]["c2w"][0][0] = json!(1.5));
+    assert_says(&refuse_room(&room), &["c2w of view 2", "isn't rigid", "a rotation"]);
+}
+
+#[test]
+fn a_pose_that_mirrors() {
+    let (_folder, room) = broken_room(|cameras| {
+        for row in 0..3 {
+            let entry = &mut cameras["views"][2]["c2w"][row][0];
+            *entry = json!(-entry.as_f64().unwrap());
+        }
+    });
+    assert_says(&refuse_room(&room), &["c2w of view 2", "mirrors"]);
+}
+
+#[test]
+fn a_singular_pose() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"][2]["c2w"][1] = json!([0., 0., 0., 0.]));
+    assert_says(&refuse_room(&room), &["c2w of view 2", "singular"]);
+}
+
+#[test]
+fn a_pose_of_another_shape() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"][2]["c2w"] = json!([[1., 0.], [0., 1.]]));
+    assert_says(&refuse_room(&room), &["c2w of view 2", "a 4×4 matrix"]);
+}
+
+#[test]
+fn a_focal_length_of_zero() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"][1]["intrinsic"][1][1] = json!(0.));
+    assert_says(&refuse_room(&room), &["focal length fy of view 1", "is 0", "above 0"]);
+}
+
+#[test]
+fn a_principal_point_outside() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"][1]["intrinsic"][0][2] = json!(80.));
+    assert_says(&refuse_room(&room), &["principal point cx of view 1", "is 80", "0 to 40"]);
+}
+
+#[test]
+fn fewer_than_two_views() {
+    let (_folder, room) = broken_room(|cameras| cameras["views"].as_array_mut().unwrap().truncate(1));
+    assert_says(&refuse_room(&room), &["number of views is 1", "two or more"]);
+}
+
+#[test]
+fn a_file_that_is_no_json() {
+    let (_folder, room) = room();
+    std::fs::write(room.join("cameras.json"), "{\"views\": [").unwrap();
+    assert_says(&refuse_room(&room), &["cameras.json", "not a description of cameras"]);
+}
+
+#[test]
+fn a_folder_without_a_capture() {
+    let (folder, room) = room();
+    let empty = folder.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    let error = refuse(&["eval", "--splat", arg(&room.join("truth.ply")), "--scene", arg(&empty)]);
+    assert_says(&error, &[arg(&empty), "cameras.json"]);
+    let error = refuse(&["inspect", arg(&folder.path().join("nowhere.ply"))]);
+    assert_says(&error, &["nowhere.ply", "can't be read"]);
+}
+
+#[test]
+fn an_image_size_that_the_patch_does_not_divide() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let run = folder.path().join("run");
+    let error =
+        refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", "data.image_size=[36, 32]"]);
+    assert_says(&error, &["height is 36", "multiple of the patch size 8"]);
+    assert!(!run.exists(), "nothing was begun");
+}
+
+/// The room's splat with its bytes changed.
+fn broken_splat(change: impl FnOnce(&mut Vec<u8>)) -> String {
+    let (folder, room) = room();
+    let file = folder.path().join("broken.ply");
+    let mut bytes = std::fs::read(room.join("truth.ply")).unwrap();
+    change(&mut bytes);
+    std::fs::write(&file, bytes).unwrap();
+    let error = refuse(&["inspect", arg(&file)]);
+    assert_says(&error, &["broken.ply"]);
+    error
+}
+
+fn header_length(ply: &[u8]) -> usize {
+    ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11
+}
+
+fn replace_in_header(ply: &mut Vec<u8>, from: &str, to: &str) {
+    let length = header_length(ply);
+    let header = String::from_utf8(ply[..length].to_vec()).unwrap();
+    assert!(header.contains(from));
+    ply.splice(..length, header.replacen(from, to, 1).into_bytes());
+}
+
+#[test]
+fn a_splat_cut_short() {
+    assert_says(&broken_splat(|ply| ply.truncate(ply.len() - 10)), &["the body", "cut short"]);
+    assert_says(&broken_splat(|ply| ply.truncate(100)), &["the header", "end_header"]);
+}
+
+#[test]
+fn a_splat_without_a_property() {
+    let error = broken_splat(|ply| replace_in_header(ply, "property float opacity", "property float glow"));
+    assert_says(&error, &["property opacity is absent"]);
+}
+
+#[test]
+fn a_splat_with_nan() {
+    let error = broken_splat(|ply| {
+        let first = header_length(ply);
+        ply[first..first + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    });
+    assert_says(&error, &["x of vertex 0", "NaN", "finite"]);
+}
+
+#[test]
+fn a_splat_in_ascii() {
+    let error = broken_splat(|ply| replace_in_header(ply, "binary_little_endian", "ascii"));
+    assert_says(&error, &["format is ascii", "expected binary_little_endian"]);
+}
+
+#[test]
+fn a_splat_that_is_something_else() {
+    assert_says(&broken_splat(|ply| *ply = b"hello".to_vec()), &["no PLY"]);
+    let error =
+        broken_splat(|ply| replace_in_header(ply, "property float f_dc_0", "property list uchar int f_dc_0"));
+    assert_says(&error, &["a list"]);
+}
+
+#[test]
+fn splats_of_every_degree_load() {
+    use globalsplat::io::{read_ply, write_ply};
+    use globalsplat::model::Gaussians;
+    let folder = tempfile::tempdir().unwrap();
+    for degree in 0..4 {
+        let mut random = common::Random::new(degree as u64);
+        let bases = (degree + 1) * (degree + 1);
+        let gaussians = Gaussians {
+            means: random.symmetric(&[1, 5, 3]),
+            scales: random.uniform(&[1, 5, 3]) + 0.1,
+            quaternions: random.symmetric(&[1, 5, 4]),
+            opacities: random.uniform(&[1, 5]),
+            sh: random.symmetric(&[1, 5, bases, 3]),
+        };
+        let file = folder.path().join("splat.ply");
+        write_ply(&file, &gaussians).unwrap();
+        let again = read_ply(&file).unwrap();
+        assert_eq!(again.sh_degree, degree);
+        assert!(common::largest_error(&again.gaussians.sh, &gaussians.sh) < 1e-6);
+    }
+}
+
+/// The tiny model's weights with a tensor changed.
+fn broken_weights(change: impl FnOnce(&mut std::collections::BTreeMap<String, tch::Tensor>)) -> String {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let mut file = globalsplat::io::read_weights(&weights).unwrap();
+    change(&mut file.tensors);
+    globalsplat::io::write_weights(&weights, &file.tensors, file.metadata).unwrap();
+    let splat = folder.path().join("out.ply");
+    let error =
+        refuse(&["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)]);
+    assert!(!splat.exists(), "nothing was written");
+    assert_says(&error, &["tiny.safetensors"]);
+    error
+}
+
+#[test]
+fn weights_whose_names_do_not_fit() {
+    let error = broken_weights(|tensors| {
+        tensors.remove("scene_tokens");
+        tensors.remove("slot_encoder.mem_regs");
+        let stranger = tensors["slot_encoder.slot_regs"].copy();
+        tensors.insert("stranger".into(), stranger);
+    });
+    assert_says(&error, &["tensor scene_tokens is absent", "[16, 32]", "2 more"]);
+}
+
+#[test]
+fn weights_whose_shapes_do_not_fit() {
+    let error = broken_weights(|tensors| {
+        let wide = tensors["scene_tokens"].repeat([1, 2]);
+        tensors.insert("scene_tokens".into(), wide);
+    });
+    assert_says(&error, &["tensor scene_tokens is [16, 64], expected [16, 32]"]);
+}
+
+#[test]
+fn weights_that_are_something_else() {
+    let (folder, room) = room();
+    let file = folder.path().join("weights.safetensors");
+    std::fs::write(&file, b"no weights at all").unwrap();
+    let splat = folder.path().join("out.ply");
+    let error =
+        refuse(&["reconstruct", "--weights", arg(&file), "--scene", arg(&room), "--out", arg(&splat)]);
+    assert_says(&error, &["weights.safetensors", "safetensors"]);
+    let tensors = [("a".to_string(), tch::Tensor::from_slice(&[1f32]))].into();
+    globalsplat::io::write_weights(&file, &tensors, Default::default()).unwrap();
+    let error =
+        refuse(&["reconstruct", "--weights", arg(&file), "--scene", arg(&room), "--out", arg(&splat)]);
+    assert_says(&error, &["metadata globalsplat.config", "globalsplat export"]);
+}
+
+#[test]
+fn configurations_with_unknown_or_ill_typed_keys() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let text = std::fs::read_to_string(&config).unwrap();
+    let out = folder.path().join("run");
+    let train = || refuse(&["train", "--config", arg(&config), "--out", arg(&out)]);
+    std::fs::write(&config, text.replace("latents", "latent")).unwrap();
+    assert_says(&train(), &["tiny.toml", "unknown field `latent`", "line 3"]);
+    std::fs::write(&config, text.replace("latents = 16", "latents = \"many\"")).unwrap();
+    assert_says(&train(), &["tiny.toml", "invalid type", "line 3"]);
+    std::fs::write(&config, text.replace("[model]", "[model")).unwrap();
+    assert_says(&train(), &["tiny.toml", "TOML"]);
+    std::fs::write(&config, text.replace("every:3+1", "every:0")).unwrap();
+    assert_says(&train(), &["holdout is \"every:0\"", "every:N"]);
+    std::fs::write(&config, &text).unwrap();
+    let set = |assignment: &str| {
+        refuse(&["train", "--config", arg(&config), "--out", arg(&out), "--set", assignment])
+    };
+    assert_says(&set("model.depth=3"), &["--set model.depth=3", "unknown field"]);
+    assert_says(&set("train.steps=soon"), &["--set train.steps=soon", "invalid type"]);
+    assert_says(&set("train.steps"), &["--set train.steps", "section.key=value"]);
+    assert_says(&set("curriculum.final_stage=3"), &["curriculum.final_stage is 3", "2 at most"]);
+    assert_says(&set("train.learning_rate=-1.0"), &["train.learning_rate is -1", "above 0"]);
+    assert!(!out.exists(), "nothing was begun");
+}
+
+#[test]
+fn outputs_that_can_not_be_written_are_refused_before_the_work() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let (splat, config) = (room.join("truth.ply"), tiny_config(folder.path(), &room));
+    // A file where a folder has to be: no rights to bypass, even for root.
+    let blocked = room.join("cameras.json").join("below");
+    let before = std::fs::read(room.join("cameras.json")).unwrap();
+    for arguments in [
+        &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&blocked)][..],
+        &["render", "--splat", arg(&splat), "--scene", arg(&room), "--out", arg(&blocked)],
+        &["export", "--config", arg(&config), "--out", arg(&blocked)],
+        &["train", "--config", arg(&config), "--out", arg(&blocked)],
+        &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&blocked)],
+    ] {
+        assert_says(&refuse(arguments), &["cameras.json/below can't be written"]);
+    }
+    assert_eq!(std::fs::read(room.join("cameras.json")).unwrap(), before);
+    let error =
+        refuse(&["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&room)]);
+    assert_says(&error, &["a folder", "the name of a file"]);
+}
+
+/// Runs the program where no file can grow beyond `kilobytes`: to it, the disk is full.
+#[cfg(unix)]
+fn on_a_full_disk(kilobytes: u32, arguments: &[&str]) -> std::process::Output {
+    // Ignoring SIGXFSZ makes the system refuse the write instead of ending the program.
+    let script = format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\"");
+    Command::new("bash")
+        .args(["-c", &script, "bash", env!("CARGO_BIN_EXE_globalsplat")])
+        .args(arguments)
+        .output()
+        .expect("bash")
+}
+
+#[cfg(unix)]
+#[test]
+fn a_full_disk_leaves_the_older_file_whole() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let (config, splat, run) =
+        (tiny_config(folder.path(), &room), folder.path().join("out.ply"), folder.path().join("run"));
+    succeed(&["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)]);
+    succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
+    let checkpoint = run.join("checkpoints/step-00000006/model.safetensors");
+    let before = [&weights, &splat, &checkpoint].map(|path| std::fs::read(path).unwrap());
+
+    let more = ["train", "--config", arg(&config), "--out", arg(&run), "--set", "train.steps=8"];
+    for arguments in [
+        &["export", "--config", arg(&config), "--out", arg(&weights)][..],
+        &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)],
+        &more,
+    ] {
+        let output = on_a_full_disk(8, arguments);
+        let err = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {err}");
+        assert!(err.contains("can't be written"), "{err}");
+    }
+    for (path, bytes) in [&weights, &splat, &checkpoint].iter().zip(before) {
+        assert_eq!(std::fs::read(path).unwrap(), bytes, "{}", path.display());
+    }
+    for place in [folder.path(), &run.join("checkpoints")] {
+        let left = std::fs::read_dir(place)
+            .unwrap()
+            .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains("partial"));
+        assert_eq!(left.count(), 0, "no partial file is left in {}", place.display());
+    }
+    // And with room again the run goes on.
+    succeed(&more);
+}
+
+#[test]
+fn a_view_too_many_for_the_split() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let error = refuse(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--holdout", "none"]);
+    assert_says(&error, &["0 to ask for", "--holdout every:N"]);
+}
+
+#[test]
+fn a_device_that_is_not_there() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let eval = |device: &str| {
+        refuse(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--device", device])
+    };
+    assert_says(&eval("tpu"), &["--device tpu", "cpu, cuda or cuda:N"]);
+    assert_says(&eval("cuda:99"), &["--device cuda:99", "CUDA devices"]);
+}
+
+#[test]
+fn an_unknown_simd_level() {
+    let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+        .arg("doctor")
+        .env("GLOBALSPLAT_SIMD", "mmx")
+        .output()
+        .expect("a program that starts");
+    assert_ne!(output.status.code(), Some(0));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("GLOBALSPLAT_SIMD is 'mmx', expected one of"));
+}
+
+#[test]
+fn a_checkpoint_of_another_model() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
+    let error = refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", "model.width=64"]);
+    assert_says(&error, &["model.safetensors", "more that don't fit"]);
+}

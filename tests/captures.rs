@@ -1,0 +1,87 @@
+//! Published splats of real captures, rendered at the captures' own cameras.
+
+mod common;
+
+use common::captures;
+use glam::{DMat3, DVec3};
+use globalsplat::data::{find_captures, open_capture};
+use globalsplat::eval::score_splat;
+use globalsplat::io::{read_ply, write_ply};
+use globalsplat::render::transform;
+use globalsplat::scene::Similarity;
+
+/// Mean PSNR and SSIM over a capture's views that the published splat is known to reach.
+const PUBLISHED: [(&str, f64, f64); 2] =
+    [("322261824c4a3003", 29.089, 0.9160), ("5aca87f95a9412c6", 27.222, 0.9175)];
+
+#[test]
+fn published_splats_reach_their_scores() {
+    for path in captures().unwrap_or_default() {
+        let capture = open_capture(&path).expect("a capture");
+        let Some((_, psnr, ssim)) = PUBLISHED.iter().find(|(name, ..)| *name == capture.name) else {
+            continue;
+        };
+        let splat = read_ply(&path.join("reference.ply")).expect("a splat");
+        let (scores, ..) = score_splat(&splat.gaussians, &capture).expect("scores");
+        assert!((scores.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.psnr);
+        assert!((scores.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.ssim);
+    }
+}
+
+#[test]
+fn a_splat_survives_being_written() {
+    for path in captures().unwrap_or_default() {
+        let file = path.join("reference.ply");
+        let splat = read_ply(&file).expect("a splat").gaussians;
+        let folder = tempfile::tempdir().expect("a folder");
+        let copy = folder.path().join("copy.ply");
+        write_ply(&copy, &splat).expect("a written splat");
+        if splat.count() == 16_384 && splat.sh.size()[2] == 16 {
+            assert_eq!(std::fs::metadata(&copy).expect("a file").len(), 4_064_762);
+        }
+        let again = read_ply(&copy).expect("a splat").gaussians;
+        assert!(again.means.equal(&splat.means) && again.sh.equal(&splat.sh));
+        assert!(common::largest_error(&again.scales, &splat.scales) < 1e-6);
+        assert!(common::largest_error(&again.opacities, &splat.opacities) < 1e-5);
+    }
+}
+
+#[test]
+fn a_moved_splat_looks_the_same_to_moved_cameras() {
+    for path in captures().unwrap_or_default() {
+        let capture = open_capture(&path).expect("a capture");
+        let splat = read_ply(&path.join("reference.ply")).expect("a splat").gaussians;
+        let to = Similarity {
+            rotation: DMat3::from_euler(glam::EulerRot::XYZ, 0.7, -1.1, 2.3),
+            translation: DVec3::new(3., -2., 5.),
+            scale: 2.5,
+        };
+        let moved = transform(&splat, &to);
+        let cameras = capture.cameras();
+        let moved_cameras: Vec<_> = cameras[..2]
+            .iter()
+            .map(|camera| {
+                let mut c2w = glam::DMat4::from_mat3(to.rotation) * camera.c2w;
+                c2w.w_axis =
+                    (to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation).extend(1.);
+                globalsplat::scene::Camera { c2w, ..*camera }
+            })
+            .collect();
+        let before = globalsplat::eval::render_views(&splat, &cameras[..2]).expect("pictures");
+        let after = globalsplat::eval::render_views(&moved, &moved_cameras).expect("pictures");
+        for (a, b) in before.iter().zip(&after) {
+            // Not to the last bit: positions of size 10 instead of 1 keep fewer digits in float32.
+            assert!(globalsplat::eval::psnr(&b.rgb, &a.rgb) > 60.);
+            assert!(common::relative_error(&b.depth, &(&a.depth * to.scale)) < 1e-3);
+        }
+    }
+}
+
+#[test]
+fn folders_of_captures_are_found() {
+    let Some(paths) = captures() else { return };
+    let found = find_captures(paths[0].parent().expect("a parent")).expect("captures");
+    assert_eq!(found.len(), paths.len());
+    let names: Vec<_> = found.iter().map(|capture| capture.name.clone()).collect();
+    assert!(names.is_sorted());
+}

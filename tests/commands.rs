@@ -1,0 +1,260 @@
+//! Every command as a user runs it.
+
+mod common;
+
+use common::program::{arg, fail, globalsplat, room, succeed, tiny_config, tiny_weights};
+use serde_json::Value;
+use std::path::Path;
+
+fn json(arguments: &[&str]) -> Value {
+    let out = succeed(arguments);
+    assert_eq!(out.lines().count(), 1, "one object: {out}");
+    serde_json::from_str(&out).expect("JSON")
+}
+
+#[test]
+fn every_command_helps_with_an_example() {
+    for command in ["train", "eval", "reconstruct", "render", "export", "synth", "inspect", "doctor"] {
+        let help = succeed(&[command, "--help"]);
+        assert!(help.contains("Example"), "{command}");
+        assert!(help.contains("--json"), "{command}");
+    }
+}
+
+#[test]
+fn doctor_names_what_it_found() {
+    let report = json(&["doctor", "--json"]);
+    assert_eq!(report["devices"][0], "cpu");
+    assert!(["avx512", "avx2", "neon", "portable"].contains(&report["simd"].as_str().unwrap()));
+    assert!(report["libtorch"].as_str().unwrap().starts_with("2."));
+}
+
+#[test]
+fn every_simd_level_renders_alike() {
+    let (folder, room) = room();
+    let score = |level: &str| {
+        let output = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+            .args(["eval", "--splat", arg(&room.join("truth.ply")), "--scene", arg(&room), "--json"])
+            .env("GLOBALSPLAT_SIMD", level)
+            .output()
+            .expect("a program that starts");
+        output.status.success().then(|| serde_json::from_slice::<Value>(&output.stdout).expect("JSON"))
+    };
+    let scores: Vec<Value> = ["avx512", "avx2", "neon", "portable"].into_iter().filter_map(score).collect();
+    assert!(!scores.is_empty());
+    for other in &scores[1..] {
+        let off = other["psnr"].as_f64().unwrap() - scores[0]["psnr"].as_f64().unwrap();
+        assert!(off.abs() < 1e-3, "{off}");
+    }
+    drop(folder);
+}
+
+#[test]
+fn a_splat_is_scored_by_its_capture() {
+    let (_folder, room) = room();
+    let (splat, sheet) = (room.join("truth.ply"), room.join("sheet.png"));
+    let scores =
+        json(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&sheet), "--json"]);
+    // The photos were rendered from this splat: what is left is 8-bit rounding.
+    assert!(scores["psnr"].as_f64().unwrap() > 50.);
+    assert!(scores["ssim"].as_f64().unwrap() > 0.999);
+    assert!(scores["gaussians"].as_u64().unwrap() > 1000);
+    let views = scores["views"].as_array().unwrap();
+    assert_eq!(views.len(), 9);
+    assert_eq!(views[2]["image"], "images/002.png");
+    assert!(views.iter().all(|v| v["psnr"].is_f64() && v["ssim"].is_f64()));
+    // Three pictures of 40 pixels and two gaps wide, nine and eight high.
+    assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 40 + 2 * 4, 9 * 40 + 8 * 4));
+}
+
+#[test]
+fn anybody_s_pictures_are_scored() {
+    let (folder, room) = room();
+    let renders = folder.path().join("renders");
+    succeed(&[
+        "render",
+        "--splat",
+        arg(&room.join("truth.ply")),
+        "--scene",
+        arg(&room),
+        "--out",
+        arg(&renders),
+    ]);
+    let scores = json(&["eval", "--renders", arg(&renders), "--scene", arg(&room), "--json"]);
+    assert!(scores["psnr"].as_f64().unwrap() > 50.);
+    assert!(scores.get("gaussians").is_none());
+}
+
+#[test]
+fn render_writes_what_is_asked_for() {
+    let (folder, room) = room();
+    let splat = room.join("truth.ply");
+    let out = folder.path().join("views");
+    let args = ["render", "--splat", arg(&splat), "--scene", arg(&room), "--out", arg(&out)];
+    let report = json(&[&args[..], &["--depth", "--alpha", "--json"]].concat());
+    assert_eq!(report["files"].as_array().unwrap().len(), 27);
+    for name in ["000.png", "000_depth.png", "008_alpha.png"] {
+        assert_eq!(image::image_dimensions(out.join(name)).unwrap(), (40, 40), "{name}");
+    }
+    let film = folder.path().join("orbit.gif");
+    succeed(&[
+        "render",
+        "--splat",
+        arg(&splat),
+        "--scene",
+        arg(&room),
+        "--orbit",
+        "--frames",
+        "3",
+        "--out",
+        arg(&film),
+    ]);
+    assert!(std::fs::read(&film).unwrap().starts_with(b"GIF89a"));
+    let strip = folder.path().join("orbit.png");
+    succeed(&[
+        "render",
+        "--splat",
+        arg(&splat),
+        "--orbit",
+        "--frames",
+        "2",
+        "--size",
+        "32x16",
+        "--out",
+        arg(&strip),
+    ]);
+    assert_eq!(image::image_dimensions(&strip).unwrap(), (2 * 32 + 4, 16));
+    let path = folder.path().join("path.png");
+    let cameras = room.join("cameras.json");
+    succeed(&["render", "--splat", arg(&splat), "--path", arg(&cameras), "--out", arg(&path)]);
+    assert_eq!(image::image_dimensions(&path).unwrap(), (9 * 40 + 8 * 4, 40));
+}
+
+#[test]
+fn inspect_tells_what_is_there() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let splat = json(&["inspect", arg(&room.join("truth.ply")), "--json"]);
+    assert_eq!((splat["kind"].as_str(), splat["sh_degree"].as_i64()), (Some("splat"), Some(0)));
+    let capture = json(&["inspect", arg(&room), "--json"]);
+    assert_eq!((capture["kind"].as_str(), capture["views"].as_i64()), (Some("capture"), Some(9)));
+    let weights = json(&["inspect", arg(&weights), "--json"]);
+    assert_eq!(weights["kind"], "weights");
+    assert!(weights["configuration"].as_str().unwrap().contains("latents = 16"));
+}
+
+#[test]
+fn a_run_goes_from_photos_to_a_splat() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let report = json(&["train", "--config", arg(&config), "--out", arg(&run), "--json"]);
+    assert!(report["held_out"]["psnr"].is_f64() && report["held_out"]["nearest_photo_psnr"].is_f64());
+    assert_eq!(report["held_out"]["scenes"][0]["ours"]["views"].as_array().unwrap().len(), 3);
+    assert!(run.join("config.toml").is_file());
+    assert_eq!(std::fs::read_to_string(run.join("metrics.jsonl")).unwrap().lines().count(), 6);
+
+    let (weights, half) = (folder.path().join("model.safetensors"), folder.path().join("half.safetensors"));
+    succeed(&["export", "--run", arg(&run), "--out", arg(&weights)]);
+    succeed(&["export", "--run", arg(&run), "--out", arg(&half), "--dtype", "bf16"]);
+    let bytes = |path: &Path| std::fs::metadata(path).unwrap().len();
+    assert!(bytes(&half) < bytes(&weights) * 2 / 3);
+
+    let splat = folder.path().join("room.ply");
+    for file in [&weights, &half] {
+        let report = json(&[
+            "reconstruct",
+            "--weights",
+            arg(file),
+            "--scene",
+            arg(&room),
+            "--out",
+            arg(&splat),
+            "--json",
+        ]);
+        assert_eq!(report["gaussians"], 16 * 4);
+        assert_eq!(report["views"], 9);
+        assert!(
+            report["seconds"].as_f64().unwrap() > 0.
+                && report["peak_memory_bytes"].as_u64().unwrap() > 1 << 20
+        );
+    }
+    // In the capture's world: the capture's cameras see what the model's own rendering shows.
+    let by_model = json(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--json"]);
+    assert_eq!(by_model["views"].as_array().unwrap().len(), 3);
+    let by_splat = json(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"]);
+    assert!(by_splat["psnr"].is_f64());
+}
+
+#[test]
+fn a_stopped_run_ends_with_the_same_bits() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let train = |name: &str, steps: &str| {
+        let run = folder.path().join(name);
+        succeed(&[
+            "train",
+            "--config",
+            arg(&config),
+            "--out",
+            arg(&run),
+            "--set",
+            &format!("train.keep_checkpoints={steps}"),
+        ]);
+        run.join("checkpoints")
+    };
+    let whole = train("whole", "9");
+    let parts = train("parts", "9");
+    // As if it had been killed after step 4: the later checkpoint isn't there.
+    std::fs::remove_dir_all(parts.join("step-00000006")).unwrap();
+    train("parts", "9");
+    for file in ["model.safetensors", "optimizer.safetensors"] {
+        let read = |checkpoints: &Path| {
+            globalsplat::io::read_weights(&checkpoints.join("step-00000006").join(file)).unwrap().tensors
+        };
+        let (a, b) = (read(&whole), read(&parts));
+        assert!(!a.is_empty() && a.iter().zip(&b).all(|((n, x), (m, y))| n == m && x.equal(y)), "{file}");
+    }
+}
+
+#[test]
+fn interrupted_training_saves_a_checkpoint() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+        .args(["train", "--config", arg(&config), "--out", arg(&run), "--set", "train.steps=1000000"])
+        .env("OMP_NUM_THREADS", "1")
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .expect("a program that starts");
+    // Until it has done a few steps.
+    let metrics = run.join("metrics.jsonl");
+    while std::fs::read_to_string(&metrics).map_or(0, |text| text.lines().count()) < 3 {
+        assert!(child.try_wait().expect("a child").is_none(), "it ended by itself");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    // SAFETY: sends a signal to a child that has not been waited for.
+    unsafe { libc::kill(child.id() as i32, libc::SIGINT) };
+    let output = child.wait_with_output().expect("a child");
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{err}");
+    assert!(err.contains("stopped") && err.contains("checkpoints/step-"), "{err}");
+    let steps = std::fs::read_to_string(&metrics).unwrap().lines().count();
+    assert!(run.join(format!("checkpoints/step-{steps:08}/state.json")).is_file());
+}
+
+#[test]
+fn a_run_is_not_begun_anew_over_another() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
+    let error = fail(&["train", "--config", arg(&config), "--out", arg(&run), "--resume", "never"], 2);
+    assert!(error.contains("--resume never"), "{error}");
+}
+
+#[test]
+fn wrong_usage_is_exit_code_2() {
+    for arguments in [&["nonsense"][..], &["eval", "--scene", "x"], &["render", "--splat", "x", "--out", "y"]]
+    {
+        assert_eq!(globalsplat(arguments).status.code(), Some(2), "{arguments:?}");
+    }
+}

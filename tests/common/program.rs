@@ -1,0 +1,114 @@
+//! The program as a user runs it, on a small capture that it makes itself.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+use tempfile::TempDir;
+
+/// A small model that trains in no time.
+pub const TINY_CONFIG: &str = r#"
+[model]
+latents = 16
+width = 32
+rgb_width = 32
+ray_width = 16
+rounds = 1
+self_attention_blocks = 1
+heads = 4
+candidates = 4
+
+[data]
+image_size = [32, 32]
+context_views = 3
+target_views = 2
+holdout = "every:3+1"
+
+[curriculum]
+final_stage = 2
+boundaries = [2, 4]
+transition = 2
+
+[train]
+steps = 6
+batch = 1
+checkpoint_every = 2
+"#;
+
+/// Runs `globalsplat` with `arguments` and returns what it did. One thread: tests run beside each other.
+pub fn globalsplat(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+        .args(arguments)
+        .env("OMP_NUM_THREADS", "1")
+        .output()
+        .expect("a program that starts")
+}
+
+/// Standard output of a run that must succeed.
+pub fn succeed(arguments: &[&str]) -> String {
+    let output = globalsplat(arguments);
+    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{arguments:?}: {err}");
+    out.into_owned()
+}
+
+/// The one sentence of a run that must be refused with exit code 2.
+pub fn refuse(arguments: &[&str]) -> String {
+    fail(arguments, 2)
+}
+
+/// The one sentence of a run that must end with `code`.
+pub fn fail(arguments: &[&str], code: i32) -> String {
+    let output = globalsplat(arguments);
+    let err = String::from_utf8_lossy(&output.stderr).trim().to_string();
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {err}");
+    assert!(output.stdout.is_empty(), "a refusal prints no result");
+    assert_eq!(err.lines().count(), 1, "one sentence: {err}");
+    assert!(!err.contains("panicked"), "{err}");
+    err
+}
+
+/// The path as an argument.
+pub fn arg(path: &Path) -> &str {
+    path.to_str().expect("an UTF-8 path")
+}
+
+/// A capture of nine 40×40 photos of a procedural room, `truth.ply` beside them; every caller has a copy of its own.
+pub fn room() -> (TempDir, PathBuf) {
+    static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
+    let original = ORIGINAL.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a folder");
+        succeed(&["synth", "--out", arg(folder.path()), "--frames", "9", "--size", "40"]);
+        folder
+    });
+    let folder = tempfile::tempdir().expect("a folder");
+    let room = folder.path().join("room_000");
+    copy_dir(&original.path().join("room_000"), &room);
+    (folder, room)
+}
+
+fn copy_dir(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("a folder");
+    for entry in std::fs::read_dir(from).expect("a folder") {
+        let entry = entry.expect("an entry");
+        let target = to.join(entry.file_name());
+        match entry.path().is_dir() {
+            true => copy_dir(&entry.path(), &target),
+            false => drop(std::fs::copy(entry.path(), target).expect("a copy")),
+        }
+    }
+}
+
+/// [`TINY_CONFIG`] in `folder`, looking at `capture`.
+pub fn tiny_config(folder: &Path, capture: &Path) -> PathBuf {
+    let file = folder.join("tiny.toml");
+    let data = format!("[data]\ncaptures = [{:?}]", arg(capture));
+    std::fs::write(&file, TINY_CONFIG.replace("[data]", &data)).expect("a configuration");
+    file
+}
+
+/// Exported weights of [`TINY_CONFIG`], not trained.
+pub fn tiny_weights(folder: &Path, capture: &Path) -> PathBuf {
+    let (config, weights) = (tiny_config(folder, capture), folder.join("tiny.safetensors"));
+    succeed(&["export", "--config", arg(&config), "--out", arg(&weights)]);
+    weights
+}

@@ -1,0 +1,85 @@
+//! Every configuration that ships.
+
+use globalsplat::config::Config;
+use globalsplat::model::{GlobalSplat, Streams};
+use std::path::{Path, PathBuf};
+use tch::{Device, nn};
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("configs")
+}
+
+fn read(name: &str) -> Config {
+    Config::read(&folder().join(name).with_extension("toml"), &[]).expect("a configuration")
+}
+
+#[test]
+fn every_configuration_builds_its_model() {
+    let mut count = 0;
+    for entry in std::fs::read_dir(folder()).expect("configs/") {
+        let path = entry.expect("an entry").path();
+        let config = Config::read(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
+        // Written out and read back it is the same.
+        let again = Config::parse(&config.to_toml(), &[], &path).expect("a configuration");
+        assert_eq!(again, config, "{}", path.display());
+        let vs = nn::VarStore::new(Device::Cpu);
+        GlobalSplat::new(&vs.root(), &config.model).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        count += 1;
+    }
+    assert!(count >= 9);
+}
+
+#[test]
+fn variants_show_as_many_gaussians_as_the_paper_says() {
+    let gaussians = |name: &str| {
+        let config = read(name);
+        config.model.latents << config.curriculum.final_stage
+    };
+    assert_eq!(gaussians("re10k_2k"), 2_048);
+    assert_eq!(gaussians("re10k_2k_few_latents"), 2_048);
+    assert_eq!(gaussians("re10k_16k"), 16_384);
+    assert_eq!(gaussians("re10k_32k"), 32_768);
+    assert_eq!(gaussians("re10k_32k_dense"), 32_768);
+}
+
+#[test]
+fn ablations_differ_from_the_full_model_in_one_thing() {
+    let full = read("re10k_16k");
+    let mut config = read("plucker_only");
+    assert!(!config.model.camera_code);
+    config.model.camera_code = true;
+    assert_eq!(config, full);
+    let mut config = read("full_capacity");
+    assert!(config.curriculum.full_capacity);
+    config.curriculum.full_capacity = false;
+    assert_eq!(config, full);
+    let mut config = read("single_stream");
+    assert_eq!(config.model.streams, Streams::Single);
+    (config.model.streams, config.model.width) = (Streams::Dual, full.model.width);
+    assert_eq!(config, full);
+}
+
+#[test]
+fn keys_are_overridden_one_by_one() {
+    let sets = ["train.steps=7", "data.image_size=[64, 32]", "data.holdout=every:4", "model.streams=single"];
+    let config = Config::parse("", &sets.map(String::from), Path::new("none")).expect("a configuration");
+    assert_eq!(config.train.steps, 7);
+    assert_eq!((config.data.image_size.height, config.data.image_size.width), (64, 32));
+    assert_eq!(config.data.holdout.to_string(), "every:4");
+    assert_eq!(config.model.streams, Streams::Single);
+    assert_eq!(config.train.learning_rate, 5e-4);
+}
+
+#[test]
+fn environment_variables_are_filled_in() {
+    let paths = |text: &str| {
+        let set = [format!("data.captures=[{text:?}]")];
+        Config::parse("", &set, Path::new("none")).expect("a configuration").data.capture_paths()
+    };
+    let home = std::env::var("HOME").expect("HOME");
+    assert_eq!(paths("${HOME}/a").unwrap(), [PathBuf::from(format!("{home}/a"))]);
+    assert_eq!(paths("${GLOBALSPLAT_NO_SUCH:-b}/c").unwrap(), [PathBuf::from("b/c")]);
+    assert!(
+        paths("${GLOBALSPLAT_NO_SUCH}/c").unwrap_err().to_string().contains("GLOBALSPLAT_NO_SUCH is not set")
+    );
+}
