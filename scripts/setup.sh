@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Finds a Rust toolchain, a C++ compiler, Python and libtorch, in one clear line each where one is missing.
-# libtorch comes in .venv (pinned in requirements.txt), unless LIBTORCH names one already.
+# Finds a Rust toolchain, a C++ compiler, Python and libtorch, and says in one clear line which is missing.
+#   setup.sh        what building needs: libtorch comes in .venv, unless LIBTORCH names one already
+#   setup.sh venv   .venv in any case: the parity checks run in it
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -12,13 +13,17 @@ missing() {
 command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.88 or newer"
 command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
 
+if [ -n "${LIBTORCH:-}" ]; then
+    [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; name the folder of a libtorch 2.11, or unset it"
+    [ "${1:-}" = venv ] || exit 0
+fi
+
 python="${PYTHON:-python3}"
 if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
     missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
 fi
-
 if [ ! -x .venv/bin/python ]; then
-    "$python" -m venv .venv || missing "python3 can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
+    "$python" -m venv .venv || missing "$python can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
 fi
 if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2

@@ -63,8 +63,8 @@ fn a_splat_is_scored_by_its_capture() {
     assert_eq!(views.len(), 9);
     assert_eq!(views[2]["image"], "images/002.png");
     assert!(views.iter().all(|v| v["psnr"].is_f64() && v["ssim"].is_f64()));
-    // Three pictures of 40 pixels and two gaps wide, nine and eight high.
-    assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 40 + 2 * 4, 9 * 40 + 8 * 4));
+    // Three pictures of 6·40 pixels and two gaps wide, nine and eight high.
+    assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 240 + 2 * 4, 9 * 240 + 8 * 4));
 }
 
 #[test]

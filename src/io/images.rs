@@ -55,12 +55,14 @@ pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
 }
 
 /// Depth [H, W] as colours [3, H, W]: near is bright, far dark, by inverse depth between the picture's own 2nd and 98th
-/// percentiles; nothing (`alpha` below ½) is black.
+/// percentiles; where little is seen (`alpha`) it fades to black.
 pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
+    /// Depth behind less opacity than this is no depth.
+    const MIN_ALPHA: f64 = 0.05;
     // From far to near: dark blue, violet, orange, pale yellow.
     const STOPS: [[f32; 3]; 5] =
         [[0.05, 0.03, 0.30], [0.45, 0.05, 0.60], [0.80, 0.25, 0.45], [0.97, 0.60, 0.20], [0.98, 0.97, 0.70]];
-    let seen = alpha.ge(0.5).logical_and(&depth.gt(0.));
+    let seen = alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.));
     let inverse = depth.clamp_min(1e-6).reciprocal();
     let values = inverse.masked_select(&seen);
     if values.numel() == 0 {
@@ -75,9 +77,16 @@ pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
     let index = below.to_kind(Kind::Int64).flatten(0, -1);
     let at = |i: &Tensor| stops.index_select(0, i).view([depth.size()[0], depth.size()[1], 3]);
     let colour = Tensor::lerp_tensor(&at(&index), &at(&(&index + 1)), &share);
-    colour.permute([2, 0, 1]) * seen.to_kind(Kind::Float)
+    colour.permute([2, 0, 1]) * seen.to_kind(Kind::Float) * alpha.clamp(0., 1.)
 }
 
+/// `picture` [3, H, W] enlarged by a whole factor, pixels left as they are, until it is `height` high or a little less.
+pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
+    let factor = (height / picture.size()[1]).max(1);
+    picture.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
+}
+
+/// Pixels between pictures.
 const GAP: i64 = 4;
 
 /// Pictures [3, H, W] of one height side by side, with a white gap.
