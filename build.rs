@@ -38,7 +38,7 @@ fn main() {
         .flag("-isystem")
         .flag(torch_include.join("torch/csrc/api/include").to_str().expect("an UTF-8 path"))
         .include("csrc")
-        .file("csrc/splat.cpp")
+        .files(["csrc/splat.cpp", "csrc/projection.cpp", "csrc/marshal.cpp"])
         .compile("globalsplat_splat");
 
     cpp()

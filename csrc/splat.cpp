@@ -1,35 +1,21 @@
 #include "splat.h"
 
-#include <torch/torch.h>
-
 #include <algorithm>
 #include <memory>
-#include <string>
+#include <type_traits>
 #include <vector>
 
+#include "marshal.h"
 #include "raster/kernels.h"
-#include "raster/raster.h"
 #include "raster/sh.h"
 
 namespace globalsplat {
 namespace {
 
-using torch::Tensor;
 using torch::autograd::AutogradContext;
-using torch::autograd::tensor_list;
 
-constexpr int kGaussianInputs = 5;  // means, scales, quaternions, opacities, sh
-
-template <class T>
-std::vector<raster::Gaussians<T>> scenes_of(const tensor_list& t) {
-  std::vector<raster::Gaussians<T>> scenes;
-  const int64_t count = t[0].size(1), bases = t[4].size(2);
-  for (int64_t b = 0; b < t[0].size(0); ++b)
-    scenes.push_back({t[0].data_ptr<T>() + b * count * 3, t[1].data_ptr<T>() + b * count * 3,
-                      t[2].data_ptr<T>() + b * count * 4, t[3].data_ptr<T>() + b * count,
-                      t[4].data_ptr<T>() + b * count * bases * 3, count, int(bases)});
-  return scenes;
-}
+constexpr size_t kGaussianInputs = 5;  // means, scales, quaternions, opacities, sh
+constexpr size_t kInputs = 10;         // and w2c, intrinsics, width, height, eps2d
 
 template <class T>
 std::vector<raster::GaussianGradients<T>> gradients_of(const tensor_list& t) {
@@ -40,22 +26,6 @@ std::vector<raster::GaussianGradients<T>> gradients_of(const tensor_list& t) {
                       t[2].data_ptr<T>() + b * count * 4, t[3].data_ptr<T>() + b * count,
                       t[4].data_ptr<T>() + b * count * bases * 3});
   return scenes;
-}
-
-template <class T>
-std::vector<raster::View<T>> views_of(const Tensor& w2c, const Tensor& intrinsics) {
-  std::vector<raster::View<T>> views;
-  const int64_t scenes = w2c.size(0), cameras = w2c.size(1);
-  for (int64_t b = 0; b < scenes; ++b)
-    for (int64_t c = 0; c < cameras; ++c) {
-      const T* m = w2c.data_ptr<T>() + (b * cameras + c) * 16;
-      const T* k = intrinsics.data_ptr<T>() + (b * cameras + c) * 9;
-      views.push_back({{{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]},
-                        {m[3], m[7], m[11]},
-                        k[0], k[4], k[2], k[5]},
-                       int(b)});
-    }
-  return views;
 }
 
 // rgb [B, C, 3, H, W], alpha and depth [B, C, H, W] as one item per view.
@@ -104,53 +74,23 @@ struct SplatFunction : torch::autograd::Function<SplatFunction<T>> {
     for (Tensor& g : gradients) g = g.contiguous();
     holder->frame->backward(scenes_of<T>(gaussians), pictures_of<const T>(saved[5], saved[6], saved[7]),
                             pictures_of<const T>(gradients[0], gradients[1], gradients[2]), gradients_of<T>(out));
-    out.resize(10);  // no gradient for cameras and numbers
+    out.resize(kInputs);  // undefined: no gradient for cameras and numbers
     return out;
   }
 };
 
-void expect_shape(const char* name, const Tensor& t, std::vector<int64_t> expected) {
-  TORCH_CHECK(t.sizes() == torch::IntArrayRef(expected), "splat: ", name, " has shape ", t.sizes(), ", expected ",
-              torch::IntArrayRef(expected));
-}
-
-const Tensor& borrowed(size_t pointer) { return *reinterpret_cast<const Tensor*>(pointer); }
-
 }  // namespace
 
-void splat(size_t means_, size_t scales_, size_t quaternions_, size_t opacities_, size_t sh_, size_t w2c_,
-           size_t intrinsics_, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out) {
-  const Tensor &means = borrowed(means_), &scales = borrowed(scales_), &quaternions = borrowed(quaternions_);
-  const Tensor &opacities = borrowed(opacities_), &sh = borrowed(sh_);
-  const Tensor &w2c = borrowed(w2c_), &intrinsics = borrowed(intrinsics_);
-
-  TORCH_CHECK(means.dim() == 3 && w2c.dim() == 4 && sh.dim() == 4,
-              "splat: means must be [B, N, 3], sh [B, N, bases, 3] and w2c [B, C, 4, 4]");
-  const int64_t scenes = means.size(0), count = means.size(1), cameras = w2c.size(1), bases = sh.size(2);
-  expect_shape("means", means, {scenes, count, 3});
-  expect_shape("scales", scales, {scenes, count, 3});
-  expect_shape("quaternions", quaternions, {scenes, count, 4});
-  expect_shape("opacities", opacities, {scenes, count});
-  expect_shape("sh", sh, {scenes, count, bases, 3});
-  expect_shape("w2c", w2c, {scenes, cameras, 4, 4});
-  expect_shape("intrinsics", intrinsics, {scenes, cameras, 3, 3});
-  TORCH_CHECK(bases == 1 || bases == 4 || bases == 9 || bases == 16, "splat: sh has ", bases,
-              " basis functions, expected 1, 4, 9 or 16");
-  TORCH_CHECK(width > 0 && height > 0 && width <= 1 << 20 && height <= 1 << 20, "splat: an image of ", width, "×", height);
-  TORCH_CHECK(count < int64_t(1) << 31, "splat: ", count, " Gaussians, at most 2³¹ − 1 fit");
-  TORCH_CHECK(eps2d >= 0, "splat: eps2d is ", eps2d, ", expected 0 or more");
-
-  // Moving and converting are differentiable, so gradients go back to the caller's device and type.
-  const auto type = means.scalar_type() == torch::kDouble ? torch::kDouble : torch::kFloat;
-  const auto host = [&](const Tensor& t) { return t.to(torch::kCPU, type).contiguous(); };
+void splat(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
+           size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out) {
+  const Arguments a{borrowed(means), borrowed(scales), borrowed(quaternions), borrowed(opacities), borrowed(sh),
+                    borrowed(w2c),   borrowed(intrinsics), width, height, eps2d};
+  a.check();
+  const tensor_list t = a.on_host();
   const auto apply = [&](auto function) {
-    return decltype(function)::apply(host(means), host(scales), host(quaternions), host(opacities), host(sh),
-                                     host(w2c.detach()), host(intrinsics.detach()), int64_t(width), int64_t(height),
-                                     eps2d);
+    return decltype(function)::apply(t[0], t[1], t[2], t[3], t[4], t[5], t[6], a.width, a.height, a.eps2d);
   };
-  const tensor_list pictures =
-      type == torch::kDouble ? apply(SplatFunction<double>{}) : apply(SplatFunction<float>{});
-  for (size_t k = 0; k < 3; ++k) out[k] = reinterpret_cast<size_t>(new Tensor(pictures[k].to(means.device())));
+  give(a.is_double() ? apply(SplatFunction<double>{}) : apply(SplatFunction<float>{}), a.means.device(), out);
 }
 
 void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {

@@ -88,6 +88,10 @@ impl CurriculumConfig {
 pub struct LossConfig {
     /// Mean squared error of the rendered colours.
     pub mse: f64,
+    /// Difference of the two subsets' accumulated opacities. Without this and the next, all context views go together.
+    pub consistency_alpha: f64,
+    /// Difference of the two subsets' depths.
+    pub consistency_depth: f64,
     /// Frustum constraint on the Gaussians' centres.
     pub frustum: f64,
     /// L_dec, which has its own 1e-2 inside.
@@ -96,9 +100,23 @@ pub struct LossConfig {
     pub decoder_opacity: bool,
 }
 
+impl LossConfig {
+    /// Whether the context is split into two subsets that have to agree.
+    pub fn has_consistency(&self) -> bool {
+        self.consistency_alpha > 0. || self.consistency_depth > 0.
+    }
+}
+
 impl Default for LossConfig {
     fn default() -> Self {
-        LossConfig { mse: 2., frustum: 1e-2, decoder: 1., decoder_opacity: false }
+        LossConfig {
+            mse: 2.,
+            consistency_alpha: 1e-3,
+            consistency_depth: 1e-2,
+            frustum: 1e-2,
+            decoder: 1.,
+            decoder_opacity: false,
+        }
     }
 }
 

@@ -10,6 +10,7 @@ pub mod eval;
 pub mod io;
 pub mod loss;
 pub mod model;
+pub mod parity;
 pub mod render;
 pub mod scene;
 pub mod synth;

@@ -26,7 +26,7 @@ fn every_configuration_builds_its_model() {
         GlobalSplat::new(&vs.root(), &config.model).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         count += 1;
     }
-    assert!(count >= 9);
+    assert!(count >= 10);
 }
 
 #[test]
@@ -48,6 +48,10 @@ fn ablations_differ_from_the_full_model_in_one_thing() {
     let mut config = read("plucker_only");
     assert!(!config.model.camera_code);
     config.model.camera_code = true;
+    assert_eq!(config, full);
+    let mut config = read("no_consistency");
+    assert!(!config.loss.has_consistency() && full.loss.has_consistency());
+    config.loss = full.loss.clone();
     assert_eq!(config, full);
     let mut config = read("full_capacity");
     assert!(config.curriculum.full_capacity);

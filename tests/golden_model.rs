@@ -12,7 +12,8 @@ use tch::{Device, Kind, Tensor, nn};
 
 const OUTPUT_TOLERANCE: f64 = 1e-5;
 const GRADIENT_TOLERANCE: f64 = 1e-4;
-/// The gradient of a key bias is zero in exact arithmetic: softmax ignores a constant.
+/// The gradient of a key bias is zero in exact arithmetic: softmax ignores a constant. What is there is rounding, which
+/// goes with the gradients around it: it is held as a share of the case's largest.
 const ZERO_GRADIENT: &str = "mem_k.bias";
 const ZERO_TOLERANCE: f64 = 1e-5;
 
@@ -107,6 +108,8 @@ fn every_stage_matches_in_values_and_gradients() {
             vs.trainable_variables().iter_mut().for_each(|v| v.zero_grad());
             objective.backward();
 
+            let gradients = golden.iter().filter(|(key, _)| key.starts_with("grad"));
+            let largest = gradients.map(|(_, g)| g.norm().double_value(&[])).fold(0., f64::max);
             let mut compared = 0;
             let variables = vs.variables();
             for (key, expected) in golden.iter().filter(|(key, _)| key.starts_with("grad")) {
@@ -117,8 +120,8 @@ fn every_stage_matches_in_values_and_gradients() {
                 };
                 assert!(gradient.defined(), "{}: no gradient", what(parameter));
                 if parameter.ends_with(ZERO_GRADIENT) {
-                    let error = largest_error(&gradient, expected);
-                    assert!(error <= ZERO_TOLERANCE, "{}: absolute error {error:.2e}", what(parameter));
+                    let error = largest_error(&gradient, expected) / largest;
+                    assert!(error <= ZERO_TOLERANCE, "{}: {error:.2e} of the largest", what(parameter));
                 } else if expected.norm().double_value(&[]) == 0. {
                     assert_eq!(gradient.norm().double_value(&[]), 0., "{}", what(parameter));
                 } else {

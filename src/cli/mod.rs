@@ -8,6 +8,7 @@ mod doctor;
 mod eval;
 mod export;
 mod inspect;
+mod parity;
 mod progress;
 mod reconstruct;
 mod render;
@@ -41,6 +42,8 @@ enum Command {
     Synth(synth::Synth),
     Inspect(inspect::Inspect),
     Doctor(doctor::Doctor),
+    #[command(hide = true)]
+    Parity(parity::Parity),
 }
 
 /// Runs the command line of this process.
@@ -64,6 +67,7 @@ pub fn main() -> ExitCode {
         Command::Synth(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Doctor(command) => command.run(),
+        Command::Parity(command) => command.run(),
     });
     match result {
         Ok(Ok(())) => ExitCode::from(DONE),

@@ -35,10 +35,24 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
 }
 
 impl ViewBatch {
+    /// The views at `positions`, of every scene.
+    pub fn select(&self, positions: &[usize]) -> Self {
+        let index: Vec<i64> = positions.iter().map(|&p| p as i64).collect();
+        let index = Tensor::from_slice(&index).to_device(self.images.device());
+        let select = |t: &Tensor| t.index_select(1, &index);
+        ViewBatch {
+            images: select(&self.images),
+            c2w: select(&self.c2w),
+            w2c: select(&self.w2c),
+            intrinsics: select(&self.intrinsics),
+        }
+    }
+
     /// Scenes with equally many views along the batch.
-    pub fn stack(scenes: &[ViewBatch]) -> Self {
-        let cat =
-            |field: fn(&ViewBatch) -> &Tensor| Tensor::cat(&scenes.iter().map(field).collect::<Vec<_>>(), 0);
+    pub fn stack<B: Borrow<ViewBatch>>(scenes: &[B]) -> Self {
+        let cat = |field: fn(&ViewBatch) -> &Tensor| {
+            Tensor::cat(&scenes.iter().map(|scene| field(scene.borrow())).collect::<Vec<_>>(), 0)
+        };
         ViewBatch {
             images: cat(|s| &s.images),
             c2w: cat(|s| &s.c2w),

@@ -19,6 +19,26 @@ pub struct Sample {
     pub target: ViewBatch,
     /// Far end of the input views' frusta in each normalized scene, [B].
     pub far: Tensor,
+    /// Whether the second half of the batch is the first half's scenes again, seen through other photos.
+    pub paired: bool,
+}
+
+impl Sample {
+    /// Every scene twice, along the batch: first with the context views at `subsets[0]`, then with those at `subsets[1]`.
+    pub fn paired(&self, subsets: &[Vec<usize>; 2]) -> Self {
+        let twice = |batch: &ViewBatch| ViewBatch::stack(&[batch, batch]);
+        Sample {
+            context: ViewBatch::stack(&[self.context.select(&subsets[0]), self.context.select(&subsets[1])]),
+            target: twice(&self.target),
+            far: Tensor::cat(&[&self.far, &self.far], 0),
+            paired: true,
+        }
+    }
+
+    /// Photos that the model sees of every scene.
+    pub fn context_views(&self) -> usize {
+        self.context.images.size()[1] as usize
+    }
 }
 
 /// Far end of a frustum in units of the capture: these data sets have no metric scale (SPEC section 2).
@@ -80,6 +100,7 @@ impl Sampler {
             context: ViewBatch::stack(&contexts),
             target: ViewBatch::stack(&targets),
             far: Tensor::from_slice(&far).to_kind(Kind::Float).to_device(device),
+            paired: false,
         })
     }
 

@@ -1,9 +1,11 @@
 //! Losses (SPEC section 7), one file per term, and their weighted sum.
 
+mod consistency;
 mod decoder_regularization;
 mod frustum;
 mod mse;
 
+pub use consistency::consistency;
 pub use decoder_regularization::{decoder_regularization, sh_soft_cap};
 pub use frustum::frustum;
 pub use mse::mse;
@@ -21,17 +23,28 @@ pub struct Losses {
     pub total: Tensor,
     /// Mean squared error, before its factor.
     pub mse: Tensor,
+    /// L_con, with its factors; 0 where the sample isn't paired.
+    pub consistency: Tensor,
     /// L_fru, before its factor.
     pub frustum: Tensor,
     /// L_dec, before its factor.
     pub decoder: Tensor,
 }
 
-/// What `decoded` is worth, whose `pictures` were rendered from the sample's target cameras.
+/// What `decoded` is worth, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
+/// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con.
 pub fn losses(config: &LossConfig, sample: &Sample, decoded: &Decoded, pictures: &Pictures) -> Losses {
     let mse = mse(&pictures.rgb, &sample.target.images);
+    let consistency = match sample.paired {
+        true => {
+            let (alpha, depth) = (pictures.alpha.chunk(2, 0), pictures.depth.chunk(2, 0));
+            let factors = (config.consistency_alpha, config.consistency_depth);
+            consistency([&alpha[0], &alpha[1]], [&depth[0], &depth[1]], factors.0, factors.1)
+        }
+        false => mse.zeros_like(),
+    };
     let frustum = frustum(&decoded.gaussians.means, &sample.context, &sample.far);
     let decoder = decoder_regularization(&decoded.raw, config.decoder_opacity);
-    let total = &mse * config.mse + &frustum * config.frustum + &decoder * config.decoder;
-    Losses { total, mse, frustum, decoder }
+    let total = &mse * config.mse + &consistency + &frustum * config.frustum + &decoder * config.decoder;
+    Losses { total, mse, consistency, frustum, decoder }
 }

@@ -13,19 +13,19 @@ const CENTRE_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
 
 /// Intrinsics through an MLP and the camera centre through sines, joined by one linear layer.
 #[derive(Debug)]
-pub(super) struct CameraCode {
+pub(crate) struct CameraCode {
     intrinsics_in: nn::Linear,
     intrinsics_out: nn::Linear,
     project: nn::Linear,
 }
 
 impl CameraCode {
-    pub fn new(vs: nn::Path, width: i64) -> Self {
-        let mlp = &vs / "k_mlp";
+    pub fn new(vs: &nn::Path, width: i64) -> Self {
+        let mlp = vs / "k_mlp";
         CameraCode {
             intrinsics_in: default_linear(&mlp / "0", 4, INTRINSICS_WIDTH, true),
             intrinsics_out: default_linear(&mlp / "2", INTRINSICS_WIDTH, INTRINSICS_WIDTH, true),
-            project: default_linear(&vs / "proj", INTRINSICS_WIDTH + CENTRE_WIDTH, width, true),
+            project: default_linear(vs / "proj", INTRINSICS_WIDTH + CENTRE_WIDTH, width, true),
         }
     }
 

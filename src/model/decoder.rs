@@ -40,6 +40,16 @@ pub struct RawOutputs {
     pub opacity_logits: Tensor,
 }
 
+/// What the heads say, per candidate.
+pub(crate) struct Heads {
+    pub positions: Tensor,      // [B, M, K, 3]
+    pub log_scales: Tensor,     // [B, M, K, 3], with their offset
+    pub rotations: Tensor,      // [B, M, K, 6]
+    pub opacity_logits: Tensor, // [B, M, K, 1], without offset
+    pub gate: Tensor,           // [B, M, K]
+    pub sh: Tensor,             // [B, M, K, bases · 3]
+}
+
 /// Gaussians, and what the losses need beside them.
 #[derive(Debug)]
 pub struct Decoded {
@@ -80,19 +90,26 @@ impl Decoder {
         }
     }
 
-    /// The heads, then the Gaussians of `stage`.
-    pub fn forward(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+    /// The linear heads alone.
+    pub(crate) fn heads(&self, encoded: &Encoded) -> Heads {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
-        let positions = self.positions.forward(&encoded.geometry).view([b, m, k, 3]);
         let parameters = self.parameters.forward(&encoded.geometry).view([b, m, k, PARAMETERS]);
-        let log_scales = parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET;
-        let rotations = parameters.narrow(-1, 3, 6);
-        // Half the opacity at the start of a transition, which doubles the number of Gaussians.
-        let opacity_logits = parameters.narrow(-1, 9, 1) + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
-        let gate = self.gate.forward(&encoded.geometry); // [B, M, K]
-        let sh = self.sh.forward(&encoded.appearance).view([b, m, k, self.sh_bases * 3]);
+        Heads {
+            positions: self.positions.forward(&encoded.geometry).view([b, m, k, 3]),
+            log_scales: parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET,
+            rotations: parameters.narrow(-1, 3, 6),
+            opacity_logits: parameters.narrow(-1, 9, 1),
+            gate: self.gate.forward(&encoded.geometry),
+            sh: self.sh.forward(&encoded.appearance).view([b, m, k, self.sh_bases * 3]),
+        }
+    }
 
+    /// The heads, then the Gaussians of `stage`.
+    pub fn forward(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+        let Heads { positions, log_scales, rotations, opacity_logits, gate, sh } = self.heads(encoded);
+        // Half the opacity at the start of a transition, which doubles the number of Gaussians.
+        let opacity_logits = opacity_logits + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
         let candidates = Candidates {
             positions,
             log_scales: log_scales.clamp(MIN_SCALE.ln() - 1., MAX_SCALE.ln() + 2.),
@@ -102,7 +119,7 @@ impl Decoder {
         };
         let shown = candidates.at_stage(&gate, stage); // [B, M, G, ..]
 
-        let n = m << stage.index;
+        let (b, n) = (gate.size()[0], gate.size()[1] << stage.index);
         let rotations_6d = self.activate_rotations(&shown.rotations.view([b, n, 6]));
         let logits = shown.opacity_logits.view([b, n]);
         let gaussians = Gaussians {

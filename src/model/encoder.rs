@@ -50,7 +50,7 @@ impl Encoder {
         let tokens =
             |name: &str, count: i64, width: i64| vs.var(name, &[1, count, width], randn(ENCODER_STD));
         let rounds = |name: &str| {
-            (0..config.rounds).map(|i| StreamRound::new(vs / name / i, config)).collect::<Vec<_>>()
+            (0..config.rounds).map(|i| StreamRound::new(&(vs / name / i), config)).collect::<Vec<_>>()
         };
         Encoder {
             auxiliaries: tokens("aux_query_tokens", AUXILIARIES, d),
@@ -64,7 +64,7 @@ impl Encoder {
                 Streams::Dual => Some(Appearance {
                     start: StreamStart::new(vs / "slot_to_tex", d),
                     rounds: rounds("tex_rounds"),
-                    mixers: (0..config.rounds).map(|i| Mixer::new(vs / "pair_adapters" / i, d)).collect(),
+                    mixers: (0..config.rounds).map(|i| Mixer::new(&(vs / "pair_adapters" / i), d)).collect(),
                 }),
             },
             latents: config.latents,

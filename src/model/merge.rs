@@ -25,7 +25,7 @@ impl Stage {
 
 /// Candidates, [B, M, K, ..], or merged Gaussians, [B, M, G, ..]: the same five quantities before activation.
 #[derive(Debug)]
-pub(super) struct Candidates {
+pub(crate) struct Candidates {
     pub positions: Tensor,      // [.., 3]
     pub log_scales: Tensor,     // [.., 3]
     pub rotations: Tensor,      // [.., 6]

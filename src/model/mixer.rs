@@ -7,7 +7,7 @@ const MIXER_LAYER_SCALE: f64 = 1e-3;
 
 /// An MLP over both streams, side by side, whose halves are added to them.
 #[derive(Debug)]
-pub(super) struct Mixer {
+pub(crate) struct Mixer {
     geometry_norm: nn::LayerNorm,
     appearance_norm: nn::LayerNorm,
     mlp: Mlp,
@@ -16,13 +16,13 @@ pub(super) struct Mixer {
 }
 
 impl Mixer {
-    pub fn new(vs: nn::Path, d: i64) -> Self {
+    pub fn new(vs: &nn::Path, d: i64) -> Self {
         Mixer {
-            geometry_norm: layer_norm(&vs / "ln_g", d),
-            appearance_norm: layer_norm(&vs / "ln_t", d),
-            mlp: Mlp::new(&vs / "mlp", 2 * d, d, 2 * d, ["0", "2"]),
-            geometry_scale: LayerScale::new(&vs / "ls_g", d, MIXER_LAYER_SCALE),
-            appearance_scale: LayerScale::new(&vs / "ls_t", d, MIXER_LAYER_SCALE),
+            geometry_norm: layer_norm(vs / "ln_g", d),
+            appearance_norm: layer_norm(vs / "ln_t", d),
+            mlp: Mlp::new(vs / "mlp", 2 * d, d, 2 * d, ["0", "2"]),
+            geometry_scale: LayerScale::new(vs / "ls_g", d, MIXER_LAYER_SCALE),
+            appearance_scale: LayerScale::new(vs / "ls_t", d, MIXER_LAYER_SCALE),
         }
     }
 

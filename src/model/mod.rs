@@ -5,7 +5,6 @@
 
 mod camera_code;
 mod config;
-pub(crate) use decoder::MAX_SCALE;
 mod decoder;
 mod encoder;
 mod gaussians;
@@ -24,8 +23,16 @@ pub use merge::Stage;
 pub use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub use tokens::{Tokenizer, patchify};
 
+// For the parity checks, which run every module by itself.
+pub(crate) use camera_code::CameraCode;
+pub(crate) use decoder::MAX_SCALE;
+pub(crate) use merge::Candidates;
+pub(crate) use mixer::Mixer;
+pub(crate) use stream::{SelfAttentionBlock, StreamRound};
+pub(crate) use tokens::{RayTokens, RgbTokens};
+
 use crate::error::Result;
-use layers::randn;
+use layers::{ENCODER_STD, randn};
 use tch::{Tensor, nn};
 
 /// The whole model.
@@ -45,15 +52,9 @@ impl GlobalSplat {
     /// A configuration whose numbers don't fit together.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Result<Self> {
         config.check()?;
-        // Orthogonal tokens start as different from each other as they can be; that needs no more of them than dimensions.
-        let scene_tokens = if config.latents <= config.width {
-            vs.var("scene_tokens", &[config.latents, config.width], nn::Init::Orthogonal { gain: 0.02 })
-        } else {
-            vs.var("scene_tokens", &[config.latents, config.width], randn(0.02))
-        };
         Ok(GlobalSplat {
             tokenizer: Tokenizer::new(vs, config),
-            scene_tokens,
+            scene_tokens: scene_tokens(vs, config),
             encoder: Encoder::new(&(vs / "slot_encoder"), config),
             decoder: Decoder::new(&(vs / "gaussian_decoder"), config),
             config: config.clone(),
@@ -87,4 +88,14 @@ impl GlobalSplat {
     pub fn config(&self) -> &ModelConfig {
         &self.config
     }
+}
+
+/// The learned scene tokens, [M, d]. Orthogonal ones start as different from each other as they can be; that needs no more
+/// of them than dimensions.
+pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
+    let init = match config.latents <= config.width {
+        true => nn::Init::Orthogonal { gain: ENCODER_STD },
+        false => randn(ENCODER_STD),
+    };
+    vs.var("scene_tokens", &[config.latents, config.width], init)
 }

@@ -11,7 +11,7 @@ const SELF_LAYER_SCALE: f64 = 1e-2;
 
 /// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
 #[derive(Debug)]
-pub(super) struct StreamRound {
+pub(crate) struct StreamRound {
     slots_norm: nn::LayerNorm,
     memory_norm: nn::LayerNorm,
     query: nn::Linear,
@@ -27,21 +27,21 @@ pub(super) struct StreamRound {
 }
 
 impl StreamRound {
-    pub fn new(vs: nn::Path, config: &ModelConfig) -> Self {
+    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         let (d, memory) = (config.width, config.token_width());
         StreamRound {
-            slots_norm: layer_norm(&vs / "slots_ln", d),
-            memory_norm: layer_norm(&vs / "mem_ln", memory),
-            query: linear(&vs / "lat_q", d, d, ENCODER_STD),
-            key: linear(&vs / "mem_k", memory, d, ENCODER_STD),
-            value: linear(&vs / "mem_v", memory, d, ENCODER_STD),
-            output: linear(&vs / "out_proj", d, d, ENCODER_STD),
-            attention_scale: LayerScale::new(&vs / "attn_ls", d, CROSS_LAYER_SCALE),
-            mlp_norm: layer_norm(&vs / "post_ln", d),
-            mlp: Mlp::new(&vs / "mlp", d, MLP_RATIO * d, d, ["0", "2"]),
-            mlp_scale: LayerScale::new(&vs / "mlp_ls", d, CROSS_LAYER_SCALE),
+            slots_norm: layer_norm(vs / "slots_ln", d),
+            memory_norm: layer_norm(vs / "mem_ln", memory),
+            query: linear(vs / "lat_q", d, d, ENCODER_STD),
+            key: linear(vs / "mem_k", memory, d, ENCODER_STD),
+            value: linear(vs / "mem_v", memory, d, ENCODER_STD),
+            output: linear(vs / "out_proj", d, d, ENCODER_STD),
+            attention_scale: LayerScale::new(vs / "attn_ls", d, CROSS_LAYER_SCALE),
+            mlp_norm: layer_norm(vs / "post_ln", d),
+            mlp: Mlp::new(vs / "mlp", d, MLP_RATIO * d, d, ["0", "2"]),
+            mlp_scale: LayerScale::new(vs / "mlp_ls", d, CROSS_LAYER_SCALE),
             blocks: (0..config.self_attention_blocks)
-                .map(|i| SelfAttentionBlock::new(&vs / "tower" / i, d, config.heads))
+                .map(|i| SelfAttentionBlock::new(&(vs / "tower" / i), d, config.heads))
                 .collect(),
             heads: config.heads,
         }
@@ -67,7 +67,7 @@ impl StreamRound {
 
 /// A pre-norm transformer block.
 #[derive(Debug)]
-struct SelfAttentionBlock {
+pub(crate) struct SelfAttentionBlock {
     attention_norm: nn::LayerNorm,
     qkv: nn::Linear,
     project: nn::Linear,
@@ -79,20 +79,21 @@ struct SelfAttentionBlock {
 }
 
 impl SelfAttentionBlock {
-    fn new(vs: nn::Path, d: i64, heads: i64) -> Self {
+    pub fn new(vs: &nn::Path, d: i64, heads: i64) -> Self {
         SelfAttentionBlock {
-            attention_norm: layer_norm(&vs / "norm1", d),
-            qkv: linear(&vs / "attn" / "qkv", d, 3 * d, ENCODER_STD),
-            project: linear(&vs / "attn" / "proj", d, d, ENCODER_STD),
-            attention_scale: LayerScale::new(&vs / "ls1", d, SELF_LAYER_SCALE),
-            mlp_norm: layer_norm(&vs / "norm2", d),
-            mlp: Mlp::new(&vs / "mlp", d, MLP_RATIO * d, d, ["fc1", "fc2"]),
-            mlp_scale: LayerScale::new(&vs / "ls2", d, SELF_LAYER_SCALE),
+            attention_norm: layer_norm(vs / "norm1", d),
+            qkv: linear(vs / "attn" / "qkv", d, 3 * d, ENCODER_STD),
+            project: linear(vs / "attn" / "proj", d, d, ENCODER_STD),
+            attention_scale: LayerScale::new(vs / "ls1", d, SELF_LAYER_SCALE),
+            mlp_norm: layer_norm(vs / "norm2", d),
+            mlp: Mlp::new(vs / "mlp", d, MLP_RATIO * d, d, ["fc1", "fc2"]),
+            mlp_scale: LayerScale::new(vs / "ls2", d, SELF_LAYER_SCALE),
             heads,
         }
     }
 
-    fn forward(&self, xs: &Tensor) -> Tensor {
+    /// [B, S, d], and so the result.
+    pub fn forward(&self, xs: &Tensor) -> Tensor {
         let qkv = self.qkv.forward(&self.attention_norm.forward(xs)).chunk(3, -1);
         let mixed = attention(&qkv[0], &qkv[1], &qkv[2], self.heads);
         let xs = xs + self.attention_scale.forward(&self.project.forward(&mixed));

@@ -26,43 +26,73 @@ pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
 /// Images and cameras to tokens.
 #[derive(Debug)]
 pub struct Tokenizer {
-    patch_size: i64,
-    rgb: nn::Linear,
-    ray: nn::Linear,
-    camera_code: Option<CameraCode>,
+    rgb: RgbTokens,
+    ray: RayTokens,
 }
 
 impl Tokenizer {
     /// `vs` is the model's root.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
-        let pixels = config.patch_size * config.patch_size;
-        Tokenizer {
-            patch_size: config.patch_size,
-            rgb: default_linear(vs / "rgb_patch_embeds" / "1", 3 * pixels, config.rgb_width, false),
-            ray: default_linear(
-                vs / "ray_patch_embeds" / "1",
-                RAY_CHANNELS * pixels,
-                config.ray_width,
-                false,
-            ),
-            camera_code: config.camera_code.then(|| CameraCode::new(vs / "view_pe", config.ray_width)),
-        }
+        Tokenizer { rgb: RgbTokens::new(vs, config), ray: RayTokens::new(vs, config) }
     }
 
     /// `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is
     /// [B, V, P, ray width + RGB width].
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
         let (height, width) = (images.size()[3], images.size()[4]);
+        let rgb = self.rgb.forward(images);
+        let ray = self.ray.forward(c2w, intrinsics, height, width);
+        Tensor::cat(&[ray, rgb], -1)
+    }
+}
+
+/// What patches look like.
+#[derive(Debug)]
+pub(crate) struct RgbTokens {
+    patch_size: i64,
+    project: nn::Linear,
+}
+
+impl RgbTokens {
+    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
+        let inputs = 3 * config.patch_size * config.patch_size;
+        let project = default_linear(vs / "rgb_patch_embeds" / "1", inputs, config.rgb_width, false);
+        RgbTokens { patch_size: config.patch_size, project }
+    }
+
+    /// `images` [B, V, 3, H, W] in [0, 1]; the result is [B, V, P, RGB width].
+    pub fn forward(&self, images: &Tensor) -> Tensor {
         let channel = |values: &[f32]| Tensor::from_slice(values).view([3, 1, 1]).to_device(images.device());
         let normalized = (images - channel(&IMAGENET_MEAN)) / channel(&IMAGENET_STD);
-        let rgb = self.rgb.forward(&patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size));
+        self.project.forward(&patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
+    }
+}
 
+/// Along which rays patches are seen, and by which camera.
+#[derive(Debug)]
+pub(crate) struct RayTokens {
+    patch_size: i64,
+    project: nn::Linear,
+    camera_code: Option<CameraCode>,
+}
+
+impl RayTokens {
+    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
+        let inputs = RAY_CHANNELS * config.patch_size * config.patch_size;
+        RayTokens {
+            patch_size: config.patch_size,
+            project: default_linear(vs / "ray_patch_embeds" / "1", inputs, config.ray_width, false),
+            camera_code: config.camera_code.then(|| CameraCode::new(&(vs / "view_pe"), config.ray_width)),
+        }
+    }
+
+    /// `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, P, ray width].
+    pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let rays = plucker_rays(c2w, intrinsics, height, width);
-        let ray = self.ray.forward(&patchify(&rays, self.patch_size));
-        let ray = match &self.camera_code {
-            Some(camera_code) => ray + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
-            None => ray,
-        };
-        Tensor::cat(&[ray, rgb], -1)
+        let tokens = self.project.forward(&patchify(&rays, self.patch_size));
+        match &self.camera_code {
+            Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
+            None => tokens,
+        }
     }
 }

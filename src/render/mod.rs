@@ -69,10 +69,55 @@ pub struct Pictures {
 /// # Errors
 /// Shapes that don't fit together, and a `GLOBALSPLAT_SIMD` that this machine doesn't have.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pictures> {
+    let [rgb, alpha, depth] = call(ffi::splat, gaussians, cameras, eps2d)?;
+    Ok(Pictures { rgb, alpha, depth })
+}
+
+/// What projection makes of every Gaussian for every camera: the rasterizer's first step by itself. Zeros where a Gaussian
+/// isn't visible.
+#[derive(Debug)]
+pub struct Projected {
+    /// 1 where the Gaussian isn't dropped, int64 [B, C, N].
+    pub visible: Tensor,
+    /// Pixels, [B, C, N, 2].
+    pub mean2d: Tensor,
+    /// xx, xy and yy of the inverse 2D covariance, pixels⁻², [B, C, N, 3].
+    pub conic: Tensor,
+    /// Camera z, [B, C, N].
+    pub depth: Tensor,
+    /// RGB as seen from the camera, [B, C, N, 3].
+    pub colour: Tensor,
+}
+
+/// Projects as [`render()`] does. Differentiable with respect to means, scales, quaternions and SH.
+///
+/// # Errors
+/// As [`render()`].
+pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Projected> {
+    let [visible, mean2d, conic, depth, colour] = call(ffi::project, gaussians, cameras, eps2d)?;
+    Ok(Projected { visible, mean2d, conic, depth, colour })
+}
+
+/// The C++ side's ops take tensors and a place for new ones as addresses.
+type Op = fn(
+    usize,
+    usize,
+    usize,
+    usize,
+    usize,
+    usize,
+    usize,
+    i32,
+    i32,
+    f64,
+    &mut [usize],
+) -> std::result::Result<(), cxx::Exception>;
+
+fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
     let address = |t: &Tensor| t.as_ptr() as usize;
-    let mut out = [0usize; 3];
+    let mut out = [0usize; N];
     // The tensors outlive the call, which only borrows them.
-    ffi::splat(
+    op(
         address(&gaussians.means),
         address(&gaussians.scales),
         address(&gaussians.quaternions),
@@ -85,9 +130,8 @@ pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pi
         eps2d,
         &mut out,
     )?;
-    // SAFETY: on success the C++ side has put three new tensors there and left them to us.
-    let [rgb, alpha, depth] = out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) });
-    Ok(Pictures { rgb, alpha, depth })
+    // SAFETY: on success the C++ side has put new tensors there and left them to us.
+    Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
 }
 
 /// The instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.

@@ -5,6 +5,7 @@ mod curriculum;
 mod optimizer;
 mod run;
 mod schedule;
+mod subsets;
 mod trainer;
 
 pub use checkpoint::{latest_checkpoint, list_checkpoints};
@@ -12,4 +13,5 @@ pub use curriculum::stage_at;
 pub use optimizer::AdamW;
 pub use run::{Outcome, Resume, run};
 pub use schedule::learning_rate;
+pub use subsets::subsets;
 pub use trainer::{StepReport, Trainer};

@@ -2,7 +2,7 @@
 
 use super::optimizer::AdamW;
 use super::schedule::learning_rate;
-use super::stage_at;
+use super::{stage_at, subsets};
 use crate::config::Config;
 use crate::data::{Capture, Sampler, View};
 use crate::error::Result;
@@ -36,6 +36,8 @@ pub struct StepReport {
     pub loss: f64,
     /// Mean squared error of colours.
     pub mse: f64,
+    /// L_con with its factors; 0 without subsets.
+    pub consistency: f64,
     /// L_fru before its factor.
     pub frustum: f64,
     /// L_dec before its factor.
@@ -74,7 +76,10 @@ impl Trainer {
         let config = &self.config;
         let stage = stage_at(&config.curriculum, self.step);
         let learning_rate = learning_rate(&config.train, self.step);
-        let sample = self.sampler.sample(self.step, config.train.batch, self.vs.device())?;
+        let mut sample = self.sampler.sample(self.step, config.train.batch, self.vs.device())?;
+        if config.loss.has_consistency() && sample.context_views() >= 2 {
+            sample = sample.paired(&subsets(sample.context_views(), self.step));
+        }
 
         let context = &sample.context;
         let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, stage);
@@ -95,6 +100,7 @@ impl Trainer {
             learning_rate,
             loss,
             mse: losses.mse.double_value(&[]),
+            consistency: losses.consistency.double_value(&[]),
             frustum: losses.frustum.double_value(&[]),
             decoder: losses.decoder.double_value(&[]),
             gradient_norm,

@@ -1,0 +1,389 @@
+//! The cases: which code answers which name.
+
+use super::{Answer, Request, Tensors};
+use crate::config::{CurriculumConfig, TrainConfig};
+use crate::data::ViewBatch;
+use crate::error::{Error, Result};
+use crate::io::Weights;
+use crate::loss;
+use crate::model::Gaussians;
+use crate::model::{self, Encoded, GlobalSplat, ModelConfig, RawOutputs, Stage};
+use crate::render::{self, Cameras};
+use crate::scene;
+use crate::train;
+use glam::DMat4;
+use serde::de::DeserializeOwned;
+use std::path::Path;
+use tch::{Kind, Tensor, nn};
+
+/// Runs the case that `request` names.
+pub(super) fn run(request: &Request) -> Result<Answer> {
+    match request.case.as_str() {
+        "patchify" => patchify(request),
+        "rgb_tokens" | "ray_tokens" | "tokens" => tokens(request),
+        "rays" => rays(request),
+        "camera_code" => camera_code(request),
+        "stream_round" => stream_round(request),
+        "self_attention_block" => self_attention_block(request),
+        "mixer" => mixer(request),
+        "encoder" => encoder(request),
+        "heads" => heads(request),
+        "merge" => merge(request),
+        "decoder" => decoder(request),
+        "rotation_matrix" => {
+            outputs([("matrix", model::rotation_matrix_from_6d(request.input("rotations")?))])
+        }
+        "quaternion" => outputs([("quaternion", model::quaternion_from_6d(request.input("rotations")?))]),
+        "scene_normalization" => scene_normalization(request),
+        "projection" => projection(request),
+        "rasterizer" => rasterizer(request),
+        "mse" => loss_of(loss::mse(request.input("rendered")?, request.input("truth")?)),
+        "frustum" => frustum(request),
+        "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
+        "decoder_regularization" => decoder_regularization(request),
+        "consistency" => consistency(request),
+        "subsets" => subsets(request),
+        "learning_rate" => learning_rate(request),
+        "stages" => stages(request),
+        "adamw" => adamw(request),
+        "model" => whole_model(request),
+        other => Err(Error::Request(format!("there is no parity case {other}"))),
+    }
+}
+
+impl Request {
+    fn input(&self, name: &str) -> Result<&Tensor> {
+        self.inputs.get(name).ok_or_else(|| Error::Request(format!("{}: no input {name}", self.case)))
+    }
+
+    /// A number or list of the configuration.
+    fn number<T: DeserializeOwned>(&self, key: &str) -> Result<T> {
+        serde_json::from_value(self.config[key].clone())
+            .map_err(|e| Error::Request(format!("{}: config.{key}: {e}", self.case)))
+    }
+
+    fn model_config(&self) -> Result<ModelConfig> {
+        // The configuration's own keys may stand beside those of the case.
+        let known = serde_json::to_value(ModelConfig::default()).expect("numbers and words");
+        let known = known.as_object().expect("an object");
+        let given = self.config.as_object().cloned().unwrap_or_default();
+        let ours = given.into_iter().filter(|(key, _)| known.contains_key(key)).collect();
+        serde_json::from_value(serde_json::Value::Object(ours))
+            .map_err(|e| Error::Request(format!("{}: config: {e}", self.case)))
+    }
+
+    fn stage(&self) -> Result<Stage> {
+        Ok(Stage { index: self.number("stage")?, mix: self.number("mix")? })
+    }
+
+    /// [height, width].
+    fn image(&self) -> Result<[i64; 2]> {
+        self.number("image")
+    }
+
+    /// Builds a module and gives it the request's parameters, whose names must be its own.
+    fn build<M>(&self, new: impl FnOnce(&nn::Path) -> M) -> Result<(M, Tensors)> {
+        let vs = nn::VarStore::new(self.device);
+        let module = new(&vs.root());
+        let mut tensors =
+            self.params.iter().map(|(name, t)| (name.clone(), t.shallow_clone())).collect::<Tensors>();
+        // What isn't trained isn't drawn.
+        for (name, constant) in vs.variables().into_iter().filter(|(_, t)| !t.requires_grad()) {
+            tensors.entry(name).or_insert(constant);
+        }
+        Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&self.case))?;
+        let params = vs.variables().into_iter().filter(|(_, t)| t.requires_grad()).collect();
+        Ok((module, params))
+    }
+}
+
+fn outputs<const N: usize>(outputs: [(&str, Tensor); N]) -> Result<Answer> {
+    with_params(outputs, Tensors::new())
+}
+
+fn with_params<const N: usize>(outputs: [(&str, Tensor); N], params: Tensors) -> Result<Answer> {
+    Ok(Answer { outputs: outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect(), params })
+}
+
+fn loss_of(loss: Tensor) -> Result<Answer> {
+    outputs([("loss", loss.view([1]))])
+}
+
+fn patchify(request: &Request) -> Result<Answer> {
+    outputs([("tokens", model::patchify(request.input("xs")?, request.number("patch_size")?))])
+}
+
+fn tokens(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) = match request.case.as_str() {
+        "rgb_tokens" => {
+            let (rgb, params) = request.build(|vs| model::RgbTokens::new(vs, &config))?;
+            return with_params([("tokens", rgb.forward(request.input("images")?))], params);
+        }
+        "ray_tokens" => {
+            let (ray, params) = request.build(|vs| model::RayTokens::new(vs, &config))?;
+            let [height, width] = request.image()?;
+            let tokens = ray.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
+            return with_params([("tokens", tokens)], params);
+        }
+        _ => request.build(|vs| model::Tokenizer::new(vs, &config))?,
+    };
+    let tokens =
+        module.forward(request.input("images")?, request.input("c2w")?, request.input("intrinsics")?);
+    with_params([("tokens", tokens)], params)
+}
+
+fn rays(request: &Request) -> Result<Answer> {
+    let [height, width] = request.image()?;
+    outputs([(
+        "rays",
+        scene::plucker_rays(request.input("c2w")?, request.input("intrinsics")?, height, width),
+    )])
+}
+
+fn camera_code(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let [height, width] = request.image()?;
+    let (module, params) = request.build(|vs| model::CameraCode::new(vs, config.ray_width))?;
+    let code = module.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
+    with_params([("code", code)], params)
+}
+
+fn stream_round(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
+    with_params([("slots", module.forward(request.input("slots")?, request.input("memory")?))], params)
+}
+
+fn self_attention_block(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) =
+        request.build(|vs| model::SelfAttentionBlock::new(vs, config.width, config.heads))?;
+    with_params([("slots", module.forward(request.input("slots")?))], params)
+}
+
+fn mixer(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) = request.build(|vs| model::Mixer::new(vs, config.width))?;
+    let (geometry, appearance) = module.forward(request.input("geometry")?, request.input("appearance")?);
+    with_params([("geometry", geometry), ("appearance", appearance)], params)
+}
+
+fn encoder(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let ((scene_tokens, encoder), params) = request.build(|vs| {
+        let scene_tokens = model::scene_tokens(vs, &config);
+        (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
+    })?;
+    let encoded = encoder.forward(&scene_tokens, request.input("tokens")?);
+    with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
+}
+
+fn encoded(request: &Request) -> Result<Encoded> {
+    Ok(Encoded {
+        geometry: request.input("geometry")?.shallow_clone(),
+        appearance: request.input("appearance")?.shallow_clone(),
+    })
+}
+
+fn heads(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) = request.build(|vs| model::Decoder::new(vs, &config))?;
+    let heads = module.heads(&encoded(request)?);
+    let result = [
+        ("positions", heads.positions),
+        ("log_scales", heads.log_scales),
+        ("rotations", heads.rotations),
+        ("opacity_logits", heads.opacity_logits),
+        ("gate", heads.gate),
+        ("sh", heads.sh),
+    ];
+    with_params(result, params)
+}
+
+fn merge(request: &Request) -> Result<Answer> {
+    let candidates = model::Candidates {
+        positions: request.input("positions")?.shallow_clone(),
+        log_scales: request.input("log_scales")?.shallow_clone(),
+        rotations: request.input("rotations")?.shallow_clone(),
+        opacity_logits: request.input("opacity_logits")?.shallow_clone(),
+        sh: request.input("sh")?.shallow_clone(),
+    };
+    let shown = candidates.at_stage(request.input("gate")?, request.stage()?);
+    outputs([
+        ("positions", shown.positions),
+        ("log_scales", shown.log_scales),
+        ("rotations", shown.rotations),
+        ("opacity_logits", shown.opacity_logits),
+        ("sh", shown.sh),
+    ])
+}
+
+fn decoded(decoded: model::Decoded, params: Tensors) -> Result<Answer> {
+    let g = decoded.gaussians;
+    let result = [
+        ("means", g.means),
+        ("scales", g.scales),
+        ("rotations_6d", decoded.rotations_6d),
+        ("quaternions", g.quaternions),
+        ("opacities", g.opacities),
+        ("sh", g.sh),
+    ];
+    with_params(result, params)
+}
+
+fn decoder(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    let (module, params) = request.build(|vs| model::Decoder::new(vs, &config))?;
+    decoded(module.forward(&encoded(request)?, request.stage()?), params)
+}
+
+fn whole_model(request: &Request) -> Result<Answer> {
+    let config = request.model_config()?;
+    config.check()?;
+    let (module, params) =
+        request.build(|vs| GlobalSplat::new(vs, &config).expect("a checked configuration"))?;
+    let (images, c2w) = (request.input("images")?, request.input("c2w")?);
+    decoded(module.forward(images, c2w, request.input("intrinsics")?, request.stage()?), params)
+}
+
+fn scene_normalization(request: &Request) -> Result<Answer> {
+    let rows = Vec::<f64>::try_from(request.input("c2w")?.flatten(0, -1))?;
+    let poses: Vec<DMat4> =
+        rows.chunks_exact(16).map(|rows| DMat4::from_cols_slice(rows).transpose()).collect();
+    let normalization = scene::normalize(&poses)?;
+    let rows: Vec<f64> = normalization.c2w.iter().flat_map(scene::pose_to_rows).collect();
+    outputs([
+        ("c2w", Tensor::from_slice(&rows).view([-1, 4, 4])),
+        ("scale", Tensor::from_slice(&[normalization.world_from_normalized.scale])),
+    ])
+}
+
+fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {
+    let input = |name: &str| request.input(name).map(Tensor::shallow_clone);
+    let gaussians = Gaussians {
+        means: input("means")?,
+        scales: input("scales")?,
+        quaternions: input("quaternions")?,
+        opacities: input("opacities")?,
+        sh: input("sh")?,
+    };
+    let cameras = Cameras {
+        w2c: input("w2c")?,
+        intrinsics: input("intrinsics")?,
+        width: request.number("width")?,
+        height: request.number("height")?,
+    };
+    Ok((gaussians, cameras))
+}
+
+fn rasterizer(request: &Request) -> Result<Answer> {
+    let (gaussians, cameras) = gaussians_and_cameras(request)?;
+    let pictures = render::render(&gaussians, &cameras, request.number("eps2d")?)?;
+    outputs([("rgb", pictures.rgb), ("alpha", pictures.alpha), ("depth", pictures.depth)])
+}
+
+fn projection(request: &Request) -> Result<Answer> {
+    let (gaussians, cameras) = gaussians_and_cameras(request)?;
+    let seen = render::project(&gaussians, &cameras, request.number("eps2d")?)?;
+    outputs([
+        ("visible", seen.visible),
+        ("mean2d", seen.mean2d),
+        ("conic", seen.conic),
+        ("depth", seen.depth),
+        ("colour", seen.colour),
+    ])
+}
+
+fn frustum(request: &Request) -> Result<Answer> {
+    let [height, width] = request.image()?;
+    let (w2c, intrinsics) = (request.input("w2c")?, request.input("intrinsics")?);
+    let views = ViewBatch {
+        images: Tensor::zeros([1, 1, 3, height, width], (Kind::Float, request.device)),
+        c2w: w2c.inverse(),
+        w2c: w2c.shallow_clone(),
+        intrinsics: intrinsics.shallow_clone(),
+    };
+    loss_of(loss::frustum(request.input("means")?, &views, request.input("far")?))
+}
+
+fn decoder_regularization(request: &Request) -> Result<Answer> {
+    let raw = RawOutputs {
+        log_scales: request.input("log_scales")?.shallow_clone(),
+        rotations: request.input("rotations")?.shallow_clone(),
+        sh: request.input("sh")?.shallow_clone(),
+        opacity_logits: request.input("opacity_logits")?.shallow_clone(),
+    };
+    loss_of(loss::decoder_regularization(&raw, request.number("opacity")?))
+}
+
+fn consistency(request: &Request) -> Result<Answer> {
+    let alpha = [request.input("alpha_a")?, request.input("alpha_b")?];
+    let depth = [request.input("depth_a")?, request.input("depth_b")?];
+    loss_of(loss::consistency(alpha, depth, request.number("alpha_factor")?, request.number("depth_factor")?))
+}
+
+fn subsets(request: &Request) -> Result<Answer> {
+    let [a, b] = train::subsets(request.number("views")?, request.number("step")?);
+    let tensor =
+        |positions: Vec<usize>| Tensor::from_slice(&positions.iter().map(|&p| p as i64).collect::<Vec<_>>());
+    outputs([("a", tensor(a)), ("b", tensor(b))])
+}
+
+fn steps(request: &Request) -> Result<Vec<u64>> {
+    Ok(Vec::<i64>::try_from(request.input("steps")?)?.into_iter().map(|step| step as u64).collect())
+}
+
+fn learning_rate(request: &Request) -> Result<Answer> {
+    let config = TrainConfig {
+        learning_rate: request.number("peak")?,
+        steps: request.number("total")?,
+        warmup: request.number("warmup")?,
+        ..Default::default()
+    };
+    let rates: Vec<f64> = steps(request)?.iter().map(|&step| train::learning_rate(&config, step)).collect();
+    outputs([("learning_rate", Tensor::from_slice(&rates))])
+}
+
+fn stages(request: &Request) -> Result<Answer> {
+    let config = CurriculumConfig {
+        final_stage: request.number("final_stage")?,
+        boundaries: request.number("boundaries")?,
+        transition: request.number("transition")?,
+        full_capacity: request.number("full_capacity")?,
+    };
+    let stages: Vec<Stage> = steps(request)?.iter().map(|&step| train::stage_at(&config, step)).collect();
+    let index: Vec<i64> = stages.iter().map(|stage| i64::from(stage.index)).collect();
+    let mix: Vec<f64> = stages.iter().map(|stage| stage.mix).collect();
+    outputs([("index", Tensor::from_slice(&index)), ("mix", Tensor::from_slice(&mix))])
+}
+
+fn adamw(request: &Request) -> Result<Answer> {
+    let mut vs = nn::VarStore::new(request.device);
+    for (name, value) in &request.params {
+        let mut path = vs.root();
+        let mut parts: Vec<&str> = name.split('.').collect();
+        let last = parts.pop().expect("a name");
+        for part in parts {
+            path = path / part;
+        }
+        let _variable = path.var_copy(last, value);
+    }
+    vs.unfreeze();
+    let mut optimizer = train::AdamW::new(&vs, request.number("weight_decay")?);
+    let learning_rate = request.number("learning_rate")?;
+    let variables: Tensors = vs.variables().into_iter().collect();
+    let gradients = |name: &str| request.input(&format!("grad.{name}"));
+    let count = variables.keys().next().map_or(Ok(0), |name| gradients(name).map(|g| g.size()[0]))?;
+    for step in 0..count {
+        optimizer.zero_grad();
+        let mut objective = Tensor::zeros([], (Kind::Float, request.device));
+        for (name, variable) in &variables {
+            objective = &objective + (variable * gradients(name)?.get(step)).sum(Kind::Float);
+        }
+        objective.backward();
+        optimizer.step(learning_rate);
+    }
+    let outputs = variables.into_iter().map(|(name, value)| (name, value.detach())).collect();
+    Ok(Answer { outputs, params: Tensors::new() })
+}
