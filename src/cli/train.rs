@@ -52,7 +52,6 @@ impl Train {
             "never" => Resume::Never,
             path => Resume::From(path.into()),
         };
-        check_writable_dir(&self.out)?;
         let mut captures = vec![];
         for path in config.data.capture_paths()? {
             captures.extend(find_captures(&path)?);
@@ -66,6 +65,7 @@ impl Train {
             )
             .into());
         }
+        check_writable_dir(&self.out)?;
         let mut trainer = Trainer::new(&config, &captures, device)?;
 
         let start = Instant::now();
