@@ -39,9 +39,18 @@ struct Arguments {
 // Tensors come as the addresses of at::Tensor (tch's C_tensor).
 inline const Tensor& borrowed(size_t address) { return *reinterpret_cast<const Tensor*>(address); }
 
-// Leaves new tensors to the caller.
-inline void give(const tensor_list& tensors, const torch::Device& device, rust::Slice<size_t> out) {
-  for (size_t k = 0; k < out.size(); ++k) out[k] = reinterpret_cast<size_t>(new Tensor(tensors[k].to(device)));
+// Checks the arguments, runs the autograd function of their scalar type, and leaves its results, on the device of the
+// means, to the caller. Function<T>::apply takes (means, …, intrinsics, width, height, eps2d).
+template <template <class> class Function>
+void run(const Arguments& a, rust::Slice<size_t> out) {
+  a.check();
+  const tensor_list t = a.on_host();
+  const auto apply = [&](auto function) {
+    return decltype(function)::apply(t[0], t[1], t[2], t[3], t[4], t[5], t[6], a.width, a.height, a.eps2d);
+  };
+  const tensor_list results = a.is_double() ? apply(Function<double>{}) : apply(Function<float>{});
+  for (size_t k = 0; k < out.size(); ++k)
+    out[k] = reinterpret_cast<size_t>(new Tensor(results[k].to(a.means.device())));
 }
 
 // The rasterizer's view of the Gaussian tensors `t` (means, scales, quaternions, opacities, sh), one item per scene.

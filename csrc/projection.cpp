@@ -106,14 +106,9 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction<T>> {
 
 void project(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
              size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out) {
-  const Arguments a{borrowed(means), borrowed(scales), borrowed(quaternions), borrowed(opacities), borrowed(sh),
-                    borrowed(w2c),   borrowed(intrinsics), width, height, eps2d};
-  a.check();
-  const tensor_list t = a.on_host();
-  const auto apply = [&](auto function) {
-    return decltype(function)::apply(t[0], t[1], t[2], t[3], t[4], t[5], t[6], a.width, a.height, a.eps2d);
-  };
-  give(a.is_double() ? apply(ProjectFunction<double>{}) : apply(ProjectFunction<float>{}), a.means.device(), out);
+  run<ProjectFunction>({borrowed(means), borrowed(scales), borrowed(quaternions), borrowed(opacities), borrowed(sh),
+       borrowed(w2c), borrowed(intrinsics), width, height, eps2d},
+      out);
 }
 
 }  // namespace globalsplat
