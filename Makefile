@@ -24,10 +24,12 @@ test: venv
 	$(CARGO) fmt --check
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
 	$(CARGO) test --release --locked
-	.venv/bin/python -m pytest -q parity
+	@$(MAKE) --no-print-directory parity
 
-parity: venv
+# Every module, loss and kernel against plain torch, and whether wrong answers would be noticed.
+parity: venv build
 	.venv/bin/python -m pytest -q parity
+	.venv/bin/python parity/run.py --self-test
 
 docker:
 	docker build -f docker/cpu.Dockerfile -t globalsplat:cpu .

@@ -11,9 +11,9 @@ TRANSITION_STEPS = 2_000
 LEARNABLE_TOKENS = ("scene_tokens", "scale_emb", "aux_query_tokens", "slot_regs", "mem_regs")
 
 
-def learning_rate(step, total_steps, peak):
+def learning_rate(step, total_steps, peak, warmup_fraction=WARMUP_FRACTION):
     """Rate of update `step`, from 0: linear from 1e-3 peak to peak, then half a cosine to max(peak / 50, 1e-6)."""
-    warmup = WARMUP_FRACTION * total_steps
+    warmup = warmup_fraction * total_steps
     if step < warmup:
         return peak * (WARMUP_START + (1.0 - WARMUP_START) * step / warmup)
     floor = max(peak / 50.0, 1e-6)

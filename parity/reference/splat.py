@@ -91,7 +91,8 @@ def sh_colour(means, sh, w2c):
     """means [N, 3], sh [N, C, 3], w2c [4, 4] -> [N, 3]: max(0, 0.5 + sum of basis(direction) sh)."""
     centre = -w2c[:3, :3].T @ w2c[:3, 3]
     direction = means - centre
-    direction = direction / direction.norm(dim=-1, keepdim=True)
+    # In the camera's very centre nothing is drawn, but a gradient that is not chosen must still be finite.
+    direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-30)
     colour = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
     return torch.where(colour > 0, colour, 0.0)
 

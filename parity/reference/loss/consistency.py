@@ -10,9 +10,11 @@ def symmetric_l1(x, y):
     return 0.5 * (x - y.detach()).abs() + 0.5 * (y - x.detach()).abs()
 
 
-def consistency(opacity_a, opacity_b, depth_a, depth_b):
+def consistency(
+    opacity_a, opacity_b, depth_a, depth_b, opacity_weight=OPACITY_WEIGHT, depth_weight=DEPTH_WEIGHT
+):
     """All four [...] of one shape -> 1e-3 L1(A_a, A_b) + 1e-2 L1(D_a, D_b)."""
     opacity = symmetric_l1(opacity_a, opacity_b).mean()
     supported = ((opacity_a > SUPPORT) & (opacity_b > SUPPORT)).to(depth_a.dtype)
     depth = (supported * symmetric_l1(depth_a, depth_b)).sum() / supported.sum().clamp(min=1.0)
-    return OPACITY_WEIGHT * opacity + DEPTH_WEIGHT * depth
+    return opacity_weight * opacity + depth_weight * depth

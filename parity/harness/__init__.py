@@ -1,0 +1,1 @@
+"""Holds the Rust program against the torch reference: the same numbers in, the same numbers and gradients out."""

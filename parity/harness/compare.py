@@ -1,0 +1,116 @@
+"""Judges an answer, tensor by tensor."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# A gradient whose norm is this share of the largest one in the case, or that is zero in exact arithmetic because
+# softmax ignores a constant, is rounding alone: there is no direction to compare. It has to be small in that measure.
+NOTHING = 1e-12
+ZERO_IN_EXACT_ARITHMETIC = ("mem_k.bias",)
+ZERO_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Relative L2 errors; `pictures` is a largest absolute difference (of the largest value, where that is below 1),
+    and then holds for outputs instead. `why` says what needs more than FLOAT32 or FLOAT64."""
+
+    outputs: float
+    gradients: float
+    pictures: float | None = None
+    why: str = ""
+
+
+FLOAT32 = Tolerance(1e-5, 1e-4)
+FLOAT64 = Tolerance(1e-9, 1e-7)
+
+
+@dataclass
+class Finding:
+    """How far one tensor of an answer is from the reference's."""
+
+    tensor: str
+    shape: tuple
+    measure: str  # "relative", "absolute", "zero" or "exact"
+    tolerance: float
+    error: float = np.inf  # in that measure
+    largest: float = np.inf  # absolute difference
+    relative: float | None = None  # L2
+    problem: str = ""
+
+    @property
+    def passed(self):
+        return not self.problem and self.error <= self.tolerance
+
+    @property
+    def share(self):
+        """Of the tolerance that is used up."""
+        if self.problem or self.tolerance == 0.0:
+            return 0.0 if self.passed else np.inf
+        return self.error / self.tolerance
+
+
+def norm(array):
+    return float(np.linalg.norm(np.asarray(array, dtype=np.float64)))
+
+
+def gradient_scale(expected):
+    """The largest norm among the gradients: what "zero" is measured by."""
+    return max((norm(value) for name, value in expected.items() if name.startswith("grad.")), default=0.0)
+
+
+def judge(name, ours, expected, tolerance, scale, doubtful=None):
+    """`expected` is the reference's; `doubtful` [B, C, H, W] the pixels where pictures can't be compared."""
+    is_gradient = name.startswith("grad.")
+    allowed = tolerance.gradients if is_gradient else tolerance.outputs
+    finding = Finding(name, expected.shape, "relative", allowed)
+    if ours is None:
+        finding.problem = "missing"
+    elif ours.shape != expected.shape:
+        finding.problem = f"has shape {ours.shape}, expected {expected.shape}"
+    elif not np.isfinite(ours).all():
+        finding.problem = f"{int((~np.isfinite(ours)).sum())} numbers are not finite"
+    if finding.problem:
+        return finding
+
+    if expected.dtype.kind == "i":
+        finding.measure, finding.tolerance = "exact", 0.0
+    ours, expected = np.asarray(ours, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    difference = ours - expected
+    if doubtful is not None and not is_gradient:
+        # [B, C, H, W] against [B, C, 3, H, W] or itself
+        sure = ~doubtful[:, :, None] if difference.ndim == 5 else ~doubtful
+        difference, expected = difference * sure, expected * sure
+    length = norm(expected)
+    finding.largest = float(np.abs(difference).max(initial=0.0))
+    if length > 0.0:
+        finding.relative = norm(difference) / length
+
+    if finding.measure == "exact":
+        finding.error = finding.largest
+    elif is_gradient and (length <= NOTHING * scale or name.endswith(ZERO_IN_EXACT_ARITHMETIC)):
+        finding.measure, finding.tolerance, finding.relative = "zero", ZERO_TOLERANCE, None
+        finding.error = norm(ours) / (scale or 1.0)
+    elif tolerance.pictures is not None and not is_gradient:
+        finding.measure, finding.tolerance = "absolute", tolerance.pictures
+        peak = float(np.abs(expected).max(initial=0.0))
+        finding.error = finding.largest / min(1.0, peak or 1.0)
+    elif length == 0.0:
+        finding.measure, finding.error = "absolute", finding.largest
+    else:
+        finding.error = finding.relative
+    return finding
+
+
+def compare(answer, expected, tolerance, doubtful=None):
+    """-> findings, the failures among them included. An answer with tensors that nobody asked for fails, too."""
+    if "error" in answer:
+        return [Finding("answer", (), "exact", 0.0, problem=answer["error"])]
+    scale = gradient_scale(expected)
+    findings = [
+        judge(name, answer.get(name), value, tolerance, scale, doubtful) for name, value in expected.items()
+    ]
+    strangers = sorted(answer.keys() - expected.keys())
+    findings += [Finding(name, answer[name].shape, "exact", 0.0, problem="nobody asked for it") for name in strangers]
+    return findings

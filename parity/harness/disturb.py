@@ -1,0 +1,71 @@
+"""Wrong answers made of right ones: each has to be judged a failure, or the comparison is blind to such a mistake."""
+
+import numpy as np
+
+from .compare import gradient_scale, judge, norm
+
+FACTOR = 1.001
+# The slice that is dropped is the least one with at least this share of the tensor's norm.
+SMALLEST_SHARE = 1e-2
+# Where the tolerance itself is wide, mistakes are this many times it.
+BEYOND = 2.0
+
+
+def disturbances(array, tolerance, is_zero, scale):
+    """Yields (what was done, the tensor after it). A tensor that should be zero is measured by `scale`."""
+    yield "left out", None
+    if array.size == 0:
+        return
+    if array.dtype.kind == "i":
+        yield "one more", array + 1
+        return
+    yield "not a number", np.full_like(array, np.nan)
+    if is_zero:
+        yield "not zero", array + array.dtype.type(1e-3 * (scale or 1.0))
+        return
+    factor = max(FACTOR, 1.0 + BEYOND * tolerance)
+    yield f"times {factor:g}", array * array.dtype.type(factor)
+    share = max(SMALLEST_SHARE, BEYOND * tolerance)
+    yield from without_a_slice(array, share)
+    yield from transposed(array, share)
+
+
+def without_a_slice(array, share):
+    """A term dropped, along each axis in turn."""
+    for axis in range(array.ndim):
+        if array.shape[axis] == 1:
+            continue
+        others = tuple(k for k in range(array.ndim) if k != axis)
+        shares = np.sqrt(np.sum(np.square(array, dtype=np.float64), axis=others)) / norm(array)
+        shares[shares < share] = np.inf
+        if np.isfinite(shares).any():
+            dropped = array.copy()
+            np.moveaxis(dropped, axis, 0)[shares.argmin()] = 0.0
+            yield f"slice {shares.argmin()} of axis {axis} dropped", dropped
+
+
+def transposed(array, share):
+    """Two axes of one length swapped, the last such pair."""
+    for second in reversed(range(array.ndim)):
+        for first in reversed(range(second)):
+            if array.shape[first] == array.shape[second] > 1:
+                swapped = array.swapaxes(first, second)
+                if norm(swapped - array) > share * norm(array):
+                    yield f"axes {first} and {second} swapped", swapped
+                return
+
+
+def undetected(answer, expected, tolerance, doubtful=None):
+    """`answer` passes. -> (number of disturbed answers, those that pass all the same as "tensor: what was done").
+
+    One tensor is disturbed at a time, so it alone decides.
+    """
+    scale, tried, blind = gradient_scale(expected), 0, []
+    for name, value in expected.items():
+        finding = judge(name, answer[name], value, tolerance, scale, doubtful)
+        is_zero = finding.measure == "zero" or norm(value) == 0.0
+        for what, wrong in disturbances(answer[name], finding.tolerance, is_zero, scale):
+            tried += 1
+            if judge(name, wrong, value, tolerance, scale, doubtful).passed:
+                blind.append(f"{name}: {what}")
+    return tried, blind

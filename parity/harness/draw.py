@@ -1,0 +1,197 @@
+"""Random numbers with the sizes and magnitudes of the model."""
+
+import numpy as np
+import torch
+from reference.normalize import invert_rigid
+from reference.rotation import matrix_from_quaternion
+
+AUXILIARIES = 4
+MAIN_16K = {
+    "patch_size": 8,
+    "latents": 2048,
+    "width": 512,
+    "rgb_width": 512,
+    "ray_width": 256,
+    "rounds": 4,
+    "self_attention_blocks": 2,
+    "heads": 8,
+    "candidates": 16,
+    "sh_degree": 3,
+    "streams": "dual",
+    "camera_code": True,
+}
+
+
+def whole(rng, low, high):
+    """A whole number from low to high, both possible."""
+    return int(rng.integers(low, high + 1))
+
+
+def normal(rng, *shape, scale=1.0, mean=0.0):
+    return (mean + scale * rng.standard_normal(shape)).astype(np.float32)
+
+
+def uniform(rng, low, high, *shape):
+    return rng.uniform(low, high, shape).astype(np.float32)
+
+
+def model_config(rng, **fixed):
+    """A small model, all of its numbers different from each other where they can be."""
+    heads = whole(rng, 1, 4)
+    config = {
+        "patch_size": whole(rng, 2, 5),
+        "latents": whole(rng, 3, 11),
+        "width": heads * whole(rng, 4, 8),
+        "rgb_width": whole(rng, 6, 20),
+        "ray_width": whole(rng, 6, 20),
+        "rounds": whole(rng, 1, 3),
+        "self_attention_blocks": whole(rng, 1, 2),
+        "heads": heads,
+        "candidates": 2 ** whole(rng, 1, 4),
+        "sh_degree": whole(rng, 0, 3),
+        "streams": "dual",
+        "camera_code": True,
+    }
+    return config | fixed
+
+
+# ---- parameters ------------------------------------------------------------------------------------------------------
+
+
+def shapes(config):
+    """Name -> shape of everything that a model trains."""
+    d, token = config["width"], config["ray_width"] + config["rgb_width"]
+    k, bases, pixels = config["candidates"], (config["sh_degree"] + 1) ** 2, config["patch_size"] ** 2
+    found = {}
+
+    def linear(name, outputs, inputs, bias=True):
+        found[f"{name}.weight"] = (outputs, inputs)
+        if bias:
+            found[f"{name}.bias"] = (outputs,)
+
+    def norm(name, width):
+        found[f"{name}.weight"] = found[f"{name}.bias"] = (width,)
+
+    def scale(name):
+        found[f"{name}.gamma"] = (d,)
+
+    found["scene_tokens"] = (config["latents"], d)
+    linear("rgb_patch_embeds.1", config["rgb_width"], 3 * pixels, bias=False)
+    linear("ray_patch_embeds.1", config["ray_width"], 6 * pixels, bias=False)
+    if config["camera_code"]:
+        linear("view_pe.k_mlp.0", 64, 4)
+        linear("view_pe.k_mlp.2", 64, 64)
+        linear("view_pe.proj", config["ray_width"], 64 + 27)
+
+    found["slot_encoder.scale_emb"] = (1, 1, d)
+    found["slot_encoder.aux_query_tokens"] = found["slot_encoder.slot_regs"] = (1, AUXILIARIES, d)
+    found["slot_encoder.mem_regs"] = (1, 4, token)
+    dual = config["streams"] == "dual"
+    for stream in ("geo", "tex") if dual else ("geo",):
+        norm(f"slot_encoder.slot_to_{stream}.0", d)
+        linear(f"slot_encoder.slot_to_{stream}.1", d, d)
+        for i in range(config["rounds"]):
+            name = f"slot_encoder.{stream}_rounds.{i}"
+            norm(f"{name}.slots_ln", d)
+            norm(f"{name}.mem_ln", token)
+            norm(f"{name}.post_ln", d)
+            linear(f"{name}.lat_q", d, d)
+            linear(f"{name}.mem_k", d, token)
+            linear(f"{name}.mem_v", d, token)
+            linear(f"{name}.out_proj", d, d)
+            scale(f"{name}.attn_ls")
+            linear(f"{name}.mlp.0", 4 * d, d)
+            linear(f"{name}.mlp.2", d, 4 * d)
+            scale(f"{name}.mlp_ls")
+            for j in range(config["self_attention_blocks"]):
+                block = f"{name}.tower.{j}"
+                norm(f"{block}.norm1", d)
+                linear(f"{block}.attn.qkv", 3 * d, d)
+                linear(f"{block}.attn.proj", d, d)
+                scale(f"{block}.ls1")
+                norm(f"{block}.norm2", d)
+                linear(f"{block}.mlp.fc1", 4 * d, d)
+                linear(f"{block}.mlp.fc2", d, 4 * d)
+                scale(f"{block}.ls2")
+    for i in range(config["rounds"]) if dual else ():
+        name = f"slot_encoder.pair_adapters.{i}"
+        norm(f"{name}.ln_g", d)
+        norm(f"{name}.ln_t", d)
+        linear(f"{name}.mlp.0", d, 2 * d)
+        linear(f"{name}.mlp.2", 2 * d, d)
+        scale(f"{name}.ls_g")
+        scale(f"{name}.ls_t")
+
+    linear("gaussian_decoder.geo_pos_readout", 3 * k, d)
+    linear("gaussian_decoder.geo_param_readout", 10 * k, d)
+    linear("gaussian_decoder.gate_readout", k, d)
+    linear("gaussian_decoder.sh_readout", 3 * bases * k, d)
+    return found
+
+
+def parameters(rng, config, prefix=""):
+    """Those whose name begins with `prefix`, without it.
+
+    Weights have 0.45 / sqrt(inputs), at 512 inputs the 0.02 that training starts from; LayerScales 0.1 to 1, far above
+    their start, so that every path matters; nothing is exactly 0 or 1. The decoder's biases put some of the candidates
+    beyond each clamp.
+    """
+    drawn = {}
+    for name, shape in shapes(config).items():
+        if not name.startswith(prefix):
+            continue
+        if name.endswith(".gamma"):
+            value = uniform(rng, 0.1, 1.0, *shape)
+        elif name.endswith(".weight") and len(shape) == 1:
+            value = normal(rng, *shape, scale=0.2, mean=1.0)
+        elif name.endswith(".weight"):
+            value = normal(rng, *shape, scale=0.45 / shape[1] ** 0.5)
+        elif name == "gaussian_decoder.geo_param_readout.bias":
+            value = np.concatenate(
+                [
+                    normal(rng, config["candidates"], 3, scale=3.0, mean=-2.0),
+                    normal(rng, config["candidates"], 6, scale=0.5),
+                    normal(rng, config["candidates"], 1, scale=4.0, mean=4.0),
+                ],
+                axis=1,
+            ).flatten()
+        else:  # biases and learnable tokens
+            value = normal(rng, *shape, scale=0.3)
+        drawn[name.removeprefix(prefix)] = value
+    return drawn
+
+
+# ---- cameras ---------------------------------------------------------------------------------------------------------
+
+
+def poses(rng, *batch, turn=0.15, move=0.4):
+    """Camera-to-world [*batch, 4, 4], float64: near the origin, looking roughly along z."""
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + turn * rng.standard_normal((*batch, 4))
+    pose = np.zeros((*batch, 4, 4))
+    pose[..., :3, :3] = matrix_from_quaternion(torch.tensor(quaternion)).numpy()
+    pose[..., :3, 3] = move * rng.standard_normal((*batch, 3))
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def inverse(pose):
+    return invert_rigid(torch.tensor(pose)).numpy()
+
+
+def intrinsics(rng, *batch, height, width):
+    """[*batch, 3, 3] in pixels, float64."""
+    k = np.zeros((*batch, 3, 3))
+    k[..., 0, 0] = width * rng.uniform(0.7, 1.3, batch)
+    k[..., 1, 1] = height * rng.uniform(0.7, 1.3, batch)
+    k[..., 0, 2] = width * rng.uniform(0.4, 0.6, batch)
+    k[..., 1, 2] = height * rng.uniform(0.4, 0.6, batch)
+    k[..., 2, 2] = 1.0
+    return k
+
+
+def views(rng, batch, count, height, width):
+    """c2w and intrinsics of B x V cameras, float32."""
+    return {
+        "c2w": poses(rng, batch, count).astype(np.float32),
+        "intrinsics": intrinsics(rng, batch, count, height=height, width=width).astype(np.float32),
+    }

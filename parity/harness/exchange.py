@@ -1,0 +1,103 @@
+"""What goes to the program and comes back: folders of npz files.
+
+A request holds `case` (JSON: the module, its config, the inputs to differentiate), param.X, in.X, and cot.Y for every
+output Y that has a gradient. An answer holds out.Y, and with cotangents grad.param.X and grad.in.X, the gradients of
+sum over Y of sum(cot.Y out.Y); or `error`, a text.
+"""
+
+import json
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass
+class Request:
+    """A question to the program. `module` is the name that both sides know."""
+
+    module: str
+    config: dict
+    params: dict = field(default_factory=dict)
+    inputs: dict = field(default_factory=dict)
+    cotangents: dict = field(default_factory=dict)
+    differentiate: tuple = ()
+
+
+class ProgramError(Exception):
+    """The program did not answer."""
+
+
+def text(words):
+    return np.frombuffer(words.encode(), dtype=np.uint8)
+
+
+def write_request(path, request):
+    case = {"case": request.module, "config": request.config, "differentiate": list(request.differentiate)}
+    arrays = {"case": text(json.dumps(case))}
+    groups = (("param", request.params), ("in", request.inputs), ("cot", request.cotangents))
+    for prefix, group in groups:
+        arrays |= {f"{prefix}.{name}": np.ascontiguousarray(value) for name, value in group.items()}
+    np.savez(path, **arrays)
+
+
+def read_request(path):
+    with np.load(path) as file:
+        arrays = dict(file)
+    case = json.loads(bytes(arrays.pop("case")))
+    request = Request(case["case"], case["config"], differentiate=tuple(case["differentiate"]))
+    groups = {"param": request.params, "in": request.inputs, "cot": request.cotangents}
+    for key, value in arrays.items():
+        prefix, name = key.split(".", 1)
+        groups[prefix][name] = value
+    return request
+
+
+def write_answer(path, arrays):
+    np.savez(path, **arrays)
+
+
+def read_answer(path):
+    """Name -> array. An answer that is an error, or isn't there, has `error` alone."""
+    if not path.exists():
+        return {"error": "no answer"}
+    with np.load(path) as file:
+        arrays = dict(file)
+    if "error" in arrays:
+        return {"error": bytes(arrays["error"]).decode(errors="replace")}
+    return arrays
+
+
+def program(binary, device="cpu"):
+    """An answerer: (folder of requests, folder for answers, called with the number of answers now and then)."""
+
+    def answer(requests, answers, on_progress):
+        command = [binary, "parity", "--requests", requests, "--responses", answers, "--device", device]
+        with tempfile.TemporaryFile() as messages:
+            process = subprocess.Popen([str(word) for word in command], stdout=messages, stderr=messages)
+            while process.poll() is None:
+                on_progress(sum(1 for _ in answers.iterdir()))
+                time.sleep(0.1)
+            if process.returncode != 0:
+                messages.seek(0)
+                said = messages.read().decode(errors="replace").strip()
+                raise ProgramError(f"{binary} parity ended with {process.returncode}: {said[-2000:]}")
+
+    return answer
+
+
+def ask(requests, answerer, on_progress=lambda done: None):
+    """Yields the answers to `requests`, in their order, after all of them are there."""
+    with tempfile.TemporaryDirectory(prefix="globalsplat-parity-") as folder:
+        asked, answered = Path(folder, "requests"), Path(folder, "answers")
+        asked.mkdir()
+        answered.mkdir()
+        names = [f"{number:04}_{request.module}.npz" for number, request in enumerate(requests)]
+        for name, request in zip(names, requests):
+            write_request(asked / name, request)
+        answerer(asked, answered, on_progress)
+        for name in names:
+            yield read_answer(answered / name)

@@ -1,0 +1,106 @@
+"""Draws cases, has both sides compute them, and compares."""
+
+import time
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from .cases import CASES, Draw
+from .compare import Tolerance, compare
+from .disturb import undetected
+from .evaluate import Evaluation
+from .exchange import Request, ask
+
+THREADS = 2  # for large cases; handing out small ones to threads costs more than it gains
+
+
+@dataclass
+class Result:
+    """One draw of one case, judged."""
+
+    case: str
+    label: str
+    seed: int
+    tolerance: Tolerance
+    findings: list
+    doubtful: int  # pixels left out
+    seconds: float  # of the reference
+    tried: int = 0  # disturbed answers
+    blind: list = field(default_factory=list)  # those that pass
+
+    @property
+    def passed(self):
+        return all(finding.passed for finding in self.findings)
+
+
+@dataclass
+class Question:
+    """A draw with its request and the reference's answer."""
+
+    case: str
+    drawn: Draw
+    request: Request
+    expected: dict
+    seconds: float
+
+
+def generator(seed, case):
+    """A case draws the same numbers whether or not others are drawn, too."""
+    return np.random.default_rng([seed, zlib.crc32(case.encode())])
+
+
+def questions(names, seed):
+    """Draws the named cases and computes the reference's answers."""
+    for name in names:
+        rng = generator(seed, name)
+        for drawn in CASES[name](rng):
+            started = time.perf_counter()
+            request = Request(
+                drawn.module or name, drawn.config, drawn.params, drawn.inputs, differentiate=drawn.differentiate
+            )
+            torch.set_num_threads(THREADS if drawn.large else 1)
+            evaluation = Evaluation(request, torch.float32 if drawn.large else torch.float64)
+            expected = evaluation.output_arrays()
+            if drawn.gradients:
+                request.cotangents = cotangents(rng, request, expected, drawn.doubtful)
+                expected |= evaluation.gradient_arrays(request.cotangents)
+            yield Question(name, drawn, request, expected, time.perf_counter() - started)
+
+
+def cotangents(rng, request, outputs, doubtful):
+    """Standard normal, for every output that is differentiable; none for pixels that can't be compared."""
+    double = any(value.dtype == np.float64 for value in request.inputs.values())
+    drawn = {}
+    for name, value in outputs.items():
+        if value.dtype.kind == "i":
+            continue
+        cotangent = rng.standard_normal(value.shape)
+        if doubtful is not None:
+            cotangent *= ~doubtful[:, :, None] if value.ndim == 5 else ~doubtful
+        drawn[name.removeprefix("out.")] = cotangent.astype(np.float64 if double else np.float32)
+    return drawn
+
+
+def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None):
+    """Yields a Result for every draw of the named cases."""
+    asked = []
+    for question in questions(names, seed):
+        asked.append(question)
+        on_progress(f"reference, {len(asked)} draws: {question.case}, {question.drawn.label}")
+
+    def on_answers(done):
+        at = asked[min(done, len(asked) - 1)]
+        on_progress(f"program, {done} of {len(asked)} draws: {at.case}, {at.drawn.label}")
+
+    answers = ask([question.request for question in asked], answerer, on_answers)
+    for done, (question, answer) in enumerate(zip(asked, answers), start=1):
+        drawn = question.drawn
+        on_progress(f"comparison, {done} of {len(asked)} draws: {question.case}, {drawn.label}")
+        findings = compare(answer, question.expected, drawn.tolerance, drawn.doubtful)
+        doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
+        result = Result(question.case, drawn.label, seed, drawn.tolerance, findings, doubtful, question.seconds)
+        if self_test and result.passed:
+            result.tried, result.blind = undetected(answer, question.expected, drawn.tolerance, drawn.doubtful)
+        yield result

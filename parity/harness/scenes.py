@@ -1,0 +1,155 @@
+"""Gaussians and cameras for the rasterizer, in float64: random ones, and those that break rasterizers.
+
+RANDOM, ADVERSARIAL and THIN: label -> ((height, width), function of a random generator and that size).
+"""
+
+from functools import partial
+
+import numpy as np
+
+from . import draw
+
+EPS_2D = 0.05
+
+
+def settings(size):
+    return {"height": size[0], "width": size[1], "eps2d": EPS_2D}
+
+
+def scattered(rng, size, batch, cameras, count, bases):
+    """Gaussians from under a pixel to a third of the image, some outside of it, at all opacities."""
+    height, width = size
+    depth = rng.uniform(1.0, 5.0, (batch, count, 1))
+    pixels = np.exp(rng.uniform(np.log(0.3), np.log(0.3 * max(size) + 1.0), (batch, count, 3)))
+    return {
+        "means": np.concatenate([rng.uniform(-0.8, 0.8, (batch, count, 2)) * depth, depth], axis=-1),
+        "scales": pixels * depth / max(size),
+        "quaternions": rng.uniform(0.2, 3.0) * rng.standard_normal((batch, count, 4)),
+        "opacities": rng.uniform(0.0, 1.0, (batch, count)),
+        "sh": 0.3 * rng.standard_normal((batch, count, bases, 3)),
+        "w2c": draw.inverse(draw.poses(rng, batch, cameras, turn=0.08, move=0.2)),
+        "intrinsics": draw.intrinsics(rng, batch, cameras, height=height, width=width),
+    }
+
+
+def random_scene(size, batch, cameras, count, bases):
+    label = f"{batch}×{cameras} views of {size[0]}×{size[1]}, {count} Gaussians, {bases} bases"
+    return label, (size, partial(scattered, batch=batch, cameras=cameras, count=count, bases=bases))
+
+
+RANDOM = dict(
+    [
+        random_scene((24, 40), batch=2, cameras=2, count=50, bases=16),
+        random_scene((31, 19), batch=1, cameras=3, count=30, bases=9),
+        random_scene((16, 16), batch=3, cameras=1, count=20, bases=4),
+        random_scene((9, 50), batch=1, cameras=1, count=40, bases=1),
+    ]
+)
+ADVERSARIAL = {
+    "1×1": ((1, 1), partial(scattered, batch=2, cameras=2, count=12, bases=4)),
+    "3×17": ((3, 17), partial(scattered, batch=1, cameras=2, count=20, bases=16)),
+}
+# Gaussians hundreds of times longer than wide: float32 has few digits left for them.
+THIN = {
+    "255×257": ((255, 257), partial(scattered, batch=1, cameras=1, count=24, bases=16)),
+}
+
+
+def scene(label, family=ADVERSARIAL, size=(33, 48)):
+    def register(function):
+        family[f"{label}, {size[0]}×{size[1]}"] = (size, function)
+        return function
+
+    return register
+
+
+def before(rng, size, means, scales, opacities, cameras=1):
+    """Given Gaussians before cameras with w2c = I, a second one 1/4 to the left and 1/2 ahead: depths are exact, in
+    float32 too. Focal length 32, principal point in the middle."""
+    height, width = size
+    means = np.asarray(means, dtype=np.float64)
+    count = len(means)
+    w2c = np.tile(np.eye(4), (1, cameras, 1, 1))
+    w2c[:, 1:, :3, 3] = (0.25, 0.0, -0.5)
+    k = np.array([[32.0, 0.0, width / 2], [0.0, 32.0, height / 2], [0.0, 0.0, 1.0]])
+    return {
+        "means": means[None],
+        "scales": np.broadcast_to(np.asarray(scales, dtype=np.float64), (1, count, 3)).copy(),
+        "quaternions": rng.standard_normal((1, count, 4)),
+        "opacities": np.broadcast_to(np.asarray(opacities, dtype=np.float64), (1, count)).copy(),
+        "sh": 0.3 * rng.standard_normal((1, count, 9, 3)),
+        "w2c": w2c,
+        "intrinsics": np.tile(k, (1, cameras, 1, 1)),
+    }
+
+
+def around(rng, depth, spread=0.6):
+    """Means at the given depths, within the view of `before` and a little beyond."""
+    depth = np.asarray(depth, dtype=np.float64)[:, None]
+    return np.concatenate([spread * rng.uniform(-1.0, 1.0, (len(depth), 2)) * depth, depth], axis=-1)
+
+
+@scene("near plane")
+def near_plane(rng, size):
+    """Three Gaussians at each depth, some of them in the camera's very centre."""
+    just_above = np.nextafter(np.float32(0.01), np.float32(1))
+    depth = np.repeat([-3.0, -0.01, 0.0, 1e-9, 0.0099, 0.01, just_above, 0.0101, 0.02, 0.1], 3)
+    scales = rng.uniform(0.05, 0.4, (len(depth), 3)) * np.maximum(np.abs(depth), 1e-3)[:, None]
+    return before(rng, size, around(rng, depth), scales, 0.4)
+
+
+@scene("far outside")
+def far_outside(rng, size):
+    tangent = rng.uniform(-1.0, 1.0, (24, 2)) * np.repeat([2.0, 10.0, 1000.0], 8)[:, None]
+    depth = rng.uniform(1.0, 3.0, (24, 1))
+    scales = depth * np.abs(tangent).max(-1, keepdims=True) * rng.uniform(0.1, 1.0, (24, 3))
+    return before(rng, size, np.concatenate([tangent * depth, depth], axis=-1), scales, 0.5, cameras=2)
+
+
+@scene("needles and discs", THIN)
+def needles(rng, size):
+    kinds = [[1e-7, 1e-7, 1.0], [1.0, 1e-7, 1.0], [1e-3, 1e-4, 0.5], [1e-12, 1e-12, 1e-12]]
+    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), np.tile(kinds, (6, 1)), 0.5)
+
+
+@scene("huge")
+def huge(rng, size):
+    scales = 10.0 ** rng.uniform(1.0, 3.0, (8, 1)) * rng.uniform(0.5, 1.5, (8, 3))
+    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 8)), scales, 0.3)
+
+
+@scene("opacity 0 to 1")
+def opacities(rng, size):
+    opacity = np.tile([0.0, 1e-12, 0.0039, 0.0040, 0.5, 1.0], 4)  # 1/255 is 0.00392
+    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), rng.uniform(0.02, 0.3, (24, 3)), opacity)
+
+
+@scene("equal depths")
+def equal_depths(rng, size):
+    means = around(rng, np.full(30, 2.0))
+    means[20:] = means[:10]
+    return before(rng, size, means, rng.uniform(0.05, 0.4, (30, 3)), rng.uniform(0.1, 0.9, 30), cameras=2)
+
+
+@scene("tile borders")
+def tile_borders(rng, size):
+    """Centres at multiples of 16 pixels and on the borders of the image: (u, v) = 16 (x, y) + (24, 16.5) at depth 2."""
+    u, v = np.meshgrid([0.0, 16.0, 32.0, 48.0], [0.0, 16.0, 16.5, 32.0, 33.0])
+    means = np.stack([(u.ravel() - 24.0) / 16.0, (v.ravel() - 16.5) / 16.0, np.full(u.size, 2.0)], axis=-1)
+    scales = np.tile([[0.001], [0.0625], [1.0], [0.5]], (5, 1))
+    return before(rng, size, means, scales[rng.permutation(20)], rng.uniform(0.1, 0.9, 20))
+
+
+@scene("opaque stack")
+def opaque_stack(rng, size):
+    return before(rng, size, around(rng, np.linspace(1.0, 4.0, 60), spread=0.2), 1.0, rng.uniform(0.3, 1.0, 60))
+
+
+@scene("all behind")
+def all_behind(rng, size):
+    return before(rng, size, around(rng, np.full(5, -2.0)), 0.3, 0.9)
+
+
+@scene("no Gaussian")
+def no_gaussian(rng, size):
+    return before(rng, size, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))

@@ -1,0 +1,85 @@
+"""Holds the Rust program against the torch reference, module by module, outputs and gradients, on random numbers.
+
+    python parity/run.py                         everything, about a minute
+    python parity/run.py --only 'rasterizer*'    the cases of that name
+    python parity/run.py --self-test             are wrong answers noticed?
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from harness.cases import CASES
+from harness.exchange import ProgramError, program
+from harness.hold import hold
+from harness.table import as_json, self_test_report, table
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+WRONG_REQUEST = 2
+
+
+def arguments(argv):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", metavar="PATTERN", default="*", help="cases of that name; * and ? as in a shell")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the random numbers (default: 0)")
+    parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
+    parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
+    parser.add_argument("--self-test", action="store_true", help="disturb right answers and expect each to be noticed")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write every number to FILE")
+    parser.add_argument(
+        "--binary",
+        metavar="PATH",
+        type=Path,
+        default=REPOSITORY / "target" / "release" / "globalsplat",
+        help="the program (default: target/release/globalsplat)",
+    )
+    return parser.parse_args(argv)
+
+
+def progress(text):
+    """One line on a terminal, written over."""
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r\x1b[2K{text[:width]}", end="", file=sys.stderr, flush=True)
+
+
+def main(argv=None):
+    options = arguments(argv)
+    names = [name for name in CASES if fnmatchcase(name, options.only)]
+    if not names:
+        print(f"--only {options.only}: no such case, there are {', '.join(CASES)}", file=sys.stderr)
+        return WRONG_REQUEST
+    if not options.binary.is_file():
+        print(f"{options.binary} doesn't exist: run make build, or name another with --binary", file=sys.stderr)
+        return WRONG_REQUEST
+
+    started, results = time.perf_counter(), []
+    answerer = program(options.binary, options.device)
+    try:
+        for seed in range(options.seed, options.seed + options.repeat):
+            results += hold(names, seed, answerer, options.self_test, progress)
+    except ProgramError as error:
+        progress("")
+        print(error, file=sys.stderr)
+        return 1
+    progress("")
+
+    print(table(results))
+    failed = sum(not result.passed for result in results)
+    print(f"{len(results)} draws, {failed} failed, {time.perf_counter() - started:.0f} s")
+    undetected = 0
+    if options.self_test:
+        undetected = sum(len(result.blind) for result in results)
+        print(self_test_report(results))
+    if options.json:
+        about = {"seed": options.seed, "repeat": options.repeat, "device": options.device}
+        options.json.write_text(json.dumps(as_json(results, **about), indent=1) + "\n")
+    return 1 if failed or undetected else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
