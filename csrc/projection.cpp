@@ -74,14 +74,14 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction<T>> {
         [&](const auto& scene, const auto& lens, int b, int64_t i, int64_t at, const auto& p, const auto& s) {
           const T *d_mean = g[1].data_ptr<T>() + 2 * at, *d_conic = g[2].data_ptr<T>() + 3 * at;
           const T* d_colour = g[4].data_ptr<T>() + 3 * at;
-          // The sums over pixels that project_backward() turns into just these gradients: ∂L/∂(u,v) = C Σ νΔ and
-          // ∂L/∂C = ½Σ νΔΔᵀ, where the one number xy stands for two entries of C.
+          // The sums over pixels that project_backward() turns into just these gradients. With U = [[a, b], [0, c]]:
+          // ∂L/∂(u, v) = 2UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the one number xy stands for two entries.
           raster::SplatGradient<T> d{};
-          d.power_x = p.cov_xx * d_mean[0] + p.cov_xy * d_mean[1];
-          d.power_y = p.cov_xy * d_mean[0] + p.cov_yy * d_mean[1];
-          d.power_xx = 2 * d_conic[0];
-          d.power_xy = d_conic[1];
-          d.power_yy = 2 * d_conic[2];
+          d.power_p = d_mean[0] / (2 * s.a);
+          d.power_r = (d_mean[1] - 2 * s.b * d.power_p) / (2 * s.c);
+          d.power_pp = 2 * (s.a * s.a * d_conic[0] + s.a * s.b * d_conic[1] + s.b * s.b * d_conic[2]);
+          d.power_pr = s.a * s.c * d_conic[1] + 2 * s.b * s.c * d_conic[2];
+          d.power_rr = 2 * s.c * s.c * d_conic[2];
           d.red = d_colour[0];
           d.green = d_colour[1];
           d.blue = d_colour[2];

@@ -1,7 +1,7 @@
 // Alpha blending of one 16×16 tile, forward and backward.
 //
 // For a pixel and the splats in front-to-back order i = 1, 2, …
-//     σ_i = ½ Δᵀ Σ2D⁻¹ Δ = (aΔx + bΔy)² + (cΔy)²,  Δ = mean2d_i − pixel centre
+//     σ_i = ½ Δᵀ Σ2D⁻¹ Δ = p² + r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
 //     α_i = min(0.999, opacity_i · e^{−σ_i}),            skipped when α_i < 1/255
 //     w_i = T_i α_i,  T_{i+1} = T_i (1 − α_i),  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
 //     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.
@@ -44,19 +44,13 @@ GS_INLINE Rows reached_rows(const Splat<T>& s, int y0) {
   return rows;
 }
 
-// What a splat does to a vector of pixels: Δx, σ and, for lanes where it is seen, α and T behind it.
+// What a splat does to a vector of pixels: α, before and after its cap, and T behind it.
 template <class T>
 struct Contribution {
-  Vector<T> dx, unclamped, alpha, behind;
+  Vector<T> unclamped, alpha, behind;
   Mask<T> reaches;  // α ≥ 1/255
   Mask<T> blends;   // and the pixel goes on: T behind it > 1e-4
 };
-
-template <class T>
-GS_INLINE Vector<T> power(const Splat<T>& s, Vector<T> dx, T dy) {
-  const Vector<T> slanted = fma(broadcast<T>(s.a), dx, broadcast<T>(s.b * dy));
-  return fma(slanted, slanted, broadcast<T>(s.c * dy * (s.c * dy)));
-}
 
 template <class T>
 GS_INLINE void contribute(const Splat<T>& s, Vector<T> sigma, Vector<T> transmittance, Contribution<T>& c) {
@@ -106,13 +100,13 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
     const Splat<T>& s = job.splats[job.entries[item].splat];
     const Rows rows = reached_rows(s, job.y0);
     for (int row = rows.begin; row < rows.end; ++row) {
-      const T dy = s.v - (T(job.y0 + row) + T(0.5));
+      const T dy = s.v - (T(job.y0 + row) + T(0.5)), r = s.c * dy;
       for (int k = 0; k < Shape::per_row; ++k) {
         const int i = row * Shape::per_row + k;
-        Contribution<T> c;
-        c.dx = s.u - x[k];
-        const V sigma = power(s, c.dx, dy);
+        const V p = fma(broadcast<T>(s.a), s.u - x[k], broadcast<T>(s.b * dy));
+        const V sigma = fma(p, p, broadcast<T>(r * r));
         if (!any((sigma <= broadcast<T>(s.max_power)) & (transmittance[i] > V{}))) continue;
+        Contribution<T> c;
         contribute(s, sigma, transmittance[i], c);
 
         const V weight = c.blends ? transmittance[i] * c.alpha : V{};
@@ -188,15 +182,15 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
     const TileEntry& entry = job.entries[item];
     const Splat<T>& s = job.splats[entry.splat];
     const Rows rows = reached_rows(s, job.y0);
-    V n{}, nx{}, ny{}, nxx{}, nxy{}, nyy{}, red{}, green{}, blue{}, z{};
+    V n{}, np{}, nr{}, npp{}, npr{}, nrr{}, red{}, green{}, blue{}, z{};
     for (int row = rows.begin; row < rows.end; ++row) {
-      const T dy = s.v - (T(job.y0 + row) + T(0.5));
+      const T dy = s.v - (T(job.y0 + row) + T(0.5)), r = s.c * dy;
       for (int k = 0; k < Shape::per_row; ++k) {
         const int i = row * Shape::per_row + k;
-        Contribution<T> c;
-        c.dx = s.u - x[k];
-        const V sigma = power(s, c.dx, dy);
+        const V p = fma(broadcast<T>(s.a), s.u - x[k], broadcast<T>(s.b * dy));
+        const V sigma = fma(p, p, broadcast<T>(r * r));
         if (!any((sigma <= broadcast<T>(s.max_power)) & (transmittance[i] > V{}))) continue;
+        Contribution<T> c;
         contribute(s, sigma, transmittance[i], c);
 
         const V weight = c.blends ? transmittance[i] * c.alpha : V{};
@@ -209,13 +203,13 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
         // ν = ∂L/∂σ = −α ∂L/∂α, nothing through the cap.
         const V d_alpha = transmittance[i] * q - remaining[i] / (T(1) - c.alpha);
         const V nu = (c.blends & (c.unclamped < broadcast<T>(T(kMaxAlpha)))) ? -c.alpha * d_alpha : V{};
-        const V nu_x = nu * c.dx;
+        const V nu_p = nu * p;
         n += nu;
-        nx += nu_x;
-        ny = fma(nu, broadcast<T>(dy), ny);
-        nxx = fma(nu_x, c.dx, nxx);
-        nxy = fma(nu_x, broadcast<T>(dy), nxy);
-        nyy = fma(nu, broadcast<T>(dy * dy), nyy);
+        np += nu_p;
+        nr = fma(nu, broadcast<T>(r), nr);
+        npp = fma(nu_p, p, npp);
+        npr = fma(nu_p, broadcast<T>(r), npr);
+        nrr = fma(nu, broadcast<T>(r * r), nrr);
         red = fma(weight, g_red[i], red);
         green = fma(weight, g_green[i], green);
         blue = fma(weight, g_blue[i], blue);
@@ -226,8 +220,8 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
         transmittance[i] = ends ? V{} : next;
       }
     }
-    records[entry.record] = {sum<T>(n),   sum<T>(nx),  sum<T>(ny),    sum<T>(nxx),  sum<T>(nxy),
-                             sum<T>(nyy), sum<T>(red), sum<T>(green), sum<T>(blue), sum<T>(z)};
+    records[entry.record] = {sum<T>(n),   sum<T>(np),  sum<T>(nr),    sum<T>(npp),  sum<T>(npr),
+                             sum<T>(nrr), sum<T>(red), sum<T>(green), sum<T>(blue), sum<T>(z)};
   }
 }
 

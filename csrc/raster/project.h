@@ -178,16 +178,13 @@ inline void project_backward(const Gaussians<T>& g, int64_t i, const Lens<T>& le
   const T along = d_direction[0] * p.direction[0] + d_direction[1] * p.direction[1] + d_direction[2] * p.direction[2];
   for (int k = 0; k < 3; ++k) out.mean[k] += (d_direction[k] - along * p.direction[k]) * p.inverse_distance;
 
-  // σ = ½ΔᵀCΔ: ∂L/∂(u,v) = C Σ νΔ, and with N = ½Σ νΔΔᵀ = ∂L/∂C, ∂L/∂Σ2D = −C N C.
-  const T c_xx = p.cov_yy / p.determinant, c_xy = -p.cov_xy / p.determinant, c_yy = p.cov_xx / p.determinant;
-  const T d_u = c_xx * d.power_x + c_xy * d.power_y;
-  const T d_v = c_xy * d.power_x + c_yy * d.power_y;
-  const T n_xx = T(0.5) * d.power_xx, n_xy = T(0.5) * d.power_xy, n_yy = T(0.5) * d.power_yy;
-  const T left_xx = c_xx * n_xx + c_xy * n_xy, left_xy = c_xx * n_xy + c_xy * n_yy;
-  const T left_yx = c_xy * n_xx + c_yy * n_xy, left_yy = c_xy * n_xy + c_yy * n_yy;
-  const T m_xx = -(left_xx * c_xx + left_xy * c_xy);
-  const T m_xy = -(left_xx * c_xy + left_xy * c_yy);
-  const T m_yy = -(left_yx * c_xy + left_yy * c_yy);
+  // With U = [[a, b], [0, c]], σ = |UΔ|² and Σ2D⁻¹ = 2UᵀU. From M = Σ ν UΔ and W = Σ ν (UΔ)(UΔ)ᵀ,
+  // ∂L/∂(u, v) = 2UᵀM and ∂L/∂Σ2D = −2UᵀWU.
+  const T d_u = 2 * s.a * d.power_p;
+  const T d_v = 2 * (s.b * d.power_p + s.c * d.power_r);
+  const T m_xx = -2 * s.a * s.a * d.power_pp;
+  const T m_xy = -2 * s.a * (s.b * d.power_pp + s.c * d.power_pr);
+  const T m_yy = -2 * (s.b * s.b * d.power_pp + 2 * s.b * s.c * d.power_pr + s.c * s.c * d.power_rr);
 
   // Σ2D = H Hᵀ + εI: ∂L/∂H = 2 (∂L/∂Σ2D) H;  H = J V with V = W R S.
   T d_half[6], d_wr[9];

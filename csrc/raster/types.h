@@ -64,23 +64,24 @@ struct TileEntry {
   uint32_t record;
 };
 
-// Sums over the pixels of one (splat, tile) pair; ν = ∂L/∂σ, Δ = mean2d − pixel.
-// With these ten numbers every gradient of the pair follows: see project.h.
+// Sums over the pixels of one (splat, tile) pair; ν = ∂L/∂σ, and (p, r) = (aΔx + bΔy, cΔy) is the offset Δ measured in
+// the splat's own widths, so that σ = p² + r² and nothing cancels on needles. With these ten numbers every gradient of
+// the pair follows: see project.h.
 template <class T>
 struct SplatGradient {
   T power;                // Σ ν
-  T power_x, power_y;     // Σ ν·Δ
-  T power_xx, power_xy, power_yy;  // Σ ν·Δ·Δᵀ
+  T power_p, power_r;     // Σ ν·(p, r)
+  T power_pp, power_pr, power_rr;  // Σ ν·(p, r)(p, r)ᵀ
   T red, green, blue;     // Σ w·∂L/∂C
   T z;                    // Σ w·∂L/∂(Σ w z)
 
   SplatGradient& operator+=(const SplatGradient& other) {
     power += other.power;
-    power_x += other.power_x;
-    power_y += other.power_y;
-    power_xx += other.power_xx;
-    power_xy += other.power_xy;
-    power_yy += other.power_yy;
+    power_p += other.power_p;
+    power_r += other.power_r;
+    power_pp += other.power_pp;
+    power_pr += other.power_pr;
+    power_rr += other.power_rr;
     red += other.red;
     green += other.green;
     blue += other.blue;

@@ -26,14 +26,7 @@ RASTERIZER_FLOAT32 = Tolerance(
     3e-4,
     pictures=1e-4,
     why="a gradient sums terms of both signs over all pixels of a Gaussian, and 1 - T has few digits where little is "
-    "covered; 1e-4 measured",
-)
-RASTERIZER_THIN_FLOAT32 = Tolerance(
-    1e-5,
-    2e-2,
-    pictures=1e-4,
-    why="the sums of offset times offset over a needle's pixels cancel when they meet the inverse covariance, by the "
-    "square of length over width; 1.2e-2 measured, and 1e-11 in float64",
+    "covered; 2.4e-4 is the largest over 8 seeds",
 )
 # Relative distance from a threshold within which rounding may decide.
 DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
@@ -331,7 +324,7 @@ def rasterizer_adversarial_float32(rng):
 
 @case
 def rasterizer_thin_float32(rng):
-    yield from splat_draws(rng, "rasterizer", np.float32, scenes.THIN, RASTERIZER_THIN_FLOAT32)
+    yield from splat_draws(rng, "rasterizer", np.float32, scenes.THIN, RASTERIZER_FLOAT32)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
