@@ -16,7 +16,7 @@ from pathlib import Path
 from harness.cases import CASES
 from harness.exchange import ProgramError, program
 from harness.hold import hold
-from harness.table import as_json, self_test_report, table
+from harness.table import as_json, markdown, self_test_report, table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 WRONG_REQUEST = 2
@@ -29,6 +29,7 @@ def arguments(argv):
     parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
     parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
     parser.add_argument("--self-test", action="store_true", help="disturb right answers and expect each to be noticed")
+    parser.add_argument("--markdown", metavar="FILE", type=Path, help="write a line per case to FILE")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write every number to FILE")
     parser.add_argument(
         "--binary",
@@ -75,6 +76,8 @@ def main(argv=None):
     if options.self_test:
         undetected = sum(len(result.blind) for result in results)
         print(self_test_report(results))
+    if options.markdown:
+        options.markdown.write_text(markdown(results) + "\n")
     if options.json:
         about = {"seed": options.seed, "repeat": options.repeat, "device": options.device}
         options.json.write_text(json.dumps(as_json(results, **about), indent=1) + "\n")

@@ -26,6 +26,25 @@ def table(results):
     return "\n".join([*lines, *doubtful(results), *failures(results)])
 
 
+def markdown(results):
+    """A line per case for the README: the worst error of its outputs and of its gradients, with what is allowed."""
+    lines = ["| case | draws | outputs | gradients |", "|---|---|---|---|"]
+    for case, found in by_case(results).items():
+        cells = []
+        for is_kind in (is_output, is_gradient):
+            findings = [finding for result in found for finding in result.findings if is_kind(finding)]
+            worst_one = max(findings, key=lambda finding: finding.share, default=None)
+            if worst_one is None:
+                cells.append("")
+            elif worst_one.measure == "exact":
+                cells.append("exact" if worst_one.passed else "**wrong**")
+            else:
+                unit = "" if worst_one.measure == "relative" else f" {worst_one.measure}"
+                cells.append(f"{worst_one.error:.0e} of {worst_one.tolerance:.0e}{unit}")
+        lines.append(f"| {case} | {len(found)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def by_case(results):
     found = {}
     for result in results:
