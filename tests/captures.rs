@@ -82,6 +82,10 @@ fn folders_of_captures_are_found() {
     let Some(paths) = captures() else { return };
     let found = find_captures(paths[0].parent().expect("a parent")).expect("captures");
     assert_eq!(found.len(), paths.len());
+    let above = tempfile::tempdir().expect("a folder");
+    std::os::unix::fs::symlink(paths[0].parent().expect("a parent"), above.path().join("re10k"))
+        .expect("a link");
+    assert_eq!(find_captures(above.path()).expect("captures").len(), paths.len());
     let names: Vec<_> = found.iter().map(|capture| capture.name.clone()).collect();
     assert!(names.is_sorted());
 }

@@ -61,26 +61,35 @@ pub fn read_camera_path(file: &Path) -> Result<Vec<Camera>> {
     cameras_json::read_cameras(file)
 }
 
-/// Every capture in `path`: itself, or the folders right below it, in the order of their names.
+/// How many folders deep captures are looked for.
+const DEPTH: usize = 2;
+
+/// Every capture in `path`: itself, or those in the folders up to two levels below it, in the order of their paths.
 ///
 /// # Errors
 /// A folder that can't be read or holds no capture.
 pub fn find_captures(path: &Path) -> Result<Vec<Capture>> {
-    if cameras_file(path).is_some() {
-        return Ok(vec![open_capture(path)?]);
-    }
     let mut folders = vec![];
-    for entry in std::fs::read_dir(path).map_err(Error::read(path))? {
-        let folder = entry.map_err(Error::read(path))?.path();
-        if cameras_file(&folder).is_some() {
-            folders.push(folder);
-        }
-    }
+    collect_folders(path, DEPTH, &mut folders)?;
     if folders.is_empty() {
         return Err(Error::input(path, "the folder", "without captures", "folders with a cameras.json"));
     }
     folders.sort();
     folders.iter().map(|folder| open_capture(folder)).collect()
+}
+
+fn collect_folders(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<()> {
+    if cameras_file(path).is_some() {
+        found.push(path.to_owned());
+    } else if depth > 0 {
+        for entry in std::fs::read_dir(path).map_err(Error::read(path))? {
+            let below = entry.map_err(Error::read(path))?.path();
+            if below.is_dir() {
+                collect_folders(&below, depth - 1, found)?;
+            }
+        }
+    }
+    Ok(())
 }
 
 fn cameras_file(path: &Path) -> Option<PathBuf> {
