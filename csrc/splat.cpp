@@ -5,6 +5,7 @@
 #include <type_traits>
 #include <vector>
 
+#include "globalsplat/src/render/bridge.rs.h"
 #include "marshal.h"
 #include "raster/kernels.h"
 #include "raster/sh.h"
@@ -13,6 +14,9 @@ namespace globalsplat {
 namespace {
 
 using torch::autograd::AutogradContext;
+
+// Of this thread's last call and of its backward pass, which autograd runs on the thread that asked for it.
+thread_local raster::StageTimes last_times;
 
 constexpr size_t kGaussianInputs = 5;  // means, scales, quaternions, opacities, sh
 constexpr size_t kInputs = 10;         // and w2c, intrinsics, width, height, eps2d
@@ -58,7 +62,8 @@ struct SplatFunction : torch::autograd::Function<SplatFunction<T>> {
     Tensor alpha = torch::empty({scenes, cameras, height, width}, options), depth = torch::empty_like(alpha);
     const raster::Settings settings{int(width), int(height), eps2d, torch::get_num_threads()};
     auto frame = raster::Frame<T>::draw(scenes_of<T>({means, scales, quaternions, opacities, sh}),
-                                        views_of<T>(w2c, intrinsics), settings, pictures_of<T>(rgb, alpha, depth));
+                                        views_of<T>(w2c, intrinsics), settings, pictures_of<T>(rgb, alpha, depth),
+                                        last_times);
     ctx->save_for_backward({means, scales, quaternions, opacities, sh, rgb, alpha, depth});
     ctx->saved_data["frame"] =
         c10::IValue::make_capsule(c10::make_intrusive<FrameHolder<T>>(std::move(frame)));
@@ -73,7 +78,8 @@ struct SplatFunction : torch::autograd::Function<SplatFunction<T>> {
     for (const Tensor& t : gaussians) out.push_back(torch::empty_like(t));
     for (Tensor& g : gradients) g = g.contiguous();
     holder->frame->backward(scenes_of<T>(gaussians), pictures_of<const T>(saved[5], saved[6], saved[7]),
-                            pictures_of<const T>(gradients[0], gradients[1], gradients[2]), gradients_of<T>(out));
+                            pictures_of<const T>(gradients[0], gradients[1], gradients[2]), gradients_of<T>(out),
+                            last_times);
     out.resize(kInputs);  // undefined: no gradient for cameras and numbers
     return out;
   }
@@ -92,6 +98,11 @@ void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
   double values[raster::kMaxBases];
   raster::sh_basis(int(out.size()), direction.data(), values);
   std::copy_n(values, out.size(), out.data());
+}
+
+StageTimes stage_times() {
+  const raster::StageTimes& t = last_times;
+  return {t.project, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
 }
 
 rust::String libtorch_version() { return TORCH_VERSION; }

@@ -18,6 +18,11 @@ namespace globalsplat {
 void splat(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
            size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out);
 
+struct StageTimes;  // shared with Rust, see src/render/bridge.rs
+
+// Wall-clock seconds that the stages of this thread's last call of splat(), and of its backward pass, took.
+StageTimes stage_times();
+
 // The first out.size() (1, 4, 9 or 16) spherical harmonics of a unit vector, as the rasterizer evaluates them.
 void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out);
 

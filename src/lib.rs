@@ -1,8 +1,9 @@
 //! GlobalSplat: posed photos to a compact 3D Gaussian splat in one forward pass.
 //!
 //! Data flows down this list; an arrow never points up.
-//! [`data`] → [`scene`] → [`model`] → [`render`] → [`loss`] → [`train`] → [`eval`], with [`io`] for files.
+//! [`data`] → [`scene`] → [`model`] → [`render`] → [`loss`] → [`train`] → [`eval`] → [`bench`], with [`io`] for files.
 
+pub mod bench;
 pub mod config;
 pub mod data;
 pub mod error;

@@ -1,8 +1,10 @@
 #include "raster.h"
 
 #include <algorithm>
+#include <chrono>
 #include <limits>
 #include <stdexcept>
+#include <utility>
 
 #include "bins.h"
 #include "kernels.h"
@@ -15,6 +17,19 @@ namespace {
 
 constexpr int64_t kBlock = 1024;  // Gaussians a task projects
 constexpr uint32_t kUnseen = std::numeric_limits<uint32_t>::max();
+
+// Tells the seconds since it was last asked.
+class Stopwatch {
+ public:
+  double lap() {
+    const Clock::time_point now = Clock::now();
+    return std::chrono::duration<double>(now - std::exchange(start_, now)).count();
+  }
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  Clock::time_point start_ = Clock::now();
+};
 
 int64_t blocks(int64_t count) { return (count + kBlock - 1) / kBlock; }
 
@@ -105,7 +120,9 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
 
 template <class T>
 std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
-                                         const Settings& settings, const std::vector<Pictures<T>>& out) {
+                                         const Settings& settings, const std::vector<Pictures<T>>& out,
+                                         StageTimes& times) {
+  Stopwatch watch;
   std::unique_ptr<Frame> frame(new Frame(views, settings));
   const BlendKernels<T>& blend = blend_kernels<T>();
   const int64_t count = scenes.empty() ? 0 : scenes[0].count;
@@ -122,24 +139,28 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
       if (!project(scenes[size_t(views[view].scene)], i, lens, unused, s)) s.z = 0;
     }
   });
+  times.project = watch.lap();
   parallel_for(settings.threads, views_count, [&](int64_t view) {
     frame->views_[size_t(view)].bin(std::move(projected[size_t(view)]), frame->tiles_x_, frame->tiles_y_, settings);
   });
+  times.bin = watch.lap();
   parallel_for(settings.threads, views_count * tiles, [&](int64_t task) {
     const size_t view = size_t(task / tiles);
     blend.forward(frame->job(frame->views_[view], int(task % tiles)), out[view]);
   });
+  times.blend = watch.lap();
   return frame;
 }
 
 template <class T>
 void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
                         const std::vector<Pictures<const T>>& gradients,
-                        const std::vector<GaussianGradients<T>>& out) const {
+                        const std::vector<GaussianGradients<T>>& out, StageTimes& times) const {
   const BlendKernels<T>& blend = blend_kernels<T>();
   const int64_t count = scenes.empty() ? 0 : scenes[0].count, bases = scenes.empty() ? 0 : scenes[0].bases;
   const int64_t tiles = int64_t(tiles_x_) * tiles_y_;
 
+  Stopwatch watch;
   std::vector<std::vector<SplatGradient<T>>> records(views_.size());
   for (size_t k = 0; k < views_.size(); ++k) records[k].resize(views_[k].entries.size());
   parallel_for(settings_.threads, int64_t(views_.size()) * tiles, [&](int64_t task) {
@@ -147,6 +168,7 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
     blend.backward(job(views_[k], int(task % tiles)), pictures[k], gradients[k], records[k].data());
   });
 
+  times.blend_backward = watch.lap();
   parallel_for(settings_.threads, int64_t(scenes.size()) * blocks(count), [&](int64_t task) {
     const size_t scene = size_t(task / blocks(count));
     const int64_t begin = task % blocks(count) * kBlock, end = std::min(begin + kBlock, count);
@@ -176,6 +198,7 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
       std::copy_n(sum.sh, 3 * bases, to.sh + 3 * bases * i);
     }
   });
+  times.project_backward = watch.lap();
 }
 
 template class Frame<float>;

@@ -3,6 +3,7 @@
 //! Exit codes: 0 done, 1 the work failed, 2 the request was wrong. Results go to standard output (with `--json` one
 //! object), everything else to standard error.
 
+mod bench;
 mod device;
 mod doctor;
 mod eval;
@@ -41,6 +42,7 @@ enum Command {
     Export(export::Export),
     Synth(synth::Synth),
     Inspect(inspect::Inspect),
+    Bench(bench::Bench),
     Doctor(doctor::Doctor),
     #[command(hide = true)]
     Parity(parity::Parity),
@@ -66,6 +68,7 @@ pub fn main() -> ExitCode {
         Command::Export(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Bench(command) => command.run(),
         Command::Doctor(command) => command.run(),
         Command::Parity(command) => command.run(),
     });

@@ -2,6 +2,23 @@
 
 #[cxx::bridge(namespace = "globalsplat")]
 pub(super) mod ffi {
+    /// Wall-clock seconds that the stages of a call took, all its views together.
+    #[derive(Debug, Clone, Copy)]
+    struct StageTimes {
+        /// Gaussians to splats.
+        project: f64,
+        /// Splats into the order of their depths.
+        sort: f64,
+        /// Splats to the lists of the tiles that they touch.
+        bin: f64,
+        /// Lists to pictures.
+        blend: f64,
+        /// From the pictures' gradients to the splats'.
+        blend_backward: f64,
+        /// From the splats' gradients to the Gaussians'.
+        project_backward: f64,
+    }
+
     unsafe extern "C++" {
         include!("projection.h");
         include!("splat.h");
@@ -40,6 +57,8 @@ pub(super) mod ffi {
 
         /// The first `out.len()` (1, 4, 9 or 16) spherical harmonics of a unit vector.
         fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
+
+        fn stage_times() -> StageTimes;
 
         fn libtorch_version() -> String;
 

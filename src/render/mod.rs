@@ -3,6 +3,7 @@
 mod bridge;
 mod transform;
 
+pub use bridge::ffi::StageTimes;
 pub use transform::transform;
 
 use crate::data::ViewBatch;
@@ -140,6 +141,11 @@ fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d:
 /// A `GLOBALSPLAT_SIMD` that names one which this machine doesn't have.
 pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
+}
+
+/// How long the stages of this thread's last [`render()`] and of its backward pass took.
+pub fn stage_times() -> StageTimes {
+    ffi::stage_times()
 }
 
 /// The version of the libtorch that this program was built with.

@@ -1,0 +1,27 @@
+//! How fast things are: measured by commands that anyone can run, never by tests.
+
+mod raster;
+
+pub use raster::{RasterReport, Stage, bench_raster, made_up_scene};
+
+use serde::Serialize;
+
+/// Of several measurements of the same thing, in milliseconds: the middle one and how far the others lie apart.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Spread {
+    /// Half of the measurements are below.
+    pub median: f64,
+    /// The fastest.
+    pub least: f64,
+    /// Three of four are below: what a busy machine makes of it.
+    pub upper_quartile: f64,
+}
+
+impl Spread {
+    /// Of at least one number.
+    fn of(mut milliseconds: Vec<f64>) -> Self {
+        milliseconds.sort_by(f64::total_cmp);
+        let at = |share: f64| milliseconds[((milliseconds.len() - 1) as f64 * share).round() as usize];
+        Spread { median: at(0.5), least: at(0.), upper_quartile: at(0.75) }
+    }
+}

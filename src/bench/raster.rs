@@ -1,0 +1,175 @@
+//! The splat op: from Gaussians in tensors to pictures, and back to gradients in tensors.
+
+use super::Spread;
+use crate::error::Result;
+use crate::model::Gaussians;
+use crate::render::{Cameras, DEFAULT_EPS2D, StageTimes, render, simd_level, stage_times};
+use glam::{DMat4, DQuat, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+use std::time::Instant;
+use tch::{Kind, Tensor, no_grad};
+
+/// A part of the work.
+#[derive(Debug, Serialize)]
+pub struct Stage {
+    /// What the part is called.
+    pub name: &'static str,
+    /// Milliseconds per view.
+    pub milliseconds: Spread,
+}
+
+/// What [`bench_raster`] measured. All times are milliseconds per view.
+#[derive(Debug, Serialize)]
+pub struct RasterReport {
+    /// Instruction set of the kernels.
+    pub simd: String,
+    /// Threads that shared the work.
+    pub threads: i32,
+    /// Of the scene.
+    pub gaussians: i64,
+    /// Cameras of one call.
+    pub views: i64,
+    /// Of a picture.
+    pub width: i64,
+    /// Of a picture.
+    pub height: i64,
+    /// A call without gradients.
+    pub forward: Spread,
+    /// A call that records gradients, and its backward pass.
+    pub forward_backward: Spread,
+    /// In the order of the work.
+    pub stages: Vec<Stage>,
+}
+
+/// Times `repeats` calls of the splat op without gradients and as many with them, by turns.
+///
+/// # Errors
+/// What [`render()`] refuses.
+pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
+    let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
+    let per_view = |seconds: f64| seconds * 1e3 / views as f64;
+    let (mut forward, mut forward_backward) = (vec![], vec![]);
+    let mut stages: Vec<StageTimes> = vec![];
+    // The first round warms caches and threads up.
+    for round in 0..=repeats {
+        let start = Instant::now();
+        no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D))?;
+        let without = start.elapsed().as_secs_f64();
+
+        let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
+        let start = Instant::now();
+        let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
+        let drawn = start.elapsed().as_secs_f64();
+        let objective = [&pictures.rgb, &pictures.alpha, &pictures.depth]
+            .map(|t| t.sum(Kind::Float))
+            .into_iter()
+            .reduce(|a, b| a + b)
+            .expect("three");
+        let start = Instant::now();
+        objective.backward();
+        let with = drawn + start.elapsed().as_secs_f64();
+        if round > 0 {
+            forward.push(per_view(without));
+            forward_backward.push(per_view(with));
+            stages.push(stage_times());
+        }
+    }
+    let stage = |name, seconds: fn(&StageTimes) -> f64| Stage {
+        name,
+        milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
+    };
+    Ok(RasterReport {
+        simd: simd_level()?,
+        threads: tch::get_num_threads(),
+        gaussians: gaussians.count(),
+        views,
+        width: cameras.width,
+        height: cameras.height,
+        forward: Spread::of(forward),
+        forward_backward: Spread::of(forward_backward),
+        stages: vec![
+            stage("project", |t| t.project),
+            stage("sort", |t| t.sort),
+            stage("bin", |t| t.bin),
+            stage("blend", |t| t.blend),
+            stage("blend backward", |t| t.blend_backward),
+            stage("project backward", |t| t.project_backward),
+        ],
+    })
+}
+
+/// A scene shaped like a trained one, and `views` cameras that walk past it, made from a fixed seed. Sizes in the picture,
+/// their elongation and opacities follow the published 16K splats; more Gaussians are smaller ones, so that they cover as
+/// much.
+pub fn made_up_scene(count: usize, views: usize, width: u32, height: u32) -> (Gaussians, Cameras) {
+    let mut random = ChaCha8Rng::seed_from_u64(0);
+    let (w, h) = (f64::from(width), f64::from(height));
+    let focal = 0.9 * w.max(h);
+    let finer = (16_384. / count.max(1) as f64).sqrt();
+    let mut gaussians = Columns::default();
+    for _ in 0..count {
+        let z = 3. * (0.4 * normal(&mut random)).exp();
+        let (x, y) = (random.random_range(-0.75..0.75) * w, random.random_range(-0.75..0.75) * h);
+        gaussians.means.extend([x / focal * z, y / focal * z, z]);
+        for (median, spread) in [(0.0044, 0.75), (0.0065, 0.6), (0.0116, 0.55)] {
+            gaussians.scales.push(finer * median * z * (spread * normal(&mut random)).exp());
+        }
+        gaussians.quaternions.extend(std::array::from_fn::<f64, 4, _>(|_| normal(&mut random)));
+        gaussians.opacities.push(0.98 * random.random::<f64>().powf(1.35));
+        gaussians.sh.extend(std::array::from_fn::<f64, 48, _>(|_| 0.5 * normal(&mut random)));
+    }
+    (gaussians.tensors(count as i64), walk(views, focal, w, h))
+}
+
+#[derive(Default)]
+struct Columns {
+    means: Vec<f64>,
+    scales: Vec<f64>,
+    quaternions: Vec<f64>,
+    opacities: Vec<f64>,
+    sh: Vec<f64>,
+}
+
+impl Columns {
+    fn tensors(&self, count: i64) -> Gaussians {
+        let tensor =
+            |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).to_kind(Kind::Float);
+        Gaussians {
+            means: tensor(&self.means, &[1, count, 3]),
+            scales: tensor(&self.scales, &[1, count, 3]),
+            quaternions: tensor(&self.quaternions, &[1, count, 4]),
+            opacities: tensor(&self.opacities, &[1, count]),
+            sh: tensor(&self.sh, &[1, count, 16, 3]),
+        }
+    }
+}
+
+fn walk(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
+    let (mut w2c, mut intrinsics) = (vec![], vec![]);
+    for i in 0..views {
+        let t = i as f64 / (views.max(2) - 1) as f64 - 0.5;
+        let c2w = DMat4::from_rotation_translation(
+            DQuat::from_rotation_y(-0.2 * t),
+            DVec3::new(0.6 * t, 0., 0.2 * t),
+        );
+        w2c.extend(c2w.inverse().transpose().to_cols_array());
+        intrinsics.extend([focal, 0., width / 2., 0., focal, height / 2., 0., 0., 1.]);
+    }
+    let tensor = |values: &[f64], n: i64| {
+        Tensor::from_slice(values).view([1, views as i64, n, n]).to_kind(Kind::Float)
+    };
+    Cameras {
+        w2c: tensor(&w2c, 4),
+        intrinsics: tensor(&intrinsics, 3),
+        width: width as i64,
+        height: height as i64,
+    }
+}
+
+/// A standard normal number, by Box and Muller.
+fn normal(random: &mut impl Rng) -> f64 {
+    let (radius, angle) = (1. - random.random::<f64>(), random.random::<f64>());
+    (-2. * radius.ln()).sqrt() * (std::f64::consts::TAU * angle).cos()
+}
