@@ -13,6 +13,8 @@ namespace globalsplat {
 using torch::Tensor;
 using torch::autograd::tensor_list;
 
+constexpr size_t kGaussianInputs = 5;  // means, scales, quaternions, opacities, sh
+
 // Gaussians and cameras of one call, borrowed.
 //   means [B, N, 3], scales [B, N, 3], quaternions [B, N, 4], opacities [B, N], sh [B, N, bases, 3]
 //   w2c [B, C, 4, 4], intrinsics [B, C, 3, 3] in pixels
@@ -62,6 +64,18 @@ std::vector<raster::Gaussians<T>> scenes_of(const tensor_list& t) {
     scenes.push_back({t[0].data_ptr<T>() + b * count * 3, t[1].data_ptr<T>() + b * count * 3,
                       t[2].data_ptr<T>() + b * count * 4, t[3].data_ptr<T>() + b * count,
                       t[4].data_ptr<T>() + b * count * bases * 3, count, int(bases)});
+  return scenes;
+}
+
+// The same for gradients.
+template <class T>
+std::vector<raster::GaussianGradients<T>> gradients_of(const tensor_list& t) {
+  std::vector<raster::GaussianGradients<T>> scenes;
+  const int64_t count = t[0].size(1), bases = t[4].size(2);
+  for (int64_t b = 0; b < t[0].size(0); ++b)
+    scenes.push_back({t[0].data_ptr<T>() + b * count * 3, t[1].data_ptr<T>() + b * count * 3,
+                      t[2].data_ptr<T>() + b * count * 4, t[3].data_ptr<T>() + b * count,
+                      t[4].data_ptr<T>() + b * count * bases * 3});
   return scenes;
 }
 

@@ -18,19 +18,7 @@ using torch::autograd::AutogradContext;
 // Of this thread's last call and of its backward pass, which autograd runs on the thread that asked for it.
 thread_local raster::StageTimes last_times;
 
-constexpr size_t kGaussianInputs = 5;  // means, scales, quaternions, opacities, sh
-constexpr size_t kInputs = 10;         // and w2c, intrinsics, width, height, eps2d
-
-template <class T>
-std::vector<raster::GaussianGradients<T>> gradients_of(const tensor_list& t) {
-  std::vector<raster::GaussianGradients<T>> scenes;
-  const int64_t count = t[0].size(1), bases = t[4].size(2);
-  for (int64_t b = 0; b < t[0].size(0); ++b)
-    scenes.push_back({t[0].data_ptr<T>() + b * count * 3, t[1].data_ptr<T>() + b * count * 3,
-                      t[2].data_ptr<T>() + b * count * 4, t[3].data_ptr<T>() + b * count,
-                      t[4].data_ptr<T>() + b * count * bases * 3});
-  return scenes;
-}
+constexpr size_t kInputs = 10;  // kGaussianInputs, w2c, intrinsics, width, height, eps2d
 
 // rgb [B, C, 3, H, W], alpha and depth [B, C, H, W] as one item per view.
 template <class Pixel>
@@ -96,13 +84,13 @@ void splat(size_t means, size_t scales, size_t quaternions, size_t opacities, si
 
 void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
   double values[raster::kMaxBases];
-  raster::sh_basis(int(out.size()), direction.data(), values);
+  raster::sh_basis<double>(int(out.size()), direction.data(), values);
   std::copy_n(values, out.size(), out.data());
 }
 
 StageTimes stage_times() {
   const raster::StageTimes& t = last_times;
-  return {t.project, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
+  return {t.project, t.cover, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
 }
 
 rust::String libtorch_version() { return TORCH_VERSION; }

@@ -1,74 +1,93 @@
-// Which tiles a splat can touch, and the order of splats by depth.
+// Stable sorting by counting, in parallel: of splats by depth, and of (splat, tile) pairs into the tiles' lists.
 #pragma once
 
-#include <cmath>
-#include <cstdint>
 #include <cstring>
+#include <memory>
 #include <type_traits>
 #include <vector>
 
+#include "parallel.h"
 #include "types.h"
 
 namespace globalsplat::raster {
 
-// The region σ = (aΔx + bΔy)² + (cΔy)² ≤ m, m = max_power, is an ellipse. For every row of tiles that it crosses, calls
-// visit(tile_y, first tile_x, one past the last tile_x). The range is exact for the strip of pixel centres of a row of
-// tiles, plus a little room for rounding: no pixel whose α reaches 1/255 is lost.
-template <class T, class Visit>
-inline void for_each_tile_row(const Splat<T>& s, int tiles_x, int tiles_y, int width, int height, Visit visit) {
-  const T room = T(1e-3);
-  const T top = s.v - s.half_height, bottom = s.v + s.half_height;
-  if (!(bottom >= T(0.5)) || !(top <= height - T(0.5))) return;
-  const int first_row = top > 0 ? int(top / kTile) : 0;
-  const int last_row = bottom < height ? int(bottom / kTile) : tiles_y - 1;
-  // At height y the ellipse reaches x = (−by ± √(m − c²y²)) / a. It is furthest right at y = −(b/c)·√(m / (b² + c²)) and
-  // furthest left at the opposite point; inside a strip the nearest y to it counts.
-  const T furthest_y = -s.b / s.c * std::sqrt(s.max_power / (s.b * s.b + s.c * s.c));
-  for (int row = first_row; row <= last_row && row < tiles_y; ++row) {
-    const T low = T(row * kTile) + T(0.5) - s.v - room, high = low + T(kTile - 1) + 2 * room;
-    const auto reach = [&](T y, T sign) {
-      const T nearest = y < low ? low : y > high ? high : y;
-      const T left_over = s.max_power - s.c * nearest * (s.c * nearest);
-      return (-s.b * nearest + sign * std::sqrt(left_over > 0 ? left_over : T(0))) / s.a;
-    };
-    T right = reach(furthest_y, T(1)), left = reach(-furthest_y, T(-1));
-    const T slack = room + T(1e-5) * (right - left);
-    right += s.u + slack;
-    left += s.u - slack;
-    if (!(right >= T(0.5)) || !(left <= width - T(0.5))) continue;
-    // Tile x holds centres from 16x + ½ to 16x + 15½.
-    const T first = (left - T(kTile) + T(0.5)) / kTile;
-    const int begin = first > 0 ? int(std::ceil(first)) : 0;
-    const int end = right < width ? int((right - T(0.5)) / kTile) + 1 : tiles_x;
-    if (begin < end) visit(row, begin, end < tiles_x ? end : tiles_x);
+// Memory that isn't filled before it is written.
+template <class T>
+struct Buffer {
+  std::unique_ptr<T[]> data;
+  size_t size = 0;
+
+  Buffer() = default;
+  explicit Buffer(size_t n) : data(new T[n]), size(n) {}
+  T& operator[](size_t i) { return data[i]; }
+  const T& operator[](size_t i) const { return data[i]; }
+};
+
+// Distributes the items of several lists among buckets, each list by itself, keeping the order within a bucket. A list is
+// taken in `chunks` consecutive parts, which are counted and placed side by side.
+//   each(list, chunk, visit)   calls visit(bucket, item) for the chunk's items in order; is called twice, with the same result
+//   place(list, at, item)      puts the item at its place in the sorted list
+// Returns for every list where its buckets start, one more than there are buckets.
+template <class Each, class Place>
+std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chunks, int64_t buckets,
+                                         const Each& each, const Place& place) {
+  std::vector<Buffer<uint32_t>> starts(lists), next(lists);
+  for (int64_t list = 0; list < lists; ++list) {
+    starts[size_t(list)] = Buffer<uint32_t>(size_t(buckets + 1));
+    next[size_t(list)] = Buffer<uint32_t>(size_t(chunks * buckets));
   }
+  parallel_for(threads, lists * chunks, [&](int64_t task) {
+    const int64_t list = task / chunks, chunk = task % chunks;
+    uint32_t* counts = next[size_t(list)].data.get() + chunk * buckets;
+    std::memset(counts, 0, size_t(buckets) * sizeof(uint32_t));
+    each(list, chunk, [&](int64_t bucket, const auto&) { ++counts[bucket]; });
+  });
+  parallel_for(threads, lists, [&](int64_t list) {
+    Buffer<uint32_t>&start = starts[size_t(list)], &at = next[size_t(list)];
+    uint32_t sum = 0;
+    for (int64_t bucket = 0; bucket < buckets; ++bucket) {
+      start[size_t(bucket)] = sum;
+      for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+        const uint32_t count = at[size_t(chunk * buckets + bucket)];
+        at[size_t(chunk * buckets + bucket)] = sum;
+        sum += count;
+      }
+    }
+    start[size_t(buckets)] = sum;
+  });
+  parallel_for(threads, lists * chunks, [&](int64_t task) {
+    const int64_t list = task / chunks, chunk = task % chunks;
+    uint32_t* at = next[size_t(list)].data.get() + chunk * buckets;
+    each(list, chunk, [&](int64_t bucket, const auto& item) { place(list, at[bucket]++, item); });
+  });
+  return starts;
 }
 
-// Indices of `depths` (all positive) in ascending order, equal ones by index: radix sort, least significant byte first,
-// on the bits, whose order is the numbers' own for positive IEEE floats.
+// A splat in the order of depths.
 template <class T>
-inline std::vector<uint32_t> order_by_depth(const std::vector<T>& depths) {
-  using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
-  struct Item {
-    Key key;
-    uint32_t index;
-  };
-  const size_t n = depths.size();
-  std::vector<Item> items(n), other(n);
-  for (size_t i = 0; i < n; ++i) {
-    std::memcpy(&items[i].key, &depths[i], sizeof(T));
-    items[i].index = uint32_t(i);
+struct DepthItem {
+  std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> key;  // bits of z, whose order is that of the positive numbers
+  uint32_t splat;
+};
+
+// Sorts every list of items by key; equal ones keep their order. Radix sort, 11 bits at a time.
+template <class T>
+void sort_by_depth(int threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_t chunks) {
+  constexpr int kBits = 11;
+  std::vector<Buffer<DepthItem<T>>> sorted(lists.size());
+  for (size_t i = 0; i < lists.size(); ++i) sorted[i] = Buffer<DepthItem<T>>(lists[i].size);
+  for (int shift = 0; shift < int(8 * sizeof(T)); shift += kBits) {
+    distribute(
+        threads, int64_t(lists.size()), chunks, int64_t(1) << kBits,
+        [&](int64_t list, int64_t chunk, const auto& visit) {
+          const Buffer<DepthItem<T>>& items = lists[size_t(list)];
+          const size_t begin = items.size * size_t(chunk) / size_t(chunks);
+          const size_t end = items.size * size_t(chunk + 1) / size_t(chunks);
+          for (size_t i = begin; i < end; ++i) visit(int64_t(items[i].key >> shift) & ((1 << kBits) - 1), items[i]);
+        },
+        [&](int64_t list, uint32_t at, const DepthItem<T>& item) { sorted[size_t(list)][at] = item; });
+    lists.swap(sorted);
   }
-  for (size_t shift = 0; shift < 8 * sizeof(Key); shift += 8) {
-    size_t start[257] = {};
-    for (const Item& item : items) ++start[((item.key >> shift) & 255) + 1];
-    for (int digit = 0; digit < 256; ++digit) start[digit + 1] += start[digit];
-    for (const Item& item : items) other[start[(item.key >> shift) & 255]++] = item;
-    items.swap(other);
-  }
-  std::vector<uint32_t> order(n);
-  for (size_t i = 0; i < n; ++i) order[i] = items[i].index;
-  return order;
 }
 
 }  // namespace globalsplat::raster

@@ -1,19 +1,20 @@
 // Alpha blending of one 16×16 tile, forward and backward.
 //
 // For a pixel and the splats in front-to-back order i = 1, 2, …
-//     σ_i = ½ Δᵀ Σ2D⁻¹ Δ = p² + r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
-//     α_i = min(0.999, opacity_i · e^{−σ_i}),            skipped when α_i < 1/255
-//     w_i = T_i α_i,  T_{i+1} = T_i (1 − α_i),  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
+//     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
+//     α_i = min(0.999, 2^e_i),            skipped when e_i < −log₂ 255
+//     w_i = T_i α_i,  T_{i+1} = T_i − w_i,  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
 //     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.
 //
 // Backward. With the pictures' gradients g_C, g_A, g_D, ∂D/∂w_i = (z_i − D) / A, so that
 //     q_i = ∂L/∂w_i = g_C·c_i + (g_D / A) z_i + (g_A − g_D D / A)
-//     ∂L/∂α_i = T_i q_i − (Σ_{j>i} w_j q_j) / (1 − α_i).
+//     α_i ∂L/∂α_i = w_i q_i − (Σ_{j>i} w_j q_j) α_i / (1 − α_i) = w_i (q_i − (Σ_{j>i} w_j q_j) / T_{i+1}).
 // The sum over what lies behind is the pixel's total, known from the pictures alone, Q = Σ w_j q_j = g_C·C + g_A A,
 // less what has been passed: the tile is replayed front to back and nothing per pixel has to be stored.
 //
-// A vector holds consecutive pixels of a row. Pixels that ended, or lie outside the image, have T = 0: their weights
-// vanish and T_{i+1} ≤ 1e-4 holds for ever, so no other mask is carried.
+// The unit of work is a block of 4×4 pixels, which is one vector on AVX-512 and several elsewhere: splats are small and round
+// rather than long, so a square is filled better than a row. Pixels that ended, or lie outside the image, have T = 0:
+// their weights vanish and T_{i+1} ≤ 1e-4 holds for ever, so no other mask is carried.
 #pragma once
 
 #include "simd.h"
@@ -21,207 +22,281 @@
 
 namespace globalsplat::raster::GS_ISA {
 
+// Vectors that make up a block: vector k holds its pixels k·lanes … (k + 1)·lanes − 1, counted row by row.
 template <class T>
-struct TileShape {
-  static constexpr int lanes = Simd<T>::lanes;
-  static constexpr int per_row = kTile / lanes;         // vectors in a row
-  static constexpr int vectors = kTile * per_row;       // vectors in the tile
-};
+inline constexpr int kVectors = kBlock * kBlock / Simd<T>::lanes;
 
-// Which of a tile's rows a splat can reach.
-struct Rows {
-  int begin, end;
-};
-
+// Centres of the pixels of every vector of a block whose first pixel is (0, 0).
 template <class T>
-GS_INLINE Rows reached_rows(const Splat<T>& s, int y0) {
-  // First row whose centre y0 + r + ½ is not above v − h, and one past the last that is not below v + h.
-  const T first = s.v - s.half_height - T(y0) - T(0.5);
-  const T last = s.v + s.half_height - T(y0) - T(0.5);
-  Rows rows{0, kTile};
-  if (first > T(0)) rows.begin = first < T(kTile) ? int(__builtin_ceil(double(first))) : kTile;
-  if (last < T(kTile - 1)) rows.end = last >= T(0) ? int(last) + 1 : 0;
-  return rows;
-}
+struct Centres {
+  T x[16], y[16];
+  constexpr Centres() : x{}, y{} {
+    for (int i = 0; i < 16; ++i) {
+      x[i] = T(i % kBlock) + T(0.5);
+      y[i] = T(i / kBlock) + T(0.5);
+    }
+  }
+};
+template <class T>
+inline constexpr Centres<T> kCentres{};
 
-// What a splat does to a vector of pixels: α, before and after its cap, and T behind it.
+// What a splat does to a vector of pixels.
 template <class T>
 struct Contribution {
-  Vector<T> unclamped, alpha, behind;
-  Mask<T> reaches;  // α ≥ 1/255
-  Mask<T> blends;   // and the pixel goes on: T behind it > 1e-4
+  Vector<T> p, r;
+  Vector<T> raw, alpha;  // before and after the cap
+  Vector<T> behind;      // T behind the splat
+  Mask<T> reaches;       // α ≥ 1/255
+  Mask<T> goes_on;       // T behind the splat > 1e-4
 };
 
 template <class T>
-GS_INLINE void contribute(const Splat<T>& s, Vector<T> sigma, Vector<T> transmittance, Contribution<T>& c) {
-  // Beyond 87 e^{−σ} leaves float's range, and no α comes near 1/255.
-  const Vector<T> limit = broadcast<T>(T(87));
-  c.unclamped = s.opacity * exp(-(sigma < limit ? sigma : limit));
-  const Vector<T> cap = broadcast<T>(T(kMaxAlpha));
-  c.alpha = c.unclamped < cap ? c.unclamped : cap;
-  c.behind = transmittance * (T(1) - c.alpha);
-  c.reaches = c.alpha >= broadcast<T>(T(kMinAlpha));
-  c.blends = c.reaches & (c.behind > broadcast<T>(T(kMinTransmittance)));
+GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
+  const Vector<T> dx = s.u - x, dy = s.v - y;
+  c.p = fma(broadcast<T>(s.a), dx, s.b * dy);
+  c.r = s.c * dy;
+  const Vector<T> exponent = fnma(c.p, c.p, fnma(c.r, c.r, broadcast<T>(s.log2_opacity)));
+  c.reaches = at_most(broadcast<T>(T(-kLog2Of255)), exponent);
+  c.raw = exp2(exponent);
+  c.alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
+  c.behind = fnma(transmittance, c.alpha, transmittance);
+  c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
 }
 
-// x of the pixel centres of the vector that starts at pixel column x0.
+// T behind the splat for pixels that it reaches, 0 for those that it ends.
 template <class T>
-GS_INLINE Vector<T> centres(int x0) {
-  Vector<T> x;
-  for (int i = 0; i < Simd<T>::lanes; ++i) x[i] = T(x0 + i) + T(0.5);
-  return x;
+GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c, Vector<T> transmittance) {
+  return select(c.reaches, select(c.goes_on, c.behind, Vector<T>{}), transmittance);
 }
 
-// 1 inside the image, 0 outside.
+// A block's pixels in an image plane, and which of them lie inside the image.
+struct BlockPlace {
+  int64_t offset;     // of its first pixel
+  int64_t row;        // from one row to the next
+  int columns, rows;  // inside the image
+
+  BlockPlace(int x0, int y0, int width, int height)
+      : offset(int64_t(y0) * width + x0), row(width), columns(width - x0), rows(height - y0) {}
+  bool whole() const { return columns >= kBlock && rows >= kBlock; }
+  bool outside() const { return columns <= 0 || rows <= 0; }
+};
+
+// Pixels outside the image read 0.
 template <class T>
-GS_INLINE Vector<T> inside(int x0, int y, int width, int height) {
-  Vector<T> t;
-  for (int i = 0; i < Simd<T>::lanes; ++i) t[i] = y < height && x0 + i < width ? T(1) : T(0);
-  return t;
+GS_INLINE void load_block(const T* plane, const BlockPlace& at, Vector<T>* out) {
+  T pixels[kBlock * kBlock] = {};
+  for (int j = 0; j < kBlock; ++j) {
+    if (at.whole())
+      __builtin_memcpy(pixels + kBlock * j, plane + at.offset + at.row * j, kBlock * sizeof(T));
+    else
+      for (int i = 0; i < kBlock; ++i)
+        if (i < at.columns && j < at.rows) pixels[kBlock * j + i] = plane[at.offset + at.row * j + i];
+  }
+  for (int k = 0; k < kVectors<T>; ++k) out[k] = load<T>(pixels + k * Simd<T>::lanes);
 }
 
+template <class T>
+GS_INLINE void store_block(const Vector<T>* in, const BlockPlace& at, T* plane) {
+  T pixels[kBlock * kBlock];
+  for (int k = 0; k < kVectors<T>; ++k) store<T>(pixels + k * Simd<T>::lanes, in[k]);
+  for (int j = 0; j < kBlock; ++j) {
+    if (at.whole())
+      __builtin_memcpy(plane + at.offset + at.row * j, pixels + kBlock * j, kBlock * sizeof(T));
+    else
+      for (int i = 0; i < kBlock; ++i)
+        if (i < at.columns && j < at.rows) plane[at.offset + at.row * j + i] = pixels[kBlock * j + i];
+  }
+}
+
+// T = 1 inside the image, 0 outside.
+template <class T>
+GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
+  T ones[kBlock * kBlock];
+  for (int i = 0; i < kBlock * kBlock; ++i) ones[i] = i % kBlock < at.columns && i / kBlock < at.rows ? T(1) : T(0);
+  for (int k = 0; k < kVectors<T>; ++k) transmittance[k] = load<T>(ones + k * Simd<T>::lanes);
+}
+
+// Sums of a vector of pixels.
+template <class T>
+struct Pixels {
+  Vector<T> transmittance, alpha{}, red{}, green{}, blue{}, z{};
+};
+
+// The tile's list is taken in parts that fit the first-level cache: the splats of a part are copied together, then each
+// vector of pixels goes through those that reach its block with all its sums in registers.
 template <class T>
 void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
   using V = Vector<T>;
-  using Shape = TileShape<T>;
-  V transmittance[Shape::vectors], ended[Shape::vectors];  // T of pixels that go on, and of those that ended
-  V red[Shape::vectors], green[Shape::vectors], blue[Shape::vectors], depth[Shape::vectors];
-  V x[Shape::per_row];
-  int going_on = 0;
-  for (int k = 0; k < Shape::per_row; ++k) x[k] = centres<T>(job.x0 + k * Shape::lanes);
-  for (int i = 0; i < Shape::vectors; ++i) {
-    const int column = job.x0 + i % Shape::per_row * Shape::lanes, row = job.y0 + i / Shape::per_row;
-    transmittance[i] = inside<T>(column, row, job.width, job.height);
-    going_on += any(transmittance[i] > V{});
-    red[i] = green[i] = blue[i] = depth[i] = ended[i] = V{};
+  constexpr int part = 128;
+  Splat<T> splats[part];
+  uint8_t lists[kBlocks][part];
+  Pixels<T> pixels[kBlocks][kVectors<T>];
+  uint32_t alive = 0;
+  for (int block = 0; block < kBlocks; ++block) {
+    const BlockPlace at(job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height);
+    V transmittance[kVectors<T>];
+    begin_block<T>(at, transmittance);
+    for (int k = 0; k < kVectors<T>; ++k) pixels[block][k].transmittance = transmittance[k];
+    alive |= uint32_t(!at.outside()) << block;
   }
 
-  for (int64_t item = 0; item < job.count && going_on > 0; ++item) {
-    const Splat<T>& s = job.splats[job.entries[item].splat];
-    const Rows rows = reached_rows(s, job.y0);
-    for (int row = rows.begin; row < rows.end; ++row) {
-      const T dy = s.v - (T(job.y0 + row) + T(0.5)), r = s.c * dy;
-      for (int k = 0; k < Shape::per_row; ++k) {
-        const int i = row * Shape::per_row + k;
-        const V p = fma(broadcast<T>(s.a), s.u - x[k], broadcast<T>(s.b * dy));
-        const V sigma = fma(p, p, broadcast<T>(r * r));
-        if (!any((sigma <= broadcast<T>(s.max_power)) & (transmittance[i] > V{}))) continue;
-        Contribution<T> c;
-        contribute(s, sigma, transmittance[i], c);
-
-        const V weight = c.blends ? transmittance[i] * c.alpha : V{};
-        red[i] = fma(weight, broadcast<T>(s.red), red[i]);
-        green[i] = fma(weight, broadcast<T>(s.green), green[i]);
-        blue[i] = fma(weight, broadcast<T>(s.blue), blue[i]);
-        depth[i] = fma(weight, broadcast<T>(s.z), depth[i]);
-
-        const Mask<T> ends = c.reaches & ~c.blends & (transmittance[i] > V{});
-        const V next = c.blends ? c.behind : transmittance[i];
-        if (any(ends)) {
-          ended[i] = ends ? transmittance[i] : ended[i];
-          transmittance[i] = ends ? V{} : next;
-          going_on -= !any(transmittance[i] > V{});
-        } else {
-          transmittance[i] = next;
-        }
+  for (int64_t begin = 0; begin < job.count && alive != 0; begin += part) {
+    const int count = int(job.count - begin < part ? job.count - begin : part);
+    int lengths[kBlocks] = {};
+    for (int i = 0; i < count; ++i) {
+      const TileEntry& entry = job.entries[begin + i];
+      splats[i] = job.splats[entry.splat];
+      for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
+        const int block = __builtin_ctz(blocks);
+        lists[block][lengths[block]++] = uint8_t(i);
       }
+    }
+    for (uint32_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      bool goes_on = false;
+      for (int k = 0; k < kVectors<T>; ++k) {
+        Pixels<T> px = pixels[block][k];
+        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
+        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
+        for (int i = 0; i < lengths[block]; ++i) {
+          const Splat<T>& s = splats[lists[block][i]];
+          Contribution<T> c;
+          contribute(s, x, y, px.transmittance, c);
+          const V weight = select(both(c.reaches, c.goes_on), px.transmittance * c.alpha, V{});
+          px.alpha += weight;
+          px.red = fma(weight, broadcast<T>(s.red), px.red);
+          px.green = fma(weight, broadcast<T>(s.green), px.green);
+          px.blue = fma(weight, broadcast<T>(s.blue), px.blue);
+          px.z = fma(weight, broadcast<T>(s.z), px.z);
+          px.transmittance = next_transmittance(c, px.transmittance);
+        }
+        goes_on |= any(less(V{}, px.transmittance));
+        pixels[block][k] = px;
+      }
+      if (!goes_on) alive &= ~(1u << block);
     }
   }
 
   const int64_t plane = int64_t(job.width) * job.height;
-  for (int i = 0; i < Shape::vectors; ++i) {
-    const int column = job.x0 + i % Shape::per_row * Shape::lanes, row = job.y0 + i / Shape::per_row;
-    if (row >= job.height) break;
-    const V alpha = T(1) - (transmittance[i] + ended[i]);
-    const V divisor = alpha > broadcast<T>(T(kMinDepthAlpha)) ? alpha : broadcast<T>(T(1));
-    const V expected = alpha > broadcast<T>(T(kMinDepthAlpha)) ? depth[i] / divisor : V{};
-    for (int lane = 0; lane < Shape::lanes && column + lane < job.width; ++lane) {
-      const int64_t pixel = int64_t(row) * job.width + column + lane;
-      out.rgb[pixel] = red[i][lane];
-      out.rgb[pixel + plane] = green[i][lane];
-      out.rgb[pixel + 2 * plane] = blue[i][lane];
-      out.alpha[pixel] = alpha[lane];
-      out.depth[pixel] = expected[lane];
+  for (int block = 0; block < kBlocks; ++block) {
+    const BlockPlace at(job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height);
+    if (at.outside()) continue;
+    V red[kVectors<T>], green[kVectors<T>], blue[kVectors<T>], alpha[kVectors<T>], depth[kVectors<T>];
+    for (int k = 0; k < kVectors<T>; ++k) {
+      const Pixels<T>& px = pixels[block][k];
+      red[k] = px.red;
+      green[k] = px.green;
+      blue[k] = px.blue;
+      alpha[k] = px.alpha;
+      depth[k] = select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), px.z / px.alpha, V{});
     }
+    store_block(red, at, out.rgb);
+    store_block(green, at, out.rgb + plane);
+    store_block(blue, at, out.rgb + 2 * plane);
+    store_block(alpha, at, out.alpha);
+    store_block(depth, at, out.depth);
+  }
+}
+
+// What the backward pass knows of a vector of pixels: T, Q less what has been passed, and q_i = g_red·r + g_green·g +
+// g_blue·b + per_z·z + constant.
+template <class T>
+struct PixelGradients {
+  Vector<T> transmittance, remaining, g_red, g_green, g_blue, per_z, constant;
+};
+
+template <class T>
+GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const Pictures<const T>& pictures,
+                              const Pictures<const T>& gradients, PixelGradients<T>* out) {
+  using V = Vector<T>;
+  V transmittance[kVectors<T>], colour[3][kVectors<T>], g_colour[3][kVectors<T>];
+  V alpha[kVectors<T>], g_alpha[kVectors<T>], depth[kVectors<T>], g_depth[kVectors<T>];
+  begin_block<T>(at, transmittance);
+  for (int channel = 0; channel < 3; ++channel) {
+    load_block(pictures.rgb + channel * plane, at, colour[channel]);
+    load_block(gradients.rgb + channel * plane, at, g_colour[channel]);
+  }
+  load_block(pictures.alpha, at, alpha);
+  load_block(gradients.alpha, at, g_alpha);
+  load_block(pictures.depth, at, depth);
+  load_block(gradients.depth, at, g_depth);
+  for (int k = 0; k < kVectors<T>; ++k) {
+    const V per_z = select(less(broadcast<T>(T(kMinDepthAlpha)), alpha[k]), g_depth[k] / alpha[k], V{});
+    V total = g_alpha[k] * alpha[k];
+    for (int channel = 0; channel < 3; ++channel) total = fma(g_colour[channel][k], colour[channel][k], total);
+    out[k] = {transmittance[k], total, g_colour[0][k], g_colour[1][k], g_colour[2][k], per_z,
+              g_alpha[k] - per_z * depth[k]};
   }
 }
 
 // `pictures` are the forward pass's own, `gradients` the loss's with respect to them; one record per entry is written.
+// Here splats are the outer loop, so that a splat's ten sums over the tile stay in registers.
 template <class T>
 void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& pictures,
                          const Pictures<const T>& gradients, SplatGradient<T>* records) {
   using V = Vector<T>;
-  using Shape = TileShape<T>;
-  // Per pixel: T, Q less what has been passed, and q_i = g_red·r + g_green·g + g_blue·b + per_z·z + constant.
-  V transmittance[Shape::vectors], remaining[Shape::vectors];
-  V g_red[Shape::vectors], g_green[Shape::vectors], g_blue[Shape::vectors];
-  V per_z[Shape::vectors], constant[Shape::vectors], x[Shape::per_row];
-  const int64_t plane = int64_t(job.width) * job.height;
-  for (int k = 0; k < Shape::per_row; ++k) x[k] = centres<T>(job.x0 + k * Shape::lanes);
-  for (int i = 0; i < Shape::vectors; ++i) {
-    const int column = job.x0 + i % Shape::per_row * Shape::lanes, row = job.y0 + i / Shape::per_row;
-    transmittance[i] = inside<T>(column, row, job.width, job.height);
-    remaining[i] = g_red[i] = g_green[i] = g_blue[i] = per_z[i] = constant[i] = V{};
-    if (row >= job.height) continue;
-    for (int lane = 0; lane < Shape::lanes && column + lane < job.width; ++lane) {
-      const int64_t pixel = int64_t(row) * job.width + column + lane;
-      const T r = gradients.rgb[pixel], g = gradients.rgb[pixel + plane], b = gradients.rgb[pixel + 2 * plane];
-      const T alpha = pictures.alpha[pixel], g_alpha = gradients.alpha[pixel];
-      const T g_depth = alpha > T(kMinDepthAlpha) ? gradients.depth[pixel] / alpha : T(0);
-      g_red[i][lane] = r;
-      g_green[i][lane] = g;
-      g_blue[i][lane] = b;
-      per_z[i][lane] = g_depth;
-      constant[i][lane] = g_alpha - g_depth * pictures.depth[pixel];
-      remaining[i][lane] = r * pictures.rgb[pixel] + g * pictures.rgb[pixel + plane] +
-                           b * pictures.rgb[pixel + 2 * plane] + g_alpha * alpha;
+  PixelGradients<T> pixels[kBlocks][kVectors<T>];
+  V x[4][kVectors<T>], y[4][kVectors<T>];  // centres of a column's, a row's blocks
+  for (int i = 0; i < 4; ++i)
+    for (int k = 0; k < kVectors<T>; ++k) {
+      x[i][k] = T(job.x0 + i * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
+      y[i][k] = T(job.y0 + i * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
     }
+  uint32_t alive = 0;
+  for (int block = 0; block < kBlocks; ++block) {
+    const BlockPlace at(job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height);
+    if (at.outside()) continue;
+    load_gradients(at, int64_t(job.width) * job.height, pictures, gradients, pixels[block]);
+    alive |= 1u << block;
   }
 
   for (int64_t item = 0; item < job.count; ++item) {
     const TileEntry& entry = job.entries[item];
     const Splat<T>& s = job.splats[entry.splat];
-    const Rows rows = reached_rows(s, job.y0);
-    V n{}, np{}, nr{}, npp{}, npr{}, nrr{}, red{}, green{}, blue{}, z{};
-    for (int row = rows.begin; row < rows.end; ++row) {
-      const T dy = s.v - (T(job.y0 + row) + T(0.5)), r = s.c * dy;
-      for (int k = 0; k < Shape::per_row; ++k) {
-        const int i = row * Shape::per_row + k;
-        const V p = fma(broadcast<T>(s.a), s.u - x[k], broadcast<T>(s.b * dy));
-        const V sigma = fma(p, p, broadcast<T>(r * r));
-        if (!any((sigma <= broadcast<T>(s.max_power)) & (transmittance[i] > V{}))) continue;
+    V power{}, power_p{}, power_r{}, power_pp{}, power_pr{}, power_rr{}, red{}, green{}, blue{}, z{};
+    for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      bool ended = false;
+      for (int k = 0; k < kVectors<T>; ++k) {
+        PixelGradients<T>& px = pixels[block][k];
         Contribution<T> c;
-        contribute(s, sigma, transmittance[i], c);
+        contribute(s, x[block % 4][k], y[block / 4][k], px.transmittance, c);
+        const Mask<T> blends = both(c.reaches, c.goes_on);
 
-        const V weight = c.blends ? transmittance[i] * c.alpha : V{};
-        V q = fma(g_red[i], broadcast<T>(s.red), constant[i]);
-        q = fma(g_green[i], broadcast<T>(s.green), q);
-        q = fma(g_blue[i], broadcast<T>(s.blue), q);
-        q = fma(per_z[i], broadcast<T>(s.z), q);
-        remaining[i] -= weight * q;
+        const V weight = select(blends, px.transmittance * c.alpha, V{});
+        V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
+        q = fma(px.g_green, broadcast<T>(s.green), q);
+        q = fma(px.g_blue, broadcast<T>(s.blue), q);
+        q = fma(px.per_z, broadcast<T>(s.z), q);
+        px.remaining = fnma(weight, q, px.remaining);
 
-        // ν = ∂L/∂σ = −α ∂L/∂α, nothing through the cap.
-        const V d_alpha = transmittance[i] * q - remaining[i] / (T(1) - c.alpha);
-        const V nu = (c.blends & (c.unclamped < broadcast<T>(T(kMaxAlpha)))) ? -c.alpha * d_alpha : V{};
-        const V nu_p = nu * p;
-        n += nu;
-        np += nu_p;
-        nr = fma(nu, broadcast<T>(r), nr);
-        npp = fma(nu_p, p, npp);
-        npr = fma(nu_p, broadcast<T>(r), npr);
-        nrr = fma(nu, broadcast<T>(r * r), nrr);
-        red = fma(weight, g_red[i], red);
-        green = fma(weight, g_green[i], green);
-        blue = fma(weight, g_blue[i], blue);
-        z = fma(weight, per_z[i], z);
+        // ν = −α ∂L/∂α, nothing through the cap.
+        const Mask<T> follows = both(blends, less(c.raw, broadcast<T>(T(kMaxAlpha))));
+        const V nu = select(follows, weight * (px.remaining * reciprocal(c.behind) - q), V{});
+        const V nu_p = nu * c.p, nu_r = nu * c.r;
+        power += nu;
+        power_p += nu_p;
+        power_r += nu_r;
+        power_pp = fma(nu_p, c.p, power_pp);
+        power_pr = fma(nu_p, c.r, power_pr);
+        power_rr = fma(nu_r, c.r, power_rr);
+        red = fma(weight, px.g_red, red);
+        green = fma(weight, px.g_green, green);
+        blue = fma(weight, px.g_blue, blue);
+        z = fma(weight, px.per_z, z);
 
-        const Mask<T> ends = c.reaches & ~c.blends;
-        const V next = c.blends ? c.behind : transmittance[i];
-        transmittance[i] = ends ? V{} : next;
+        ended |= any(c.reaches) && !any(c.goes_on);
+        px.transmittance = next_transmittance(c, px.transmittance);
+      }
+      if (ended) {
+        bool goes_on = false;
+        for (int k = 0; k < kVectors<T>; ++k) goes_on |= any(less(V{}, pixels[block][k].transmittance));
+        if (!goes_on) alive &= ~(1u << block);
       }
     }
-    records[entry.record] = {sum<T>(n),   sum<T>(np),  sum<T>(nr),    sum<T>(npp),  sum<T>(npr),
-                             sum<T>(nrr), sum<T>(red), sum<T>(green), sum<T>(blue), sum<T>(z)};
+    const V sums[kSplatGradientNumbers] = {power,    power_p, power_r, power_pp, power_pr,
+                                           power_rr, red,     green,   blue,     z};
+    sum_each(sums, &records[entry.record].power);
   }
 }
 

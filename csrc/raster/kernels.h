@@ -5,17 +5,32 @@
 
 namespace globalsplat::raster {
 
+// In the order of the work. Described where they are written: project.h, cover.h, blend.h.
 template <class T>
-struct BlendKernels {
-  void (*forward)(const TileJob<T>&, const Pictures<T>&);
-  void (*backward)(const TileJob<T>&, const Pictures<const T>& pictures, const Pictures<const T>& gradients,
-                   SplatGradient<T>* records);
+struct KernelsOf {
+  void (*project)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+                  Splat<T>* const* splats);
+  int64_t (*cover)(const Splat<T>* splats, int64_t begin, int64_t end, const Grid&, TilePair* pairs, int64_t capacity,
+                   int64_t& used, uint32_t* first);
+  void (*blend)(const TileJob<T>&, const Pictures<T>&);
+  void (*blend_backward)(const TileJob<T>&, const Pictures<const T>& pictures, const Pictures<const T>& gradients,
+                         SplatGradient<T>* records);
+  void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+                           const SplatRecords<T>* records, const GaussianGradients<T>& out);
 };
 
 struct Kernels {
   const char* name;  // "avx512", "avx2", "neon", "portable"
-  BlendKernels<float> blend32;
-  BlendKernels<double> blend64;
+  KernelsOf<float> of_float;
+  KernelsOf<double> of_double;
+
+  template <class T>
+  const KernelsOf<T>& of() const {
+    if constexpr (sizeof(T) == sizeof(float))
+      return of_float;
+    else
+      return of_double;
+  }
 };
 
 // The best that this machine runs, or the one GLOBALSPLAT_SIMD names. Throws std::invalid_argument when it names one

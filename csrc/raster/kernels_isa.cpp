@@ -1,6 +1,8 @@
 // Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
 #include "blend.h"
+#include "cover.h"
 #include "kernels.h"
+#include "project.h"
 
 namespace globalsplat::raster::GS_ISA {
 
@@ -10,8 +12,8 @@ namespace globalsplat::raster::GS_ISA {
 extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
-    {blend_tile<float>, blend_tile_backward<float>},
-    {blend_tile<double>, blend_tile_backward<double>},
+    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, project_backward<float>},
+    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, project_backward<double>},
 };
 
 }  // namespace globalsplat::raster::GS_ISA

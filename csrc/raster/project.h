@@ -1,238 +1,373 @@
-// One Gaussian seen by one camera, forward and backward.
+// Gaussians seen by cameras, forward and backward, a vector of Gaussians at a time.
 //
 //     t = W μ + p                          camera space; z ≤ 0.01 is dropped
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)
 //     J = [[f_x/z, 0, −f_x a/z], [0, f_y/z, −f_y b/z]],   a = clamp(t_x/z), b = clamp(t_y/z)
-//     Σ2D = (J W R S)(J W R S)ᵀ + eps2d·I,  C = Σ2D⁻¹;    det ≤ 0 is dropped
+//     Σ2D = (J W R S)(J W R S)ᵀ + eps2d·I;    det ≤ 0 is dropped
 //     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p.
 //
 // R is the rotation of the normalized quaternion, S = diag(scales). Only J sees the clamp: 15 % of the image's width
 // (height) beyond its borders. Writing Σ2D as a product of one factor keeps it positive semi-definite in float.
+//
+// All cameras of a scene are served while a vector of its Gaussians is at hand: what doesn't depend on the camera, above
+// all reading 59 numbers of each and turning them into lanes, is done once.
 #pragma once
 
-#include <cmath>
-
 #include "sh.h"
+#include "simd.h"
 #include "types.h"
 
-namespace globalsplat::raster {
+namespace globalsplat::raster::GS_ISA {
 
-// A camera with what all of its Gaussians share.
+// As many Gaussians as a vector has lanes.
 template <class T>
-struct Lens {
-  Camera<T> camera;
-  int width, height;
-  T eps2d;
-  T centre[3];                     // o, world
-  T x_low, x_high, y_low, y_high;  // the clamp of t_x/z and t_y/z
-
-  Lens(const Camera<T>& c, int width, int height, T eps2d) : camera(c), width(width), height(height), eps2d(eps2d) {
-    for (int k = 0; k < 3; ++k)
-      centre[k] = -(c.rotation[k] * c.translation[0] + c.rotation[3 + k] * c.translation[1] +
-                    c.rotation[6 + k] * c.translation[2]);
-    const T margin_x = T(kJacobianMargin) * width / c.fx, margin_y = T(kJacobianMargin) * height / c.fy;
-    x_low = -c.cx / c.fx - margin_x;
-    x_high = (width - c.cx) / c.fx + margin_x;
-    y_low = -c.cy / c.fy - margin_y;
-    y_high = (height - c.cy) / c.fy + margin_y;
-  }
+struct Group {
+  int count;             // lanes in use; the others repeat the last Gaussian
+  Vector<T> mean[3], scale[3];
+  Vector<T> inverse_norm, unit[4];       // 1/‖q‖, q/‖q‖
+  Vector<T> rotation[9], axes[9];        // R, R S
+  Vector<T> opacity, log2_opacity;
+  Vector<T> sh[kMaxBases * 3];
 };
 
-// Everything between a Gaussian and its Splat that the backward pass needs again.
+// What one camera makes of a group, as far as the backward pass needs it.
 template <class T>
 struct Projection {
-  T t[3];             // camera space mean
-  T a, b;             // clamped t_x/z, t_y/z
-  bool a_free, b_free;
-  T inverse_norm;     // 1/‖q‖
-  T unit[4];          // q/‖q‖
-  T rotation[9];      // R
-  T wr[9];            // W R S
-  T half[6];          // J W R S, 2×3
-  T cov_xx, cov_xy, cov_yy, determinant;
-  T direction[3], inverse_distance;
-  T basis[kMaxBases];
-  T colour[3];        // before the clamp at 0
+  Mask<T> visible;
+  Vector<T> t[3], inverse_z;
+  Vector<T> a, b;                   // clamped t_x/z, t_y/z
+  Mask<T> a_free, b_free;
+  Vector<T> wrs[9], half[6];        // W R S and J W R S (2×3)
+  Vector<T> cov_xx, cov_xy, cov_yy, determinant;
+  Vector<T> factor_a, factor_b, factor_c;  // Splat's a, b, c
 };
 
+// A group's colours from one camera.
 template <class T>
-inline void rotation_from_unit_quaternion(const T q[4], T r[9]) {
-  const T w = q[0], x = q[1], y = q[2], z = q[3];
-  r[0] = 1 - 2 * (y * y + z * z);
-  r[1] = 2 * (x * y - w * z);
-  r[2] = 2 * (x * z + w * y);
-  r[3] = 2 * (x * y + w * z);
-  r[4] = 1 - 2 * (x * x + z * z);
-  r[5] = 2 * (y * z - w * x);
-  r[6] = 2 * (x * z - w * y);
-  r[7] = 2 * (y * z + w * x);
-  r[8] = 1 - 2 * (x * x + y * y);
+struct Shading {
+  Vector<T> direction[3], inverse_distance, basis[kMaxBases];
+  Vector<T> colour[3];  // before the clamp at 0
+};
+
+// Lanes from rows of `width` numbers: out[k] holds number k of each of the group's rows.
+template <class T>
+GS_INLINE void load_columns(const T* rows, int width, int count, Vector<T>* out) {
+  constexpr int lanes = Simd<T>::lanes;
+  T columns[kMaxBases * 3][lanes];
+  for (int lane = 0; lane < lanes; ++lane) {
+    const T* row = rows + int64_t(width) * (lane < count ? lane : count - 1);
+    for (int k = 0; k < width; ++k) columns[k][lane] = row[k];
+  }
+  for (int k = 0; k < width; ++k) out[k] = load<T>(columns[k]);
 }
 
-// False when the camera doesn't see Gaussian i at all. NaN anywhere in the geometry counts as not seen.
+// The way back, for the first `count` lanes.
 template <class T>
-inline bool project(const Gaussians<T>& g, int64_t i, const Lens<T>& lens, Projection<T>& p, Splat<T>& s) {
+GS_INLINE void store_columns(const Vector<T>* in, int width, int count, T* rows) {
+  constexpr int lanes = Simd<T>::lanes;
+  T columns[kMaxBases * 3][lanes];
+  for (int k = 0; k < width; ++k) store<T>(columns[k], in[k]);
+  for (int lane = 0; lane < count; ++lane)
+    for (int k = 0; k < width; ++k) rows[int64_t(width) * lane + k] = columns[k][lane];
+}
+
+template <class T>
+GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Group<T>& group) {
+  using V = Vector<T>;
+  constexpr int lanes = Simd<T>::lanes;
+  group.count = int(end - begin < lanes ? end - begin : lanes);
+  load_columns(g.means + 3 * begin, 3, group.count, group.mean);
+  load_columns(g.scales + 3 * begin, 3, group.count, group.scale);
+  load_columns(g.quaternions + 4 * begin, 4, group.count, group.unit);
+  load_columns(g.opacities + begin, 1, group.count, &group.opacity);
+  load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, group.count, group.sh);
+  for (int lane = 0; lane < lanes; ++lane) group.log2_opacity[lane] = T(__builtin_log2(double(group.opacity[lane])));
+
+  V* q = group.unit;
+  group.inverse_norm = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  for (int k = 0; k < 4; ++k) q[k] *= group.inverse_norm;
+  const V w = q[0], x = q[1], y = q[2], z = q[3];
+  V* r = group.rotation;
+  r[0] = T(1) - T(2) * (y * y + z * z);
+  r[1] = T(2) * (x * y - w * z);
+  r[2] = T(2) * (x * z + w * y);
+  r[3] = T(2) * (x * y + w * z);
+  r[4] = T(1) - T(2) * (x * x + z * z);
+  r[5] = T(2) * (y * z - w * x);
+  r[6] = T(2) * (x * z - w * y);
+  r[7] = T(2) * (y * z + w * x);
+  r[8] = T(1) - T(2) * (x * x + y * y);
+  for (int k = 0; k < 9; ++k) group.axes[k] = r[k] * group.scale[k % 3];
+}
+
+// NaN anywhere in a Gaussian's geometry makes it invisible.
+template <class T>
+GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<T>& p) {
+  using V = Vector<T>;
   const Camera<T>& c = lens.camera;
-  const T* mean = g.means + 3 * i;
+  const V largest = broadcast<T>(sizeof(T) == 4 ? T(3e38) : T(1e308)), zero{};
   for (int r = 0; r < 3; ++r)
-    p.t[r] = c.rotation[3 * r] * mean[0] + c.rotation[3 * r + 1] * mean[1] + c.rotation[3 * r + 2] * mean[2] +
+    p.t[r] = c.rotation[3 * r] * g.mean[0] + c.rotation[3 * r + 1] * g.mean[1] + c.rotation[3 * r + 2] * g.mean[2] +
              c.translation[r];
-  const T z = p.t[2];
-  if (!(z > T(kNearPlane))) return false;
-  const T opacity = g.opacities[i];
-  if (!(opacity >= T(kMinAlpha))) return false;
+  p.visible = both(less(broadcast<T>(T(kNearPlane)), p.t[2]), at_most(broadcast<T>(T(kMinAlpha)), g.opacity));
+  if (!any(p.visible)) return;
 
-  const T x = p.t[0] / z, y = p.t[1] / z;
-  p.a = x < lens.x_low ? lens.x_low : x > lens.x_high ? lens.x_high : x;
-  p.b = y < lens.y_low ? lens.y_low : y > lens.y_high ? lens.y_high : y;
-  p.a_free = p.a == x;
-  p.b_free = p.b == y;
-
-  const T* q = g.quaternions + 4 * i;
-  p.inverse_norm = 1 / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int k = 0; k < 4; ++k) p.unit[k] = q[k] * p.inverse_norm;
-  rotation_from_unit_quaternion(p.unit, p.rotation);
-  const T* scale = g.scales + 3 * i;
+  p.inverse_z = T(1) / p.t[2];
+  const V x = p.t[0] * p.inverse_z, y = p.t[1] * p.inverse_z;
+  const V x_low = broadcast<T>(lens.x_low), x_high = broadcast<T>(lens.x_high);
+  const V y_low = broadcast<T>(lens.y_low), y_high = broadcast<T>(lens.y_high);
+  p.a = clamp(x, x_low, x_high);
+  p.b = clamp(y, y_low, y_high);
+  p.a_free = both(at_most(x_low, x), at_most(x, x_high));
+  p.b_free = both(at_most(y_low, y), at_most(y, y_high));
   for (int r = 0; r < 3; ++r)
     for (int k = 0; k < 3; ++k)
-      p.wr[3 * r + k] = (c.rotation[3 * r] * p.rotation[k] + c.rotation[3 * r + 1] * p.rotation[3 + k] +
-                         c.rotation[3 * r + 2] * p.rotation[6 + k]) *
-                        scale[k];
-  const T fx = c.fx / z, fy = c.fy / z;
+      p.wrs[3 * r + k] = c.rotation[3 * r] * g.axes[k] + c.rotation[3 * r + 1] * g.axes[3 + k] +
+                         c.rotation[3 * r + 2] * g.axes[6 + k];
+  const V fx = c.fx * p.inverse_z, fy = c.fy * p.inverse_z;
   for (int k = 0; k < 3; ++k) {
-    p.half[k] = fx * (p.wr[k] - p.a * p.wr[6 + k]);
-    p.half[3 + k] = fy * (p.wr[3 + k] - p.b * p.wr[6 + k]);
+    p.half[k] = fx * (p.wrs[k] - p.a * p.wrs[6 + k]);
+    p.half[3 + k] = fy * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
   }
-  const T* h = p.half;
+  const V* h = p.half;
   p.cov_xx = h[0] * h[0] + h[1] * h[1] + h[2] * h[2] + lens.eps2d;
   p.cov_xy = h[0] * h[3] + h[1] * h[4] + h[2] * h[5];
   p.cov_yy = h[3] * h[3] + h[4] * h[4] + h[5] * h[5] + lens.eps2d;
   // det(H Hᵀ + εI) = |h₁ × h₂|² + ε (tr + ε): no cancellation for needles, unlike xx·yy − xy².
-  const T cross_x = h[1] * h[5] - h[2] * h[4], cross_y = h[2] * h[3] - h[0] * h[5], cross_z = h[0] * h[4] - h[1] * h[3];
+  const V cross_x = h[1] * h[5] - h[2] * h[4], cross_y = h[2] * h[3] - h[0] * h[5], cross_z = h[0] * h[4] - h[1] * h[3];
   p.determinant = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z +
                   lens.eps2d * (p.cov_xx + p.cov_yy - lens.eps2d);
-  if (!(p.determinant > 0) || !std::isfinite(p.determinant)) return false;
+  p.visible = both(p.visible, both(less(zero, p.determinant), at_most(p.determinant, largest)));
 
-  s.u = c.fx * x + c.cx;
-  s.v = c.fy * y + c.cy;
-  // ½Σ2D⁻¹ = [[a², ab], [ab, b² + c²]]; the Schur complement of an inverse is the inverse of an entry: 2c² = 1/Σ_yy.
-  s.a = std::sqrt(T(0.5) * p.cov_yy / p.determinant);
-  s.b = -s.a * p.cov_xy / p.cov_yy;
-  s.c = std::sqrt(T(0.5) / p.cov_yy);
-  s.opacity = opacity;
-  s.z = z;
-  // α ≥ 1/255 ⟺ σ ≤ ln(255·opacity). The room on top covers the rounding of σ, whose terms may be larger than σ itself.
-  const T exact = std::log(opacity * T(255));
-  s.max_power = exact + T(1e-3) * (1 + exact);
-  s.half_height = std::sqrt(s.max_power) / s.c * (1 + T(1e-5)) + T(1e-3);
-
-  T distance2 = 0;
-  for (int k = 0; k < 3; ++k) {
-    p.direction[k] = mean[k] - lens.centre[k];
-    distance2 += p.direction[k] * p.direction[k];
-  }
-  p.inverse_distance = 1 / std::sqrt(distance2);
-  for (int k = 0; k < 3; ++k) p.direction[k] *= p.inverse_distance;
-  sh_basis(g.bases, p.direction, p.basis);
-  const T* coefficients = g.sh + int64_t(3) * g.bases * i;
-  for (int channel = 0; channel < 3; ++channel) {
-    T value = T(0.5);
-    for (int k = 0; k < g.bases; ++k) value += p.basis[k] * coefficients[3 * k + channel];
-    p.colour[channel] = value;
-  }
-  s.red = p.colour[0] > 0 ? p.colour[0] : T(0);
-  s.green = p.colour[1] > 0 ? p.colour[1] : T(0);
-  s.blue = p.colour[2] > 0 ? p.colour[2] : T(0);
-  return std::isfinite(s.u) && std::isfinite(s.v) && s.a > 0 && s.c > 0;
+  // Half the inverse is [[a², ab], [ab, b² + c²]]: 2a² = Σ_yy/det, and as the Schur complement of an inverse is the inverse
+  // of an entry, 2c² = 1/Σ_yy. The factor log₂e makes exponents those of 2.
+  constexpr T scale = T(0.5 * kLog2E);
+  p.factor_a = sqrt(scale * p.cov_yy / p.determinant);
+  p.factor_b = -p.factor_a * p.cov_xy / p.cov_yy;
+  p.factor_c = sqrt(scale / p.cov_yy);
+  p.visible = both(p.visible, both(less(zero, p.factor_a), less(zero, p.factor_c)));
+  const V u = c.fx * x, v = c.fy * y;
+  p.visible = both(p.visible, both(at_most(u * u, largest), at_most(v * v, largest)));
 }
 
-// Gradients of one Gaussian, summed over cameras.
+// The numbers of Splat, in its order, lane by lane.
 template <class T>
-struct GaussianGradient {
-  T mean[3] = {}, scale[3] = {}, quaternion[4] = {}, opacity = 0, sh[kMaxBases * 3] = {};
-};
+GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, const Shading<T>& s,
+                         Vector<T> out[16]) {
+  using V = Vector<T>;
+  const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
+  // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The room on top covers the rounding of s, whose terms may be larger than s itself: on
+  // the rim of a splat by 1 + |b|/c.
+  const V exact = g.log2_opacity + T(kLog2Of255), skew = larger(b, -b) / c;
+  constexpr T rounding = sizeof(T) == 4 ? T(1e-6) : T(1e-15);
+  const V reach = exact + T(1e-3) * (T(1) + exact) + rounding * exact * (T(1) + skew);
+  const V radius = sqrt(reach), bb_cc = b * b + c * c;
+  const V numbers[16] = {lens.camera.fx * (p.t[0] * p.inverse_z) + lens.camera.cx,
+                         lens.camera.fy * (p.t[1] * p.inverse_z) + lens.camera.cy,
+                         a,
+                         b,
+                         c,
+                         g.log2_opacity,
+                         larger(s.colour[0], zero),
+                         larger(s.colour[1], zero),
+                         larger(s.colour[2], zero),
+                         select(p.visible, p.t[2], zero),
+                         reach,
+                         radius * sqrt(bb_cc) / (a * c) * T(1 + 1e-5) + T(1e-3),
+                         radius / c * T(1 + 1e-5) + T(1e-3),
+                         b / a,
+                         a * b / bb_cc,
+                         zero};
+  for (int k = 0; k < 16; ++k) out[k] = numbers[k];
+}
 
-// Adds what one camera's pixels, summed in `d`, ask of Gaussian i. `p` and `s` are what project() gave.
+// Lanes where `visible` is false get a direction of zero.
 template <class T>
-inline void project_backward(const Gaussians<T>& g, int64_t i, const Lens<T>& lens, const Projection<T>& p,
-                             const Splat<T>& s, const SplatGradient<T>& d, GaussianGradient<T>& out) {
-  const Camera<T>& c = lens.camera;
-  const T z = p.t[2];
+GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
+  using V = Vector<T>;
+  V distance2{};
+  for (int k = 0; k < 3; ++k) {
+    s.direction[k] = select(visible, g.mean[k] - lens.centre[k], V{});
+    distance2 += s.direction[k] * s.direction[k];
+  }
+  s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});
+  for (int k = 0; k < 3; ++k) s.direction[k] *= s.inverse_distance;
+  sh_basis<T>(bases, s.direction, s.basis);
+  for (int channel = 0; channel < 3; ++channel) {
+    s.colour[channel] = broadcast<T>(T(0.5));
+    for (int k = 0; k < bases; ++k) s.colour[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.colour[channel]);
+  }
+}
 
-  // α = opacity·e^{−σ} and ν = −α ∂L/∂α, so ∂L/∂opacity = Σ e^{−σ} ∂L/∂α = −Σν / opacity.
-  out.opacity -= d.power / s.opacity;
-
-  // Colour, and the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
-  const T d_colour[3] = {p.colour[0] > 0 ? d.red : T(0), p.colour[1] > 0 ? d.green : T(0),
-                         p.colour[2] > 0 ? d.blue : T(0)};
-  const T* coefficients = g.sh + int64_t(3) * g.bases * i;
-  T d_basis[kMaxBases], d_direction[3];
-  for (int k = 0; k < g.bases; ++k) {
-    d_basis[k] = 0;
-    for (int channel = 0; channel < 3; ++channel) {
-      out.sh[3 * k + channel] += p.basis[k] * d_colour[channel];
-      d_basis[k] += coefficients[3 * k + channel] * d_colour[channel];
+// Gaussians begin … end − 1 as each of `views` cameras sees them: splats[view][i].
+template <class T>
+void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+             Splat<T>* const* splats) {
+  static_assert(sizeof(Splat<T>) == 16 * sizeof(T));
+  for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
+    Group<T> group;
+    load_group(g, i, end, group);
+    for (int64_t view = 0; view < views; ++view) {
+      Projection<T> projection;
+      Shading<T> shading;
+      Vector<T> numbers[16] = {};
+      project_group(group, lenses[view], projection);
+      if (any(projection.visible)) {
+        shade_group(group, g.bases, lenses[view], projection.visible, shading);
+        splats_of(group, lenses[view], projection, shading, numbers);
+      }
+      store_columns(numbers, 16, group.count, &splats[view][i].u);
     }
   }
-  sh_basis_backward(g.bases, p.direction, d_basis, d_direction);
-  const T along = d_direction[0] * p.direction[0] + d_direction[1] * p.direction[1] + d_direction[2] * p.direction[2];
-  for (int k = 0; k < 3; ++k) out.mean[k] += (d_direction[k] - along * p.direction[k]) * p.inverse_distance;
+}
 
-  // With U = [[a, b], [0, c]], σ = |UΔ|² and Σ2D⁻¹ = 2UᵀU. From M = Σ ν UΔ and W = Σ ν (UΔ)(UΔ)ᵀ,
-  // ∂L/∂(u, v) = 2UᵀM and ∂L/∂Σ2D = −2UᵀWU.
-  const T d_u = 2 * s.a * d.power_p;
-  const T d_v = 2 * (s.b * d.power_p + s.c * d.power_r);
-  const T m_xx = -2 * s.a * s.a * d.power_pp;
-  const T m_xy = -2 * s.a * (s.b * d.power_pp + s.c * d.power_pr);
-  const T m_yy = -2 * (s.b * s.b * d.power_pp + 2 * s.b * s.c * d.power_pr + s.c * s.c * d.power_rr);
+// Gradients of a group's Gaussians, summed over cameras; of R S instead of scales and quaternions.
+template <class T>
+struct GroupGradient {
+  Vector<T> mean[3] = {}, axes[9] = {}, opacity = {}, sh[kMaxBases * 3] = {};
+};
+
+// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds; in others `d` is 0.
+template <class T>
+GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T>& lens, const Projection<T>& p,
+                                      const Shading<T>& s, Mask<T> touched, const Vector<T> d[kSplatGradientNumbers],
+                                      GroupGradient<T>& out) {
+  using V = Vector<T>;
+  const V zero{};
+  const V power = d[0], power_p = d[1], power_r = d[2], power_pp = d[3], power_pr = d[4], power_rr = d[5];
+  const auto add = [&](V& to, V value) { to += select(touched, value, zero); };
+
+  // α = opacity·e^{−σ} and ν = −α ∂L/∂α, so ∂L/∂opacity = Σ e^{−σ} ∂L/∂α = −Σν / opacity.
+  add(out.opacity, -power / g.opacity);
+
+  // Colour, and the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
+  V d_colour[3], d_basis[kMaxBases], d_direction[3];
+  for (int channel = 0; channel < 3; ++channel)
+    d_colour[channel] = select(less(zero, s.colour[channel]), d[6 + channel], zero);
+  for (int k = 0; k < bases; ++k) {
+    d_basis[k] = zero;
+    for (int channel = 0; channel < 3; ++channel) {
+      V& sum = out.sh[3 * k + channel];
+      sum = fma(s.basis[k], d_colour[channel], sum);
+      d_basis[k] = fma(g.sh[3 * k + channel], d_colour[channel], d_basis[k]);
+    }
+  }
+  sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);
+  const V along = d_direction[0] * s.direction[0] + d_direction[1] * s.direction[1] + d_direction[2] * s.direction[2];
+  for (int k = 0; k < 3; ++k) add(out.mean[k], (d_direction[k] - along * s.direction[k]) * s.inverse_distance);
+
+  // With U = [[a, b], [0, c]], σ = ln 2·|UΔ|² and Σ2D⁻¹ = 2 ln 2·UᵀU. From M = Σ ν UΔ and W = Σ ν (UΔ)(UΔ)ᵀ,
+  // ∂L/∂(u, v) = 2 ln 2·UᵀM and ∂L/∂Σ2D = −2 ln²2·UᵀWU.
+  constexpr T ln2 = T(1 / kLog2E), two_ln2 = 2 * ln2, two_ln2_squared = two_ln2 * ln2;
+  const V a = p.factor_a, b = p.factor_b, c = p.factor_c;
+  const V d_u = two_ln2 * a * power_p;
+  const V d_v = two_ln2 * (b * power_p + c * power_r);
+  const V m_xx = -two_ln2_squared * a * a * power_pp;
+  const V m_xy = -two_ln2_squared * a * (b * power_pp + c * power_pr);
+  const V m_yy = -two_ln2_squared * (b * b * power_pp + T(2) * b * c * power_pr + c * c * power_rr);
 
   // Σ2D = H Hᵀ + εI: ∂L/∂H = 2 (∂L/∂Σ2D) H;  H = J V with V = W R S.
-  T d_half[6], d_wr[9];
+  const Camera<T>& camera = lens.camera;
+  const V fx = camera.fx * p.inverse_z, fy = camera.fy * p.inverse_z;
+  V d_half[6], d_wrs[9];
+  V d_fx{}, d_fy{}, d_a{}, d_b{};  // of f_x/z, f_y/z, a, b
   for (int k = 0; k < 3; ++k) {
-    d_half[k] = 2 * (m_xx * p.half[k] + m_xy * p.half[3 + k]);
-    d_half[3 + k] = 2 * (m_xy * p.half[k] + m_yy * p.half[3 + k]);
+    d_half[k] = T(2) * (m_xx * p.half[k] + m_xy * p.half[3 + k]);
+    d_half[3 + k] = T(2) * (m_xy * p.half[k] + m_yy * p.half[3 + k]);
   }
-  const T fx = c.fx / z, fy = c.fy / z;
-  T d_fx = 0, d_fy = 0, d_a = 0, d_b = 0;  // of f_x/z, f_y/z, a, b
   for (int k = 0; k < 3; ++k) {
-    d_wr[k] = fx * d_half[k];
-    d_wr[3 + k] = fy * d_half[3 + k];
-    d_wr[6 + k] = -fx * p.a * d_half[k] - fy * p.b * d_half[3 + k];
-    d_fx += d_half[k] * (p.wr[k] - p.a * p.wr[6 + k]);
-    d_fy += d_half[3 + k] * (p.wr[3 + k] - p.b * p.wr[6 + k]);
-    d_a -= fx * d_half[k] * p.wr[6 + k];
-    d_b -= fy * d_half[3 + k] * p.wr[6 + k];
+    d_wrs[k] = fx * d_half[k];
+    d_wrs[3 + k] = fy * d_half[3 + k];
+    d_wrs[6 + k] = -fx * p.a * d_half[k] - fy * p.b * d_half[3 + k];
+    d_fx += d_half[k] * (p.wrs[k] - p.a * p.wrs[6 + k]);
+    d_fy += d_half[3 + k] * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
+    d_a -= fx * d_half[k] * p.wrs[6 + k];
+    d_b -= fy * d_half[3 + k] * p.wrs[6 + k];
   }
 
   // t_x/z reaches u always and a where it isn't clamped.
-  const T d_x = c.fx * d_u + (p.a_free ? d_a : T(0));
-  const T d_y = c.fy * d_v + (p.b_free ? d_b : T(0));
-  const T d_t[3] = {d_x / z, d_y / z,
-                    d.z - (d_x * p.t[0] + d_y * p.t[1]) / (z * z) - (d_fx * c.fx + d_fy * c.fy) / (z * z)};
-  for (int k = 0; k < 3; ++k)
-    out.mean[k] += c.rotation[k] * d_t[0] + c.rotation[3 + k] * d_t[1] + c.rotation[6 + k] * d_t[2];
-
-  // V = W R S.
-  const T* scale = g.scales + 3 * i;
-  T d_rotation[9];
-  for (int k = 0; k < 3; ++k) {
-    for (int r = 0; r < 3; ++r) {
-      const T through = c.rotation[r] * d_wr[k] + c.rotation[3 + r] * d_wr[3 + k] + c.rotation[6 + r] * d_wr[6 + k];
-      out.scale[k] += through * p.rotation[3 * r + k];
-      d_rotation[3 * r + k] = through * scale[k];
-    }
-  }
-
-  // R of the unit quaternion, then the normalization: ∂/∂q = (I − q̂ q̂ᵀ)/‖q‖.
-  const T w = p.unit[0], x = p.unit[1], y = p.unit[2], zq = p.unit[3];
-  const T* r = d_rotation;
-  const T d_unit[4] = {
-      2 * (-zq * r[1] + y * r[2] + zq * r[3] - x * r[5] - y * r[6] + x * r[7]),
-      2 * (y * r[1] + zq * r[2] + y * r[3] - 2 * x * r[4] - w * r[5] + zq * r[6] + w * r[7] - 2 * x * r[8]),
-      2 * (-2 * y * r[0] + x * r[1] + w * r[2] + x * r[3] + zq * r[5] - w * r[6] + zq * r[7] - 2 * y * r[8]),
-      2 * (-2 * zq * r[0] - w * r[1] + x * r[2] + w * r[3] - 2 * zq * r[4] + y * r[5] + x * r[6] + y * r[7])};
-  const T inward = d_unit[0] * w + d_unit[1] * x + d_unit[2] * y + d_unit[3] * zq;
-  for (int k = 0; k < 4; ++k) out.quaternion[k] += (d_unit[k] - inward * p.unit[k]) * p.inverse_norm;
+  const V d_x = camera.fx * d_u + select(p.a_free, d_a, zero);
+  const V d_y = camera.fy * d_v + select(p.b_free, d_b, zero);
+  const V inverse_z2 = p.inverse_z * p.inverse_z;
+  const V d_t[3] = {d_x * p.inverse_z, d_y * p.inverse_z,
+                    d[9] - (d_x * p.t[0] + d_y * p.t[1]) * inverse_z2 - (d_fx * camera.fx + d_fy * camera.fy) * inverse_z2};
+  const T* w = camera.rotation;
+  for (int k = 0; k < 3; ++k) add(out.mean[k], w[k] * d_t[0] + w[3 + k] * d_t[1] + w[6 + k] * d_t[2]);
+  for (int r = 0; r < 3; ++r)
+    for (int k = 0; k < 3; ++k)
+      add(out.axes[3 * r + k], w[r] * d_wrs[k] + w[3 + r] * d_wrs[3 + k] + w[6 + r] * d_wrs[6 + k]);
 }
 
-}  // namespace globalsplat::raster
+// From ∂L/∂(R S) to scales and quaternions, which no camera's pixels see in any other way.
+template <class T>
+GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vector<T> d_scale[3],
+                             Vector<T> d_quaternion[4]) {
+  using V = Vector<T>;
+  V r[9];  // ∂L/∂R
+  for (int k = 0; k < 3; ++k) d_scale[k] = V{};
+  for (int k = 0; k < 9; ++k) {
+    d_scale[k % 3] += d_axes[k] * g.rotation[k];
+    r[k] = d_axes[k] * g.scale[k % 3];
+  }
+  // R of the unit quaternion, then the normalization: ∂/∂q = (I − q̂ q̂ᵀ)/‖q‖.
+  const V w = g.unit[0], x = g.unit[1], y = g.unit[2], z = g.unit[3];
+  const V d_unit[4] = {T(2) * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1])),
+                       T(2) * (w * (r[7] - r[5]) + y * (r[1] + r[3]) + z * (r[2] + r[6]) - T(2) * x * (r[4] + r[8])),
+                       T(2) * (w * (r[2] - r[6]) + x * (r[1] + r[3]) + z * (r[5] + r[7]) - T(2) * y * (r[0] + r[8])),
+                       T(2) * (w * (r[3] - r[1]) + x * (r[2] + r[6]) + y * (r[5] + r[7]) - T(2) * z * (r[0] + r[4]))};
+  const V inward = d_unit[0] * w + d_unit[1] * x + d_unit[2] * y + d_unit[3] * z;
+  for (int k = 0; k < 4; ++k) d_quaternion[k] = (d_unit[k] - inward * g.unit[k]) * g.inverse_norm;
+}
+
+// The records of Gaussian `first` and those after it, added up in their order, one Gaussian per lane. Tells which
+// lanes have any.
+template <class T>
+GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int count,
+                              Vector<T> out[kSplatGradientNumbers]) {
+  constexpr int lanes = Simd<T>::lanes;
+  T sums[lanes][kSplatGradientNumbers] = {}, has_any[lanes] = {};
+  for (int lane = 0; lane < count; ++lane) {
+    for (uint32_t r = from.first[first + lane]; r < from.first[first + lane + 1]; ++r) {
+      const T* record = &from.records[r].power;
+      for (int k = 0; k < kSplatGradientNumbers; ++k) sums[lane][k] += record[k];
+      has_any[lane] = T(1);
+    }
+  }
+  load_columns(sums[0], kSplatGradientNumbers, lanes, out);
+  return less(Vector<T>{}, load<T>(has_any));
+}
+
+// All gradients of Gaussians begin … end − 1, from what the pixels of each of `views` cameras ask of them.
+template <class T>
+void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+                      const SplatRecords<T>* records, const GaussianGradients<T>& out) {
+  using V = Vector<T>;
+  for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
+    Group<T> group;
+    load_group(g, i, end, group);
+    GroupGradient<T> sum;
+    Mask<T> ever{};
+    for (int64_t view = 0; view < views; ++view) {
+      V d[kSplatGradientNumbers];
+      const Mask<T> touched = sum_records(records[view], i, group.count, d);
+      if (!any(touched)) continue;
+      ever = Mask<T>(ever | touched);
+      Projection<T> projection;
+      Shading<T> shading;
+      project_group(group, lenses[view], projection);
+      shade_group(group, g.bases, lenses[view], touched, shading);
+      project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum);
+    }
+    V d_scale[3], d_quaternion[4];
+    axes_backward(group, sum.axes, d_scale, d_quaternion);
+    for (V& v : d_scale) v = select(ever, v, V{});
+    for (V& v : d_quaternion) v = select(ever, v, V{});
+    store_columns(sum.mean, 3, group.count, out.means + 3 * i);
+    store_columns(d_scale, 3, group.count, out.scales + 3 * i);
+    store_columns(d_quaternion, 4, group.count, out.quaternions + 4 * i);
+    store_columns(&sum.opacity, 1, group.count, out.opacities + i);
+    store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
+  }
+}
+
+}  // namespace globalsplat::raster::GS_ISA

@@ -22,15 +22,19 @@ struct Settings {
 
 // Wall-clock seconds that the stages of one call took, all views together.
 struct StageTimes {
-  double project = 0, sort = 0, bin = 0, blend = 0;
+  double project = 0, cover = 0, sort = 0, bin = 0, blend = 0;
   double blend_backward = 0, project_backward = 0;
 };
 
-// What a forward pass leaves for its backward pass: per view the visible splats front to back and the tile lists.
+template <class T>
+Lens<T> lens_of(const Camera<T>& camera, int width, int height, double eps2d);
+
+// What a forward pass leaves for its backward pass: per view the splats and the tile lists.
 template <class T>
 class Frame {
  public:
-  // Draws every view into its pictures: `out[k]` for `views[k]`.
+  // Draws every view into its pictures: `out[k]` for `views[k]`. All scenes have the same number of Gaussians; a scene's
+  // views follow each other.
   static std::unique_ptr<Frame> draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
                                      const Settings& settings, const std::vector<Pictures<T>>& out,
                                      StageTimes& times);
@@ -38,18 +42,22 @@ class Frame {
   // `scenes` and `pictures` are draw()'s inputs and outputs, unchanged. Writes every gradient of every Gaussian; sums
   // run over a scene's cameras and a camera's tiles in order, so the bits don't depend on the number of threads.
   void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
-                const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out, StageTimes& times) const;
+                const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
+                StageTimes& times) const;
 
   ~Frame();
 
  private:
   struct PerView;
-  Frame(const std::vector<View<T>>& views, const Settings& settings);
+  Frame(const std::vector<View<T>>& views, size_t scenes, const Settings& settings);
+  void bin(StageTimes& times);
   TileJob<T> job(const PerView& view, int tile) const;
 
   Settings settings_;
-  int tiles_x_, tiles_y_;
+  Grid grid_;
   std::vector<PerView> views_;
+  std::vector<Lens<T>> lenses_;
+  std::vector<size_t> first_view_;  // [scenes + 1] of a scene
 };
 
 }  // namespace globalsplat::raster

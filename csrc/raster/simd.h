@@ -1,12 +1,14 @@
-// Vectors of pixels. GCC's and Clang's vector extensions give arithmetic and comparisons on every machine; what they
-// lack (fused multiply-add, mask tests) is here, once per instruction set. This file is compiled several times with
-// different instruction sets, so everything is inside the namespace that the including kernel file names.
+// Vectors of numbers. GCC's and Clang's vector extensions give arithmetic and comparisons on every machine; what they
+// lack (fused multiply-add, masks in a form each machine likes, approximations) is here, once per instruction set. This
+// file is compiled several times with different instruction sets, so everything is inside the namespace that the
+// including kernel file names, and nothing of the standard library is instantiated here: the linker would keep one copy
+// for all.
 #pragma once
 
 #include <cmath>
 #include <cstdint>
 
-#if defined(__AVX2__) || defined(__AVX512F__)
+#if defined(__x86_64__)
 #include <immintrin.h>
 #elif defined(__aarch64__)
 #include <arm_neon.h>
@@ -24,6 +26,8 @@ inline constexpr int kVectorBytes = 32;
 inline constexpr int kVectorBytes = 16;
 #endif
 
+// `bits` is what a comparison of vectors gives: −1 or 0 in every lane. `mask` is the form that the machine computes
+// with: a bit per lane in a mask register on AVX-512, the same as `bits` elsewhere.
 template <class T>
 struct Simd;
 
@@ -31,66 +35,30 @@ template <>
 struct Simd<float> {
   static constexpr int lanes = kVectorBytes / 4;
   typedef float vector __attribute__((vector_size(kVectorBytes)));
-  typedef int32_t mask __attribute__((vector_size(kVectorBytes)));  // −1 where true, 0 where false
+  typedef int32_t bits __attribute__((vector_size(kVectorBytes)));
+#if defined(__AVX512F__)
+  typedef __mmask16 mask;
+#else
+  typedef bits mask;
+#endif
 };
 
 template <>
 struct Simd<double> {
   static constexpr int lanes = kVectorBytes / 8;
   typedef double vector __attribute__((vector_size(kVectorBytes)));
-  typedef int64_t mask __attribute__((vector_size(kVectorBytes)));
+  typedef int64_t bits __attribute__((vector_size(kVectorBytes)));
+#if defined(__AVX512F__)
+  typedef __mmask8 mask;
+#else
+  typedef bits mask;
+#endif
 };
 
 template <class T>
 using Vector = typename Simd<T>::vector;
 template <class T>
 using Mask = typename Simd<T>::mask;
-
-// a·b + c in one rounding where the machine can. Kernels are compiled without contraction, so this is the only source
-// of fused operations and a forward pass and its backward replay take the same decisions bit for bit.
-GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) {
-#if defined(__AVX512F__)
-  return _mm512_fmadd_ps(a, b, c);
-#elif defined(__AVX2__)
-  return _mm256_fmadd_ps(a, b, c);
-#elif defined(__aarch64__)
-  return vfmaq_f32(c, a, b);
-#else
-  return a * b + c;
-#endif
-}
-
-GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) {
-#if defined(__AVX512F__)
-  return _mm512_fmadd_pd(a, b, c);
-#elif defined(__AVX2__)
-  return _mm256_fmadd_pd(a, b, c);
-#elif defined(__aarch64__)
-  return vfmaq_f64(c, a, b);
-#else
-  return a * b + c;
-#endif
-}
-
-GS_INLINE bool any(Mask<float> m) {
-#if defined(__AVX512F__)
-  return _mm512_movepi32_mask((__m512i)m) != 0;
-#elif defined(__AVX2__)
-  return _mm256_movemask_ps((__m256)m) != 0;
-#else
-  return (m[0] | m[1] | m[2] | m[3]) != 0;
-#endif
-}
-
-GS_INLINE bool any(Mask<double> m) {
-#if defined(__AVX512F__)
-  return _mm512_movepi64_mask((__m512i)m) != 0;
-#elif defined(__AVX2__)
-  return _mm256_movemask_pd((__m256d)m) != 0;
-#else
-  return (m[0] | m[1]) != 0;
-#endif
-}
 
 template <class T>
 GS_INLINE Vector<T> broadcast(T value) {
@@ -109,40 +77,222 @@ GS_INLINE void store(T* to, Vector<T> v) {
   __builtin_memcpy(to, &v, sizeof v);
 }
 
-// Lane sum by halving, the same order on every call.
+// fma(a, b, c) = a·b + c and fnma(a, b, c) = c − a·b, in one rounding on every machine: which splats reach which pixels
+// then is decided alike everywhere. Kernels are compiled without contraction, so nothing else is fused. float64 exists to
+// prove gradients and is rounded twice where the machine can't do better.
+#if defined(__AVX512F__)
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fmadd_ps(a, b, c); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fnmadd_ps(a, b, c); }
+GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm512_fmadd_pd(a, b, c); }
+GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm512_fnmadd_pd(a, b, c); }
+#elif defined(__AVX2__)
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm256_fmadd_ps(a, b, c); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm256_fnmadd_ps(a, b, c); }
+GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm256_fmadd_pd(a, b, c); }
+GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm256_fnmadd_pd(a, b, c); }
+#elif defined(__aarch64__)
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return vfmaq_f32(c, a, b); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return vfmsq_f32(c, a, b); }
+GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return vfmaq_f64(c, a, b); }
+GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return vfmsq_f64(c, a, b); }
+#else
+#if defined(__SSE2__)
+// The product of two floats is exact in float64, and the sum rounded to float64 and then to float is all but always the
+// sum rounded once.
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) {
+  const auto low = [](__m128 v) { return _mm_cvtps_pd(v); };
+  const auto high = [](__m128 v) { return _mm_cvtps_pd(_mm_movehl_ps(v, v)); };
+  return _mm_movelh_ps(_mm_cvtpd_ps(low(a) * low(b) + low(c)), _mm_cvtpd_ps(high(a) * high(b) + high(c)));
+}
+#else
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) {
+  for (int i = 0; i < Simd<float>::lanes; ++i) a[i] = __builtin_fmaf(a[i], b[i], c[i]);
+  return a;
+}
+#endif
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return fma(-a, b, c); }
+GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return a * b + c; }
+GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return c - a * b; }
+#endif
+
+// Comparisons are false where an operand is NaN.
+#if defined(__AVX512F__)
+GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+GS_INLINE Mask<float> at_most(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+GS_INLINE Mask<double> less(Vector<double> a, Vector<double> b) { return _mm512_cmp_pd_mask(a, b, _CMP_LT_OQ); }
+GS_INLINE Mask<double> at_most(Vector<double> a, Vector<double> b) { return _mm512_cmp_pd_mask(a, b, _CMP_LE_OQ); }
+GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) { return _mm512_mask_blend_ps(m, b, a); }
+GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return _mm512_mask_blend_pd(m, b, a); }
+GS_INLINE int lane_bits(Mask<float> m) { return m; }
+GS_INLINE int lane_bits(Mask<double> m) { return m; }
 template <class T>
-GS_INLINE T sum(Vector<T> v) {
-  T lane[Simd<T>::lanes];
-  store<T>(lane, v);
-  for (int half = Simd<T>::lanes / 2; half > 0; half /= 2)
-    for (int i = 0; i < half; ++i) lane[i] += lane[i + half];
-  return lane[0];
+GS_INLINE Mask<T> first_lanes(int count) { return Mask<T>((1 << count) - 1); }
+#else
+GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return a < b; }
+GS_INLINE Mask<float> at_most(Vector<float> a, Vector<float> b) { return a <= b; }
+GS_INLINE Mask<double> less(Vector<double> a, Vector<double> b) { return a < b; }
+GS_INLINE Mask<double> at_most(Vector<double> a, Vector<double> b) { return a <= b; }
+GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) { return m ? a : b; }
+GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return m ? a : b; }
+template <class T>
+GS_INLINE Mask<T> first_lanes(int count) {
+  Mask<T> m{};
+  for (int i = 0; i < count; ++i) m[i] = -1;
+  return m;
+}
+#if defined(__AVX2__)
+GS_INLINE int lane_bits(Mask<float> m) { return _mm256_movemask_ps((__m256)m); }
+GS_INLINE int lane_bits(Mask<double> m) { return _mm256_movemask_pd((__m256d)m); }
+#elif defined(__SSE2__)
+GS_INLINE int lane_bits(Mask<float> m) { return __builtin_ia32_movmskps((Vector<float>)m); }
+GS_INLINE int lane_bits(Mask<double> m) { return __builtin_ia32_movmskpd((Vector<double>)m); }
+#else
+GS_INLINE int lane_bits(Mask<float> m) { return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8); }
+GS_INLINE int lane_bits(Mask<double> m) { return int((m[0] & 1) | (m[1] & 2)); }
+#endif
+#endif
+
+template <class M>
+GS_INLINE M both(M a, M b) {
+  return M(a & b);
 }
 
-// e^x for x in [−87, 0]: x = n·ln 2 + r with |r| ≤ ln 2 / 2, Taylor to r⁷ (remainder 5e-9), exponent bits plus n.
-// Measured over the whole range: relative error below 1.2e-7.
-GS_INLINE Vector<float> exp(Vector<float> x) {
+template <class M>
+GS_INLINE bool any(M m) {
+  return lane_bits(m) != 0;
+}
+
+// The second operand where the first is NaN.
+template <class V>
+GS_INLINE V smaller(V a, V b) {
+  return a < b ? a : b;
+}
+
+template <class V>
+GS_INLINE V larger(V a, V b) {
+  return a > b ? a : b;
+}
+
+template <class V>
+GS_INLINE V clamp(V v, V low, V high) {
+  return smaller(larger(v, low), high);
+}
+
+#if defined(__AVX512F__)
+GS_INLINE Vector<float> sqrt(Vector<float> v) { return _mm512_sqrt_ps(v); }
+GS_INLINE Vector<double> sqrt(Vector<double> v) { return _mm512_sqrt_pd(v); }
+#elif defined(__AVX2__)
+GS_INLINE Vector<float> sqrt(Vector<float> v) { return _mm256_sqrt_ps(v); }
+GS_INLINE Vector<double> sqrt(Vector<double> v) { return _mm256_sqrt_pd(v); }
+#elif defined(__aarch64__)
+GS_INLINE Vector<float> sqrt(Vector<float> v) { return vsqrtq_f32(v); }
+GS_INLINE Vector<double> sqrt(Vector<double> v) { return vsqrtq_f64(v); }
+#else
+GS_INLINE Vector<float> sqrt(Vector<float> v) {
+  for (int i = 0; i < Simd<float>::lanes; ++i) v[i] = __builtin_sqrtf(v[i]);
+  return v;
+}
+GS_INLINE Vector<double> sqrt(Vector<double> v) {
+  for (int i = 0; i < Simd<double>::lanes; ++i) v[i] = __builtin_sqrt(v[i]);
+  return v;
+}
+#endif
+
+// 1/v to 2e-7: an estimate of 12 or 14 bits and one step of Newton's method. No decision hangs on it.
+#if defined(__AVX512F__)
+GS_INLINE Vector<float> reciprocal(Vector<float> v) {
+  const Vector<float> estimate = _mm512_rcp14_ps(v);
+  return fma(fnma(v, estimate, broadcast<float>(1)), estimate, estimate);
+}
+#elif defined(__AVX2__)
+GS_INLINE Vector<float> reciprocal(Vector<float> v) {
+  const Vector<float> estimate = _mm256_rcp_ps(v);
+  return fma(fnma(v, estimate, broadcast<float>(1)), estimate, estimate);
+}
+#else
+GS_INLINE Vector<float> reciprocal(Vector<float> v) { return 1.0f / v; }
+#endif
+GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
+
+// 2^x where it is a normal number (x ≥ −126); anything below. x = n + f with |f| ≤ ½, and a polynomial of degree 6 that is
+// within 1.9e-9 of 2^f (Remez): with its rounding, the relative error is below 1.2e-7. All machines give the same bits.
+GS_INLINE Vector<float> exp2(Vector<float> x) {
   using V = Vector<float>;
+#if defined(__AVX512F__)
+  const V n = _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+#else
   const V magic = broadcast<float>(12582912.0f);  // 1.5·2²³: adding it rounds to an integer in the low bits
-  const V shifted = fma(x, broadcast<float>(1.44269504089f), magic);
+  const V shifted = x + magic;
   const V n = shifted - magic;
-  V r = fma(n, broadcast<float>(-0.693359375f), x);       // ln 2 in two parts, the first exact in few bits
-  r = fma(n, broadcast<float>(2.12194440055e-4f), r);
-  V p = broadcast<float>(1.0f / 5040);
-  p = fma(p, r, broadcast<float>(1.0f / 720));
-  p = fma(p, r, broadcast<float>(1.0f / 120));
-  p = fma(p, r, broadcast<float>(1.0f / 24));
-  p = fma(p, r, broadcast<float>(1.0f / 6));
-  p = fma(p, r, broadcast<float>(0.5f));
-  p = fma(p, r, broadcast<float>(1.0f));
-  p = fma(p, r, broadcast<float>(1.0f));
-  return (V)((Mask<float>)p + ((Mask<float>)shifted << 23));
+#endif
+  const V f = x - n;
+  V p = broadcast<float>(1.534581201e-4f);
+  p = fma(p, f, broadcast<float>(1.339993122e-3f));
+  p = fma(p, f, broadcast<float>(9.618488957e-3f));
+  p = fma(p, f, broadcast<float>(5.550328777e-2f));
+  p = fma(p, f, broadcast<float>(2.402264689e-1f));
+  p = fma(p, f, broadcast<float>(6.931472057e-1f));
+  p = fma(p, f, broadcast<float>(1.0f));
+#if defined(__AVX512F__)
+  return _mm512_scalef_ps(p, n);
+#else
+  return (V)((Simd<float>::bits)p + ((Simd<float>::bits)shifted << 23));
+#endif
 }
 
 // float64 exists to prove gradients, so it takes the library's exponential.
-GS_INLINE Vector<double> exp(Vector<double> x) {
-  for (int i = 0; i < Simd<double>::lanes; ++i) x[i] = std::exp(x[i]);
+GS_INLINE Vector<double> exp2(Vector<double> x) {
+  for (int i = 0; i < Simd<double>::lanes; ++i) x[i] = __builtin_exp2(x[i]);
   return x;
 }
+
+// out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.
+template <class T, int count>
+GS_INLINE void sum_each(const Vector<T> (&v)[count], T* out) {
+  for (int k = 0; k < count; ++k) {
+    T lane[Simd<T>::lanes];
+    store<T>(lane, v[k]);
+    for (int half = Simd<T>::lanes / 2; half > 0; half /= 2)
+      for (int i = 0; i < half; ++i) lane[i] += lane[i + half];
+    out[k] = lane[0];
+  }
+}
+
+#if defined(__AVX512F__)
+// Pairs of vectors are folded into one that holds both halves' sums: 16 vectors become one of 16 sums in four levels.
+template <int count>
+GS_INLINE void sum_each(const Vector<float> (&v)[count], float* out) {
+  static_assert(count <= 16);
+  __m512 level[16];
+  for (int k = 0; k < 16; ++k) level[k] = k < count ? (__m512)v[k] : _mm512_setzero_ps();
+  // Values k and k + 4, then those and k + 8, k + 12, share a vector; a quarter of it each.
+  __m512 quarter[4];
+  for (int k = 0; k < 4; ++k) {
+    const auto fold = [](__m512 a, __m512 b) {
+      return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));
+    };
+    const __m512 low = fold(level[k], level[k + 4]), high = fold(level[k + 8], level[k + 12]);
+    quarter[k] = _mm512_add_ps(_mm512_shuffle_f32x4(low, high, 0x88), _mm512_shuffle_f32x4(low, high, 0xDD));
+  }
+  const auto interleave = [](__m512 a, __m512 b) {
+    return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
+  };
+  const __m512 even = interleave(quarter[0], quarter[1]), odd = interleave(quarter[2], quarter[3]);
+  const __m512 sums = _mm512_add_ps(_mm512_shuffle_ps(even, odd, 0x44), _mm512_shuffle_ps(even, odd, 0xEE));
+  _mm512_mask_storeu_ps(out, __mmask16((1 << count) - 1), sums);
+}
+#elif defined(__AVX2__)
+template <int count>
+GS_INLINE void sum_each(const Vector<float> (&v)[count], float* out) {
+  static_assert(count <= 12 && count > 8);
+  const auto at = [&](int k) { return k < count ? (__m256)v[k] : _mm256_setzero_ps(); };
+  float sums[12];
+  for (int k = 0; k < 12; k += 4) {
+    const __m256 four = _mm256_hadd_ps(_mm256_hadd_ps(at(k), at(k + 1)), _mm256_hadd_ps(at(k + 2), at(k + 3)));
+    _mm_storeu_ps(sums + k, _mm_add_ps(_mm256_castps256_ps128(four), _mm256_extractf128_ps(four, 1)));
+  }
+  __builtin_memcpy(out, sums, count * sizeof(float));
+}
+#endif
 
 }  // namespace globalsplat::raster::GS_ISA

@@ -13,7 +13,11 @@ inline constexpr double kMaxAlpha = 0.999;          // α is capped here, and no
 inline constexpr double kMinTransmittance = 1e-4;   // a Gaussian that would bring T to it or below ends the pixel
 inline constexpr double kJacobianMargin = 0.15;     // share of the width (height) the clamp of J leaves on each side
 inline constexpr double kMinDepthAlpha = 1e-10;     // expected depth is 0 where the accumulated opacity is not above
+inline constexpr double kLog2E = 1.4426950408889634;
+inline constexpr double kLog2Of255 = 7.994353436858858;
 inline constexpr int kTile = 16;                    // tile edge in pixels
+inline constexpr int kBlock = 4;                    // edge in pixels of the blocks that a tile is culled and blended by
+inline constexpr int kBlocks = 16;                  // of a tile
 
 // One scene. Row-major arrays of `count` Gaussians.
 template <class T>
@@ -45,28 +49,54 @@ struct Camera {
   T fx, fy, cx, cy;
 };
 
-// A Gaussian seen by one camera: what blending needs, and nothing else.
+// A camera with what all of its Gaussians share.
 template <class T>
-struct Splat {
-  T u, v;                 // 2D mean, pixels
-  T a, b, c;              // σ = (aΔx + bΔy)² + (cΔy)²: a triangular factor of half the inverse 2D covariance. A sum of
-                          // squares loses no digits on needles, where the terms of ½ΔᵀCΔ nearly cancel.
-  T opacity;
-  T red, green, blue;
-  T z;                    // camera depth
-  T max_power;            // σ above which α < 1/255, with a little room for rounding
-  T half_height;          // |y − v| beyond it has σ > max_power
+struct Lens {
+  Camera<T> camera;
+  int width, height;
+  T eps2d;                         // added to the diagonal of every 2D covariance, pixels²
+  T centre[3];                     // world
+  T x_low, x_high, y_low, y_high;  // what x/z and y/z are clamped to for the Jacobian
 };
 
-// An item of a tile's list: which splat, and where its gradient record goes.
+// A Gaussian seen by one camera. Exponents are to base 2: α = min(0.999, 2^(log2_opacity − s)), where
+// s = (aΔx + bΔy)² + (cΔy)² and Δ = mean − pixel centre. A sum of squares loses no digits on needles, where the terms of
+// the usual quadratic form nearly cancel. 16 numbers: in float32 a cache line.
+template <class T>
+struct alignas(64) Splat {
+  T u, v;                     // 2D mean, pixels
+  T a, b, c;                  // √½·log₂e times the inverse 2D covariance's Cholesky factor [[a, b], [0, c]]
+  T log2_opacity;
+  T red, green, blue;
+  T z;                        // camera depth; 0: not seen
+  T reach;                    // s above which α < 1/255, with a little room for rounding
+  T half_width, half_height;  // |Δx| or |Δy| beyond them has s > reach
+  T slope_x, slope_y;         // s is least at Δx = −slope_x·Δy for a given Δy, and at Δy = −slope_y·Δx for a given Δx
+  T unused;
+};
+
+// A splat that touches a tile. Bit 4·j + i of `blocks` says that it touches the tile's block in column i and row j.
+struct TilePair {
+  uint32_t tile;
+  uint32_t blocks;
+};
+
+// The tiles of a picture.
+struct Grid {
+  int width, height;  // of the picture, pixels
+  int columns, rows;  // of tiles
+  int tiles() const { return columns * rows; }
+};
+
+// An item of a tile's list: which splat, where its gradient record goes, which of the tile's blocks it touches.
 struct TileEntry {
   uint32_t splat;
   uint32_t record;
+  uint32_t blocks;
 };
 
-// Sums over the pixels of one (splat, tile) pair; ν = ∂L/∂σ, and (p, r) = (aΔx + bΔy, cΔy) is the offset Δ measured in
-// the splat's own widths, so that σ = p² + r² and nothing cancels on needles. With these ten numbers every gradient of
-// the pair follows: see project.h.
+// Sums over the pixels of one (splat, tile) pair; ν = −α ∂L/∂α, and (p, r) = (aΔx + bΔy, cΔy) is the offset Δ measured
+// in the splat's own widths. With these ten numbers every gradient of the pair follows: see project.h.
 template <class T>
 struct SplatGradient {
   T power;                // Σ ν
@@ -74,20 +104,14 @@ struct SplatGradient {
   T power_pp, power_pr, power_rr;  // Σ ν·(p, r)(p, r)ᵀ
   T red, green, blue;     // Σ w·∂L/∂C
   T z;                    // Σ w·∂L/∂(Σ w z)
+};
+inline constexpr int kSplatGradientNumbers = 10;
 
-  SplatGradient& operator+=(const SplatGradient& other) {
-    power += other.power;
-    power_p += other.power_p;
-    power_r += other.power_r;
-    power_pp += other.power_pp;
-    power_pr += other.power_pr;
-    power_rr += other.power_rr;
-    red += other.red;
-    green += other.green;
-    blue += other.blue;
-    z += other.z;
-    return *this;
-  }
+// One camera's records: those of Gaussian i are records[first[i]] … records[first[i + 1] − 1].
+template <class T>
+struct SplatRecords {
+  const SplatGradient<T>* records;
+  const uint32_t* first;  // [N + 1]
 };
 
 // One camera's pictures, planar: rgb is three planes of width × height. `Pixel` is T or const T.
@@ -101,11 +125,11 @@ struct Pictures {
 // One tile's work.
 template <class T>
 struct TileJob {
-  const Splat<T>* splats;    // sorted front to back
+  const Splat<T>* splats;    // by Gaussian
   const TileEntry* entries;  // this tile's, front to back
   int64_t count;
   int x0, y0;                // the tile's first pixel
-  int width, height;         // of the image
+  int width, height;         // of the picture
 };
 
 }  // namespace globalsplat::raster

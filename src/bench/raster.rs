@@ -91,6 +91,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         forward_backward: Spread::of(forward_backward),
         stages: vec![
             stage("project", |t| t.project),
+            stage("cover", |t| t.cover),
             stage("sort", |t| t.sort),
             stage("bin", |t| t.bin),
             stage("blend", |t| t.blend),

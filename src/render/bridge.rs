@@ -7,9 +7,11 @@ pub(super) mod ffi {
     struct StageTimes {
         /// Gaussians to splats.
         project: f64,
+        /// Which tiles the splats reach.
+        cover: f64,
         /// Splats into the order of their depths.
         sort: f64,
-        /// Splats to the lists of the tiles that they touch.
+        /// Splats to the tiles' lists.
         bin: f64,
         /// Lists to pictures.
         blend: f64,
