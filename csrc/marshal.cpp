@@ -1,5 +1,7 @@
 #include "marshal.h"
 
+#include "globalsplat/src/render/bridge.rs.h"
+
 namespace globalsplat {
 namespace {
 
@@ -30,6 +32,12 @@ void Arguments::check() const {
               height, ", expected sides from 1 to ", kMaxSide);
   TORCH_CHECK(count < kMaxCount, "there are ", count, " Gaussians, expected fewer than ", kMaxCount);
   TORCH_CHECK(eps2d >= 0, "eps2d is ", eps2d, ", expected 0 or more");
+}
+
+Arguments borrowed(const SplatArguments& of) {
+  const auto tensor = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
+  return {tensor(of.means), tensor(of.scales), tensor(of.quaternions), tensor(of.opacities), tensor(of.sh),
+          tensor(of.w2c), tensor(of.intrinsics), of.width, of.height, of.eps2d};
 }
 
 }  // namespace globalsplat

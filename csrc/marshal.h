@@ -10,6 +10,8 @@
 
 namespace globalsplat {
 
+struct SplatArguments;  // shared with Rust, see src/render/bridge.rs
+
 using torch::Tensor;
 using torch::autograd::tensor_list;
 
@@ -38,8 +40,7 @@ struct Arguments {
   }
 };
 
-// Tensors come as the addresses of at::Tensor (tch's C_tensor).
-inline const Tensor& borrowed(size_t address) { return *reinterpret_cast<const Tensor*>(address); }
+Arguments borrowed(const SplatArguments& of);
 
 // Checks the arguments, runs the autograd function of their scalar type, and leaves its results, on the device of the
 // means, to the caller. Function<T>::apply takes (means, …, intrinsics, width, height, eps2d).

@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "globalsplat/src/render/bridge.rs.h"
 #include "marshal.h"
 #include "raster/kernels.h"
 
@@ -128,11 +129,8 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction<T>> {
 
 }  // namespace
 
-void project(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
-             size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out) {
-  run<ProjectFunction>({borrowed(means), borrowed(scales), borrowed(quaternions), borrowed(opacities), borrowed(sh),
-       borrowed(w2c), borrowed(intrinsics), width, height, eps2d},
-      out);
+void project(const SplatArguments& of, rust::Slice<size_t> out) {
+  run<ProjectFunction>(borrowed(of), out);
 }
 
 }  // namespace globalsplat

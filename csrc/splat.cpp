@@ -75,11 +75,8 @@ struct SplatFunction : torch::autograd::Function<SplatFunction<T>> {
 
 }  // namespace
 
-void splat(size_t means, size_t scales, size_t quaternions, size_t opacities, size_t sh, size_t w2c,
-           size_t intrinsics, int32_t width, int32_t height, double eps2d, rust::Slice<size_t> out) {
-  run<SplatFunction>({borrowed(means), borrowed(scales), borrowed(quaternions), borrowed(opacities), borrowed(sh),
-       borrowed(w2c), borrowed(intrinsics), width, height, eps2d},
-      out);
+void splat(const SplatArguments& of, rust::Slice<size_t> out) {
+  run<SplatFunction>(borrowed(of), out);
 }
 
 void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
@@ -87,6 +84,26 @@ void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
   raster::sh_basis<double>(int(out.size()), direction.data(), values);
   std::copy_n(values, out.size(), out.data());
 }
+
+PairCounts count_pairs(const SplatArguments& of) {
+  const Arguments a = borrowed(of);
+  a.check();
+  TORCH_CHECK(!a.is_double(), "pairs are counted as float32 sees them");
+  const tensor_list t = a.on_host();
+  const int64_t scenes = a.w2c.size(0), cameras = a.w2c.size(1);
+  const Tensor rgb = torch::empty({scenes, cameras, 3, of.height, of.width});
+  const Tensor alpha = torch::empty({scenes, cameras, of.height, of.width});
+  const Tensor depth = torch::empty_like(alpha);
+  raster::StageTimes unused;
+  const raster::PairCounts counts =
+      raster::Frame<float>::draw(scenes_of<float>(t), views_of<float>(t[5], t[6]),
+                                 {of.width, of.height, of.eps2d, torch::get_num_threads()},
+                                 pictures_of<float>(rgb, alpha, depth), unused)
+          ->count();
+  return {counts.tile_entries, counts.evaluated, counts.contributing};
+}
+
+double multiply_add_peak(double seconds) { return raster::multiply_add_peak(torch::get_num_threads(), seconds); }
 
 StageTimes stage_times() {
   const raster::StageTimes& t = last_times;

@@ -40,14 +40,23 @@ struct Centres {
 template <class T>
 inline constexpr Centres<T> kCentres{};
 
+// A tile's splats lie scattered in memory, and waiting for each costs more than blending it: they are asked for this many
+// items ahead.
+inline constexpr int64_t kPrefetch = 12;
+
+template <class T>
+GS_INLINE void prefetch_splat(const TileJob<T>& job, int64_t item) {
+  if (item < job.count) __builtin_prefetch(job.splats + job.entries[item].splat);
+}
+
 // What a splat does to a vector of pixels.
 template <class T>
 struct Contribution {
   Vector<T> p, r;
-  Vector<T> raw, alpha;  // before and after the cap
-  Vector<T> behind;      // T behind the splat
-  Mask<T> reaches;       // α ≥ 1/255
-  Mask<T> goes_on;       // T behind the splat > 1e-4
+  Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
+  Vector<T> weight;   // 0 also where the pixel ends, or ended before
+  Vector<T> behind;   // T behind the splat
+  Mask<T> goes_on;    // T behind the splat > 1e-4
 };
 
 template <class T>
@@ -56,17 +65,17 @@ GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T>
   c.p = fma(broadcast<T>(s.a), dx, s.b * dy);
   c.r = s.c * dy;
   const Vector<T> exponent = fnma(c.p, c.p, fnma(c.r, c.r, broadcast<T>(s.log2_opacity)));
-  c.reaches = at_most(broadcast<T>(T(-kLog2Of255)), exponent);
-  c.raw = exp2(exponent);
-  c.alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
-  c.behind = fnma(transmittance, c.alpha, transmittance);
+  c.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
+  const Vector<T> alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
+  c.behind = fnma(transmittance, alpha, transmittance);
   c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
+  c.weight = select(c.goes_on, transmittance * alpha, Vector<T>{});
 }
 
-// T behind the splat for pixels that it reaches, 0 for those that it ends.
+// 0 where the pixel ends.
 template <class T>
-GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c, Vector<T> transmittance) {
-  return select(c.reaches, select(c.goes_on, c.behind, Vector<T>{}), transmittance);
+GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c) {
+  return select(c.goes_on, c.behind, Vector<T>{});
 }
 
 // A block's pixels in an image plane, and which of them lie inside the image.
@@ -145,6 +154,7 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
     int lengths[kBlocks] = {};
     for (int i = 0; i < count; ++i) {
       const TileEntry& entry = job.entries[begin + i];
+      prefetch_splat(job, begin + i + kPrefetch);
       splats[i] = job.splats[entry.splat];
       for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
         const int block = __builtin_ctz(blocks);
@@ -162,13 +172,12 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
           const Splat<T>& s = splats[lists[block][i]];
           Contribution<T> c;
           contribute(s, x, y, px.transmittance, c);
-          const V weight = select(both(c.reaches, c.goes_on), px.transmittance * c.alpha, V{});
-          px.alpha += weight;
-          px.red = fma(weight, broadcast<T>(s.red), px.red);
-          px.green = fma(weight, broadcast<T>(s.green), px.green);
-          px.blue = fma(weight, broadcast<T>(s.blue), px.blue);
-          px.z = fma(weight, broadcast<T>(s.z), px.z);
-          px.transmittance = next_transmittance(c, px.transmittance);
+          px.alpha += c.weight;
+          px.red = fma(c.weight, broadcast<T>(s.red), px.red);
+          px.green = fma(c.weight, broadcast<T>(s.green), px.green);
+          px.blue = fma(c.weight, broadcast<T>(s.blue), px.blue);
+          px.z = fma(c.weight, broadcast<T>(s.z), px.z);
+          px.transmittance = next_transmittance(c);
         }
         goes_on |= any(less(V{}, px.transmittance));
         pixels[block][k] = px;
@@ -252,27 +261,25 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
 
   for (int64_t item = 0; item < job.count; ++item) {
     const TileEntry& entry = job.entries[item];
+    prefetch_splat(job, item + kPrefetch);
     const Splat<T>& s = job.splats[entry.splat];
     V power{}, power_p{}, power_r{}, power_pp{}, power_pr{}, power_rr{}, red{}, green{}, blue{}, z{};
     for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
-      bool ended = false;
+      bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
         PixelGradients<T>& px = pixels[block][k];
         Contribution<T> c;
         contribute(s, x[block % 4][k], y[block / 4][k], px.transmittance, c);
-        const Mask<T> blends = both(c.reaches, c.goes_on);
-
-        const V weight = select(blends, px.transmittance * c.alpha, V{});
         V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
         q = fma(px.g_green, broadcast<T>(s.green), q);
         q = fma(px.g_blue, broadcast<T>(s.blue), q);
         q = fma(px.per_z, broadcast<T>(s.z), q);
-        px.remaining = fnma(weight, q, px.remaining);
+        px.remaining = fnma(c.weight, q, px.remaining);
 
         // ν = −α ∂L/∂α, nothing through the cap.
-        const Mask<T> follows = both(blends, less(c.raw, broadcast<T>(T(kMaxAlpha))));
-        const V nu = select(follows, weight * (px.remaining * reciprocal(c.behind) - q), V{});
+        const Mask<T> follows = both(c.goes_on, less(c.raw, broadcast<T>(T(kMaxAlpha))));
+        const V nu = select(follows, c.weight * (px.remaining * reciprocal(c.behind) - q), V{});
         const V nu_p = nu * c.p, nu_r = nu * c.r;
         power += nu;
         power_p += nu_p;
@@ -280,24 +287,62 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
         power_pp = fma(nu_p, c.p, power_pp);
         power_pr = fma(nu_p, c.r, power_pr);
         power_rr = fma(nu_r, c.r, power_rr);
-        red = fma(weight, px.g_red, red);
-        green = fma(weight, px.g_green, green);
-        blue = fma(weight, px.g_blue, blue);
-        z = fma(weight, px.per_z, z);
+        red = fma(c.weight, px.g_red, red);
+        green = fma(c.weight, px.g_green, green);
+        blue = fma(c.weight, px.g_blue, blue);
+        z = fma(c.weight, px.per_z, z);
 
-        ended |= any(c.reaches) && !any(c.goes_on);
-        px.transmittance = next_transmittance(c, px.transmittance);
+        goes_on |= any(c.goes_on);
+        px.transmittance = next_transmittance(c);
       }
-      if (ended) {
-        bool goes_on = false;
-        for (int k = 0; k < kVectors<T>; ++k) goes_on |= any(less(V{}, pixels[block][k].transmittance));
-        if (!goes_on) alive &= ~(1u << block);
-      }
+      alive &= ~(uint32_t(!goes_on) << block);
     }
     const V sums[kSplatGradientNumbers] = {power,    power_p, power_r, power_pp, power_pr,
                                            power_rr, red,     green,   blue,     z};
     sum_each(sums, &records[entry.record].power);
   }
+}
+
+// What blending this tile takes, for benchmarks.
+template <class T>
+PairCounts count_tile(const TileJob<T>& job) {
+  using V = Vector<T>;
+  PairCounts counts{job.count, 0, 0};
+  V transmittance[kBlocks][kVectors<T>];
+  for (int block = 0; block < kBlocks; ++block)
+    begin_block<T>({job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height},
+                   transmittance[block]);
+  for (int64_t item = 0; item < job.count; ++item) {
+    for (uint32_t blocks = job.entries[item].blocks; blocks != 0; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      for (int k = 0; k < kVectors<T>; ++k) {
+        V& t = transmittance[block][k];
+        if (!any(less(V{}, t))) continue;
+        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
+        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
+        Contribution<T> c;
+        contribute(job.splats[job.entries[item].splat], x, y, t, c);
+        t = next_transmittance(c);
+        counts.evaluated += Simd<T>::lanes;
+        counts.contributing += __builtin_popcount(uint32_t(lane_bits(less(V{}, c.weight))));
+      }
+    }
+  }
+  return counts;
+}
+
+// Multiply-adds as fast as they go: `rounds` times 16 vectors of independent ones. Returns how many floating-point
+// operations that were, a multiplication and an addition each; `out` keeps the compiler from leaving them out.
+inline int64_t multiply_adds(int64_t rounds, float* out) {
+  constexpr int chains = 16;
+  Vector<float> sums[chains];
+  for (int k = 0; k < chains; ++k) sums[k] = broadcast<float>(*out + float(k));
+  const Vector<float> factor = broadcast<float>(0.999f), term = broadcast<float>(*out);
+  for (int64_t round = 0; round < rounds; ++round)
+    for (int k = 0; k < chains; ++k) sums[k] = fma(sums[k], factor, term);
+  for (int k = 1; k < chains; ++k) sums[0] += sums[k];
+  *out = sums[0][0];
+  return rounds * chains * Simd<float>::lanes * 2;
 }
 
 }  // namespace globalsplat::raster::GS_ISA

@@ -15,6 +15,7 @@ struct KernelsOf {
   void (*blend)(const TileJob<T>&, const Pictures<T>&);
   void (*blend_backward)(const TileJob<T>&, const Pictures<const T>& pictures, const Pictures<const T>& gradients,
                          SplatGradient<T>* records);
+  PairCounts (*count)(const TileJob<T>&);
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out);
 };
@@ -23,6 +24,7 @@ struct Kernels {
   const char* name;  // "avx512", "avx2", "neon", "portable"
   KernelsOf<float> of_float;
   KernelsOf<double> of_double;
+  int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>
   const KernelsOf<T>& of() const {

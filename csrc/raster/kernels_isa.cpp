@@ -12,8 +12,9 @@ namespace globalsplat::raster::GS_ISA {
 extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
-    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, project_backward<float>},
-    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, project_backward<double>},
+    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>, project_backward<float>},
+    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>},
+    multiply_adds,
 };
 
 }  // namespace globalsplat::raster::GS_ISA

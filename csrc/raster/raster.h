@@ -45,6 +45,9 @@ class Frame {
                 const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
                 StageTimes& times) const;
 
+  // What blending all views takes, for benchmarks.
+  PairCounts count() const;
+
   ~Frame();
 
  private:
@@ -59,5 +62,8 @@ class Frame {
   std::vector<Lens<T>> lenses_;
   std::vector<size_t> first_view_;  // [scenes + 1] of a scene
 };
+
+// Floating-point operations per second that multiply-adds alone reach on so many threads, for benchmarks.
+double multiply_add_peak(int threads, double seconds);
 
 }  // namespace globalsplat::raster

@@ -162,16 +162,22 @@ GS_INLINE bool any(M m) {
   return lane_bits(m) != 0;
 }
 
-// The second operand where the first is NaN.
+// The second operand where either is NaN.
+#if defined(__AVX512F__)
+GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm512_min_ps(a, b); }
+GS_INLINE Vector<double> smaller(Vector<double> a, Vector<double> b) { return _mm512_min_pd(a, b); }
+GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm512_max_ps(a, b); }
+GS_INLINE Vector<double> larger(Vector<double> a, Vector<double> b) { return _mm512_max_pd(a, b); }
+#else
 template <class V>
 GS_INLINE V smaller(V a, V b) {
   return a < b ? a : b;
 }
-
 template <class V>
 GS_INLINE V larger(V a, V b) {
   return a > b ? a : b;
 }
+#endif
 
 template <class V>
 GS_INLINE V clamp(V v, V low, V high) {
@@ -214,9 +220,9 @@ GS_INLINE Vector<float> reciprocal(Vector<float> v) { return 1.0f / v; }
 #endif
 GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
 
-// 2^x where it is a normal number (x ≥ −126); anything below. x = n + f with |f| ≤ ½, and a polynomial of degree 6 that is
+// 2^x where `m` holds, for x ≥ −126, and 0 elsewhere. x = n + f with |f| ≤ ½, and a polynomial of degree 6 that is
 // within 1.9e-9 of 2^f (Remez): with its rounding, the relative error is below 1.2e-7. All machines give the same bits.
-GS_INLINE Vector<float> exp2(Vector<float> x) {
+GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
   using V = Vector<float>;
 #if defined(__AVX512F__)
   const V n = _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
@@ -234,16 +240,16 @@ GS_INLINE Vector<float> exp2(Vector<float> x) {
   p = fma(p, f, broadcast<float>(6.931472057e-1f));
   p = fma(p, f, broadcast<float>(1.0f));
 #if defined(__AVX512F__)
-  return _mm512_scalef_ps(p, n);
+  return _mm512_maskz_scalef_ps(m, p, n);  // other lanes may be small enough to stumble over
 #else
-  return (V)((Simd<float>::bits)p + ((Simd<float>::bits)shifted << 23));
+  return select(m, (V)((Simd<float>::bits)p + ((Simd<float>::bits)shifted << 23)), V{});
 #endif
 }
 
 // float64 exists to prove gradients, so it takes the library's exponential.
-GS_INLINE Vector<double> exp2(Vector<double> x) {
+GS_INLINE Vector<double> exp2_where(Mask<double> m, Vector<double> x) {
   for (int i = 0; i < Simd<double>::lanes; ++i) x[i] = __builtin_exp2(x[i]);
-  return x;
+  return select(m, x, Vector<double>{});
 }
 
 // out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.

@@ -122,6 +122,13 @@ struct Pictures {
   Pixel* depth;
 };
 
+// (pixel, splat) pairs, and (tile, splat) pairs.
+struct PairCounts {
+  int64_t tile_entries = 0;
+  int64_t evaluated = 0;     // α was computed
+  int64_t contributing = 0;  // and the splat was blended
+};
+
 // One tile's work.
 template <class T>
 struct TileJob {

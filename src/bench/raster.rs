@@ -2,8 +2,11 @@
 
 use super::Spread;
 use crate::error::Result;
+use crate::eval::{peak_memory_bytes, resident_memory_bytes};
 use crate::model::Gaussians;
-use crate::render::{Cameras, DEFAULT_EPS2D, StageTimes, render, simd_level, stage_times};
+use crate::render::{
+    Cameras, DEFAULT_EPS2D, StageTimes, count_pairs, multiply_add_peak, render, simd_level, stage_times,
+};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -41,7 +44,46 @@ pub struct RasterReport {
     pub forward_backward: Spread,
     /// In the order of the work.
     pub stages: Vec<Stage>,
+    /// What there is to blend, per view.
+    pub pairs: Pairs,
+    /// What the threads together reach with multiply-adds alone, in 10⁹ floating-point operations per second.
+    pub peak_gflops: f64,
+    /// Blending.
+    pub blend: Rate,
+    /// Its backward pass.
+    pub blend_backward: Rate,
+    /// Largest resident memory during the calls less that before them, pictures and gradients included.
+    pub working_bytes: u64,
 }
+
+/// What there is to blend in a view.
+#[derive(Debug, Serialize)]
+pub struct Pairs {
+    /// (tile, splat) pairs.
+    pub tile_entries: f64,
+    /// (pixel, splat) pairs whose α is computed.
+    pub evaluated: f64,
+    /// (pixel, splat) pairs that are blended.
+    pub contributing: f64,
+}
+
+/// How fast contributing pairs are dealt with.
+#[derive(Debug, Serialize)]
+pub struct Rate {
+    /// In 10⁹ a second.
+    pub gpairs_per_second: f64,
+    /// Floating-point operations that a pair asks for, of what multiply-adds alone reach.
+    pub share_of_peak: f64,
+}
+
+/// Floating-point operations of a pair in `csrc/raster/blend.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1,
+/// and A, C and D 9.
+const FORWARD_OPERATIONS: f64 = 38.;
+/// Up to T as forward, 28, w 1, q 8, what remains 2, ν with a reciprocal 8, and the ten sums 19.
+const BACKWARD_OPERATIONS: f64 = 66.;
+
+/// How long the peak is measured.
+const PEAK_SECONDS: f64 = 0.2;
 
 /// Times `repeats` calls of the splat op without gradients and as many with them, by turns.
 ///
@@ -50,6 +92,7 @@ pub struct RasterReport {
 pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
     let per_view = |seconds: f64| seconds * 1e3 / views as f64;
+    let memory_before = resident_memory_bytes();
     let (mut forward, mut forward_backward) = (vec![], vec![]);
     let mut stages: Vec<StageTimes> = vec![];
     // The first round warms caches and threads up.
@@ -80,6 +123,27 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         name,
         milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
     };
+    let working_bytes = peak_memory_bytes().saturating_sub(memory_before);
+    let counts = count_pairs(gaussians, cameras, DEFAULT_EPS2D)?;
+    let pairs = Pairs {
+        tile_entries: counts.tile_entries as f64 / views as f64,
+        evaluated: counts.evaluated as f64 / views as f64,
+        contributing: counts.contributing as f64 / views as f64,
+    };
+    let peak = multiply_add_peak(PEAK_SECONDS);
+    let rate = |stage: &Stage, operations: f64| {
+        let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
+        Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
+    };
+    let stages = [
+        stage("project", |t| t.project),
+        stage("cover", |t| t.cover),
+        stage("sort", |t| t.sort),
+        stage("bin", |t| t.bin),
+        stage("blend", |t| t.blend),
+        stage("blend backward", |t| t.blend_backward),
+        stage("project backward", |t| t.project_backward),
+    ];
     Ok(RasterReport {
         simd: simd_level()?,
         threads: tch::get_num_threads(),
@@ -89,15 +153,12 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         height: cameras.height,
         forward: Spread::of(forward),
         forward_backward: Spread::of(forward_backward),
-        stages: vec![
-            stage("project", |t| t.project),
-            stage("cover", |t| t.cover),
-            stage("sort", |t| t.sort),
-            stage("bin", |t| t.bin),
-            stage("blend", |t| t.blend),
-            stage("blend backward", |t| t.blend_backward),
-            stage("project backward", |t| t.project_backward),
-        ],
+        peak_gflops: peak * 1e-9,
+        blend: rate(&stages[4], FORWARD_OPERATIONS),
+        blend_backward: rate(&stages[5], BACKWARD_OPERATIONS),
+        stages: stages.into(),
+        pairs,
+        working_bytes,
     })
 }
 

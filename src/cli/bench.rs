@@ -94,4 +94,19 @@ fn print_report(r: &RasterReport) {
     for stage in &r.stages {
         row(&format!("  {}", stage.name), &stage.milliseconds);
     }
+    let millions = |n: f64| n * 1e-6;
+    println!(
+        "(pixel, splat) pairs of a view: {:.2} M contribute, {:.2} M are evaluated; {:.0} (tile, splat) pairs",
+        millions(r.pairs.contributing),
+        millions(r.pairs.evaluated),
+        r.pairs.tile_entries
+    );
+    println!(
+        "multiply-adds alone reach {:.0} GFLOP/s; of it, by what contributing pairs ask for:",
+        r.peak_gflops
+    );
+    for (name, rate) in [("blend", &r.blend), ("blend backward", &r.blend_backward)] {
+        println!("  {name:<16} {:>6.2} Gpairs/s {:>6.1} %", rate.gpairs_per_second, 1e2 * rate.share_of_peak);
+    }
+    println!("working memory {:.0} MB", r.working_bytes as f64 * 1e-6);
 }

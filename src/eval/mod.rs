@@ -7,7 +7,7 @@ mod protocol;
 mod reconstruct;
 
 pub use contact_sheet::contact_sheet;
-pub use memory::peak_memory_bytes;
+pub use memory::{peak_memory_bytes, resident_memory_bytes};
 pub use metrics::{psnr, ssim};
 pub use protocol::{
     CaptureScores, Rendered, ViewScore, nearest_context_baseline, render_views, score, score_model,

@@ -2,6 +2,27 @@
 
 #[cxx::bridge(namespace = "globalsplat")]
 pub(super) mod ffi {
+    /// Gaussians and cameras of one call. Tensors are addresses of at::Tensor (tch's C_tensor) that the call borrows.
+    struct SplatArguments {
+        /// [B, N, 3]
+        means: usize,
+        /// [B, N, 3]
+        scales: usize,
+        /// [B, N, 4]
+        quaternions: usize,
+        /// [B, N]
+        opacities: usize,
+        /// [B, N, bases, 3]
+        sh: usize,
+        /// [B, C, 4, 4]
+        w2c: usize,
+        /// [B, C, 3, 3], pixels
+        intrinsics: usize,
+        width: i32,
+        height: i32,
+        eps2d: f64,
+    }
+
     /// Wall-clock seconds that the stages of a call took, all its views together.
     #[derive(Debug, Clone, Copy)]
     struct StageTimes {
@@ -21,44 +42,34 @@ pub(super) mod ffi {
         project_backward: f64,
     }
 
+    /// How much there is to blend, all views of a call together.
+    #[derive(Debug, Clone, Copy)]
+    struct PairCounts {
+        /// (tile, splat) pairs.
+        tile_entries: i64,
+        /// (pixel, splat) pairs whose α is computed.
+        evaluated: i64,
+        /// (pixel, splat) pairs that are blended.
+        contributing: i64,
+    }
+
     unsafe extern "C++" {
         include!("projection.h");
         include!("splat.h");
 
         /// See `csrc/splat.h`.
-        #[allow(clippy::too_many_arguments)]
-        fn splat(
-            means: usize,
-            scales: usize,
-            quaternions: usize,
-            opacities: usize,
-            sh: usize,
-            w2c: usize,
-            intrinsics: usize,
-            width: i32,
-            height: i32,
-            eps2d: f64,
-            out: &mut [usize],
-        ) -> Result<()>;
+        fn splat(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
         /// See `csrc/projection.h`.
-        #[allow(clippy::too_many_arguments)]
-        fn project(
-            means: usize,
-            scales: usize,
-            quaternions: usize,
-            opacities: usize,
-            sh: usize,
-            w2c: usize,
-            intrinsics: usize,
-            width: i32,
-            height: i32,
-            eps2d: f64,
-            out: &mut [usize],
-        ) -> Result<()>;
+        fn project(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
         /// The first `out.len()` (1, 4, 9 or 16) spherical harmonics of a unit vector.
         fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
+
+        /// See `csrc/splat.h`.
+        fn count_pairs(of: &SplatArguments) -> Result<PairCounts>;
+
+        fn multiply_add_peak(seconds: f64) -> f64;
 
         fn stage_times() -> StageTimes;
 

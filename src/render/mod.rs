@@ -3,14 +3,14 @@
 mod bridge;
 mod transform;
 
-pub use bridge::ffi::StageTimes;
+pub use bridge::ffi::{PairCounts, StageTimes};
 pub use transform::transform;
 
 use crate::data::ViewBatch;
 use crate::error::Result;
 use crate::model::Gaussians;
 use crate::scene::{Camera, pose_to_rows};
-use bridge::ffi;
+use bridge::ffi::{self, SplatArguments};
 use tch::{Kind, Tensor};
 
 /// Pixels² added to the diagonal of every projected covariance.
@@ -99,40 +99,31 @@ pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<P
     Ok(Projected { visible, mean2d, conic, depth, colour })
 }
 
-/// The C++ side's ops take tensors and a place for new ones as addresses.
-type Op = fn(
-    usize,
-    usize,
-    usize,
-    usize,
-    usize,
-    usize,
-    usize,
-    i32,
-    i32,
-    f64,
-    &mut [usize],
-) -> std::result::Result<(), cxx::Exception>;
+/// The C++ side's ops take a place for new tensors, as addresses.
+type Op = fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
 
 fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
-    let address = |t: &Tensor| t.as_ptr() as usize;
     let mut out = [0usize; N];
-    // The tensors outlive the call, which only borrows them.
-    op(
-        address(&gaussians.means),
-        address(&gaussians.scales),
-        address(&gaussians.quaternions),
-        address(&gaussians.opacities),
-        address(&gaussians.sh),
-        address(&cameras.w2c),
-        address(&cameras.intrinsics),
-        cameras.width as i32,
-        cameras.height as i32,
-        eps2d,
-        &mut out,
-    )?;
+    op(&arguments(gaussians, cameras, eps2d), &mut out)?;
     // SAFETY: on success the C++ side has put new tensors there and left them to us.
     Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
+}
+
+/// Valid as long as what they are made of.
+fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArguments {
+    let address = |t: &Tensor| t.as_ptr() as usize;
+    SplatArguments {
+        means: address(&gaussians.means),
+        scales: address(&gaussians.scales),
+        quaternions: address(&gaussians.quaternions),
+        opacities: address(&gaussians.opacities),
+        sh: address(&gaussians.sh),
+        w2c: address(&cameras.w2c),
+        intrinsics: address(&cameras.intrinsics),
+        width: cameras.width as i32,
+        height: cameras.height as i32,
+        eps2d,
+    }
 }
 
 /// The instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
@@ -146,6 +137,19 @@ pub fn simd_level() -> Result<String> {
 /// How long the stages of this thread's last [`render()`] and of its backward pass took.
 pub fn stage_times() -> StageTimes {
     ffi::stage_times()
+}
+
+/// How much a call of [`render()`] with float32 Gaussians has to blend.
+///
+/// # Errors
+/// As [`render()`].
+pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
+    Ok(ffi::count_pairs(&arguments(gaussians, cameras, eps2d))?)
+}
+
+/// Floating-point operations per second that multiply-adds alone reach here, measured for so many seconds on every thread.
+pub fn multiply_add_peak(seconds: f64) -> f64 {
+    ffi::multiply_add_peak(seconds)
 }
 
 /// The version of the libtorch that this program was built with.
