@@ -131,14 +131,13 @@ struct Pixels {
   Vector<T> transmittance, alpha{}, red{}, green{}, blue{}, z{};
 };
 
-// The tile's list is taken in parts that fit the first-level cache: the splats of a part are copied together, then each
-// vector of pixels goes through those that reach its block with all its sums in registers.
+// The tile's list is taken in parts whose splats fit the first-level cache; each vector of pixels goes through those that
+// reach its block with all its sums in registers.
 template <class T>
 void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
   using V = Vector<T>;
   constexpr int part = 128;
-  Splat<T> splats[part];
-  uint8_t lists[kBlocks][part];
+  uint32_t splats[part], blocks_of[part], list[part + kListRoom];
   Pixels<T> pixels[kBlocks][kVectors<T>];
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
@@ -151,25 +150,22 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
 
   for (int64_t begin = 0; begin < job.count && alive != 0; begin += part) {
     const int count = int(job.count - begin < part ? job.count - begin : part);
-    int lengths[kBlocks] = {};
     for (int i = 0; i < count; ++i) {
       const TileEntry& entry = job.entries[begin + i];
-      prefetch_splat(job, begin + i + kPrefetch);
-      splats[i] = job.splats[entry.splat];
-      for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
-        const int block = __builtin_ctz(blocks);
-        lists[block][lengths[block]++] = uint8_t(i);
-      }
+      __builtin_prefetch(job.splats + entry.splat);
+      splats[i] = entry.splat;
+      blocks_of[i] = entry.blocks;
     }
     for (uint32_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
+      const int length = choose(splats, blocks_of, count, block, list);
       bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
         Pixels<T> px = pixels[block][k];
         const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
         const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
-        for (int i = 0; i < lengths[block]; ++i) {
-          const Splat<T>& s = splats[lists[block][i]];
+        for (int i = 0; i < length; ++i) {
+          const Splat<T>& s = job.splats[list[i]];
           Contribution<T> c;
           contribute(s, x, y, px.transmittance, c);
           px.alpha += c.weight;

@@ -249,6 +249,32 @@ GS_INLINE Vector<double> exp2_where(Mask<double> m, Vector<double> x) {
   return select(m, x, Vector<double>{});
 }
 
+// Copies those of `count` values whose flags have bit `bit` to `out`, in order, and returns how many they are. `out` has
+// room for kListRoom more.
+inline constexpr int kListRoom = 16;
+#if defined(__AVX512F__)
+GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
+  const __m512i wanted = _mm512_set1_epi32(1 << bit);
+  int length = 0;
+  for (int i = 0; i < count; i += 16) {
+    const __mmask16 valid = __mmask16(count - i < 16 ? (1u << (count - i)) - 1 : 0xFFFFu);
+    const __mmask16 chosen = _mm512_mask_test_epi32_mask(valid, _mm512_maskz_loadu_epi32(valid, flags + i), wanted);
+    _mm512_storeu_si512(out + length, _mm512_maskz_compress_epi32(chosen, _mm512_maskz_loadu_epi32(valid, values + i)));
+    length += __builtin_popcount(chosen);
+  }
+  return length;
+}
+#else
+GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
+  int length = 0;
+  for (int i = 0; i < count; ++i) {
+    out[length] = values[i];
+    length += (flags[i] >> bit) & 1;
+  }
+  return length;
+}
+#endif
+
 // out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.
 template <class T, int count>
 GS_INLINE void sum_each(const Vector<T> (&v)[count], T* out) {
