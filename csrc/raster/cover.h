@@ -44,43 +44,85 @@ GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
   return bits;
 }
 
-// Lists the tiles that splats begin … end − 1 reach, splat by splat: the pairs of splat i start at pairs[first[i − begin]].
-// Stops before a splat for which `capacity` might not suffice; any splat fits into as many pairs as there are tiles.
-// Returns the first splat that isn't listed, and in `used` how many pairs there are.
+// A tile that a splat may reach, before it is known whether it does. The numbers fit: a picture has at most 2^20 pixels a
+// side, a call covers at most kCoverTask splats.
+struct Candidate {
+  uint16_t x, y;     // of the tile
+  uint16_t unused;
+  uint16_t splat;    // counted from the first of the call
+};
+static_assert(sizeof(Candidate) == sizeof(TilePair));
+
+// Writes the tiles in reach of a splat's bounding box, or fewer, and returns how many; 0 if there may be more than
+// `capacity`, with `full` set.
+template <class T>
+GS_INLINE int64_t candidates_of(const Splat<T>& s, uint16_t index, const Grid& grid, int64_t capacity, Candidate* out,
+                                bool& full) {
+  const T left = s.u - s.half_width, right = s.u + s.half_width;
+  const T top = s.v - s.half_height, bottom = s.v + s.half_height;
+  if (!(s.z > 0 && right > 0 && left < T(grid.width) && bottom > 0 && top < T(grid.height))) return 0;
+  const int x0 = left > 0 ? int(left) / kTile : 0, x1 = right < T(grid.width) ? int(right) / kTile : grid.columns - 1;
+  const int y0 = top > 0 ? int(top) / kTile : 0, y1 = bottom < T(grid.height) ? int(bottom) / kTile : grid.rows - 1;
+  const int64_t tiles = int64_t(x1 - x0 + 1) * (y1 - y0 + 1);
+  if ((full = capacity < (tiles < 4 ? 4 : tiles))) return 0;
+  const auto candidate = [&](int x, int y) { return Candidate{uint16_t(x), uint16_t(y), 0, index}; };
+  if (x1 - x0 < 2 && y1 - y0 < 2) {
+    // Nearly all of them. All four are written, whatever their number: no branch to guess wrongly.
+    out[0] = candidate(x0, y0);
+    out[1] = candidate(x1, y0 + (x1 == x0));
+    out[2] = candidate(x0, y1);
+    out[3] = candidate(x1, y1);
+    return tiles;
+  }
+  int64_t used = 0;
+  for (int y = y0; y <= y1; y += 4)
+    for (int x = x0; x <= x1; x += 4) {
+      // Columns and rows beyond the last tile don't exist.
+      const uint32_t in_row = (1u << (x1 - x < 3 ? x1 - x + 1 : 4)) - 1;
+      const uint32_t exist = (in_row * 0x1111u) & (y1 - y < 3 ? (1u << 4 * (y1 - y + 1)) - 1 : 0xFFFFu);
+      for (uint32_t tiles = reached_cells(s, x * kTile, y * kTile, kTile) & exist; tiles != 0; tiles &= tiles - 1) {
+        const int tile = __builtin_ctz(tiles);
+        out[used++] = candidate(x + tile % 4, y + tile / 4);
+      }
+    }
+  return used;
+}
+
+// Lists the tiles that splats begin … end − 1, at most kCoverTask, reach, splat by splat: after the `used` pairs that are
+// there already, those of splat i start at pairs[first[i − begin]]. Stops before a splat for which `capacity` might not
+// suffice; any splat fits into as many pairs as there are tiles, or four. Returns the first splat that isn't listed, and in
+// `used` how many pairs there are.
 template <class T>
 int64_t cover(const Splat<T>* splats, int64_t begin, int64_t end, const Grid& grid, TilePair* pairs, int64_t capacity,
               int64_t& used, uint32_t* first) {
-  for (int64_t i = begin; i < end; ++i) {
-    first[i - begin] = uint32_t(used);
-    const Splat<T>& s = splats[i];
-    const T left = s.u - s.half_width, right = s.u + s.half_width;
-    const T top = s.v - s.half_height, bottom = s.v + s.half_height;
-    if (s.z == 0 || !(right > 0 && left < T(grid.width) && bottom > 0 && top < T(grid.height))) continue;
-    const int x0 = left > 0 ? int(left) / kTile : 0, x1 = right < T(grid.width) ? int(right) / kTile : grid.columns - 1;
-    const int y0 = top > 0 ? int(top) / kTile : 0, y1 = bottom < T(grid.height) ? int(bottom) / kTile : grid.rows - 1;
-    if (used + int64_t(x1 - x0 + 1) * (y1 - y0 + 1) > capacity) return i;
-
-    const auto visit = [&](int x, int y) {
-      const uint32_t blocks = reached_cells(s, x * kTile, y * kTile, kBlock);
-      pairs[used] = {uint32_t(y * grid.columns + x), blocks};
-      used += blocks != 0;
-    };
-    if (x0 == x1 && y0 == y1) {
-      visit(x0, y0);
-      continue;
-    }
-    for (int y = y0; y <= y1; y += 4)
-      for (int x = x0; x <= x1; x += 4) {
-        // Columns and rows beyond the last tile don't exist.
-        const uint32_t in_row = (1u << (x1 - x < 3 ? x1 - x + 1 : 4)) - 1;
-        const uint32_t exist = (in_row * 0x1111u) & (y1 - y < 3 ? (1u << 4 * (y1 - y + 1)) - 1 : 0xFFFFu);
-        for (uint32_t tiles = reached_cells(s, x * kTile, y * kTile, kTile) & exist; tiles != 0; tiles &= tiles - 1) {
-          const int tile = __builtin_ctz(tiles);
-          visit(x + tile % 4, y + tile / 4);
-        }
-      }
+  // What may be reached, and where it ends for each splat; then what is, in the same place.
+  uint32_t candidates_end[kCoverTask], reached_end[kCoverTask];
+  const auto at = [&](int64_t k) { return pairs + used + k; };
+  int64_t count = 0, stop = begin;
+  for (bool full = false; stop < end; ++stop) {
+    const int64_t more = candidates_of(splats[stop], uint16_t(stop - begin), grid, capacity - used - count,
+                                       reinterpret_cast<Candidate*>(at(count)), full);
+    if (full) break;
+    count += more;
+    candidates_end[stop - begin] = uint32_t(count);
   }
-  return end;
+  int64_t kept = 0;
+  for (int64_t k = 0; k < count; ++k) {
+    Candidate c;
+    __builtin_memcpy(&c, at(k), sizeof c);
+    const uint32_t blocks = reached_cells(splats[begin + c.splat], c.x * kTile, c.y * kTile, kBlock);
+    *at(kept) = {uint32_t(c.y * grid.columns + c.x), blocks};
+    kept += blocks != 0;
+    reached_end[c.splat] = uint32_t(kept);
+  }
+  uint32_t previous_candidates = 0, previous = 0;
+  for (int64_t i = 0; i < stop - begin; ++i) {
+    first[i] = uint32_t(used) + previous;
+    if (candidates_end[i] != previous_candidates) previous = reached_end[i];
+    previous_candidates = candidates_end[i];
+  }
+  used += kept;
+  return stop;
 }
 
 }  // namespace globalsplat::raster::GS_ISA

@@ -14,7 +14,7 @@ namespace globalsplat::raster {
 
 namespace {
 
-constexpr int64_t kTask = 512;         // Gaussians that a task projects or covers
+constexpr int64_t kTask = kCoverTask;  // Gaussians that a task projects or covers
 constexpr int64_t kChunk = 64 * 1024;  // Gaussians of a view that are sorted and binned side by side
 
 // Tells the seconds since it was last asked.
@@ -110,7 +110,7 @@ void Frame<T>::bin(StageTimes& times) {
       i = kernels().of<T>().cover(view.splats.data.get(), i, end, grid_, part.pairs.data.get(), int64_t(part.pairs.size),
                                   part.used, first + i);
       if (i == end) break;
-      Buffer<TilePair> larger(2 * part.pairs.size + size_t(grid_.tiles()));
+      Buffer<TilePair> larger(2 * part.pairs.size + size_t(grid_.tiles()) + 4);
       std::copy_n(part.pairs.data.get(), part.used, larger.data.get());
       part.pairs = std::move(larger);
     }

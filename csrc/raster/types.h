@@ -17,6 +17,7 @@ inline constexpr double kLog2E = 1.4426950408889634;
 inline constexpr double kLog2Of255 = 7.994353436858858;
 inline constexpr int kTile = 16;                    // tile edge in pixels
 inline constexpr int kBlock = 4;                    // edge in pixels of the blocks that a tile is culled and blended by
+inline constexpr int kCoverTask = 512;              // splats whose tiles are listed in one go
 inline constexpr int kBlocks = 16;                  // of a tile
 
 // One scene. Row-major arrays of `count` Gaussians.
