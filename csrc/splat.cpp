@@ -107,7 +107,7 @@ double multiply_add_peak(double seconds) { return raster::multiply_add_peak(torc
 
 StageTimes stage_times() {
   const raster::StageTimes& t = last_times;
-  return {t.project, t.cover, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
+  return {t.project, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
 }
 
 rust::String libtorch_version() { return TORCH_VERSION; }

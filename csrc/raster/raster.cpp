@@ -6,7 +6,6 @@
 #include <stdexcept>
 #include <utility>
 
-#include "bins.h"
 #include "kernels.h"
 #include "parallel.h"
 
@@ -55,17 +54,29 @@ struct Frame<T>::PerView {
   Buffer<uint32_t> tile_start;    // [tiles + 1] into entries
 };
 
+// What a task leaves of its Gaussians in one view: the tiles that they reach, and the depths of those that reach any.
 template <class T>
-Frame<T>::Frame(const std::vector<View<T>>& views, size_t scenes, const Settings& settings)
+struct Frame<T>::Part {
+  Buffer<TilePair> pairs;
+  int64_t pair_count = 0;
+  Buffer<DepthItem<T>> depths;
+  int64_t depth_count = 0;
+  uint32_t pairs_before = 0, depths_before = 0;  // in the view's parts before this one
+};
+
+template <class T>
+Frame<T>::Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings)
     : settings_(settings),
       grid_{settings.width, settings.height, int(parts(settings.width, kTile)), int(parts(settings.height, kTile))},
+      count_(scenes.empty() ? 0 : scenes[0].count),
+      tasks_(parts(count_, kTask)),
       views_(views.size()),
-      first_view_(scenes + 1, 0) {
+      first_view_(scenes.size() + 1, 0) {
   for (const View<T>& view : views) {
     lenses_.push_back(lens_of(view.camera, settings.width, settings.height, settings.eps2d));
     ++first_view_[size_t(view.scene) + 1];
   }
-  for (size_t scene = 0; scene < scenes; ++scene) first_view_[scene + 1] += first_view_[scene];
+  for (size_t scene = 0; scene < scenes.size(); ++scene) first_view_[scene + 1] += first_view_[scene];
 }
 
 template <class T>
@@ -83,98 +94,108 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
           settings_.height};
 }
 
-// From splats to the tiles' lists, front to back.
+// Lists the tiles of one task's splats, while they are in the cache. first_record counts from the part's own first pair.
 template <class T>
-void Frame<T>::bin(StageTimes& times) {
-  Stopwatch watch;
-  const int64_t views = int64_t(views_.size()), count = views == 0 ? 0 : int64_t(views_[0].splats.size);
-  const int64_t tasks = parts(count, kTask), chunks = std::max<int64_t>(1, parts(count, kChunk));
-
-  // Every task lists the tiles of its splats in a buffer of its own. Places in it become places among the view's records
-  // when all the lists' lengths are known.
-  struct Part {
-    Buffer<TilePair> pairs;
-    int64_t used = 0;
-    uint32_t seen = 0;          // splats that reach any tile
-    uint32_t base = 0, rank = 0;  // records, and splats that reach any tile, of the parts before it
-  };
-  std::vector<Part> lists(size_t(views * tasks));
-  for (PerView& view : views_) view.first_record = Buffer<uint32_t>(size_t(count) + 1);
-  parallel_for(settings_.threads, views * tasks, [&](int64_t task) {
-    PerView& view = views_[size_t(task / tasks)];
-    Part& part = lists[size_t(task)];
-    const int64_t begin = task % tasks * kTask, end = std::min(begin + kTask, count);
-    uint32_t* first = view.first_record.data.get();
-    part.pairs = Buffer<TilePair>(size_t(4 * kTask));
-    for (int64_t i = begin;;) {
-      i = kernels().of<T>().cover(view.splats.data.get(), i, end, grid_, part.pairs.data.get(), int64_t(part.pairs.size),
-                                  part.used, first + i);
-      if (i == end) break;
-      Buffer<TilePair> larger(2 * part.pairs.size + size_t(grid_.tiles()) + 4);
-      std::copy_n(part.pairs.data.get(), part.used, larger.data.get());
-      part.pairs = std::move(larger);
-    }
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t next = i + 1 < end ? int64_t(first[i + 1]) : part.used;
-      part.seen += next > int64_t(first[i]);
-    }
-  });
-  times.cover = watch.lap();
-
-  std::vector<Buffer<DepthItem<T>>> order(views_.size());
-  for (size_t k = 0; k < views_.size(); ++k) {
-    int64_t records = 0;
-    uint32_t seen = 0;
-    for (size_t i = 0; i < size_t(tasks); ++i) {
-      Part& part = lists[k * size_t(tasks) + i];
-      part.base = uint32_t(records);
-      part.rank = seen;
-      records += part.used;
-      seen += part.seen;
-    }
-    if (records >= int64_t(std::numeric_limits<uint32_t>::max()))
-      throw std::length_error("more than 4 billion (Gaussian, tile) pairs in a view");
-    views_[k].first_record[size_t(count)] = uint32_t(records);
-    views_[k].entries = Buffer<TileEntry>(size_t(records));
-    order[k] = Buffer<DepthItem<T>>(seen);
+void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, Part& part) const {
+  part.pairs = Buffer<TilePair>(size_t(4 * kTask));
+  part.depths = Buffer<DepthItem<T>>(size_t(end - begin));
+  uint32_t* first = view.first_record.data.get();
+  for (int64_t i = begin;;) {
+    i = kernels().of<T>().cover(view.splats.data.get(), i, end, grid_, part.pairs.data.get(), int64_t(part.pairs.size),
+                                part.pair_count, first + i);
+    if (i == end) break;
+    Buffer<TilePair> larger(2 * part.pairs.size + size_t(grid_.tiles()) + 4);
+    std::copy_n(part.pairs.data.get(), part.pair_count, larger.data.get());
+    part.pairs = std::move(larger);
   }
-  parallel_for(settings_.threads, views * tasks, [&](int64_t task) {
-    PerView& view = views_[size_t(task / tasks)];
-    const Part& part = lists[size_t(task)];
-    const int64_t begin = task % tasks * kTask, end = std::min(begin + kTask, count);
-    DepthItem<T>* item = order[size_t(task / tasks)].data.get() + part.rank;
-    for (int64_t i = begin; i < end; ++i) {
-      uint32_t& first = view.first_record[size_t(i)];
-      const int64_t next = i + 1 < end ? int64_t(view.first_record[size_t(i) + 1]) : part.used;
-      if (next > int64_t(first)) {
-        std::memcpy(&item->key, &view.splats[size_t(i)].z, sizeof(T));
-        item++->splat = uint32_t(i);
-      }
-      first += part.base;
-    }
-  });
-  sort_by_depth<T>(settings_.threads, order, chunks);
-  times.sort = watch.lap();
+  for (int64_t i = begin; i < end; ++i) {
+    const int64_t next = i + 1 < end ? int64_t(first[i + 1]) : part.pair_count;
+    DepthItem<T>& item = part.depths[size_t(part.depth_count)];
+    item.splat = uint32_t(i);
+    std::memcpy(&item.key, &view.splats[size_t(i)].z, sizeof(T));
+    part.depth_count += next > int64_t(first[i]);
+  }
+}
 
+// All Gaussians to splats, and to the tiles that these reach: a part for every task of every view.
+template <class T>
+std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussians<T>>& scenes) {
+  std::vector<Part> made(views_.size() * size_t(tasks_));
+  std::vector<Splat<T>*> splats;
+  for (PerView& view : views_) {
+    view.splats = Buffer<Splat<T>>(size_t(count_));
+    view.first_record = Buffer<uint32_t>(size_t(count_) + 1);
+    splats.push_back(view.splats.data.get());
+  }
+  parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
+    const size_t scene = size_t(task / tasks_), first = first_view_[scene], last = first_view_[scene + 1];
+    const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
+    kernels().of<T>().project(scenes[scene], begin, end, lenses_.data() + first, int64_t(last - first),
+                              splats.data() + first);
+    for (size_t k = first; k < last; ++k) cover(views_[k], begin, end, made[k * size_t(tasks_) + size_t(task % tasks_)]);
+  });
+  for (size_t k = 0; k < views_.size(); ++k) {
+    int64_t pairs = 0, depths = 0;
+    for (size_t i = 0; i < size_t(tasks_); ++i) {
+      Part& part = made[k * size_t(tasks_) + i];
+      part.pairs_before = uint32_t(pairs);
+      part.depths_before = uint32_t(depths);
+      pairs += part.pair_count;
+      depths += part.depth_count;
+    }
+    if (pairs >= int64_t(std::numeric_limits<uint32_t>::max()))
+      throw std::length_error("more than 4 billion (Gaussian, tile) pairs in a view");
+    views_[k].first_record[size_t(count_)] = uint32_t(pairs);
+  }
+  return made;
+}
+
+// Each view's splats that reach any tile, front to back. Also lets first_record count all of the view's pairs.
+template <class T>
+std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) {
+  std::vector<Buffer<DepthItem<T>>> order;
+  for (size_t k = 0; k < views_.size(); ++k) {
+    const Part* last = tasks_ == 0 ? nullptr : &made[(k + 1) * size_t(tasks_) - 1];
+    order.emplace_back(last == nullptr ? 0 : last->depths_before + size_t(last->depth_count));
+  }
+  parallel_for(settings_.threads, int64_t(made.size()), [&](int64_t task) {
+    const Part& part = made[size_t(task)];
+    const size_t k = size_t(task / tasks_);
+    std::copy_n(part.depths.data.get(), part.depth_count, order[k].data.get() + part.depths_before);
+    const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
+    for (int64_t i = begin; i < end; ++i) views_[k].first_record[size_t(i)] += part.pairs_before;
+  });
+  sort_by_depth<T>(settings_.threads, order, chunks());
+  return order;
+}
+
+// The tiles' lists.
+template <class T>
+void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order) {
+  for (PerView& view : views_) view.entries = Buffer<TileEntry>(view.first_record[size_t(count_)]);
   std::vector<Buffer<uint32_t>> starts = distribute(
-      settings_.threads, views, chunks, grid_.tiles(),
+      settings_.threads, int64_t(views_.size()), chunks(), grid_.tiles(),
       [&](int64_t k, int64_t chunk, const auto& visit) {
         const Buffer<DepthItem<T>>& items = order[size_t(k)];
         const PerView& view = views_[size_t(k)];
-        const size_t begin = items.size * size_t(chunk) / size_t(chunks);
-        const size_t end = items.size * size_t(chunk + 1) / size_t(chunks);
+        const size_t begin = items.size * size_t(chunk) / size_t(chunks());
+        const size_t end = items.size * size_t(chunk + 1) / size_t(chunks());
         for (size_t i = begin; i < end; ++i) {
           const uint32_t splat = items[i].splat;
-          const Part& part = lists[size_t(k * tasks + splat / kTask)];
+          const Part& part = made[size_t(k * tasks_) + splat / kTask];
           for (uint32_t record = view.first_record[splat]; record < view.first_record[splat + 1]; ++record) {
-            const TilePair& pair = part.pairs[record - part.base];
+            const TilePair& pair = part.pairs[record - part.pairs_before];
             visit(int64_t(pair.tile), TileEntry{splat, record, pair.blocks});
           }
         }
       },
       [&](int64_t k, uint32_t at, const TileEntry& entry) { views_[size_t(k)].entries[at] = entry; });
   for (size_t k = 0; k < views_.size(); ++k) views_[k].tile_start = std::move(starts[k]);
-  times.bin = watch.lap();
+}
+
+template <class T>
+int64_t Frame<T>::chunks() const {
+  return std::max<int64_t>(1, parts(count_, kChunk));
 }
 
 template <class T>
@@ -182,25 +203,19 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
                                          const Settings& settings, const std::vector<Pictures<T>>& out,
                                          StageTimes& times) {
   Stopwatch watch;
-  std::unique_ptr<Frame> frame(new Frame(views, scenes.size(), settings));
-  const int64_t count = scenes.empty() ? 0 : scenes[0].count, tasks = parts(count, kTask);
-  std::vector<Splat<T>*> splats;
-  for (PerView& view : frame->views_) {
-    view.splats = Buffer<Splat<T>>(size_t(count));
-    splats.push_back(view.splats.data.get());
+  std::unique_ptr<Frame> frame(new Frame(views, scenes, settings));
+  {
+    const std::vector<Part> made = frame->project(scenes);
+    times.project = watch.lap();
+    const std::vector<Buffer<DepthItem<T>>> order = frame->sort(made);
+    times.sort = watch.lap();
+    frame->bin(made, order);
   }
-  parallel_for(settings.threads, int64_t(scenes.size()) * tasks, [&](int64_t task) {
-    const size_t scene = size_t(task / tasks), first = frame->first_view_[scene];
-    const int64_t begin = task % tasks * kTask, end = std::min(begin + kTask, count);
-    kernels().of<T>().project(scenes[scene], begin, end, frame->lenses_.data() + first,
-                              int64_t(frame->first_view_[scene + 1] - first), splats.data() + first);
-  });
-  times.project = watch.lap();
-  frame->bin(times);
-  watch.lap();
+  times.bin = watch.lap();
   const int64_t tiles = frame->grid_.tiles();
   parallel_for(settings.threads, int64_t(views.size()) * tiles, [&](int64_t task) {
-    kernels().of<T>().blend(frame->job(frame->views_[size_t(task / tiles)], int(task % tiles)), out[size_t(task / tiles)]);
+    const size_t k = size_t(task / tiles);
+    kernels().of<T>().blend(frame->job(frame->views_[k], int(task % tiles)), out[k]);
   });
   times.blend = watch.lap();
   return frame;
@@ -224,10 +239,9 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   });
   times.blend_backward = watch.lap();
 
-  const int64_t count = scenes.empty() ? 0 : scenes[0].count, tasks = parts(count, kTask);
-  parallel_for(settings_.threads, int64_t(scenes.size()) * tasks, [&](int64_t task) {
-    const size_t scene = size_t(task / tasks), first = first_view_[scene];
-    const int64_t begin = task % tasks * kTask, end = std::min(begin + kTask, count);
+  parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
+    const size_t scene = size_t(task / tasks_), first = first_view_[scene];
+    const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
     kernels().of<T>().project_backward(scenes[scene], begin, end, lenses_.data() + first,
                                        int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene]);
   });

@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "bins.h"
 #include "types.h"
 
 namespace globalsplat::raster {
@@ -22,7 +23,7 @@ struct Settings {
 
 // Wall-clock seconds that the stages of one call took, all views together.
 struct StageTimes {
-  double project = 0, cover = 0, sort = 0, bin = 0, blend = 0;
+  double project = 0, sort = 0, bin = 0, blend = 0;
   double blend_backward = 0, project_backward = 0;
 };
 
@@ -52,12 +53,19 @@ class Frame {
 
  private:
   struct PerView;
-  Frame(const std::vector<View<T>>& views, size_t scenes, const Settings& settings);
-  void bin(StageTimes& times);
+  struct Part;
+  Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings);
+  std::vector<Part> project(const std::vector<Gaussians<T>>& scenes);
+  void cover(PerView& view, int64_t begin, int64_t end, Part& part) const;
+  std::vector<Buffer<DepthItem<T>>> sort(const std::vector<Part>& made);
+  void bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order);
+  int64_t chunks() const;
   TileJob<T> job(const PerView& view, int tile) const;
 
   Settings settings_;
   Grid grid_;
+  int64_t count_;  // Gaussians of a scene
+  int64_t tasks_;  // in which a scene's Gaussians are taken
   std::vector<PerView> views_;
   std::vector<Lens<T>> lenses_;
   std::vector<size_t> first_view_;  // [scenes + 1] of a scene

@@ -137,7 +137,6 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     };
     let stages = [
         stage("project", |t| t.project),
-        stage("cover", |t| t.cover),
         stage("sort", |t| t.sort),
         stage("bin", |t| t.bin),
         stage("blend", |t| t.blend),
@@ -154,8 +153,8 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         forward: Spread::of(forward),
         forward_backward: Spread::of(forward_backward),
         peak_gflops: peak * 1e-9,
-        blend: rate(&stages[4], FORWARD_OPERATIONS),
-        blend_backward: rate(&stages[5], BACKWARD_OPERATIONS),
+        blend: rate(&stages[3], FORWARD_OPERATIONS),
+        blend_backward: rate(&stages[4], BACKWARD_OPERATIONS),
         stages: stages.into(),
         pairs,
         working_bytes,

@@ -26,13 +26,11 @@ pub(super) mod ffi {
     /// Wall-clock seconds that the stages of a call took, all its views together.
     #[derive(Debug, Clone, Copy)]
     struct StageTimes {
-        /// Gaussians to splats.
+        /// Gaussians to splats, and to the tiles that these reach.
         project: f64,
-        /// Which tiles the splats reach.
-        cover: f64,
         /// Splats into the order of their depths.
         sort: f64,
-        /// Splats to the tiles' lists.
+        /// And into the tiles' lists.
         bin: f64,
         /// Lists to pictures.
         blend: f64,
