@@ -247,22 +247,27 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
       x[i][k] = T(job.x0 + i * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
       y[i][k] = T(job.y0 + i * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
     }
-  uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
     const BlockPlace at(job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height);
-    if (at.outside()) continue;
     load_gradients(at, int64_t(job.width) * job.height, pictures, gradients, pixels[block]);
-    alive |= 1u << block;
   }
 
+  // Which blocks have pixels that go on is asked once in a while: an answer after every splat would make the next one wait.
+  constexpr int64_t while_items = 32;
+  uint32_t alive = 0;
   for (int64_t item = 0; item < job.count; ++item) {
+    if (item % while_items == 0) {
+      alive = 0;
+      for (int block = 0; block < kBlocks; ++block)
+        for (int k = 0; k < kVectors<T>; ++k)
+          alive |= uint32_t(any(less(V{}, pixels[block][k].transmittance))) << block;
+    }
     const TileEntry& entry = job.entries[item];
     prefetch_splat(job, item + kPrefetch);
     const Splat<T>& s = job.splats[entry.splat];
     V power{}, power_p{}, power_r{}, power_pp{}, power_pr{}, power_rr{}, red{}, green{}, blue{}, z{};
     for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
-      bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
         PixelGradients<T>& px = pixels[block][k];
         Contribution<T> c;
@@ -288,10 +293,8 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
         blue = fma(c.weight, px.g_blue, blue);
         z = fma(c.weight, px.per_z, z);
 
-        goes_on |= any(c.goes_on);
         px.transmittance = next_transmittance(c);
       }
-      alive &= ~(uint32_t(!goes_on) << block);
     }
     const V sums[kSplatGradientNumbers] = {power,    power_p, power_r, power_pp, power_pr,
                                            power_rr, red,     green,   blue,     z};
