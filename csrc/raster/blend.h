@@ -49,27 +49,42 @@ GS_INLINE void prefetch_splat(const TileJob<T>& job, int64_t item) {
   if (item < job.count) __builtin_prefetch(job.splats + job.entries[item].splat);
 }
 
-// What a splat does to a vector of pixels.
+// What a splat is at a vector of pixels.
 template <class T>
-struct Contribution {
+struct Exponent {
   Vector<T> p, r;
   Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
+};
+
+// And what it does to them.
+template <class T>
+struct Contribution : Exponent<T> {
   Vector<T> weight;   // 0 also where the pixel ends, or ended before
   Vector<T> behind;   // T behind the splat
   Mask<T> goes_on;    // T behind the splat > 1e-4
 };
 
 template <class T>
-GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
+GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Exponent<T>& e) {
   const Vector<T> dx = s.u - x, dy = s.v - y;
-  c.p = fma(broadcast<T>(s.a), dx, s.b * dy);
-  c.r = s.c * dy;
-  const Vector<T> exponent = fnma(c.p, c.p, fnma(c.r, c.r, broadcast<T>(s.log2_opacity)));
-  c.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
+  e.p = fma(broadcast<T>(s.a), dx, s.b * dy);
+  e.r = s.c * dy;
+  const Vector<T> exponent = fnma(e.p, e.p, fnma(e.r, e.r, broadcast<T>(s.log2_opacity)));
+  e.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
+}
+
+template <class T>
+GS_INLINE void blend(Vector<T> transmittance, Contribution<T>& c) {
   const Vector<T> alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
   c.behind = fnma(transmittance, alpha, transmittance);
   c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
   c.weight = select(c.goes_on, transmittance * alpha, Vector<T>{});
+}
+
+template <class T>
+GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
+  evaluate(s, x, y, c);
+  blend(transmittance, c);
 }
 
 // 0 where the pixel ends.
@@ -93,28 +108,20 @@ struct BlockPlace {
 // Pixels outside the image read 0.
 template <class T>
 GS_INLINE void load_block(const T* plane, const BlockPlace& at, Vector<T>* out) {
+  if (at.whole()) return load_rows(plane + at.offset, at.row, out);
   T pixels[kBlock * kBlock] = {};
-  for (int j = 0; j < kBlock; ++j) {
-    if (at.whole())
-      __builtin_memcpy(pixels + kBlock * j, plane + at.offset + at.row * j, kBlock * sizeof(T));
-    else
-      for (int i = 0; i < kBlock; ++i)
-        if (i < at.columns && j < at.rows) pixels[kBlock * j + i] = plane[at.offset + at.row * j + i];
-  }
-  for (int k = 0; k < kVectors<T>; ++k) out[k] = load<T>(pixels + k * Simd<T>::lanes);
+  for (int j = 0; j < kBlock && j < at.rows; ++j)
+    for (int i = 0; i < kBlock && i < at.columns; ++i) pixels[kBlock * j + i] = plane[at.offset + at.row * j + i];
+  load_rows(pixels, kBlock, out);
 }
 
 template <class T>
 GS_INLINE void store_block(const Vector<T>* in, const BlockPlace& at, T* plane) {
+  if (at.whole()) return store_rows(in, plane + at.offset, at.row);
   T pixels[kBlock * kBlock];
-  for (int k = 0; k < kVectors<T>; ++k) store<T>(pixels + k * Simd<T>::lanes, in[k]);
-  for (int j = 0; j < kBlock; ++j) {
-    if (at.whole())
-      __builtin_memcpy(plane + at.offset + at.row * j, pixels + kBlock * j, kBlock * sizeof(T));
-    else
-      for (int i = 0; i < kBlock; ++i)
-        if (i < at.columns && j < at.rows) plane[at.offset + at.row * j + i] = pixels[kBlock * j + i];
-  }
+  store_rows(in, pixels, kBlock);
+  for (int j = 0; j < kBlock && j < at.rows; ++j)
+    for (int i = 0; i < kBlock && i < at.columns; ++i) plane[at.offset + at.row * j + i] = pixels[kBlock * j + i];
 }
 
 // T = 1 inside the image, 0 outside.
@@ -255,6 +262,7 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
   // Which blocks have pixels that go on is asked once in a while: an answer after every splat would make the next one wait.
   constexpr int64_t while_items = 32;
   uint32_t alive = 0;
+  Exponent<T> exponents[kBlocks][kVectors<T>];
   for (int64_t item = 0; item < job.count; ++item) {
     if (item % while_items == 0) {
       alive = 0;
@@ -266,12 +274,18 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
     prefetch_splat(job, item + kPrefetch);
     const Splat<T>& s = job.splats[entry.splat];
     V power{}, power_p{}, power_r{}, power_pp{}, power_pr{}, power_rr{}, red{}, green{}, blue{}, z{};
-    for (uint32_t blocks = entry.blocks & alive; blocks != 0; blocks &= blocks - 1) {
+    const uint32_t reached = entry.blocks & alive;
+    for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      for (int k = 0; k < kVectors<T>; ++k) evaluate(s, x[block % 4][k], y[block / 4][k], exponents[block][k]);
+    }
+    for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
       for (int k = 0; k < kVectors<T>; ++k) {
         PixelGradients<T>& px = pixels[block][k];
         Contribution<T> c;
-        contribute(s, x[block % 4][k], y[block / 4][k], px.transmittance, c);
+        static_cast<Exponent<T>&>(c) = exponents[block][k];
+        blend(px.transmittance, c);
         V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
         q = fma(px.g_green, broadcast<T>(s.green), q);
         q = fma(px.g_blue, broadcast<T>(s.blue), q);

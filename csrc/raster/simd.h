@@ -77,6 +77,36 @@ GS_INLINE void store(T* to, Vector<T> v) {
   __builtin_memcpy(to, &v, sizeof v);
 }
 
+// A 4×4 block of numbers, rows `stride` apart: the vectors that it makes, row after row.
+template <class T>
+GS_INLINE void load_rows(const T* first, int64_t stride, Vector<T>* out) {
+  T rows[16];
+  for (int j = 0; j < 4; ++j) __builtin_memcpy(rows + 4 * j, first + stride * j, 4 * sizeof(T));
+  for (int k = 0; k < 16 / Simd<T>::lanes; ++k) out[k] = load<T>(rows + k * Simd<T>::lanes);
+}
+
+template <class T>
+GS_INLINE void store_rows(const Vector<T>* in, T* first, int64_t stride) {
+  T rows[16];
+  for (int k = 0; k < 16 / Simd<T>::lanes; ++k) store<T>(rows + k * Simd<T>::lanes, in[k]);
+  for (int j = 0; j < 4; ++j) __builtin_memcpy(first + stride * j, rows + 4 * j, 4 * sizeof(T));
+}
+
+#if defined(__AVX512F__)
+// In registers: the processor can't read in one piece what was just written in four.
+GS_INLINE void load_rows(const float* first, int64_t stride, Vector<float>* out) {
+  const auto two = [&](const float* row) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row)), _mm_loadu_ps(row + stride), 1);
+  };
+  out[0] = _mm512_insertf32x8(_mm512_castps256_ps512(two(first)), two(first + 2 * stride), 1);
+}
+#elif defined(__AVX2__)
+GS_INLINE void load_rows(const float* first, int64_t stride, Vector<float>* out) {
+  for (int k = 0; k < 2; ++k, first += 2 * stride)
+    out[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(first)), _mm_loadu_ps(first + stride), 1);
+}
+#endif
+
 // fma(a, b, c) = a·b + c and fnma(a, b, c) = c − a·b, in one rounding on every machine: which splats reach which pixels
 // then is decided alike everywhere. Kernels are compiled without contraction, so nothing else is fused. float64 exists to
 // prove gradients and is rounded twice where the machine can't do better.
