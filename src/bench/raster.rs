@@ -1,6 +1,7 @@
 //! The splat op: from Gaussians in tensors to pictures, and back to gradients in tensors.
 
 use super::Spread;
+use crate::data::ImageSize;
 use crate::error::Result;
 use crate::eval::{peak_memory_bytes, resident_memory_bytes};
 use crate::model::Gaussians;
@@ -164,47 +165,32 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
 /// A scene shaped like a trained one, and `views` cameras that walk past it, made from a fixed seed. Sizes in the picture,
 /// their elongation and opacities follow the published 16K splats; more Gaussians are smaller ones, so that they cover as
 /// much.
-pub fn made_up_scene(count: usize, views: usize, width: u32, height: u32) -> (Gaussians, Cameras) {
+pub fn made_up_scene(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
-    let (w, h) = (f64::from(width), f64::from(height));
-    let focal = 0.9 * w.max(h);
+    let (width, height) = (f64::from(size.width), f64::from(size.height));
+    let focal = 0.9 * width.max(height);
     let finer = (16_384. / count.max(1) as f64).sqrt();
-    let mut gaussians = Columns::default();
+    let [mut means, mut scales, mut quaternions, mut opacities, mut sh] = [(); 5].map(|()| Vec::<f32>::new());
     for _ in 0..count {
         let z = 3. * (0.4 * normal(&mut random)).exp();
-        let (x, y) = (random.random_range(-0.75..0.75) * w, random.random_range(-0.75..0.75) * h);
-        gaussians.means.extend([x / focal * z, y / focal * z, z]);
+        let (x, y) = (random.random_range(-0.55..0.55) * width, random.random_range(-0.55..0.55) * height);
+        means.extend([x / focal * z, y / focal * z, z].map(|v| v as f32));
         for (median, spread) in [(0.0044, 0.75), (0.0065, 0.6), (0.0116, 0.55)] {
-            gaussians.scales.push(finer * median * z * (spread * normal(&mut random)).exp());
+            scales.push((finer * median * z * (spread * normal(&mut random)).exp()) as f32);
         }
-        gaussians.quaternions.extend(std::array::from_fn::<f64, 4, _>(|_| normal(&mut random)));
-        gaussians.opacities.push(0.98 * random.random::<f64>().powf(1.35));
-        gaussians.sh.extend(std::array::from_fn::<f64, 48, _>(|_| 0.5 * normal(&mut random)));
+        quaternions.extend((0..4).map(|_| normal(&mut random) as f32));
+        opacities.push((0.98 * random.random::<f64>().powf(1.35)) as f32);
+        sh.extend((0..48).map(|_| 0.5 * normal(&mut random) as f32));
     }
-    (gaussians.tensors(count as i64), walk(views, focal, w, h))
-}
-
-#[derive(Default)]
-struct Columns {
-    means: Vec<f64>,
-    scales: Vec<f64>,
-    quaternions: Vec<f64>,
-    opacities: Vec<f64>,
-    sh: Vec<f64>,
-}
-
-impl Columns {
-    fn tensors(&self, count: i64) -> Gaussians {
-        let tensor =
-            |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).to_kind(Kind::Float);
-        Gaussians {
-            means: tensor(&self.means, &[1, count, 3]),
-            scales: tensor(&self.scales, &[1, count, 3]),
-            quaternions: tensor(&self.quaternions, &[1, count, 4]),
-            opacities: tensor(&self.opacities, &[1, count]),
-            sh: tensor(&self.sh, &[1, count, 16, 3]),
-        }
-    }
+    let n = count as i64;
+    let gaussians = Gaussians {
+        means: Tensor::from_slice(&means).view([1, n, 3]),
+        scales: Tensor::from_slice(&scales).view([1, n, 3]),
+        quaternions: Tensor::from_slice(&quaternions).view([1, n, 4]),
+        opacities: Tensor::from_slice(&opacities).view([1, n]),
+        sh: Tensor::from_slice(&sh).view([1, n, 16, 3]),
+    };
+    (gaussians, walk(views, focal, width, height))
 }
 
 fn walk(views: usize, focal: f64, width: f64, height: f64) -> Cameras {

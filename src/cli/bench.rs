@@ -1,8 +1,8 @@
-use super::print_json;
+use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{RasterReport, Spread, bench_raster, made_up_scene};
-use globalsplat::data::{open_capture, view_batch};
+use globalsplat::data::{ImageSize, open_capture, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::read_ply;
 use globalsplat::render::Cameras;
@@ -42,6 +42,18 @@ pub struct Raster {
     /// The capture whose cameras look at it, all in one call
     #[arg(long, value_name = "PATH", requires = "splat")]
     scene: Option<PathBuf>,
+    /// Gaussians of the made-up scene
+    #[arg(long, value_name = "N", default_value_t = 16_384, conflicts_with = "splat")]
+    gaussians: usize,
+    /// Cameras that look at the made-up scene, all in one call
+    #[arg(long, value_name = "N", default_value_t = 12, conflicts_with = "splat")]
+    cameras: usize,
+    /// Picture size of the made-up scene's cameras
+    #[arg(long, value_name = "WxH", default_value = "256x256", conflicts_with = "splat")]
+    size: String,
+    /// A table instead: made-up scenes of 16K to 1M Gaussians, one camera of 256x256 to 1920x1080
+    #[arg(long, conflicts_with_all = ["splat", "gaussians", "cameras", "size"])]
+    scaling: bool,
     /// Threads that share the work; by default all cores
     #[arg(long, value_name = "N")]
     threads: Option<u16>,
@@ -61,6 +73,14 @@ impl Raster {
         if self.repeats == 0 {
             return Err(Error::Request("--repeats is 0, expected 1 or more".into()).into());
         }
+        if self.gaussians == 0 || self.cameras == 0 {
+            return Err(
+                Error::Request("--gaussians and --cameras are expected to be 1 or more".into()).into()
+            );
+        }
+        if self.scaling {
+            return self.scaling();
+        }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
                 let gaussians = read_ply(splat)?.gaussians;
@@ -68,7 +88,7 @@ impl Raster {
                 let poses: Vec<_> = views.iter().map(|view| view.camera.c2w).collect();
                 (gaussians, Cameras::of(&view_batch(&views, &poses, Device::Cpu)))
             }
-            _ => made_up_scene(16_384, 12, 256, 256),
+            _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
         let report = bench_raster(&gaussians, &cameras, self.repeats as usize)?;
         if self.json {
@@ -79,6 +99,46 @@ impl Raster {
         Ok(())
     }
 }
+
+impl Raster {
+    fn scaling(&self) -> Result<()> {
+        let mut reports = vec![];
+        let bar = progress::bar((GAUSSIANS.len() * SIZES.len()) as u64, "scenes");
+        for count in GAUSSIANS {
+            for (width, height) in SIZES {
+                let (gaussians, cameras) = made_up_scene(count, 1, ImageSize { width, height });
+                reports.push(bench_raster(&gaussians, &cameras, self.repeats as usize)?);
+                bar.inc(1);
+            }
+        }
+        bar.finish_and_clear();
+        if self.json {
+            print_json(&serde_json::to_value(&reports)?);
+            return Ok(());
+        }
+        println!(
+            "median milliseconds, forward / forward and backward, {} threads, {}",
+            reports[0].threads, reports[0].simd
+        );
+        print!("{:>10}", "Gaussians");
+        for (width, height) in SIZES {
+            print!(" {:>17}", format!("{width}x{height}"));
+        }
+        println!();
+        for row in reports.chunks(SIZES.len()) {
+            print!("{:>10}", row[0].gaussians);
+            for r in row {
+                print!(" {:>17}", format!("{:.1} / {:.1}", r.forward.median, r.forward_backward.median));
+            }
+            println!();
+        }
+        Ok(())
+    }
+}
+
+/// Rows and columns of the scaling table.
+const GAUSSIANS: [usize; 4] = [16_384, 65_536, 262_144, 1_048_576];
+const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
 
 fn print_report(r: &RasterReport) {
     println!(

@@ -18,6 +18,7 @@ mod train;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
+use globalsplat::data::ImageSize;
 use std::panic;
 use std::process::ExitCode;
 
@@ -91,6 +92,15 @@ pub fn main() -> ExitCode {
 /// libtorch appends stack traces to its messages.
 fn first_sentence(text: &str) -> &str {
     text.lines().next().unwrap_or(text)
+}
+
+/// A picture size as `--size` takes it.
+fn parse_size(text: &str) -> Result<ImageSize, Error> {
+    let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    match sides {
+        Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
+        _ => Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
+    }
 }
 
 /// Prints a result as one JSON object.

@@ -1,8 +1,8 @@
-use super::{print_json, progress};
+use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::{DMat4, DVec3};
-use globalsplat::data::{open_capture, read_camera_path};
+use globalsplat::data::{ImageSize, open_capture, read_camera_path};
 use globalsplat::error::Error;
 use globalsplat::eval::{Rendered, render_views};
 use globalsplat::io::{
@@ -137,8 +137,8 @@ impl Render {
             return Err(Error::Request("--frames is 0, expected 1 or more".into()).into());
         }
         let Some(scene) = &self.scene else {
-            let (width, height) = size.unwrap_or((DEFAULT_SIZE, DEFAULT_SIZE));
-            let cameras = orbit_around_splat(splat, width, height, self.frames);
+            let size = size.unwrap_or(ImageSize { width: DEFAULT_SIZE, height: DEFAULT_SIZE });
+            let cameras = orbit_around_splat(splat, size, self.frames);
             return Ok((numbered(&cameras), cameras));
         };
         let capture = open_capture(scene)?;
@@ -154,19 +154,8 @@ impl Render {
     }
 }
 
-fn parse_size(text: &str) -> Result<(u32, u32)> {
-    let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
-    match sides {
-        Some((width @ 1..=16384, height @ 1..=16384)) => Ok((width, height)),
-        _ => {
-            Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))
-                .into())
-        }
-    }
-}
-
 /// The same view in a picture of another size: as much to see along the shorter side.
-fn with_size(camera: &Camera, (width, height): (u32, u32)) -> Camera {
+fn with_size(camera: &Camera, ImageSize { width, height }: ImageSize) -> Camera {
     let (x, y) = (f64::from(width) / f64::from(camera.width), f64::from(height) / f64::from(camera.height));
     let factor = x.min(y);
     let k = camera.intrinsics;
@@ -182,7 +171,7 @@ fn median_depth(splat: &Ply, cameras: &[Camera]) -> Result<f64> {
 }
 
 /// Around the middle of the splat's opaque part, far enough to see most of it.
-fn orbit_around_splat(splat: &Ply, width: u32, height: u32, frames: usize) -> Vec<Camera> {
+fn orbit_around_splat(splat: &Ply, ImageSize { width, height }: ImageSize, frames: usize) -> Vec<Camera> {
     let g = &splat.gaussians;
     let means = g.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);
