@@ -180,13 +180,18 @@ void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<Depth
         const PerView& view = views_[size_t(k)];
         const size_t begin = items.size * size_t(chunk) / size_t(chunks());
         const size_t end = items.size * size_t(chunk + 1) / size_t(chunks());
-        for (size_t i = begin; i < end; ++i) {
-          const uint32_t splat = items[i].splat;
+        const auto first_pair = [&](uint32_t splat) {
           const Part& part = made[size_t(k * tasks_) + splat / kTask];
-          for (uint32_t record = view.first_record[splat]; record < view.first_record[splat + 1]; ++record) {
-            const TilePair& pair = part.pairs[record - part.pairs_before];
-            visit(int64_t(pair.tile), TileEntry{splat, record, pair.blocks});
-          }
+          return part.pairs.data.get() + (view.first_record[splat] - part.pairs_before);
+        };
+        for (size_t i = begin; i < end; ++i) {
+          // Splats in the order of depth lie anywhere.
+          if (i + 16 < end) __builtin_prefetch(&view.first_record[items[i + 16].splat]);
+          if (i + 8 < end) __builtin_prefetch(first_pair(items[i + 8].splat));
+          const uint32_t splat = items[i].splat;
+          const TilePair* pair = first_pair(splat);
+          for (uint32_t record = view.first_record[splat]; record < view.first_record[splat + 1]; ++record, ++pair)
+            visit(int64_t(pair->tile), TileEntry{splat, record, pair->blocks});
         }
       },
       [&](int64_t k, uint32_t at, const TileEntry& entry) { views_[size_t(k)].entries[at] = entry; });
