@@ -3,8 +3,11 @@
 mod common;
 
 use common::{Random, largest_error};
+use globalsplat::data::ImageSize;
 use globalsplat::model::Gaussians;
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
+use std::collections::BTreeMap;
+use std::process::{Command, Stdio};
 use tch::{Device, Kind, Tensor};
 
 /// Gaussians in front of the cameras of [`cameras`], of sizes and opacities as a trained scene has them, every one a
@@ -222,6 +225,119 @@ fn pictures_are_those_of_brute_force() {
         let single = draw(&g.map(|t| t.to_kind(Kind::Float)), &cameras(2, 2, width, height, Kind::Float));
         assert!(largest_error(&single.rgb, &expected.rgb) < 1e-4);
         assert!(largest_error(&single.alpha, &expected.alpha) < 1e-4);
+    }
+}
+
+/// Gaussians that culling is likely to lose, one per scene: needles at any angle, large and tiny ones, faint ones, centres
+/// on the borders of tiles and blocks, and outside the picture. The camera is that of [`straight_camera`].
+fn lone_gaussians(width: f64, height: f64, seed: u64) -> Gaussians {
+    const COUNT: usize = 600;
+    let mut random = Random::new(seed);
+    let mut number = || random.uniform(&[1]).double_value(&[0]);
+    let (mut means, mut scales, mut quaternions, mut opacities) = (vec![], vec![], vec![], vec![]);
+    for i in 0..COUNT {
+        let (mut x, mut y) = (width * (2. * number() - 0.5), height * (2. * number() - 0.5));
+        if i % 3 == 0 {
+            (x, y) = (4. * (x / 4.).round(), 4. * (y / 4.).round());
+        }
+        // Standard deviations in pixels, at depth 1 and focal length 1 pixel · 100.
+        let size = [[3., 3.], [60., 0.05], [200., 0.3], [0.02, 0.02], [8., 1.], [300., 40.]][i % 6];
+        let opacity = [0.99, 0.5, 1.02 / 255., 0.05, 1., 4. / 255.][(i / 6) % 6];
+        let half_turn = std::f64::consts::PI * number() / 2.;
+        means.extend([(x - width / 2.) / 100., (y - height / 2.) / 100., 1.]);
+        scales.extend([size[0] / 100., size[1] / 100., 1e-4]);
+        quaternions.extend([half_turn.cos(), 0., 0., half_turn.sin()]);
+        opacities.push(opacity);
+    }
+    let n = COUNT as i64;
+    let tensor = |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).to_kind(Kind::Float);
+    Gaussians {
+        means: tensor(&means, &[n, 1, 3]),
+        scales: tensor(&scales, &[n, 1, 3]),
+        quaternions: tensor(&quaternions, &[n, 1, 4]),
+        opacities: tensor(&opacities, &[n, 1]),
+        sh: Tensor::zeros([n, 1, 1, 3], (Kind::Float, Device::Cpu)),
+    }
+}
+
+/// At the origin, looking along z, focal length 100 pixels; one for each of `scenes`.
+fn straight_camera(scenes: i64, width: i64, height: i64) -> Cameras {
+    let intrinsics = [100., 0., width as f64 / 2., 0., 100., height as f64 / 2., 0., 0., 1.];
+    Cameras {
+        w2c: Tensor::eye(4, (Kind::Float, Device::Cpu)).repeat([scenes, 1, 1, 1]),
+        intrinsics: Tensor::from_slice(&intrinsics)
+            .view([3, 3])
+            .to_kind(Kind::Float)
+            .repeat([scenes, 1, 1, 1]),
+        width,
+        height,
+    }
+}
+
+#[test]
+fn a_gaussian_is_seen_wherever_it_reaches() {
+    // float32 against brute force in float64. They may disagree about a pixel only where α is 1/255 but for rounding.
+    let threshold = 1. / 255.;
+    for (width, height, seed) in [(96, 80, 14), (33, 50, 15), (16, 16, 16)] {
+        let g = lone_gaussians(width as f64, height as f64, seed);
+        let c = straight_camera(g.means.size()[0], width, height);
+        let ours = draw(&g, &c).alpha.to_kind(Kind::Double);
+        let expected = brute_force(&g, &c).alpha;
+        assert!((expected.gt(0.)).sum(Kind::Int64).int64_value(&[]) > 10_000, "empty pictures prove nothing");
+        let doubtful = expected.maximum(&ours).lt(threshold * (1. + 1e-3));
+        let lost = expected.gt(0.).logical_and(&ours.eq(0.)).logical_and(&doubtful.logical_not());
+        assert_eq!(lost.sum(Kind::Int64).int64_value(&[]), 0, "{width}×{height}: pixels were lost");
+        let error = ((&ours - &expected).abs() / expected.clamp_min(threshold)).masked_fill(&doubtful, 0.);
+        let error = error.max().double_value(&[]);
+        assert!(error < 2e-3, "{width}×{height}: α is wrong by a share of {error:.1e}");
+    }
+}
+
+#[test]
+fn instruction_sets_agree() {
+    // The choice is made once per process: this test runs itself again for every set, to draw and save.
+    const OUT: &str = "GLOBALSPLAT_TEST_OUT";
+    const UNSUPPORTED: i32 = 77;
+    if let Some(out) = std::env::var_os(OUT) {
+        if globalsplat::render::simd_level().is_err() {
+            std::process::exit(UNSUPPORTED);
+        }
+        let (g, c) = globalsplat::bench::made_up_scene(16384, 12, ImageSize { width: 256, height: 256 });
+        let g = leaves(&g);
+        let p = draw(&g, &c);
+        objective(&p).backward();
+        let mut tensors = vec![("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
+        tensors.extend(fields(&g).map(|(name, leaf)| (name, leaf.grad())));
+        return Tensor::write_safetensors(&tensors, out).expect("a writable file");
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut answers = vec![];
+    for level in ["avx512", "avx2", "neon", "portable"] {
+        let out = folder.path().join(level);
+        let status = Command::new(std::env::current_exe().expect("this test's path"))
+            .args(["--exact", "instruction_sets_agree"])
+            .env("GLOBALSPLAT_SIMD", level)
+            .env(OUT, &out)
+            .stdout(Stdio::null())
+            .status()
+            .expect("this test runs");
+        match status.code() {
+            Some(0) => {
+                let tensors = Tensor::read_safetensors(&out).expect("what was written");
+                answers.push((level, tensors.into_iter().collect::<BTreeMap<_, _>>()));
+            }
+            code => assert_eq!(code, Some(UNSUPPORTED), "{level}"),
+        }
+    }
+    println!("compared: {:?}", answers.iter().map(|(level, _)| level).collect::<Vec<_>>());
+    assert!(!answers.is_empty());
+    let (_, first) = &answers[0];
+    for (level, tensors) in &answers[1..] {
+        for (name, expected) in first {
+            let found = &tensors[name];
+            let error = largest_error(found, expected) / expected.abs().max().double_value(&[]).max(1.);
+            assert!(error <= 1e-5, "{level}: {name} differs by {error:.1e}");
+        }
     }
 }
 
