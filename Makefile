@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 CARGO ?= cargo
 
-.PHONY: all setup venv build demo test parity docker clean
+.PHONY: all setup venv build demo test parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
@@ -30,6 +30,11 @@ test: venv
 parity: venv build
 	.venv/bin/python -m pytest -q parity
 	.venv/bin/python parity/run.py --self-test
+
+# How fast this machine runs the rasterizer, and how time grows with Gaussians and pixels.
+bench: build
+	@target/release/globalsplat bench raster
+	@target/release/globalsplat bench raster --scaling --repeats 5
 
 docker:
 	docker build -f docker/cpu.Dockerfile -t globalsplat:cpu .

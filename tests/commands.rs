@@ -50,6 +50,44 @@ fn every_simd_level_renders_alike() {
 }
 
 #[test]
+fn a_million_gaussians_fit_into_a_gigabyte() {
+    let report = json(&[
+        "bench",
+        "raster",
+        "--gaussians",
+        "1000000",
+        "--size",
+        "1920x1080",
+        "--cameras",
+        "1",
+        "--repeats",
+        "1",
+        "--json",
+    ]);
+    assert_eq!((&report["gaussians"], &report["width"]), (&Value::from(1_000_000), &Value::from(1920)));
+    assert!(report["pairs"]["contributing"].as_f64().unwrap() > 1e7, "an empty picture proves nothing");
+    let bytes = report["working_bytes"].as_u64().unwrap();
+    assert!((100_000_000..1_000_000_000).contains(&bytes), "{bytes} bytes of working memory");
+}
+
+#[test]
+fn bench_tells_where_time_goes() {
+    let report =
+        json(&["bench", "raster", "--gaussians", "500", "--cameras", "2", "--repeats", "3", "--json"]);
+    let stages: Vec<&str> =
+        report["stages"].as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["project", "sort", "bin", "blend", "blend backward", "project backward"]);
+    for time in report["stages"].as_array().unwrap().iter().map(|s| &s["milliseconds"]) {
+        assert!(time["least"].as_f64().unwrap() > 0. && time["least"].as_f64() <= time["median"].as_f64());
+    }
+    let pairs = &report["pairs"];
+    assert!(0. < pairs["contributing"].as_f64().unwrap());
+    assert!(pairs["contributing"].as_f64() <= pairs["evaluated"].as_f64());
+    assert!(report["forward_backward"]["median"].as_f64() > report["forward"]["least"].as_f64());
+    assert!(report["peak_gflops"].as_f64().unwrap() > 1.);
+}
+
+#[test]
 fn a_splat_is_scored_by_its_capture() {
     let (_folder, room) = room();
     let (splat, sheet) = (room.join("truth.ply"), room.join("sheet.png"));
