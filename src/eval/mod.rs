@@ -3,12 +3,14 @@
 mod contact_sheet;
 mod memory;
 mod metrics;
+mod perceptual;
 mod protocol;
 mod reconstruct;
 
 pub use contact_sheet::contact_sheet;
 pub use memory::{peak_memory_bytes, resident_memory_bytes};
 pub use metrics::{psnr, ssim};
+pub use perceptual::Perceptual;
 pub use protocol::{
     CaptureScores, Rendered, ViewScore, nearest_context_baseline, render_views, score, score_model,
     score_renders, score_splat,

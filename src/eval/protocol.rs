@@ -32,6 +32,12 @@ pub struct ViewScore {
     pub psnr: f64,
     /// As scikit-image's.
     pub ssim: f64,
+    /// The distance by VGG-16's features, where its weights are at hand.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
+    /// The distance by AlexNet's features, where its weights are at hand.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
 }
 
 /// A capture's scores: means over its views, and each of them.
@@ -43,6 +49,12 @@ pub struct CaptureScores {
     pub psnr: f64,
     /// Mean over the views.
     pub ssim: f64,
+    /// Mean over the views, where every one has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
+    /// Mean over the views, where every one has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
     /// Number of Gaussians, where a splat was scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<i64>,
@@ -50,7 +62,7 @@ pub struct CaptureScores {
     pub views: Vec<ViewScore>,
 }
 
-/// Scores pictures [3, H, W] against views of the same sizes.
+/// Scores pictures [3, H, W] against views of the same sizes, without LPIPS, which [`super::Perceptual`] adds.
 ///
 /// # Errors
 /// A picture of another size than its view.
@@ -70,13 +82,15 @@ pub fn score(
             )));
         }
         let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
-        views.push(ViewScore { image: view.name.clone(), psnr, ssim });
+        views.push(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None });
     }
     let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
     Ok(CaptureScores {
         scene: scene.to_string(),
         psnr: mean(|v| v.psnr),
         ssim: mean(|v| v.ssim),
+        lpips_vgg: None,
+        lpips_alex: None,
         gaussians,
         views,
     })

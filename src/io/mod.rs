@@ -5,6 +5,7 @@ mod film;
 mod images;
 mod model_file;
 mod ply;
+mod pretrained;
 mod weights;
 
 pub use atomic::{check_writable_dir, check_writable_file, replace_dir, write_atomically};
@@ -14,4 +15,5 @@ pub use images::{
 };
 pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, load_model, save_model};
 pub use ply::{Ply, read_ply, write_ply};
+pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
 pub use weights::{Weights, read_weights, write_weights};

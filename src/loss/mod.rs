@@ -3,11 +3,13 @@
 mod consistency;
 mod decoder_regularization;
 mod frustum;
+mod lpips;
 mod mse;
 
 pub use consistency::consistency;
 pub use decoder_regularization::{decoder_regularization, sh_soft_cap};
 pub use frustum::frustum;
+pub use lpips::{Lpips, LpipsNetwork};
 pub use mse::mse;
 
 use crate::config::LossConfig;

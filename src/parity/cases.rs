@@ -41,6 +41,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "frustum" => frustum(request),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
+        "lpips" => lpips(request),
         "consistency" => consistency(request),
         "subsets" => subsets(request),
         "learning_rate" => learning_rate(request),
@@ -328,6 +329,14 @@ fn subsets(request: &Request) -> Result<Answer> {
     let tensor =
         |positions: Vec<usize>| Tensor::from_slice(&positions.iter().map(|&p| p as i64).collect::<Vec<_>>());
     outputs([("a", tensor(a)), ("b", tensor(b))])
+}
+
+fn lpips(request: &Request) -> Result<Answer> {
+    let name: String = request.number("network")?;
+    let network = loss::LpipsNetwork::ALL.into_iter().find(|network| network.metric() == name);
+    let network = network.ok_or_else(|| Error::Request(format!("{}: no network {name}", request.case)))?;
+    let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
+    with_params([("distance", lpips.distance(request.input("picture")?, request.input("truth")?))], params)
 }
 
 fn steps(request: &Request) -> Result<Vec<u64>> {

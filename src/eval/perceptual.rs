@@ -1,0 +1,76 @@
+//! LPIPS in evaluation: wherever its weights are found.
+
+use super::protocol::{CaptureScores, ViewScore};
+use crate::data::View;
+use crate::error::Result;
+use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
+use crate::loss::{Lpips, LpipsNetwork};
+use tch::{Device, Tensor};
+
+/// The networks whose weights were found.
+#[derive(Debug)]
+pub struct Perceptual {
+    vgg: Option<Lpips>,
+    alex: Option<Lpips>,
+}
+
+impl Perceptual {
+    /// Loads what is in [`pretrained_folders`]. Weights that are absent are no error.
+    ///
+    /// # Errors
+    /// A file that holds something else.
+    pub fn find(device: Device) -> Result<Self> {
+        let load = |network: LpipsNetwork| {
+            find_pretrained(network.file_name()).map(|path| Lpips::load(&path, network, device)).transpose()
+        };
+        Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
+    }
+
+    /// Scores pictures [3, H, W], clamped to [0, 1], against the views that `scores` is of, in the same order. A network
+    /// that is absent, or too large for some view, leaves no mean.
+    pub fn add_to(&self, scores: &mut CaptureScores, pictures: &[Tensor], truth: &[View]) {
+        for ((score, picture), view) in scores.views.iter_mut().zip(pictures).zip(truth) {
+            score.lpips_vgg = distance(self.vgg.as_ref(), picture, &view.image);
+            score.lpips_alex = distance(self.alex.as_ref(), picture, &view.image);
+        }
+        let mean = |value: fn(&ViewScore) -> Option<f64>| {
+            let values: Option<Vec<f64>> = scores.views.iter().map(value).collect();
+            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        (scores.lpips_vgg, scores.lpips_alex) = (mean(|view| view.lpips_vgg), mean(|view| view.lpips_alex));
+    }
+
+    /// Why `scores`, which have been added to, lack a distance; `None` where they don't.
+    pub fn why_absent(&self, scores: &CaptureScores) -> Option<String> {
+        let networks = [
+            (LpipsNetwork::Vgg16, &self.vgg, scores.lpips_vgg),
+            (LpipsNetwork::AlexNet, &self.alex, scores.lpips_alex),
+        ];
+        let absent: Vec<_> = networks.into_iter().filter(|(.., score)| score.is_none()).collect();
+        let names = absent.iter().map(|(network, ..)| network.metric()).collect::<Vec<_>>().join(" and ");
+        let (network, loaded, _) = absent.first()?;
+        Some(match loaded {
+            Some(_) => {
+                format!("left out: {names}, which needs views of {0}×{0} or more", network.smallest_side())
+            }
+            None => {
+                let path = pretrained_folders()[0].join(network.file_name());
+                let path = path.display();
+                format!(
+                    "left out: {names}; {path} is absent (make weights makes it, {WEIGHTS_VARIABLE} names its folder)"
+                )
+            }
+        })
+    }
+}
+
+fn distance(lpips: Option<&Lpips>, picture: &Tensor, truth: &Tensor) -> Option<f64> {
+    let lpips = lpips?;
+    let size = picture.size();
+    let smallest = lpips.network().smallest_side();
+    if size[1] < smallest || size[2] < smallest {
+        return None;
+    }
+    let prepare = |picture: &Tensor| picture.to_device(lpips.device()).clamp(0., 1.);
+    Some(tch::no_grad(|| lpips.distance(&prepare(picture), &prepare(truth))).double_value(&[]))
+}

@@ -1,0 +1,228 @@
+//! LPIPS, a distance of pictures as people see it: Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
+//! Perceptual Metric", 2018, equation 1. Version 0.1 of its linear weights, with which published numbers are made.
+
+use crate::error::Result;
+use crate::io::read_weights;
+use std::path::Path;
+use tch::nn::Module;
+use tch::{Device, Kind, Tensor, nn};
+
+/// What the distance takes from pictures in [−1, 1], per channel, and divides them by: the mean and standard deviation of
+/// the photos that the networks were trained on.
+const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+/// Added to the norms that features are divided by.
+const EPSILON: f64 = 1e-10;
+
+/// The network whose features are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LpipsNetwork {
+    /// VGG-16 (Simonyan & Zisserman 2015), features after ReLU 1_2, 2_2, 3_3, 4_3 and 5_3.
+    Vgg16,
+    /// AlexNet in its one-tower form (Krizhevsky 2014), features after each of the five ReLUs.
+    AlexNet,
+}
+
+/// One convolution with its ReLU, and what stands before and after it.
+struct Layer {
+    name: &'static str,
+    channels: i64,
+    kernel: i64,
+    stride: i64,
+    padding: i64,
+    /// A max pooling comes before.
+    pooled: bool,
+    /// Its features are compared.
+    compared: bool,
+}
+
+impl LpipsNetwork {
+    /// Both.
+    pub const ALL: [LpipsNetwork; 2] = [LpipsNetwork::Vgg16, LpipsNetwork::AlexNet];
+
+    /// What the distance is called in reports.
+    pub fn metric(self) -> &'static str {
+        match self {
+            LpipsNetwork::Vgg16 => "lpips_vgg",
+            LpipsNetwork::AlexNet => "lpips_alex",
+        }
+    }
+
+    /// What `make weights` calls the file of the weights.
+    pub fn file_name(self) -> &'static str {
+        match self {
+            LpipsNetwork::Vgg16 => "lpips_vgg.safetensors",
+            LpipsNetwork::AlexNet => "lpips_alex.safetensors",
+        }
+    }
+
+    /// In pixels: of a smaller picture nothing would be left for the last layer.
+    pub fn smallest_side(self) -> i64 {
+        match self {
+            LpipsNetwork::Vgg16 => 16,
+            LpipsNetwork::AlexNet => 31,
+        }
+    }
+
+    /// Side of the max poolings' windows, which are 2 apart.
+    fn pool(self) -> i64 {
+        match self {
+            LpipsNetwork::Vgg16 => 2,
+            LpipsNetwork::AlexNet => 3,
+        }
+    }
+
+    fn layers(self) -> Vec<Layer> {
+        match self {
+            LpipsNetwork::Vgg16 => {
+                let layer = |name, channels, pooled, compared| {
+                    let (kernel, stride, padding) = (3, 1, 1);
+                    Layer { name, channels, kernel, stride, padding, pooled, compared }
+                };
+                vec![
+                    layer("conv1_1", 64, false, false),
+                    layer("conv1_2", 64, false, true),
+                    layer("conv2_1", 128, true, false),
+                    layer("conv2_2", 128, false, true),
+                    layer("conv3_1", 256, true, false),
+                    layer("conv3_2", 256, false, false),
+                    layer("conv3_3", 256, false, true),
+                    layer("conv4_1", 512, true, false),
+                    layer("conv4_2", 512, false, false),
+                    layer("conv4_3", 512, false, true),
+                    layer("conv5_1", 512, true, false),
+                    layer("conv5_2", 512, false, false),
+                    layer("conv5_3", 512, false, true),
+                ]
+            }
+            LpipsNetwork::AlexNet => {
+                let layer = |name, channels, [kernel, stride, padding]: [i64; 3], pooled| {
+                    let compared = true;
+                    Layer { name, channels, kernel, stride, padding, pooled, compared }
+                };
+                vec![
+                    layer("conv1", 64, [11, 4, 2], false),
+                    layer("conv2", 192, [5, 1, 2], true),
+                    layer("conv3", 384, [3, 1, 1], true),
+                    layer("conv4", 256, [3, 1, 1], false),
+                    layer("conv5", 256, [3, 1, 1], false),
+                ]
+            }
+        }
+    }
+}
+
+/// The distance, in float32; differentiable.
+#[derive(Debug)]
+pub struct Lpips {
+    network: LpipsNetwork,
+    /// [1, 3, 1, 1].
+    shift: Tensor,
+    /// [1, 3, 1, 1].
+    scale: Tensor,
+    steps: Vec<Step>,
+}
+
+/// A [`Layer`] with its weights.
+#[derive(Debug)]
+struct Step {
+    pooled: bool,
+    convolution: nn::Conv2D,
+    /// What a squared difference in each channel counts, [1, C, 1, 1], where features are compared.
+    linear: Option<Tensor>,
+}
+
+impl Lpips {
+    /// Builds the network under `vs`: `conv….weight` [O, I, k, k] and `.bias` [O], `lin0.weight` to `lin4.weight`
+    /// [1, C, 1, 1]. They are zero until they are loaded.
+    pub(crate) fn new(vs: &nn::Path, network: LpipsNetwork) -> Self {
+        let zero = nn::Init::Const(0.);
+        let (mut inputs, mut compared, mut steps) = (3, 0, vec![]);
+        for layer in network.layers() {
+            let config = nn::ConvConfig {
+                stride: layer.stride,
+                padding: layer.padding,
+                ws_init: zero,
+                bs_init: zero,
+                ..Default::default()
+            };
+            let convolution = nn::conv2d(vs / layer.name, inputs, layer.channels, layer.kernel, config);
+            let linear = layer.compared.then(|| {
+                compared += 1;
+                (vs / format!("lin{}", compared - 1)).var("weight", &[1, layer.channels, 1, 1], zero)
+            });
+            steps.push(Step { pooled: layer.pooled, convolution, linear });
+            inputs = layer.channels;
+        }
+        let per_channel =
+            |values: &[f32]| Tensor::from_slice(values).view([1, 3, 1, 1]).to_device(vs.device());
+        Lpips { network, shift: per_channel(&SHIFT), scale: per_channel(&SCALE), steps }
+    }
+
+    /// Reads the weights that `make weights` makes. They take no gradient; pictures do.
+    ///
+    /// # Errors
+    /// A file that can't be read or holds another network.
+    pub fn load(path: &Path, network: LpipsNetwork, device: Device) -> Result<Self> {
+        let mut vs = nn::VarStore::new(device);
+        let lpips = Lpips::new(&vs.root(), network);
+        read_weights(path)?.load_into(&vs, path)?;
+        vs.freeze();
+        Ok(lpips)
+    }
+
+    /// Whose features are compared.
+    pub fn network(&self) -> LpipsNetwork {
+        self.network
+    }
+
+    /// Where the weights are, and pictures have to be.
+    pub fn device(&self) -> Device {
+        self.shift.device()
+    }
+
+    /// How differently two pictures look: 0 for equal ones. Both […, 3, H, W] in [0, 1], float32, H and W at least
+    /// [`LpipsNetwork::smallest_side`]; the result is […].
+    ///
+    /// # Panics
+    /// Pictures of another shape or a smaller size.
+    pub fn distance(&self, picture: &Tensor, truth: &Tensor) -> Tensor {
+        let size = picture.size();
+        self.compare(self.features(picture), self.features(truth)).view(&size[..size.len() - 3])
+    }
+
+    /// What [`Lpips::compare`] compares, layer by layer: features that are divided by their norm over the channels,
+    /// [B, C, H', W']. Pictures as for [`Lpips::distance`], B of them. They are computed as they are asked for.
+    pub fn features(&self, pictures: &Tensor) -> impl Iterator<Item = Tensor> {
+        let size = pictures.size();
+        let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
+        let mut xs = (pictures * 2. - 1. - &self.shift) / &self.scale;
+        self.steps.iter().filter_map(move |step| {
+            if step.pooled {
+                let pool = self.network.pool();
+                xs = xs.max_pool2d([pool, pool], [2, 2], [0, 0], [1, 1], false);
+            }
+            xs = step.convolution.forward(&xs).relu();
+            step.linear.is_some().then(|| unit(&xs))
+        })
+    }
+
+    /// Σ over layers of the mean over pixels of Σ over channels of w (â − b̂)²: [B] of two times B pictures.
+    pub fn compare(&self, a: impl Iterator<Item = Tensor>, b: impl Iterator<Item = Tensor>) -> Tensor {
+        let linear = self.steps.iter().filter_map(|step| step.linear.as_ref());
+        linear
+            .zip(a.zip(b))
+            .map(|(linear, (a, b))| {
+                let weighted = (a - b).square().conv2d(linear, None::<&Tensor>, 1, 0, 1, 1); // [B, 1, H', W']
+                weighted.mean_dim([1i64, 2, 3].as_slice(), false, None::<Kind>)
+            })
+            .reduce(|sum, distance| sum + distance)
+            .expect("five layers")
+    }
+}
+
+/// Features [B, C, H, W] divided by their norm over C. Where all channels are 0 the norm has no derivative; libtorch's norm
+/// says 0 there, as a square root of a sum wouldn't.
+fn unit(features: &Tensor) -> Tensor {
+    features / (features.norm_scalaropt_dim(2., [1i64].as_slice(), true) + EPSILON)
+}
