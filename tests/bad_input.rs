@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::program::{arg, refuse, room, succeed, tiny_config, tiny_weights};
+use common::program::{arg, command, refuse, room, succeed, tiny_config, tiny_weights};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -415,4 +415,26 @@ fn a_checkpoint_of_another_model() {
     succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
     let error = refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", "model.width=64"]);
     assert_says(&error, &["model.safetensors", "more that don't fit"]);
+}
+
+#[test]
+fn lpips_weights_of_something_else() {
+    let (folder, room) = room();
+    let file = folder.path().join("lpips_vgg.safetensors");
+    let splat = room.join("truth.ply");
+    let score = || {
+        let output = command(&["eval", "--splat", arg(&splat), "--scene", arg(&room)])
+            .env("GLOBALSPLAT_WEIGHTS", folder.path())
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        assert!(output.stdout.is_empty());
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(error.trim().lines().count(), 1, "{error}");
+        error
+    };
+    std::fs::write(&file, "no weights").unwrap();
+    assert_says(&score(), &[arg(&file), "broken", "safetensors"]);
+    std::fs::rename(tiny_weights(folder.path(), &room), &file).unwrap();
+    assert_says(&score(), &[arg(&file), "tensor conv1_1.bias is absent, expected [64]"]);
 }

@@ -5,8 +5,9 @@ mod common;
 use common::captures;
 use glam::{DMat3, DVec3};
 use globalsplat::data::{find_captures, open_capture};
-use globalsplat::eval::score_splat;
-use globalsplat::io::{read_ply, write_ply};
+use globalsplat::eval::{Perceptual, score_splat};
+use globalsplat::io::{find_pretrained, read_ply, write_ply};
+use globalsplat::loss::LpipsNetwork;
 use globalsplat::render::transform;
 use globalsplat::scene::Similarity;
 
@@ -25,6 +26,34 @@ fn published_splats_reach_their_scores() {
         let (scores, ..) = score_splat(&splat.gaussians, &capture).expect("scores");
         assert!((scores.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.psnr);
         assert!((scores.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.ssim);
+    }
+}
+
+/// Mean LPIPS over a capture's views, by VGG-16 and AlexNet, that the published splat is known to have.
+const PUBLISHED_LPIPS: [(&str, f64, f64); 2] =
+    [("322261824c4a3003", 0.1148, 0.0500), ("5aca87f95a9412c6", 0.1020, 0.0484)];
+
+#[test]
+fn published_splats_look_as_they_are_known_to() {
+    if LpipsNetwork::ALL.iter().any(|network| find_pretrained(network.file_name()).is_none()) {
+        println!("skipped: the weights of LPIPS are not there; run make weights");
+        return;
+    }
+    let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
+    for path in captures().unwrap_or_default() {
+        let capture = open_capture(&path).expect("a capture");
+        let Some((_, vgg, alex)) = PUBLISHED_LPIPS.iter().find(|(name, ..)| *name == capture.name) else {
+            continue;
+        };
+        let splat = read_ply(&path.join("reference.ply")).expect("a splat");
+        let (mut scores, views, rendered) = score_splat(&splat.gaussians, &capture).expect("scores");
+        let pictures: Vec<_> = rendered.into_iter().map(|r| r.rgb).collect();
+        perceptual.add_to(&mut scores, &pictures, &views);
+        assert!(perceptual.why_absent(&scores).is_none());
+        let (found_vgg, found_alex) =
+            (scores.lpips_vgg.expect("LPIPS-VGG"), scores.lpips_alex.expect("LPIPS-Alex"));
+        assert!((found_vgg - vgg).abs() < 0.0005, "{}: LPIPS-VGG {found_vgg}", capture.name);
+        assert!((found_alex - alex).abs() < 0.0005, "{}: LPIPS-Alex {found_alex}", capture.name);
     }
 }
 

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::program::{arg, fail, globalsplat, room, succeed, tiny_config, tiny_weights};
+use common::program::{arg, command, fail, globalsplat, room, succeed, tiny_config, tiny_weights};
 use serde_json::Value;
 use std::path::Path;
 
@@ -103,6 +103,72 @@ fn a_splat_is_scored_by_its_capture() {
     assert!(views.iter().all(|v| v["psnr"].is_f64() && v["ssim"].is_f64()));
     // Three pictures of 6·40 pixels and two gaps wide, nine and eight high.
     assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 240 + 2 * 4, 9 * 240 + 8 * 4));
+}
+
+#[test]
+fn lpips_is_reported_where_its_weights_are() {
+    let found = json(&["doctor", "--json"])["weights"].as_object().unwrap().len();
+    if found < 2 {
+        println!("skipped: the weights of LPIPS are not there; run make weights");
+        return;
+    }
+    let (_folder, room) = room();
+    let splat = room.join("truth.ply");
+    let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room)];
+    let scores = json(&[&arguments[..], &["--json"]].concat());
+    for metric in ["lpips_vgg", "lpips_alex"] {
+        // What is left is 8-bit rounding.
+        let mean = scores[metric].as_f64().unwrap();
+        assert!(mean > 0. && mean < 0.01, "{metric} {mean}");
+        let views = scores["views"].as_array().unwrap();
+        let sum: f64 = views.iter().map(|view| view[metric].as_f64().unwrap()).sum();
+        assert!((sum / views.len() as f64 - mean).abs() < 1e-9, "{metric}");
+    }
+    let table = succeed(&arguments);
+    let heading = table.lines().nth(1).unwrap();
+    assert!(heading.ends_with(" LPIPS-VGG LPIPS-Alex"), "{heading}");
+    assert!(table.lines().skip(1).all(|line| line.len() == heading.len()), "{table}");
+}
+
+#[test]
+fn lpips_is_left_out_where_its_weights_are_not() {
+    let (folder, room) = room();
+    let run = |arguments: &[&str]| {
+        let output = command(arguments).env("GLOBALSPLAT_WEIGHTS", folder.path()).output().unwrap();
+        assert!(output.status.success());
+        (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap())
+    };
+    let splat = room.join("truth.ply");
+    let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room)];
+    let (table, said) = run(&arguments);
+    assert!(!table.contains("LPIPS"), "{table}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(said.contains("lpips_vgg and lpips_alex") && said.contains("make weights"), "{said}");
+    let (scores, _) = run(&[&arguments[..], &["--json"]].concat());
+    assert!(!scores.contains("lpips"), "{scores}");
+    let (doctor, _) = run(&["doctor", "--json"]);
+    let doctor: Value = serde_json::from_str(&doctor).unwrap();
+    assert!(doctor["weights"].as_object().unwrap().is_empty());
+    assert!(run(&["doctor"]).0.contains("make weights"));
+}
+
+#[test]
+fn lpips_is_left_out_where_views_are_too_small_for_it() {
+    if json(&["doctor", "--json"])["weights"].as_object().unwrap().len() < 2 {
+        println!("skipped: the weights of LPIPS are not there; run make weights");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("captures");
+    succeed(&["synth", "--out", arg(&out), "--frames", "3", "--size", "24"]);
+    let room = out.join("room_000");
+    let splat = room.join("truth.ply");
+    let output = globalsplat(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"]);
+    let scores: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(scores["lpips_vgg"].is_f64());
+    assert!(scores.get("lpips_alex").is_none());
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("lpips_alex") && said.contains("31×31"), "{said}");
 }
 
 #[test]

@@ -11,7 +11,7 @@ import numpy as np
 from . import draw, scenes
 from .compare import FLOAT32, FLOAT64, Tolerance
 from .draw import normal, uniform, whole
-from .thresholds import doubtful_pixels
+from .thresholds import closest_call, doubtful_pixels
 
 CASES = {}
 
@@ -31,6 +31,9 @@ RASTERIZER_FLOAT32 = Tolerance(
 # Relative distance from a threshold within which rounding may decide.
 DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
 MOST_TRIES = 100
+# Of a layer's standard deviation, within which a ReLU or a max pooling may decide otherwise: twice what rounding moves
+# numbers by.
+CLOSE_CALL = 5e-6
 
 
 @dataclass
@@ -397,6 +400,34 @@ def consistency(rng):
         config = {"alpha_factor": factors[0], "depth_factor": factors[1]}
         label = f"{by(*shape)}, factors {factors[0]:g} and {factors[1]:g}"
         yield Draw(label, inputs, config, differentiate=tuple(inputs))
+
+
+def lpips_draws(rng, network, shapes, dead=()):
+    """Pictures are drawn again until no ReLU and no pooling is a close call. The layers in `dead` put out nothing."""
+    params = draw.lpips_parameters(rng, network)
+    for name in dead:
+        params[f"{name}.bias"] -= np.float32(100.0)
+    for shape in shapes:
+        for _ in range(MOST_TRIES):
+            pictures = uniform(rng, 0.0, 1.0, 2, *shape)
+            if closest_call(network, params, pictures.reshape(-1, *shape[1:])) > CLOSE_CALL:
+                break
+        else:
+            raise RuntimeError(f"{network}: every one of {MOST_TRIES} pairs of pictures has a close call")
+        inputs = {"picture": pictures[0], "truth": pictures[1]}
+        label = by(*shape) + "".join(f", {name} dead" for name in dead)
+        yield Draw(label, inputs, {"network": network}, params, tuple(inputs), module="lpips")
+
+
+@case
+def lpips_vgg(rng):
+    yield from lpips_draws(rng, "lpips_vgg", [(2, 3, 16, 19)])
+
+
+@case
+def lpips_alex(rng):
+    yield from lpips_draws(rng, "lpips_alex", [(1, 3, 31, 31), (2, 3, 49, 36)])
+    yield from lpips_draws(rng, "lpips_alex", [(1, 3, 47, 63)], dead=("conv5",))
 
 
 # ---- training --------------------------------------------------------------------------------------------------------

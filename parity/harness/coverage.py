@@ -15,6 +15,7 @@ CASES_OF = {
     "src/loss/consistency.rs": ["consistency"],
     "src/loss/decoder_regularization.rs": ["decoder_regularization", "sh_soft_cap"],
     "src/loss/frustum.rs": ["frustum"],
+    "src/loss/lpips.rs": ["lpips_vgg", "lpips_alex"],
     "src/loss/mse.rs": ["mse"],
     "src/scene/normalize.rs": ["scene_normalization"],
     "src/scene/rays.rs": ["rays"],

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from reference.loss.lpips import COMPARED, NETWORKS
 from reference.normalize import invert_rigid
 from reference.rotation import matrix_from_quaternion
 
@@ -158,6 +159,20 @@ def parameters(rng, config, prefix=""):
         else:  # biases and learnable tokens
             value = normal(rng, *shape, scale=0.3)
         drawn[name.removeprefix(prefix)] = value
+    return drawn
+
+
+def lpips_parameters(rng, network):
+    """Of such sizes that features neither die out nor grow from layer to layer."""
+    drawn, inputs, compared = {}, 3, COMPARED[network]
+    for name, outputs, kernel, _, _ in (layer for row in NETWORKS[network] for layer in row):
+        drawn[f"{name}.weight"] = normal(
+            rng, outputs, inputs, kernel, kernel, scale=(2.0 / (inputs * kernel**2)) ** 0.5
+        )
+        drawn[f"{name}.bias"] = normal(rng, outputs, scale=0.1)
+        if name in compared:
+            drawn[f"lin{compared.index(name)}.weight"] = uniform(rng, 0.0, 1.0, 1, outputs, 1, 1)
+        inputs = outputs
     return drawn
 
 

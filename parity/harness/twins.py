@@ -8,6 +8,7 @@ import reference.encoder
 import reference.loss.consistency
 import reference.loss.decoder_regularization
 import reference.loss.frustum
+import reference.loss.lpips
 import reference.loss.mse
 import reference.loss.subsets
 import reference.model
@@ -305,6 +306,12 @@ def consistency(config, params, inputs):
         config["depth_factor"],
     )
     return {"loss": loss}
+
+
+@twin
+def lpips(config, params, inputs):
+    distance = reference.loss.lpips.lpips(config["network"], params, inputs["picture"], inputs["truth"])
+    return {"distance": distance}
 
 
 # ---- training --------------------------------------------------------------------------------------------------------

@@ -20,7 +20,9 @@ from harness.disturb import undetected  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.hold import hold, questions  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
-from harness.thresholds import doubtful_pixels  # noqa: E402
+from harness.thresholds import closest_call, doubtful_pixels  # noqa: E402
+
+from reference.loss.lpips import convolutions  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -217,6 +219,19 @@ def test_doubtful_pixels(opacities, depths, expected):
     means = [[0.0, 0.0, depth] for depth in depths]
     inputs = scenes.before(np.random.default_rng(0), (1, 1), means, 0.1, opacities)
     assert doubtful_pixels(scenes.settings((1, 1)), inputs, 5e-4).item() == expected
+
+
+def test_close_calls_of_lpips():
+    """A number before a ReLU is 0; a pooling window's largest two are equal."""
+    params = draw.lpips_parameters(np.random.default_rng(0), "lpips_alex")
+    pictures = draw.uniform(np.random.default_rng(1), 0.0, 1.0, 1, 3, 31, 31)
+    sure = closest_call("lpips_alex", params, pictures)
+    assert sure > 0.0
+    found = convolutions("lpips_alex", {k: torch.tensor(v) for k, v in params.items()}, torch.tensor(pictures))
+    params["conv5.bias"][7] -= found["conv5"][0, 7].item()  # one pixel is left: it becomes 0 but for rounding
+    assert closest_call("lpips_alex", params, pictures) < 1e-5 < sure
+    flat = np.zeros_like(pictures)  # all of a window is alike, wherever it doesn't see the border
+    assert closest_call("lpips_alex", draw.lpips_parameters(np.random.default_rng(0), "lpips_alex"), flat) < 1e-12
 
 
 def test_every_module_has_a_case():

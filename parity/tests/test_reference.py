@@ -17,7 +17,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "parity"))
 
 from reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens  # noqa: E402
-from reference.loss import consistency, decoder_regularization, frustum, mse, subsets  # noqa: E402
+from reference.loss import consistency, decoder_regularization, frustum, lpips, mse, subsets  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -155,6 +155,67 @@ def test_opacity_term_is_a_switch():
 
 def test_mse():
     assert mse.mse(torch.tensor([[0.0, 1.0]]), torch.tensor([[1.0, 3.0]])).item() == 2.5
+
+
+def lpips_params(network):
+    """Small random weights of that network."""
+    generator, inputs, params = torch.Generator().manual_seed(0), 3, {}
+    for name, outputs, kernel, _, _ in (layer for row in lpips.NETWORKS[network] for layer in row):
+        params[f"{name}.weight"] = 0.05 * torch.randn(outputs, inputs, kernel, kernel, generator=generator)
+        params[f"{name}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+        if name in lpips.COMPARED[network]:
+            at = lpips.COMPARED[network].index(name)
+            params[f"lin{at}.weight"] = torch.rand(1, outputs, 1, 1, generator=generator)
+        inputs = outputs
+    return params
+
+
+@pytest.mark.parametrize("network", lpips.NETWORKS)
+def test_lpips(network):
+    """Against its definition written pixel by pixel, on features of torch's own modules in a row."""
+    params = lpips_params(network)
+    pictures = torch.rand(2, 3, 48, 40, generator=torch.Generator().manual_seed(1))
+    found = lpips.lpips(network, params, pictures[:1], pictures[1:]).item()
+    assert lpips.lpips(network, params, pictures[:1], pictures[:1]).item() == 0.0
+
+    normalized = ((2 * pictures - 1).movedim(1, -1) - torch.tensor(lpips.SHIFT)) / torch.tensor(lpips.SCALE)
+    x, expected = normalized.movedim(-1, 1), 0.0
+    pools = {"lpips_vgg": torch.nn.MaxPool2d(2, 2), "lpips_alex": torch.nn.MaxPool2d(3, 2)}
+    # torchvision's `features` of the two, by the channels of their convolutions.
+    rows = {
+        "lpips_vgg": [(64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512)],
+        "lpips_alex": [(64,), (192,), (384, 256, 256)],
+    }[network]
+    names = iter([name[: -len(".weight")] for name in params if name.startswith("conv") and name.endswith("weight")])
+    compared = 0
+    for i, row in enumerate(rows):
+        x = pools[network](x) if i else x
+        for j, channels in enumerate(row):
+            name = next(names)
+            weight = params[f"{name}.weight"]
+            kernel = weight.shape[-1]
+            stride, padding = (4, 2) if kernel == 11 else (1, kernel // 2)
+            layer = torch.nn.Conv2d(x.shape[1], channels, kernel, stride, padding)
+            with torch.no_grad():
+                layer.weight.copy_(weight)
+                layer.bias.copy_(params[f"{name}.bias"])
+                x = layer(x).relu()
+            if network == "lpips_alex" or j == len(row) - 1:
+                linear, total = params[f"lin{compared}.weight"].flatten(), 0.0
+                a, b = (picture.flatten(1).T / (picture.flatten(1).T.norm(dim=1)[:, None] + 1e-10) for picture in x)
+                for ours, theirs in zip(a, b):
+                    total += (linear * (ours - theirs) ** 2).sum().item()
+                expected += total / len(a)
+                compared += 1
+    assert compared == 5 and found == pytest.approx(expected, rel=1e-4)
+
+
+def test_lpips_of_nothing_has_a_gradient():
+    """Where every channel is 0 the norm has no derivative: it must not become NaN."""
+    params = lpips_params("lpips_alex") | {"conv5.bias": torch.full((256,), -100.0)}
+    picture = torch.rand(1, 3, 31, 31).requires_grad_()
+    lpips.lpips("lpips_alex", params, picture, torch.zeros(1, 3, 31, 31)).sum().backward()
+    assert picture.grad.isfinite().all() and picture.grad.any()
 
 
 def test_consistency():

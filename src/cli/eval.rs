@@ -68,11 +68,11 @@ impl Eval {
             (scores, views, pictures, vec![])
         };
         perceptual.add_to(&mut scores, &pictures, &views);
-        if let Some(line) = perceptual.why_absent(&scores) {
-            eprintln!("{line}");
-        }
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &contact_sheet(&views, &rendered))?;
+        }
+        if let Some(line) = perceptual.why_absent(&scores) {
+            eprintln!("{line}");
         }
         if self.json {
             let mut object = serde_json::to_value(&scores)?;

@@ -34,13 +34,16 @@ batch = 1
 checkpoint_every = 2
 "#;
 
-/// Runs `globalsplat` with `arguments` and returns what it did. One thread: tests run beside each other.
+/// Runs `globalsplat` with `arguments` and returns what it did.
 pub fn globalsplat(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_globalsplat"))
-        .args(arguments)
-        .env("OMP_NUM_THREADS", "1")
-        .output()
-        .expect("a program that starts")
+    command(arguments).output().expect("a program that starts")
+}
+
+/// `globalsplat` with `arguments`. One thread: tests run beside each other.
+pub fn command(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_globalsplat"));
+    command.args(arguments).env("OMP_NUM_THREADS", "1");
+    command
 }
 
 /// Standard output of a run that must succeed.
