@@ -211,7 +211,7 @@ def test_lpips(network):
 
 
 def test_lpips_of_nothing_has_a_gradient():
-    """Where every channel is 0 the norm has no derivative: it must not become NaN."""
+    """Where every channel is 0 the norm has no derivative: no NaN may come of it."""
     params = lpips_params("lpips_alex") | {"conv5.bias": torch.full((256,), -100.0)}
     picture = torch.rand(1, 3, 31, 31).requires_grad_()
     lpips.lpips("lpips_alex", params, picture, torch.zeros(1, 3, 31, 31)).sum().backward()

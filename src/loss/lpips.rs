@@ -221,8 +221,8 @@ impl Lpips {
     }
 }
 
-/// Features [B, C, H, W] divided by their norm over C. Where all channels are 0 the norm has no derivative; libtorch's norm
-/// says 0 there, as a square root of a sum wouldn't.
+/// Features [B, C, H, W] divided by their norm over C. Where all channels are 0 the norm has no derivative, and the ReLU
+/// before lets none through.
 fn unit(features: &Tensor) -> Tensor {
     features / (features.norm_scalaropt_dim(2., [1i64].as_slice(), true) + EPSILON)
 }

@@ -48,7 +48,7 @@ def convolutions(network, params, pictures):
 
 
 def unit(x):
-    """x / (|x| + eps) over the channels; the derivative of |x| at 0 is taken to be 0."""
+    """x / (|x| + eps) over the channels. At 0, where |x| has no derivative, the ReLU before lets none through."""
     return x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
 
 
