@@ -52,7 +52,6 @@ impl Eval {
             check_writable_file(sheet)?;
         }
         let capture = open_capture(&self.scene)?;
-        let perceptual = Perceptual::find(device)?;
         let (mut scores, views, pictures, rendered) = if let Some(path) = &self.splat {
             with_pictures(score_splat(&read_ply(path)?.gaussians, &capture)?)
         } else if let Some(path) = &self.weights {
@@ -67,6 +66,8 @@ impl Eval {
             let (scores, views, pictures) = score_renders(folder, &capture)?;
             (scores, views, pictures, vec![])
         };
+        let peak_memory = peak_memory_bytes(); // of the subject, not of the networks that judge it
+        let perceptual = Perceptual::find(device)?;
         perceptual.add_to(&mut scores, &pictures, &views);
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &contact_sheet(&views, &rendered))?;
@@ -76,7 +77,7 @@ impl Eval {
         }
         if self.json {
             let mut object = serde_json::to_value(&scores)?;
-            object["peak_memory_bytes"] = peak_memory_bytes().into();
+            object["peak_memory_bytes"] = peak_memory.into();
             print_json(&object);
         } else {
             print_table(&scores);
