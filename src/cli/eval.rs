@@ -28,7 +28,7 @@ pub struct Eval {
     /// A folder of pictures named as the photos
     #[arg(long, value_name = "DIR", group = "subject")]
     renders: Option<PathBuf>,
-    /// The capture: a folder with a cameras.json
+    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
     /// Views the model is asked for: every:N or every:N+K; by default as it was trained

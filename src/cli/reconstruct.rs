@@ -19,7 +19,7 @@ pub struct Reconstruct {
     /// Weights that `globalsplat export` wrote
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
-    /// The capture: a folder with a cameras.json
+    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
     /// The splat to write

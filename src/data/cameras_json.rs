@@ -1,6 +1,7 @@
 //! `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}.
 
-use super::capture::{Capture, Frame, check_cameras};
+use super::capture::{Capture, Frame, check_cameras, folder_name};
+use super::distortion::Distortion;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
 use crate::scene::{Camera, Intrinsics, pose_to_rows};
@@ -45,11 +46,9 @@ pub(super) fn read(file: &Path) -> Result<Capture> {
                 expected,
             ));
         }
-        frames.push(Frame { image, name: view.image, camera });
+        frames.push(Frame { image, name: view.image, camera, distortion: Distortion::default() });
     }
-    let folder = root.canonicalize().unwrap_or(root.to_owned());
-    let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    Capture::new(name, file.to_owned(), frames)
+    Capture::new(folder_name(root), file.to_owned(), frames)
 }
 
 /// Reads the cameras alone.
@@ -123,7 +122,7 @@ fn cameras(file: &Path, parsed: &File) -> Result<Vec<Camera>> {
 }
 
 /// Replaces NaN, Infinity and −Infinity outside of strings.
-fn null_for_not_a_number(text: &str) -> String {
+pub(super) fn null_for_not_a_number(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
     let (mut in_string, mut escaped) = (false, false);

@@ -1,9 +1,10 @@
 //! A capture: what every format on disk is read into.
 
-use super::cameras_json;
+use super::distortion::Distortion;
 use super::preprocess::{ImageSize, fit};
+use super::{cameras_json, colmap, transforms_json};
 use crate::error::{Error, Result};
-use crate::io::{read_image, tensor_from_rgb};
+use crate::io::{read_photo, tensor_from_rgb};
 use crate::scene::{Camera, check_pose};
 use std::path::{Path, PathBuf};
 use tch::Tensor;
@@ -15,8 +16,10 @@ pub(super) struct Frame {
     pub image: PathBuf,
     /// As the capture names the image.
     pub name: String,
-    /// At the size of the file.
+    /// At the size of the file; a pinhole camera, which the image is once `distortion` is removed.
     pub camera: Camera,
+    /// Of the lens that took the image in the file.
+    pub distortion: Distortion,
 }
 
 /// Posed photos of one scene. The images are read when they are asked for.
@@ -39,7 +42,45 @@ pub struct View {
     pub camera: Camera,
 }
 
-/// Opens whatever capture is at `path`; the format is recognized by what is on disk.
+/// What is expected where nothing known is found.
+const KNOWN: &str = "a cameras.json, a transforms.json or a COLMAP model (sparse/0) in it";
+
+/// What a capture is read from.
+enum Source {
+    CamerasJson(PathBuf),
+    TransformsJson(PathBuf),
+    Colmap(colmap::Model),
+}
+
+/// The capture at `path`, a folder or the file that describes it; of several in a folder, the first of
+/// [`open_capture`]'s list.
+fn recognize(path: &Path) -> Option<Source> {
+    if path.is_file() {
+        let name = path.file_name()?.to_str()?;
+        return match name {
+            cameras_json::FILE_NAME => Some(Source::CamerasJson(path.to_owned())),
+            _ if name.starts_with("transforms") && name.ends_with(".json") => {
+                Some(Source::TransformsJson(path.to_owned()))
+            }
+            _ => None,
+        };
+    }
+    let file = |name: &str| Some(path.join(name)).filter(|file| file.is_file());
+    file(cameras_json::FILE_NAME)
+        .map(Source::CamerasJson)
+        .or_else(|| file(transforms_json::FILE_NAME).map(Source::TransformsJson))
+        .or_else(|| colmap::Model::find(path).map(Source::Colmap))
+}
+
+/// Opens whatever capture is at `path`; the format is recognized by what is on disk. In this order:
+///
+/// 1. a folder with a `cameras.json`, or that file;
+/// 2. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named
+///    `transforms_train.json` and the like;
+/// 3. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `dense/0/sparse`, `dense/sparse` or the folder
+///    itself, and the photos in `images` beside it.
+///
+/// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
 ///
 /// # Errors
 /// Nothing that is known there, or a capture that breaks its format's rules.
@@ -47,13 +88,22 @@ pub fn open_capture(path: &Path) -> Result<Capture> {
     if !path.exists() {
         return Err(Error::Request(format!("{}: no such capture", path.display())));
     }
-    match cameras_file(path) {
-        Some(file) => cameras_json::read(&file),
-        None => Err(Error::input(path, "the capture", "of no known format", "a folder with a cameras.json")),
+    match recognize(path) {
+        Some(Source::CamerasJson(file)) => cameras_json::read(&file),
+        Some(Source::TransformsJson(file)) => transforms_json::read(&file),
+        Some(Source::Colmap(model)) => colmap::read(path, &model),
+        None => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
     }
 }
 
-/// The cameras of a capture file without its images, as a path to render along.
+/// The name of the last folder in `path`, which may be empty for the working directory.
+pub(super) fn folder_name(path: &Path) -> String {
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
+    let folder = path.canonicalize().unwrap_or(path.to_owned());
+    folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+/// The cameras of a `cameras.json` without its images, as a path to render along.
 ///
 /// # Errors
 /// As [`open_capture`]; the images don't have to exist.
@@ -72,14 +122,19 @@ pub fn find_captures(path: &Path) -> Result<Vec<Capture>> {
     let mut folders = vec![];
     collect_folders(path, DEPTH, &mut folders)?;
     if folders.is_empty() {
-        return Err(Error::input(path, "the folder", "without captures", "folders with a cameras.json"));
+        return Err(Error::input(
+            path,
+            "the folder",
+            "without captures",
+            format!("{KNOWN} or in folders below it"),
+        ));
     }
     folders.sort();
     folders.iter().map(|folder| open_capture(folder)).collect()
 }
 
 fn collect_folders(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<()> {
-    if cameras_file(path).is_some() {
+    if recognize(path).is_some() {
         found.push(path.to_owned());
     } else if depth > 0 {
         for entry in std::fs::read_dir(path).map_err(Error::read(path))? {
@@ -90,11 +145,6 @@ fn collect_folders(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Resul
         }
     }
     Ok(())
-}
-
-fn cameras_file(path: &Path) -> Option<PathBuf> {
-    let file = if path.is_dir() { path.join(cameras_json::FILE_NAME) } else { path.to_owned() };
-    (file.is_file() && file.file_name().is_some_and(|name| name == cameras_json::FILE_NAME)).then_some(file)
 }
 
 impl Capture {
@@ -149,8 +199,8 @@ impl Capture {
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {
-        let image = read_image(&frame.image)?;
-        let Camera { width, height, .. } = frame.camera;
+        let Camera { width, height, intrinsics, .. } = frame.camera;
+        let image = read_photo(&frame.image, (width, height))?;
         if image.dimensions() != (width, height) {
             let found = format!("{}×{} pixels", image.width(), image.height());
             return Err(Error::input(
@@ -160,6 +210,7 @@ impl Capture {
                 format!("{width}×{height} as in {}", self.file.display()),
             ));
         }
+        let image = frame.distortion.remove(image, &intrinsics);
         let (image, camera) = match size {
             Some(size) => fit(image, &frame.camera, size),
             None => (image, frame.camera),

@@ -3,9 +3,12 @@
 mod batch;
 mod cameras_json;
 mod capture;
+mod colmap;
+mod distortion;
 mod holdout;
 mod preprocess;
 mod sampler;
+mod transforms_json;
 
 pub use batch::{ViewBatch, view_batch};
 pub use cameras_json::write_cameras_json;

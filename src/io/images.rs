@@ -2,19 +2,79 @@
 
 use super::write_atomically;
 use crate::error::{Error, Result};
-use image::{ImageFormat, RgbImage};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Rgb, RgbImage};
+use std::io::{BufReader, Cursor};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
-/// Reads any image as 8-bit RGB; alpha is dropped and grey repeated.
+/// Reads any image as 8-bit RGB, pixels as they are stored: grey is repeated, what is transparent lies over black, 16 bits
+/// are rounded to 8.
 ///
 /// # Errors
 /// A file that is missing or can't be decoded.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
+    Ok(rgb_over_black(&decode(path)?.0))
+}
+
+/// Reads a photo whose capture declares it to be `size` = (width, height), as [`read_image`] does.
+///
+/// Cameras turned on their side store the pixels as the sensor has them, and which way is up as EXIF orientation. Most tools
+/// that make captures, COLMAP among them, don't look at it, so their intrinsics refer to the pixels as stored; some turn the
+/// photo first. The declared size tells which: the orientation is applied only where the stored size isn't the declared one
+/// and the turned size is. A photo that fits neither way is returned as stored; compare its size.
+///
+/// # Errors
+/// As [`read_image`].
+pub fn read_photo(path: &Path, size: (u32, u32)) -> Result<RgbImage> {
+    let (mut image, orientation) = decode(path)?;
+    let stored = (image.width(), image.height());
+    let turned = match orientation {
+        Orientation::Rotate90
+        | Orientation::Rotate270
+        | Orientation::Rotate90FlipH
+        | Orientation::Rotate270FlipH => (stored.1, stored.0),
+        _ => stored,
+    };
+    if stored != size && turned == size {
+        image.apply_orientation(orientation);
+    }
+    Ok(rgb_over_black(&image))
+}
+
+/// (width, height) of the pixels as stored, from the image's header alone.
+///
+/// # Errors
+/// A file that is missing or is no image.
+pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
+    let file = std::fs::File::open(path).map_err(Error::read(path))?;
+    let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(Error::read(path))?;
+    reader.into_dimensions().map_err(undecodable(path))
+}
+
+fn decode(path: &Path) -> Result<(DynamicImage, Orientation)> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let image = image::load_from_memory(&bytes)
-        .map_err(|e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG"))?;
-    Ok(image.to_rgb8())
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(Error::read(path))?;
+    let mut decoder = reader.into_decoder().map_err(undecodable(path))?;
+    // EXIF that can't be read is no reason to refuse the pixels.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok((DynamicImage::from_decoder(decoder).map_err(undecodable(path))?, orientation))
+}
+
+fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
+    move |e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG")
+}
+
+fn rgb_over_black(image: &DynamicImage) -> RgbImage {
+    if !image.color().has_alpha() {
+        return image.to_rgb8();
+    }
+    let image = image.to_rgba8();
+    RgbImage::from_fn(image.width(), image.height(), |x, y| {
+        let [red, green, blue, alpha] = image.get_pixel(x, y).0;
+        let covered = |value: u8| ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8;
+        Rgb([red, green, blue].map(covered))
+    })
 }
 
 /// [3, H, W] in [0, 1].
@@ -47,7 +107,7 @@ pub(super) fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
 /// The system's refusal to write.
 pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
     let image = rgb_from_tensor(picture)?;
-    let mut bytes = std::io::Cursor::new(vec![]);
+    let mut bytes = Cursor::new(vec![]);
     image
         .write_to(&mut bytes, ImageFormat::Png)
         .map_err(|e| Error::Failed(format!("{}: the image can't be encoded: {e}", path.display())))?;

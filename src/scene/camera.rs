@@ -1,9 +1,12 @@
 //! Intrinsics and poses.
 
-use glam::{DMat4, DVec3};
+use glam::{DMat3, DMat4, DVec3};
 
 /// How far RᵀR may be from the identity, per entry: captures store poses with 3 to 7 digits.
 const RIGID_TOLERANCE: f64 = 5e-3;
+
+/// How far a pose's 3×3 part may be from the nearest rotation, per entry, where a file holds more digits than that.
+const ROUNDING_TOLERANCE: f64 = 1e-3;
 
 /// A pinhole camera's intrinsics, in pixels of the image they travel with. Pixel (i, j) has its centre at (j + ½, i + ½).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,13 +83,13 @@ pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
     if (last - glam::DVec4::W).abs().max_element() > RIGID_TOLERANCE {
         return Err((format!("a matrix with last row {last}"), "a last row of 0, 0, 0, 1".into()));
     }
-    let rotation = glam::DMat3::from_mat4(*c2w);
+    let rotation = DMat3::from_mat4(*c2w);
     let determinant = rotation.determinant();
     if determinant.abs() < 1e-9 {
         return Err(("a singular matrix".into(), "a rotation and a translation".into()));
     }
     let gram = rotation.transpose() * rotation;
-    let off = (gram - glam::DMat3::IDENTITY).to_cols_array().iter().fold(0f64, |m, v| m.max(v.abs()));
+    let off = (gram - DMat3::IDENTITY).to_cols_array().iter().fold(0f64, |m, v| m.max(v.abs()));
     if off > RIGID_TOLERANCE || determinant < 0. {
         let found = if determinant < 0. {
             "a matrix that mirrors (determinant below 0)".to_string()
@@ -96,6 +99,25 @@ pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
         return Err((found, "a rotation and a translation".into()));
     }
     Ok(())
+}
+
+/// The rigid motion that `c2w` is up to rounding: its 3×3 part A becomes the rotation R nearest to it, the orthogonal factor
+/// of A = R·S with S symmetric and positive, and its last row (0, 0, 0, 1).
+///
+/// # Errors
+/// As [`check_pose`], and where an entry of A is more than 1e-3 off R's: (what was found, what was expected).
+pub fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
+    check_pose(c2w)?;
+    let given = DMat3::from_mat4(*c2w);
+    // Newton's iteration X ← (X + X⁻ᵀ)/2 squares the error, which is 5e-3 at most, in every round.
+    let rotation = (0..4).fold(given, |x, _| (x + x.inverse().transpose()) * 0.5);
+    let off = (rotation - given).to_cols_array().iter().fold(0f64, |m, v| m.max(v.abs()));
+    if off > ROUNDING_TOLERANCE {
+        let found = format!("a matrix that isn't rigid ({off:.4} off the nearest rotation)");
+        return Err((found, "a rotation and a translation".into()));
+    }
+    let column = |i: usize| rotation.col(i).extend(0.);
+    Ok(DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis.truncate().extend(1.)))
 }
 
 /// The 4×4 matrix, row by row.
