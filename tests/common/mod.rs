@@ -1,6 +1,7 @@
 //! Where real data and golden tensors are found, and how tensors are compared.
 #![allow(dead_code)] // every test binary uses its own part
 
+pub mod formats;
 pub mod program;
 
 use rand::{Rng, SeedableRng, rngs::StdRng};
@@ -40,6 +41,16 @@ pub fn captures() -> Option<Vec<PathBuf>> {
         return None;
     }
     Some(captures)
+}
+
+/// A real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
+pub fn fox() -> Option<PathBuf> {
+    let fox = outside("GLOBALSPLAT_CAPTURES", "data")?.join("nerfstudio/fox");
+    if fox.is_dir() {
+        return Some(fox);
+    }
+    println!("skipped: {} is not there", fox.display());
+    None
 }
 
 /// ‖a − b‖ / ‖b‖.

@@ -1,0 +1,118 @@
+//! Captures in the formats that other tools write, written here from the formats' documentation.
+
+use glam::{DMat4, DQuat, DVec4};
+use globalsplat::data::open_capture;
+use globalsplat::scene::{Camera, pose_to_rows};
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// `transforms.json` contents: OpenGL axes, the lens shared by all frames.
+pub fn transforms(images: &[String], cameras: &[Camera]) -> Value {
+    let k = cameras[0].intrinsics;
+    let frames: Vec<Value> = images
+        .iter()
+        .zip(cameras)
+        .map(|(image, camera)| {
+            let opengl = camera.c2w * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.));
+            let rows: Vec<Vec<f64>> = pose_to_rows(&opengl).chunks(4).map(<[f64]>::to_vec).collect();
+            json!({"file_path": image, "transform_matrix": rows})
+        })
+        .collect();
+    json!({
+        "w": cameras[0].width, "h": cameras[0].height, "aabb_scale": 4,
+        "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "frames": frames,
+    })
+}
+
+/// World-to-camera: quaternion (w, x, y, z) and translation.
+fn colmap_pose(camera: &Camera) -> [f64; 7] {
+    let w2c = camera.c2w.inverse();
+    let ([x, y, z, w], t) = (DQuat::from_mat4(&w2c).to_array(), w2c.w_axis);
+    [w, x, y, z, t.x, t.y, t.z]
+}
+
+/// Writes cameras.txt and images.txt at `folder`: one camera, whose model and parameters are `lens`.
+pub fn write_colmap_text(folder: &Path, names: &[String], cameras: &[Camera], lens: &str) {
+    std::fs::create_dir_all(folder).unwrap();
+    let (width, height) = (cameras[0].width, cameras[0].height);
+    let text =
+        format!("# Camera list\n#   CAMERA_ID, MODEL\n7 {} {width} {height} {}\n", word(lens, 0), rest(lens));
+    std::fs::write(folder.join("cameras.txt"), text).unwrap();
+    let mut text = String::from("# Image list with two lines of data per image:\n");
+    for (i, (name, camera)) in names.iter().zip(cameras).enumerate().rev() {
+        let pose = colmap_pose(camera).map(|v| v.to_string()).join(" ");
+        let points = if i % 2 == 0 { "" } else { "1.5 2.5 -1 10.25 3 12" };
+        text += &format!("{} {pose} 7 {name}\n{points}\n", i + 1);
+    }
+    std::fs::write(folder.join("images.txt"), text).unwrap();
+}
+
+fn word(text: &str, index: usize) -> &str {
+    text.split(' ').nth(index).unwrap()
+}
+
+fn rest(text: &str) -> &str {
+    text.split_once(' ').unwrap().1
+}
+
+/// `PINHOLE fx fy cx cy`.
+pub fn pinhole(camera: &Camera) -> String {
+    let k = camera.intrinsics;
+    format!("PINHOLE {} {} {} {}", k.fx, k.fy, k.cx, k.cy)
+}
+
+/// Writes cameras.bin and images.bin at `folder`: one camera, a pinhole.
+pub fn write_colmap_binary(folder: &Path, names: &[String], cameras: &[Camera]) {
+    std::fs::create_dir_all(folder).unwrap();
+    let (width, height, k) = (cameras[0].width, cameras[0].height, cameras[0].intrinsics);
+    let mut bytes = vec![];
+    bytes.extend(1u64.to_le_bytes());
+    bytes.extend(7u32.to_le_bytes());
+    bytes.extend(1i32.to_le_bytes());
+    bytes.extend(u64::from(width).to_le_bytes());
+    bytes.extend(u64::from(height).to_le_bytes());
+    bytes.extend([k.fx, k.fy, k.cx, k.cy].iter().flat_map(|v| v.to_le_bytes()));
+    std::fs::write(folder.join("cameras.bin"), bytes).unwrap();
+    let mut bytes = vec![];
+    bytes.extend((names.len() as u64).to_le_bytes());
+    for (i, (name, camera)) in names.iter().zip(cameras).enumerate().rev() {
+        bytes.extend((i as u32 + 1).to_le_bytes());
+        bytes.extend(colmap_pose(camera).iter().flat_map(|v| v.to_le_bytes()));
+        bytes.extend(7u32.to_le_bytes());
+        bytes.extend(name.as_bytes());
+        bytes.push(0);
+        let points = i as u64 % 3;
+        bytes.extend(points.to_le_bytes());
+        for _ in 0..points {
+            bytes.extend(1.5f64.to_le_bytes());
+            bytes.extend(2.5f64.to_le_bytes());
+            bytes.extend(u64::MAX.to_le_bytes());
+        }
+    }
+    std::fs::write(folder.join("images.bin"), bytes).unwrap();
+}
+
+/// What a `cameras.json` capture is rewritten as.
+#[derive(Debug, Clone, Copy)]
+pub enum Format {
+    Transforms,
+    ColmapText,
+    ColmapBinary,
+}
+
+/// Adds the `cameras.json` capture at `folder` in another format, and takes the `cameras.json` away.
+pub fn rewrite(folder: &Path, format: Format) {
+    let capture = open_capture(folder).unwrap();
+    let images: Vec<String> = capture.names().map(String::from).collect();
+    let names: Vec<String> = images.iter().map(|image| image.replace("images/", "")).collect();
+    let (cameras, model) = (capture.cameras(), folder.join("sparse/0"));
+    match format {
+        Format::Transforms => {
+            let file = folder.join("transforms.json");
+            std::fs::write(file, transforms(&images, &cameras).to_string()).unwrap();
+        }
+        Format::ColmapText => write_colmap_text(&model, &names, &cameras, &pinhole(&cameras[0])),
+        Format::ColmapBinary => write_colmap_binary(&model, &names, &cameras),
+    }
+    std::fs::remove_file(folder.join("cameras.json")).unwrap();
+}
