@@ -339,11 +339,11 @@ impl Bytes<'_> {
         let rest = &self.contents[self.at..];
         let end = rest.iter().position(|&byte| byte == 0);
         match end.and_then(|end| std::str::from_utf8(&rest[..end]).ok()) {
-            Some(name) => {
+            Some(name) if !name.contains(char::is_control) => {
                 self.at += name.len() + 1;
                 Ok(name.to_string())
             }
-            None => Err(Error::input(self.file, field(), "no text that ends", "UTF-8 ended by a 0")),
+            _ => Err(Error::input(self.file, field(), "no text", "UTF-8 ended by a 0")),
         }
     }
 

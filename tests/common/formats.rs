@@ -1,10 +1,45 @@
 //! Captures in the formats that other tools write, written here from the formats' documentation.
 
-use glam::{DMat4, DQuat, DVec4};
-use globalsplat::data::open_capture;
-use globalsplat::scene::{Camera, pose_to_rows};
+use glam::{DMat4, DQuat, DVec3, DVec4, EulerRot};
+use globalsplat::data::{Capture, open_capture};
+use globalsplat::scene::{Camera, Intrinsics, pose_to_rows};
 use serde_json::{Value, json};
 use std::path::Path;
+
+/// Of the photos.
+pub const WIDTH: u32 = 24;
+pub const HEIGHT: u32 = 16;
+
+/// Five cameras in general position.
+pub fn cameras() -> Vec<Camera> {
+    let intrinsics = Intrinsics { fx: 21.5, fy: 20.25, cx: 11.75, cy: 8.5 };
+    (0..5)
+        .map(|i| {
+            let t = f64::from(i);
+            let rotation = DQuat::from_euler(EulerRot::XYZ, 0.3 + 0.9 * t, 1.1 - 0.7 * t, 2.3 * t);
+            let c2w = DMat4::from_rotation_translation(rotation, DVec3::new(t, 0.5 * t * t, -2. * t));
+            Camera { intrinsics, c2w, width: WIDTH, height: HEIGHT }
+        })
+        .collect()
+}
+
+pub fn names() -> Vec<String> {
+    (0..5).map(|i| format!("{i:03}.png")).collect()
+}
+
+pub fn in_images(names: &[String]) -> Vec<String> {
+    names.iter().map(|name| format!("images/{name}")).collect()
+}
+
+pub fn assert_same_cameras(found: &Capture, expected: &[Camera]) {
+    assert_eq!(found.len(), expected.len());
+    for (a, b) in found.cameras().iter().zip(expected) {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        let (k, l) = (a.intrinsics.to_rows(), b.intrinsics.to_rows());
+        assert!(k.iter().zip(l).all(|(a, b)| (a - b).abs() < 1e-9), "{k:?} {l:?}");
+        assert!(a.c2w.abs_diff_eq(b.c2w, 1e-9), "{} {}", a.c2w, b.c2w);
+    }
+}
 
 /// `transforms.json` contents: OpenGL axes, the lens shared by all frames.
 pub fn transforms(images: &[String], cameras: &[Camera]) -> Value {
