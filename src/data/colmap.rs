@@ -105,7 +105,7 @@ pub(super) fn read(folder: &Path, model: &Model) -> Result<Capture> {
         };
         let [w, x, y, z] = image.quaternion;
         let rotation = DQuat::from_xyzw(x, y, z, w);
-        if !((rotation.length() - 1.).abs() <= UNIT_TOLERANCE) {
+        if !rotation.is_finite() || (rotation.length() - 1.).abs() > UNIT_TOLERANCE {
             let expected = "a quaternion (w, x, y, z) of length 1";
             return refuse("rotation", format!("{:?}", image.quaternion), expected.into());
         }
