@@ -8,7 +8,7 @@ use crate::io::{LoadedModel, read_image, tensor_from_rgb};
 use crate::model::Gaussians;
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use crate::scene::Camera;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 use tch::Tensor;
 
@@ -24,7 +24,7 @@ pub struct Rendered {
 }
 
 /// One view's scores.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ViewScore {
     /// As the capture names it.
     pub image: String,
@@ -41,7 +41,7 @@ pub struct ViewScore {
 }
 
 /// A capture's scores: means over its views, and each of them.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CaptureScores {
     /// The capture's name.
     pub scene: String,

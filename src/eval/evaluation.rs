@@ -1,0 +1,111 @@
+//! What an evaluation over a data set found: the contents of `scores.json`, which the report shows.
+
+use super::protocol::CaptureScores;
+use serde::{Deserialize, Serialize};
+
+/// One subject (a model, somebody's splats, somebody's pictures) scored by one index.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// How its row is called in tables.
+    pub method: String,
+    /// The data set's name, as `re10k` or `acid`.
+    pub dataset: String,
+    /// The index file's name.
+    pub index: String,
+    /// Context views of every scene.
+    pub context_views: usize,
+    /// [height, width] of the pictures that were scored.
+    pub image_size: [u32; 2],
+    /// Scenes that the index names; the data set may hold fewer.
+    pub indexed_scenes: usize,
+    /// Means over the scenes.
+    pub summary: Summary,
+    /// What the scores cost, where a model was run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub efficiency: Option<Efficiency>,
+    /// Processor, cores and device that computed it.
+    pub machine: String,
+    /// One by one, in the index's order.
+    pub scenes: Vec<SceneScores>,
+    /// Scenes that couldn't be scored, and why.
+    pub failures: Vec<Failure>,
+}
+
+/// Means over scenes, each of which is a mean over its target views.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub struct Summary {
+    /// In dB.
+    pub psnr: f64,
+    /// As scikit-image's.
+    pub ssim: f64,
+    /// Absent where the network's weights were.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
+    /// Absent where the network's weights were.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
+    /// Gaussians of a scene, where splats were scored.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gaussians: Option<f64>,
+}
+
+/// What reconstructing a scene costs.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub struct Efficiency {
+    /// Mean seconds of the forward pass from views in memory to Gaussians; the first scene's is discarded where there are
+    /// others.
+    pub forward_seconds: f64,
+    /// Scenes that the mean is of.
+    pub timed_scenes: usize,
+    /// The largest resident size of the process, in bytes.
+    pub peak_memory_bytes: u64,
+    /// The largest amount of the GPU's memory in use, in bytes, where one was used and tells.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peak_device_memory_bytes: Option<u64>,
+    /// Mean size of a scene's splat as a PLY.
+    pub splat_bytes: f64,
+}
+
+/// One scene's scores.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SceneScores {
+    /// Means over the target views, and each of them.
+    #[serde(flatten)]
+    pub scores: CaptureScores,
+    /// Frames that were shown.
+    pub context: Vec<usize>,
+    /// Frames that were asked for.
+    pub target: Vec<usize>,
+    /// Of the forward pass, where a model was run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub forward_seconds: Option<f64>,
+    /// The largest resident size of the process up to then, in bytes, where a model was run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peak_memory_bytes: Option<u64>,
+}
+
+/// A scene that couldn't be scored.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Failure {
+    /// By which the index names it.
+    pub scene: String,
+    /// One sentence.
+    pub error: String,
+}
+
+impl Summary {
+    /// Of `scenes`, which are one at least. A distance that any scene lacks has no mean.
+    pub fn of(scenes: &[SceneScores]) -> Self {
+        let mean = |value: &dyn Fn(&CaptureScores) -> Option<f64>| {
+            let values: Option<Vec<f64>> = scenes.iter().map(|scene| value(&scene.scores)).collect();
+            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        Summary {
+            psnr: mean(&|s| Some(s.psnr)).unwrap_or(f64::NAN),
+            ssim: mean(&|s| Some(s.ssim)).unwrap_or(f64::NAN),
+            lpips_vgg: mean(&|s| s.lpips_vgg),
+            lpips_alex: mean(&|s| s.lpips_alex),
+            gaussians: mean(&|s| s.gaussians.map(|n| n as f64)),
+        }
+    }
+}
