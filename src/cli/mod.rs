@@ -9,6 +9,7 @@ mod doctor;
 mod eval;
 mod export;
 mod inspect;
+mod pack;
 mod parity;
 mod progress;
 mod reconstruct;
@@ -42,6 +43,7 @@ enum Command {
     Render(render::Render),
     Export(export::Export),
     Synth(synth::Synth),
+    Pack(pack::Pack),
     Inspect(inspect::Inspect),
     Bench(bench::Bench),
     Doctor(doctor::Doctor),
@@ -68,6 +70,7 @@ pub fn main() -> ExitCode {
         Command::Render(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Synth(command) => command.run(),
+        Command::Pack(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Doctor(command) => command.run(),

@@ -3,7 +3,9 @@
 mod batch;
 mod cameras_json;
 mod capture;
+mod chunk;
 mod colmap;
+mod dataset;
 mod distortion;
 mod holdout;
 mod preprocess;
@@ -13,6 +15,8 @@ mod transforms_json;
 pub use batch::{ViewBatch, view_batch};
 pub use cameras_json::write_cameras_json;
 pub use capture::{Capture, View, find_captures, open_capture, read_camera_path};
+pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
+pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use holdout::{Holdout, spread};
 pub use preprocess::{ImageSize, fit};
 pub use sampler::{Sample, Sampler};
