@@ -109,3 +109,21 @@ impl Summary {
         }
     }
 }
+
+/// What a scene's files are called, before the ending: its name with `_` for everything that a file system, a shell or a
+/// web page could read as more than a name.
+pub fn scene_file_name(scene: &str) -> String {
+    let harmless = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
+    scene.chars().map(|c| if harmless(c) { c } else { '_' }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn odd_scene_names_make_plain_file_names() {
+        assert_eq!(scene_file_name("a0-B_9.x"), "a0-B_9.x");
+        assert_eq!(scene_file_name("../up/<b>é \n"), ".._up__b____");
+    }
+}

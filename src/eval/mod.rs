@@ -6,10 +6,12 @@ mod memory;
 mod metrics;
 mod perceptual;
 mod protocol;
+mod published;
 mod reconstruct;
+mod scores_file;
 
 pub use contact_sheet::contact_sheet;
-pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
+pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary, scene_file_name};
 pub use memory::{peak_memory_bytes, resident_memory_bytes};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
@@ -17,4 +19,9 @@ pub use protocol::{
     CaptureScores, Rendered, ViewScore, nearest_context_baseline, render_views, score, score_model,
     score_renders, score_splat,
 };
+pub use published::{
+    Published, PublishedAblation, PublishedCompactness, PublishedEfficiency, PublishedMethod,
+    PublishedScores, published,
+};
 pub use reconstruct::{Reconstruction, reconstruct};
+pub use scores_file::{read_evaluation, strip_path, write_csv, write_evaluation};
