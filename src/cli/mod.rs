@@ -14,6 +14,7 @@ mod parity;
 mod progress;
 mod reconstruct;
 mod render;
+mod report;
 mod synth;
 mod train;
 
@@ -39,6 +40,7 @@ struct Cli {
 enum Command {
     Train(train::Train),
     Eval(eval::Eval),
+    Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
     Render(render::Render),
     Export(export::Export),
@@ -66,6 +68,7 @@ pub fn main() -> ExitCode {
     let result = panic::catch_unwind(|| match cli.command {
         Command::Train(command) => command.run(),
         Command::Eval(command) => command.run(),
+        Command::Report(command) => command.run(),
         Command::Reconstruct(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Export(command) => command.run(),

@@ -8,6 +8,7 @@ mod perceptual;
 mod protocol;
 mod published;
 mod reconstruct;
+mod report;
 mod scores_file;
 
 pub use contact_sheet::contact_sheet;
@@ -24,4 +25,5 @@ pub use published::{
     PublishedScores, published,
 };
 pub use reconstruct::{Reconstruction, reconstruct};
+pub use report::write_report;
 pub use scores_file::{read_evaluation, strip_path, write_csv, write_evaluation};

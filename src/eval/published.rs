@@ -18,6 +18,9 @@ pub struct Published {
     pub ablations: Vec<PublishedAblation>,
 }
 
+/// [height, width] of the pictures in [`Published::novel_views`].
+pub const IMAGE_SIZE: [u32; 2] = [256, 256];
+
 /// One method on one data set.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
