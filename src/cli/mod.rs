@@ -23,6 +23,8 @@ use globalsplat::Error;
 use globalsplat::data::ImageSize;
 use std::panic;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 const DONE: u8 = 0;
 const FAILED: u8 = 1;
@@ -107,6 +109,14 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
         _ => Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
     }
+}
+
+/// Becomes true when the user or the system asks the program to stop.
+fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
+    Ok(stop)
 }
 
 /// Prints a result as one JSON object.

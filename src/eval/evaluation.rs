@@ -52,7 +52,7 @@ pub struct Summary {
 /// What reconstructing a scene costs.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Efficiency {
-    /// Mean seconds of the forward pass from views in memory to Gaussians; the first scene's is discarded where there are
+    /// Mean seconds of the forward pass from views in memory to Gaussians, without scenes that warmed up, where there are
     /// others.
     pub forward_seconds: f64,
     /// Scenes that the mean is of.
@@ -76,10 +76,16 @@ pub struct SceneScores {
     pub context: Vec<usize>,
     /// Frames that were asked for.
     pub target: Vec<usize>,
+    /// Size of the splat as a PLY, where there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub splat_bytes: Option<u64>,
     /// Of the forward pass, where a model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_seconds: Option<f64>,
-    /// The largest resident size of the process up to then, in bytes, where a model was run.
+    /// Whether the scene was the process's first, whose time includes that of warming up.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub warm_up: bool,
+    /// The largest resident size of the process up to then, in bytes, where a model was run and nothing else yet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_memory_bytes: Option<u64>,
 }
