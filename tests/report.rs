@@ -119,6 +119,19 @@ fn the_file_needs_no_other_and_says_what_is_absent() {
 }
 
 #[test]
+fn an_evaluation_that_failed_throughout_has_no_means() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("report.html");
+    let mut evaluation = evaluation("m", "re10k", 24, vec![]);
+    evaluation.indexed_scenes = 1;
+    evaluation.failures = vec![Failure { scene: "a".into(), error: "unreadable".into() }];
+    write_report(&page, &[(folder.path().into(), evaluation)]).unwrap();
+    let text = std::fs::read_to_string(page).unwrap().replace("isNaN", "");
+    assert!(text.contains("0 of 1 scene<") && text.contains("unreadable") && !text.contains("NaN"));
+    assert!(write_report(folder.path(), &[]).unwrap_err().to_string().contains("found none"));
+}
+
+#[test]
 fn scores_are_read_as_they_were_written() {
     let folder = tempfile::tempdir().unwrap();
     for (folder, evaluation) in made_up(folder.path()) {

@@ -7,7 +7,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 /// A browser that doesn't answer for so long hangs.
@@ -162,7 +162,13 @@ impl Browser {
 }
 
 impl Drop for Browser {
+    /// Lets it end by itself, so that none of its processes still writes when its profile is removed.
     fn drop(&mut self) {
+        let _ = self.requests.write_all(b"{\"id\": 0, \"method\": \"Browser.close\"}\0");
+        let deadline = Instant::now() + Duration::from_secs(10);
+        while matches!(self.process.try_wait(), Ok(None)) && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(20));
+        }
         let _ = self.process.kill();
         let _ = self.process.wait();
     }

@@ -1,6 +1,6 @@
 //! Measured rows among the published ones: a table for each data set and number of context views.
 
-use super::numbers::{count, decimal, short};
+use super::numbers::{self, count, decimal, short};
 use super::plot;
 use super::subject::{Subject, dataset_name};
 use super::table::{Head, cell, measured_badges, published_badge, swatch, table};
@@ -55,10 +55,10 @@ pub fn rows<'a>(subjects: &'a [Subject<'a>], dataset: &str, views: usize) -> Vec
         Row {
             name: &subject.name,
             measured: Some(subject),
-            psnr: Some(mean.psnr),
-            ssim: Some(mean.ssim),
-            lpips: mean.lpips_vgg,
-            kilo_gaussians: mean.gaussians.map(|n| n * 1e-3),
+            psnr: numbers::mean(mean.psnr),
+            ssim: numbers::mean(mean.ssim),
+            lpips: mean.lpips_vgg.and_then(numbers::mean),
+            kilo_gaussians: mean.gaussians.and_then(numbers::mean).map(|n| n * 1e-3),
         }
     });
     let mut rows: Vec<Row> = theirs.chain(ours).collect();

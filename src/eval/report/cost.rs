@@ -1,6 +1,6 @@
 //! What a reconstruction costs, and what the paper says of the model's size and parts.
 
-use super::numbers::{decimal, short, thousands};
+use super::numbers::{self, decimal, short, thousands};
 use super::subject::Subject;
 use super::table::{Head, cell, measured_badges, published_badge, swatch, table};
 use crate::eval::published::published;
@@ -49,13 +49,13 @@ pub fn efficiency(subjects: &[Subject]) -> Markup {
                 td { (measured_badges(subject)) }
                 td.machine { (evaluation.machine) }
                 td.number { (evaluation.context_views) }
-                td.number title={ "mean of " (super::numbers::count(cost.timed_scenes, "scene")) } {
+                td.number title={ "mean of " (numbers::count(cost.timed_scenes, "scene")) } {
                     (decimal(milliseconds, 2))
                 }
                 (cell(cost.peak_device_memory_bytes.map(|bytes| decimal(bytes as f64 * GIGA, 2))))
                 (cell(Some(decimal(cost.peak_memory_bytes as f64 * GIGA, 2))))
                 (cell(Some(short(cost.splat_bytes * MEGA))))
-                (cell(evaluation.summary.gaussians.map(|n| short(n * 1e-3))))
+                (cell(evaluation.summary.gaussians.and_then(numbers::mean).map(|n| short(n * 1e-3))))
             }
         };
         Some((milliseconds, markup))

@@ -1,6 +1,6 @@
 //! What the page is about, the means at a glance, and what failed.
 
-use super::numbers::{count, decimal, thousands};
+use super::numbers::{self, count, decimal, thousands};
 use super::subject::{Subject, dataset_name};
 use super::table::{partial_badge, share, swatch};
 use maud::{Markup, html};
@@ -42,13 +42,13 @@ fn card(subject: &Subject) -> Markup {
                 @if !subject.is_whole() { " " (partial_badge(subject)) }
             }
             dl.tiles {
-                (tile("PSNR", Some(decimal(mean.psnr, 2)), "dB"))
-                (tile("SSIM", Some(decimal(mean.ssim, 4)), ""))
-                (tile("LPIPS-VGG", mean.lpips_vgg.map(|v| decimal(v, 4)), ""))
+                (tile("PSNR", numbers::mean(mean.psnr).map(|v| decimal(v, 2)), "dB"))
+                (tile("SSIM", numbers::mean(mean.ssim).map(|v| decimal(v, 4)), ""))
+                (tile("LPIPS-VGG", mean.lpips_vgg.and_then(numbers::mean).map(|v| decimal(v, 4)), ""))
                 @if mean.lpips_alex.is_some() {
-                    (tile("LPIPS-Alex", mean.lpips_alex.map(|v| decimal(v, 4)), ""))
+                    (tile("LPIPS-Alex", mean.lpips_alex.and_then(numbers::mean).map(|v| decimal(v, 4)), ""))
                 }
-                (tile("Gaussians", mean.gaussians.map(|n| thousands(n.round() as u64)), ""))
+                (tile("Gaussians", mean.gaussians.and_then(numbers::mean).map(|n| thousands(n.round() as u64)), ""))
             }
             p.fine {
                 @if subject.is_whole() {
@@ -73,7 +73,7 @@ fn tile(name: &str, value: Option<String>, unit: &str) -> Markup {
             dd {
                 @match value {
                     Some(text) => { (text) @if !unit.is_empty() { " " span.unit { (unit) } } }
-                    None => (super::numbers::absent()),
+                    None => (numbers::absent()),
                 }
             }
         }

@@ -17,9 +17,6 @@ pub fn thousands(value: u64) -> String {
 
 /// With so many digits after the point, and commas before it.
 pub fn decimal(value: f64, digits: usize) -> String {
-    if !value.is_finite() {
-        return "not a number".into();
-    }
     let text = format!("{:.digits$}", value.abs());
     let (whole, rest) = text.split_at(text.find('.').unwrap_or(text.len()));
     let sign = if value < 0. && text.contains(|c: char| ('1'..='9').contains(&c)) { "−" } else { "" };
@@ -29,6 +26,11 @@ pub fn decimal(value: f64, digits: usize) -> String {
 /// Without digits that say nothing: `16.4`, `393`, `0.1`.
 pub fn short(value: f64) -> String {
     decimal(value, if value.fract() == 0. || value.abs() >= 100. { 0 } else { 1 })
+}
+
+/// The mean of no scene is no number.
+pub fn mean(value: f64) -> Option<f64> {
+    Some(value).filter(|value| value.is_finite())
 }
 
 /// A count, as `1 scene` or `5,601 scenes`.
