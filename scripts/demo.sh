@@ -10,7 +10,12 @@ out="${OUT:-runs/demo}"
 captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-../shared/data}}"
 [ -d "$captures/re10k" ] && captures="$captures/re10k"
 
-if ! compgen -G "$captures/*/cameras.json" >/dev/null; then
+is_capture() { "$globalsplat" inspect "$1" >/dev/null 2>&1; }
+found=""
+for scene in "$captures"/*/; do
+    ! is_capture "$scene" || found=yes
+done
+if [ -z "$found" ]; then
     echo "demo: no captures in $captures, so rooms are made and photographed" >&2
     captures="$out/captures"
     "$globalsplat" synth --out "$captures" --scenes 2 --frames 12
@@ -19,7 +24,7 @@ fi
 "$globalsplat" export --run "$out" --out "$out/model.safetensors"
 
 for scene in "$captures"/*/; do
-    [ -f "$scene/cameras.json" ] || continue
+    is_capture "$scene" || continue
     name="$(basename "$scene")"
     "$globalsplat" reconstruct --weights "$out/model.safetensors" --scene "$scene" --holdout every:3+1 --out "$out/$name.ply"
     "$globalsplat" eval --weights "$out/model.safetensors" --scene "$scene" --sheet "$out/${name}_held_out.png" >/dev/null

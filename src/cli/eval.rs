@@ -56,6 +56,9 @@ pub struct Eval {
     /// Views the model is asked for: every:N or every:N+K; by default as it was trained
     #[arg(long, value_name = "WHICH", requires_all = ["weights", "scene"])]
     holdout: Option<String>,
+    /// Views the model sees, spread over the path of the camera; by default all that are not held out
+    #[arg(long, value_name = "N", requires_all = ["weights", "scene"])]
+    views: Option<usize>,
     /// Also write a picture: photo, render and depth side by side, a row per view
     #[arg(long, value_name = "FILE.png", conflicts_with = "renders", requires = "scene")]
     sheet: Option<PathBuf>,
@@ -89,7 +92,7 @@ impl Eval {
                 Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
                 None => loaded.config.data.holdout,
             };
-            with_pictures(score_model(&loaded, &capture, holdout)?)
+            with_pictures(score_model(&loaded, &capture, holdout, self.views)?)
         } else {
             let folder = self.renders.as_ref().expect("clap asks for one of the three");
             let (scores, views, pictures) = score_renders(folder, &capture)?;

@@ -1,7 +1,7 @@
 use super::{device, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Holdout, open_capture, spread};
+use globalsplat::data::{Holdout, open_capture, spread_over_path};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, reconstruct};
 use globalsplat::io::{check_writable_file, load_model, write_ply};
@@ -19,13 +19,13 @@ pub struct Reconstruct {
     /// Weights that `globalsplat export` wrote
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
-    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model
+    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
     /// The splat to write
     #[arg(long, value_name = "FILE.ply")]
     out: PathBuf,
-    /// Use this many views, spread over the capture
+    /// Use this many views, spread over the path of the camera
     #[arg(long, value_name = "N", default_value_t = 24)]
     views: usize,
     /// Views not to use: every:N, every:N+K or none
@@ -47,7 +47,8 @@ impl Reconstruct {
         let capture = open_capture(&self.scene)?;
         let loaded = load_model(&self.weights, device)?;
         let (shown, _) = holdout.split(capture.len());
-        let views = capture.load(&spread(&shown, self.views), Some(loaded.config.data.image_size))?;
+        let chosen = spread_over_path(&capture.cameras(), &shown, self.views);
+        let views = capture.load(&chosen, Some(loaded.config.data.image_size))?;
         let reconstruction = reconstruct(&loaded, &views, &[])?;
         write_ply(&self.out, &reconstruction.in_world())?;
 

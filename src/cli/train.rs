@@ -169,7 +169,7 @@ fn validate(outcome: &Outcome, config: &Config, captures: &[Capture]) -> Result<
     captures
         .iter()
         .map(|capture| {
-            let (ours, ..) = score_model(&loaded, capture, holdout)?;
+            let (ours, ..) = score_model(&loaded, capture, holdout, None)?;
             Ok(Validation { ours, nearest: nearest_context_baseline(&loaded, capture, holdout)? })
         })
         .collect()

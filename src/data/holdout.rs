@@ -71,18 +71,6 @@ impl fmt::Display for Holdout {
     }
 }
 
-/// `wanted` of `indices`, first and last among them, evenly spread; all of them when there are no more.
-pub fn spread(indices: &[usize], wanted: usize) -> Vec<usize> {
-    if indices.len() <= wanted {
-        return indices.to_vec();
-    }
-    if wanted == 1 {
-        return vec![indices[indices.len() / 2]];
-    }
-    let last = (indices.len() - 1) as f64;
-    (0..wanted).map(|k| indices[(k as f64 * last / (wanted - 1) as f64).round() as usize]).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -101,12 +89,5 @@ mod tests {
     fn every_third_view_is_held_out() {
         let (shown, held_out) = "every:3+1".parse::<Holdout>().unwrap().split(9);
         assert_eq!((shown, held_out), (vec![0, 2, 3, 5, 6, 8], vec![1, 4, 7]));
-    }
-
-    #[test]
-    fn views_are_spread_from_first_to_last() {
-        let indices: Vec<usize> = (10..20).collect();
-        assert_eq!(spread(&indices, 4), [10, 13, 16, 19]);
-        assert_eq!(spread(&indices, 20), indices);
     }
 }

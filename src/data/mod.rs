@@ -10,6 +10,7 @@ mod distortion;
 mod holdout;
 mod preprocess;
 mod sampler;
+mod spread;
 mod transforms_json;
 
 pub use batch::{ViewBatch, view_batch};
@@ -17,6 +18,7 @@ pub use cameras_json::write_cameras_json;
 pub use capture::{Capture, View, find_captures, open_capture, read_camera_path};
 pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
-pub use holdout::{Holdout, spread};
+pub use holdout::Holdout;
 pub use preprocess::{ImageSize, fit};
 pub use sampler::{Sample, Sampler};
+pub use spread::spread_over_path;

@@ -2,7 +2,7 @@
 
 use super::metrics::{psnr, ssim};
 use super::reconstruct::{Reconstruction, reconstruct};
-use crate::data::{Capture, Holdout, View};
+use crate::data::{Capture, Holdout, View, spread_over_path};
 use crate::error::{Error, Result};
 use crate::io::{LoadedModel, read_image, tensor_from_rgb};
 use crate::model::Gaussians;
@@ -129,7 +129,8 @@ pub fn score_splat(
     Ok((scores, views, rendered))
 }
 
-/// A model on one capture: it sees the views that `holdout` leaves, and is asked for the others.
+/// A model on one capture: it sees the views that `holdout` leaves, or `views` of them spread over the camera's path, and is
+/// asked for the others.
 ///
 /// # Errors
 /// Nothing held out, photos that can't be read, or whatever the reconstruction fails with.
@@ -137,8 +138,9 @@ pub fn score_model(
     loaded: &LoadedModel,
     capture: &Capture,
     holdout: Holdout,
+    views: Option<usize>,
 ) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
-    let (context, held_out) = load_split(capture, holdout, loaded)?;
+    let (context, held_out) = load_split(capture, holdout, views, loaded)?;
     let (reconstruction, rendered) = ask(loaded, &context, &held_out)?;
     let count = reconstruction.gaussians.count();
     let scores = score(&capture.name, &colours(&rendered), &held_out, Some(count))?;
@@ -173,7 +175,7 @@ pub fn nearest_context_baseline(
     capture: &Capture,
     holdout: Holdout,
 ) -> Result<CaptureScores> {
-    let (context, held_out) = load_split(capture, holdout, loaded)?;
+    let (context, held_out) = load_split(capture, holdout, None, loaded)?;
     let centre = |view: &View| view.camera.c2w.w_axis.truncate();
     let nearest = |target: &View| {
         let distance = |view: &&View| centre(view).distance(centre(target));
@@ -208,8 +210,16 @@ pub(super) fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
     }
 }
 
-fn load_split(capture: &Capture, holdout: Holdout, loaded: &LoadedModel) -> Result<(Vec<View>, Vec<View>)> {
-    let (context, held_out) = holdout.split(capture.len());
+fn load_split(
+    capture: &Capture,
+    holdout: Holdout,
+    views: Option<usize>,
+    loaded: &LoadedModel,
+) -> Result<(Vec<View>, Vec<View>)> {
+    let (mut context, held_out) = holdout.split(capture.len());
+    if let Some(views) = views {
+        context = spread_over_path(&capture.cameras(), &context, views);
+    }
     if held_out.is_empty() || context.len() < 2 {
         let split = format!("{} to show and {} to ask for", context.len(), held_out.len());
         return Err(Error::input(
