@@ -2,6 +2,8 @@
 
 use crate::data::{Holdout, ImageSize};
 use crate::error::{Error, Result};
+use crate::io::{find_pretrained, pretrained_folders};
+use crate::loss::{LpipsNetwork, PerceptualKind};
 use crate::model::{ModelConfig, Stage};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -88,6 +90,12 @@ impl CurriculumConfig {
 pub struct LossConfig {
     /// Mean squared error of the rendered colours.
     pub mse: f64,
+    /// The network that compares pictures as people see them: `none`, `vgg19`, `lpips_vgg` or `lpips_alex`.
+    pub perceptual: PerceptualKind,
+    /// What its difference counts.
+    pub perceptual_factor: f64,
+    /// The file of its weights; by default the network's own name in the folders where `make weights` puts them. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    pub perceptual_weights: String,
     /// Difference of the two subsets' accumulated opacities. Without this and the next, all context views go together.
     pub consistency_alpha: f64,
     /// Difference of the two subsets' depths.
@@ -105,12 +113,32 @@ impl LossConfig {
     pub fn has_consistency(&self) -> bool {
         self.consistency_alpha > 0. || self.consistency_depth > 0.
     }
+
+    /// `perceptual_weights` with environment variables filled in; where it is empty, the file that `make weights` makes, or
+    /// would be called.
+    ///
+    /// # Errors
+    /// A variable that isn't set and has no default.
+    pub fn perceptual_weights(&self) -> Result<PathBuf> {
+        if !self.perceptual_weights.is_empty() {
+            return expand(&self.perceptual_weights).map(PathBuf::from);
+        }
+        let name = match self.perceptual {
+            PerceptualKind::LpipsVgg => LpipsNetwork::Vgg16.file_name(),
+            PerceptualKind::LpipsAlex => LpipsNetwork::AlexNet.file_name(),
+            PerceptualKind::Vgg19 | PerceptualKind::None => "vgg19.safetensors",
+        };
+        Ok(find_pretrained(name).unwrap_or_else(|| pretrained_folders()[0].join(name)))
+    }
 }
 
 impl Default for LossConfig {
     fn default() -> Self {
         LossConfig {
             mse: 2.,
+            perceptual: PerceptualKind::Vgg19,
+            perceptual_factor: 1.,
+            perceptual_weights: String::new(),
             consistency_alpha: 1e-3,
             consistency_depth: 1e-2,
             frustum: 1e-2,

@@ -438,3 +438,35 @@ fn lpips_weights_of_something_else() {
     std::fs::rename(tiny_weights(folder.path(), &room), &file).unwrap();
     assert_says(&score(), &[arg(&file), "tensor conv1_1.bias is absent, expected [64]"]);
 }
+
+#[test]
+fn perceptual_losses_without_their_weights() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let train = |kind: &str, more: &str| {
+        let (kind, more) = (format!("loss.perceptual={kind}"), format!("loss.{more}"));
+        let arguments =
+            ["train", "--config", arg(&config), "--out", arg(&run), "--set", &kind, "--set", &more];
+        let output = command(&arguments).env("GLOBALSPLAT_WEIGHTS", folder.path()).output().unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let error = train("vgg19", "perceptual_factor=1");
+    assert_says(
+        &error,
+        &["loss.perceptual_weights is", "vgg19.safetensors, which is not there", "torchvision"],
+    );
+    assert_says(
+        &train("lpips_vgg", "perceptual_factor=1"),
+        &["lpips_vgg.safetensors", "make weights makes it"],
+    );
+    assert_says(
+        &train("vgg19", "perceptual_weights=elsewhere/v.safetensors"),
+        &["is elsewhere/v.safetensors"],
+    );
+    assert_says(&train("vgg16", "perceptual_factor=1"), &["unknown variant `vgg16`"]);
+    // Another network's weights.
+    let weights = tiny_weights(folder.path(), &room);
+    let named = format!("perceptual_weights={:?}", arg(&weights));
+    assert_says(&train("vgg19", &named), &["tiny.safetensors", "features.0."]);
+}

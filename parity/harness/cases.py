@@ -11,7 +11,7 @@ import numpy as np
 from . import draw, scenes
 from .compare import FLOAT32, FLOAT64, Tolerance
 from .draw import normal, uniform, whole
-from .thresholds import closest_call, doubtful_pixels
+from .thresholds import closest_call, closest_call_of_vgg19, doubtful_pixels
 
 CASES = {}
 
@@ -402,19 +402,25 @@ def consistency(rng):
         yield Draw(label, inputs, config, differentiate=tuple(inputs))
 
 
+def sure_pictures(rng, closest, *shapes):
+    """Random pictures of these shapes, drawn until no threshold is a close call."""
+    for _ in range(MOST_TRIES):
+        pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
+        if closest(*pictures) > CLOSE_CALL:
+            return pictures
+    raise RuntimeError(f"every one of {MOST_TRIES} sets of pictures has a close call")
+
+
 def lpips_draws(rng, network, shapes, dead=()):
     """Pictures are drawn again until no ReLU and no pooling is a close call. The layers in `dead` put out nothing."""
     params = draw.lpips_parameters(rng, network)
     for name in dead:
         params[f"{name}.bias"] -= np.float32(100.0)
     for shape in shapes:
-        for _ in range(MOST_TRIES):
-            pictures = uniform(rng, 0.0, 1.0, 2, *shape)
-            if closest_call(network, params, pictures.reshape(-1, *shape[1:])) > CLOSE_CALL:
-                break
-        else:
-            raise RuntimeError(f"{network}: every one of {MOST_TRIES} pairs of pictures has a close call")
-        inputs = {"picture": pictures[0], "truth": pictures[1]}
+        picture, truth = sure_pictures(
+            rng, lambda *pair: closest_call(network, params, np.concatenate(pair)), shape, shape
+        )
+        inputs = {"picture": picture, "truth": truth}
         label = by(*shape) + "".join(f", {name} dead" for name in dead)
         yield Draw(label, inputs, {"network": network}, params, tuple(inputs), module="lpips")
 
@@ -428,6 +434,36 @@ def lpips_vgg(rng):
 def lpips_alex(rng):
     yield from lpips_draws(rng, "lpips_alex", [(1, 3, 31, 31), (2, 3, 49, 36)])
     yield from lpips_draws(rng, "lpips_alex", [(1, 3, 47, 63)], dead=("conv5",))
+
+
+@case
+def vgg19(rng):
+    params = draw.vgg19_parameters(rng)
+    for shape in [(1, 3, 16, 16), (1, 3, 19, 17)]:
+        picture, truth = sure_pictures(rng, lambda *pair: closest_call_of_vgg19(params, *pair), shape, shape)
+        yield Draw(by(*shape), {"picture": picture, "truth": truth}, {}, params, ("picture",))
+
+
+@case
+def perceptual(rng):
+    """Two renderings of the same targets. The network's weights are inputs that take no gradient."""
+    params = draw.vgg19_parameters(rng)
+
+    def closest_to_vgg19(rendered, truth):
+        return min(closest_call_of_vgg19(params, half, truth[0]) for half in rendered)
+
+    rendered, truth = sure_pictures(rng, closest_to_vgg19, (2, 1, 3, 16, 16), (1, 1, 3, 16, 16))
+    inputs = {"rendered": rendered, "truth": truth, **params}
+    yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",))
+    params = draw.lpips_parameters(rng, "lpips_alex")
+    rendered, truth = sure_pictures(
+        rng,
+        lambda *both: closest_call("lpips_alex", params, np.concatenate(both).reshape(-1, 3, 31, 31)),
+        (2, 1, 3, 31, 31),
+        (1, 1, 3, 31, 31),
+    )
+    inputs = {"rendered": rendered, "truth": truth, **params}
+    yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",))
 
 
 # ---- training --------------------------------------------------------------------------------------------------------

@@ -17,6 +17,8 @@ CASES_OF = {
     "src/loss/frustum.rs": ["frustum"],
     "src/loss/lpips.rs": ["lpips_vgg", "lpips_alex"],
     "src/loss/mse.rs": ["mse"],
+    "src/loss/perceptual.rs": ["perceptual"],
+    "src/loss/vgg19.rs": ["vgg19"],
     "src/scene/normalize.rs": ["scene_normalization"],
     "src/scene/rays.rs": ["rays"],
     "src/render/mod.rs": [

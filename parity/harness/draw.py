@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from reference.loss.lpips import COMPARED, NETWORKS
+from reference.loss.vgg19 import BLOCKS
 from reference.normalize import invert_rigid
 from reference.rotation import matrix_from_quaternion
 
@@ -173,6 +174,18 @@ def lpips_parameters(rng, network):
         if name in compared:
             drawn[f"lin{compared.index(name)}.weight"] = uniform(rng, 0.0, 1.0, 1, outputs, 1, 1)
         inputs = outputs
+    return drawn
+
+
+def vgg19_parameters(rng):
+    """Of such sizes that features stay as large as the input, 0 to 255."""
+    drawn, inputs = {}, 3
+    for places, outputs in BLOCKS:
+        for place in places:
+            scale = (2.0 / (inputs * 9)) ** 0.5
+            drawn[f"features.{place}.weight"] = normal(rng, outputs, inputs, 3, 3, scale=scale)
+            drawn[f"features.{place}.bias"] = normal(rng, outputs, scale=5.0)
+            inputs = outputs
     return drawn
 
 

@@ -7,7 +7,7 @@ being equal: rounding may then decide, and neither the pixel nor its gradient ca
 
 import torch
 from reference import splat
-from reference.loss import lpips
+from reference.loss import lpips, vgg19
 
 
 def doubtful_pixels(config, inputs, margin):
@@ -73,5 +73,19 @@ def closest_call(network, params, pictures):
             size = lpips.POOLING[network]
             first, second = torch.relu(x).unfold(2, size, 2).unfold(3, size, 2).flatten(4).topk(2).values.unbind(-1)
             calls.append((first - second)[first > 0.0].min())
+        closest = min(closest, min(calls).item() / x.std().item())
+    return closest
+
+
+def closest_call_of_vgg19(params, picture, truth):
+    """The same of VGG-19's loss: before a ReLU, and between the features that are compared, where not both are zero."""
+    params = {name: torch.tensor(value).double() for name, value in params.items()}
+    (_, ours), (_, theirs) = (vgg19.convolutions(params, torch.tensor(t).double()) for t in (picture, truth))
+    closest = torch.inf
+    for place, x in ours.items():
+        calls = [x.abs().min()]
+        if place in vgg19.FACTORS:
+            difference = (torch.relu(x) - torch.relu(theirs[place])).abs()
+            calls.append(difference[difference > 0.0].min())
         closest = min(closest, min(calls).item() / x.std().item())
     return closest

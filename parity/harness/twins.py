@@ -9,6 +9,7 @@ import reference.loss.consistency
 import reference.loss.decoder_regularization
 import reference.loss.frustum
 import reference.loss.lpips
+import reference.loss.vgg19
 import reference.loss.mse
 import reference.loss.subsets
 import reference.model
@@ -312,6 +313,22 @@ def consistency(config, params, inputs):
 def lpips(config, params, inputs):
     distance = reference.loss.lpips.lpips(config["network"], params, inputs["picture"], inputs["truth"])
     return {"distance": distance}
+
+
+@twin
+def vgg19(config, params, inputs):
+    return {"loss": reference.loss.vgg19.vgg19(params, inputs["picture"], inputs["truth"])}
+
+
+@twin
+def perceptual(config, params, inputs):
+    halves = inputs["rendered"].chunk(2)
+    if config["kind"] == "vgg19":
+        losses = [reference.loss.vgg19.vgg19(inputs, half, inputs["truth"]) for half in halves]
+    else:
+        *halves, truth = (t.flatten(0, 1) for t in (*halves, inputs["truth"]))
+        losses = [reference.loss.lpips.lpips(config["kind"], inputs, half, truth).mean() for half in halves]
+    return {"loss": sum(losses) / 2.0}
 
 
 # ---- training --------------------------------------------------------------------------------------------------------

@@ -5,12 +5,16 @@ mod decoder_regularization;
 mod frustum;
 mod lpips;
 mod mse;
+mod perceptual;
+mod vgg19;
 
 pub use consistency::consistency;
 pub use decoder_regularization::{decoder_regularization, sh_soft_cap};
 pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
 pub use mse::mse;
+pub use perceptual::{PerceptualKind, PerceptualLoss};
+pub use vgg19::Vgg19;
 
 use crate::config::LossConfig;
 use crate::data::Sample;
@@ -25,6 +29,8 @@ pub struct Losses {
     pub total: Tensor,
     /// Mean squared error, before its factor.
     pub mse: Tensor,
+    /// L_perc, before its factor; 0 where it is left out.
+    pub perceptual: Tensor,
     /// L_con, with its factors; 0 where the sample isn't paired.
     pub consistency: Tensor,
     /// L_fru, before its factor.
@@ -35,8 +41,21 @@ pub struct Losses {
 
 /// What `decoded` is worth, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
 /// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con.
-pub fn losses(config: &LossConfig, sample: &Sample, decoded: &Decoded, pictures: &Pictures) -> Losses {
-    let mse = mse(&pictures.rgb, &sample.target.images);
+pub fn losses(
+    config: &LossConfig,
+    perceptual: Option<&PerceptualLoss>,
+    sample: &Sample,
+    decoded: &Decoded,
+    pictures: &Pictures,
+) -> Losses {
+    let truth = &sample.target.images;
+    let mse = mse(&pictures.rgb, truth);
+    let perceptual = match perceptual {
+        // Both halves of a paired sample have the same targets.
+        Some(network) if sample.paired => network.loss(&pictures.rgb, &truth.chunk(2, 0)[0]),
+        Some(network) => network.loss(&pictures.rgb, truth),
+        None => mse.zeros_like(),
+    };
     let consistency = match sample.paired {
         true => {
             let (alpha, depth) = (pictures.alpha.chunk(2, 0), pictures.depth.chunk(2, 0));
@@ -47,6 +66,10 @@ pub fn losses(config: &LossConfig, sample: &Sample, decoded: &Decoded, pictures:
     };
     let frustum = frustum(&decoded.gaussians.means, &sample.context, &sample.far);
     let decoder = decoder_regularization(&decoded.raw, config.decoder_opacity);
-    let total = &mse * config.mse + &consistency + &frustum * config.frustum + &decoder * config.decoder;
-    Losses { total, mse, consistency, frustum, decoder }
+    let total = &mse * config.mse
+        + &perceptual * config.perceptual_factor
+        + &consistency
+        + &frustum * config.frustum
+        + &decoder * config.decoder;
+    Losses { total, mse, perceptual, consistency, frustum, decoder }
 }

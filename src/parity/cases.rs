@@ -42,6 +42,8 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
+        "vgg19" => vgg19(request),
+        "perceptual" => perceptual(request),
         "consistency" => consistency(request),
         "subsets" => subsets(request),
         "learning_rate" => learning_rate(request),
@@ -337,6 +339,26 @@ fn lpips(request: &Request) -> Result<Answer> {
     let network = network.ok_or_else(|| Error::Request(format!("{}: no network {name}", request.case)))?;
     let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
     with_params([("distance", lpips.distance(request.input("picture")?, request.input("truth")?))], params)
+}
+
+fn vgg19(request: &Request) -> Result<Answer> {
+    let (network, params) = request.build(loss::Vgg19::new)?;
+    let features = |name| Ok::<_, Error>(network.features(request.input(name)?));
+    with_params([("loss", network.compare(&features("picture")?, &features("truth")?).view([1]))], params)
+}
+
+/// The loss of two renderings of the same targets, as training takes it: the network is what the other inputs say.
+fn perceptual(request: &Request) -> Result<Answer> {
+    let mut vs = nn::VarStore::new(request.device);
+    let network = match request.number::<String>("kind")?.as_str() {
+        "vgg19" => loss::PerceptualLoss::Vgg19(loss::Vgg19::new(&vs.root())),
+        _ => loss::PerceptualLoss::Lpips(loss::Lpips::new(&vs.root(), loss::LpipsNetwork::AlexNet)),
+    };
+    let weights = request.inputs.iter().filter(|(name, _)| name.contains('.'));
+    let tensors = weights.map(|(name, t)| (name.clone(), t.shallow_clone())).collect();
+    Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&request.case))?;
+    vs.freeze();
+    loss_of(network.loss(request.input("rendered")?, request.input("truth")?))
 }
 
 fn steps(request: &Request) -> Result<Vec<u64>> {

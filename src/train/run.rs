@@ -86,6 +86,7 @@ fn to_json(report: &StepReport) -> serde_json::Value {
         "learning_rate": report.learning_rate,
         "loss": report.loss,
         "mse": report.mse,
+        "perceptual": report.perceptual,
         "consistency": report.consistency,
         "frustum": report.frustum,
         "decoder": report.decoder,

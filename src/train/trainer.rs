@@ -6,7 +6,7 @@ use super::{stage_at, subsets};
 use crate::config::Config;
 use crate::data::{Capture, Sampler, View};
 use crate::error::Result;
-use crate::loss::losses;
+use crate::loss::{PerceptualLoss, losses};
 use crate::model::{GlobalSplat, Stage};
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use tch::{Device, nn};
@@ -18,6 +18,7 @@ pub struct Trainer {
     pub(super) vs: nn::VarStore,
     pub(super) model: GlobalSplat,
     pub(super) optimizer: AdamW,
+    perceptual: Option<PerceptualLoss>,
     /// Steps done.
     pub(super) step: u64,
     sampler: Sampler,
@@ -36,6 +37,8 @@ pub struct StepReport {
     pub loss: f64,
     /// Mean squared error of colours.
     pub mse: f64,
+    /// L_perc before its factor; 0 where it is left out.
+    pub perceptual: f64,
     /// L_con with its factors; 0 without subsets.
     pub consistency: f64,
     /// L_fru before its factor.
@@ -52,8 +55,9 @@ impl Trainer {
     /// Fresh weights by the configuration's seed. The captures' views that aren't held out are read into memory.
     ///
     /// # Errors
-    /// Images that can't be read, or too few views.
+    /// Images that can't be read, too few views, or no weights for the perceptual loss.
     pub fn new(config: &Config, captures: &[Capture], device: Device) -> Result<Self> {
+        let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?;
         let training_views = |capture: &Capture| -> Result<Vec<View>> {
             let (shown, _) = config.data.holdout.split(capture.len());
             capture.load(&shown, Some(config.data.image_size))
@@ -65,7 +69,7 @@ impl Trainer {
         let vs = nn::VarStore::new(device);
         let model = GlobalSplat::new(&vs.root(), &config.model)?;
         let optimizer = AdamW::new(&vs, config.train.weight_decay);
-        Ok(Trainer { config: config.clone(), vs, model, optimizer, step: 0, sampler })
+        Ok(Trainer { config: config.clone(), vs, model, optimizer, perceptual, step: 0, sampler })
     }
 
     /// Draws a sample, renders what the model makes of it, and follows the gradient.
@@ -84,7 +88,7 @@ impl Trainer {
         let context = &sample.context;
         let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, stage);
         let pictures = render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D)?;
-        let losses = losses(&config.loss, &sample, &decoded, &pictures);
+        let losses = losses(&config.loss, self.perceptual.as_ref(), &sample, &decoded, &pictures);
         let loss = losses.total.double_value(&[]);
 
         self.optimizer.zero_grad();
@@ -100,6 +104,7 @@ impl Trainer {
             learning_rate,
             loss,
             mse: losses.mse.double_value(&[]),
+            perceptual: losses.perceptual.double_value(&[]),
             consistency: losses.consistency.double_value(&[]),
             frustum: losses.frustum.double_value(&[]),
             decoder: losses.decoder.double_value(&[]),

@@ -28,6 +28,9 @@ final_stage = 2
 boundaries = [2, 4]
 transition = 2
 
+[loss]
+perceptual = "none"
+
 [train]
 steps = 6
 batch = 1

@@ -1,0 +1,110 @@
+//! L_perc of kind `vgg19` (SPEC section 7): how far apart a picture's and its truth's features are in VGG-19 (Simonyan &
+//! Zisserman 2015) with average pooling.
+
+use crate::error::Result;
+use crate::io::read_weights;
+use std::path::Path;
+use tch::nn::Module;
+use tch::{Device, Kind, Tensor, nn};
+
+/// What the network takes from 255·x: the mean of the photos that it was trained on.
+const MEANS: [f32; 3] = [123.68, 116.779, 103.939];
+
+/// Convolutions of 3×3 up to ReLU 5_2: number in torchvision's `features`, channels, whether a pooling comes before, and
+/// by what the mean absolute difference of its features is divided, where it counts.
+const LAYERS: [(u32, i64, bool, Option<f64>); 14] = [
+    (0, 64, false, None),
+    (2, 64, false, Some(2.6)),
+    (5, 128, true, None),
+    (7, 128, false, Some(4.8)),
+    (10, 256, true, None),
+    (12, 256, false, Some(3.7)),
+    (14, 256, false, None),
+    (16, 256, false, None),
+    (19, 512, true, None),
+    (21, 512, false, Some(5.6)),
+    (23, 512, false, None),
+    (25, 512, false, None),
+    (28, 512, true, None),
+    (30, 512, false, Some(1.5 / 10.)),
+];
+
+/// What the sum of all differences is divided by.
+const RANGE: f64 = 255.;
+
+/// The network, in float32.
+#[derive(Debug)]
+pub struct Vgg19 {
+    /// [1, 3, 1, 1].
+    means: Tensor,
+    /// As in [`LAYERS`].
+    convolutions: Vec<nn::Conv2D>,
+}
+
+impl Vgg19 {
+    /// Pictures have to be as large, for something to be left after four poolings.
+    pub const SMALLEST_SIDE: i64 = 16;
+
+    /// Builds the network under `vs`, with torchvision's names: `features.0.weight` [64, 3, 3, 3], `features.0.bias` [64], ….
+    /// They are zero until they are loaded.
+    pub(crate) fn new(vs: &nn::Path) -> Self {
+        let zero = nn::Init::Const(0.);
+        let config = nn::ConvConfig { padding: 1, ws_init: zero, bs_init: zero, ..Default::default() };
+        let mut inputs = 3;
+        let mut convolution = |(number, channels, ..): (u32, i64, bool, Option<f64>)| {
+            let built = nn::conv2d(vs / "features" / number, inputs, channels, 3, config);
+            inputs = channels;
+            built
+        };
+        Vgg19 {
+            convolutions: LAYERS.map(&mut convolution).into(),
+            means: Tensor::from_slice(&MEANS).view([1, 3, 1, 1]).to_device(vs.device()),
+        }
+    }
+
+    /// Reads torchvision's weights as a safetensors; what comes after ReLU 5_2 isn't looked at. They take no gradient;
+    /// pictures do.
+    ///
+    /// # Errors
+    /// A file that can't be read or holds another network.
+    pub fn load(path: &Path, device: Device) -> Result<Self> {
+        let mut vs = nn::VarStore::new(device);
+        let network = Vgg19::new(&vs.root());
+        let mut weights = read_weights(path)?;
+        let known = vs.variables();
+        weights.tensors.retain(|name, _| known.contains_key(name));
+        weights.load_into(&vs, path)?;
+        vs.freeze();
+        Ok(network)
+    }
+
+    /// What [`Vgg19::compare`] compares: the input 255·x − mean, and the features after ReLU 1_2, 2_2, 3_2, 4_2 and 5_2.
+    /// Pictures […, 3, H, W] in [0, 1], H and W at least [`Vgg19::SMALLEST_SIDE`].
+    ///
+    /// # Panics
+    /// Pictures of another shape or a smaller size.
+    pub fn features(&self, pictures: &Tensor) -> Vec<Tensor> {
+        let size = pictures.size();
+        let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
+        let mut xs = pictures * RANGE - &self.means;
+        let mut features = vec![xs.shallow_clone()];
+        for ((.., pooled, counts), convolution) in LAYERS.iter().zip(&self.convolutions) {
+            if *pooled {
+                xs = xs.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None);
+            }
+            xs = convolution.forward(&xs).relu();
+            if counts.is_some() {
+                features.push(xs.shallow_clone());
+            }
+        }
+        features
+    }
+
+    /// The loss of two lists of features: Σ of their mean absolute differences, each over its own divisor, over 255.
+    pub fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
+        let divisors = std::iter::once(1.).chain(LAYERS.iter().filter_map(|(.., divisor)| *divisor));
+        let differences = picture.iter().zip(truth).zip(divisors);
+        let differences = differences.map(|((a, b), divisor)| (a - b).abs().mean(None::<Kind>) / divisor);
+        differences.reduce(|sum, difference| sum + difference).expect("six terms") / RANGE
+    }
+}
