@@ -28,7 +28,7 @@ if [ "${1:-}" = weights ]; then
     exit
 fi
 
-command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.88 or newer"
+command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.89 or newer"
 command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
 
 if [ -n "${LIBTORCH:-}" ]; then

@@ -78,6 +78,12 @@ impl Error {
         move |source| Error::Write { path, source }
     }
 
+    /// Whether writing failed for want of room, which may come.
+    pub fn is_disk_full(&self) -> bool {
+        use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+        matches!(self, Error::Write { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
+    }
+
     /// Whether the request was wrong (exit code 2) rather than the work having failed (exit code 1).
     pub fn is_request(&self) -> bool {
         matches!(self, Error::Input { .. } | Error::Request(_) | Error::Read { .. })

@@ -6,7 +6,7 @@ use globalsplat::data::{Capture, Holdout, find_captures};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
 use globalsplat::io::{check_writable_dir, load_model};
-use globalsplat::train::{Outcome, Resume, Trainer, run};
+use globalsplat::train::{Event, Outcome, Resume, Trainer, run};
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -86,7 +86,16 @@ impl Train {
         let bar = progress::bar(config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut first = true;
-        let outcome = run(trainer, &self.out, resume, |report| {
+        let outcome = run(trainer, &self.out, resume, |event| {
+            let go_on = !stop.load(Ordering::Relaxed);
+            let report = match event {
+                Event::Step(report) => report,
+                Event::Notice(text) => {
+                    bar.suspend(|| eprintln!("{text}"));
+                    return go_on;
+                }
+                Event::Waiting => return go_on,
+            };
             if first {
                 bar.set_position(report.step);
                 bar.reset_eta();
@@ -103,7 +112,7 @@ impl Train {
                 report.stage.mix,
                 report.learning_rate
             ));
-            !stop.load(Ordering::Relaxed)
+            go_on
         })?;
         bar.abandon();
         Ok(outcome)

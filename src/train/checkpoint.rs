@@ -1,13 +1,16 @@
 //! Checkpoints: a folder per step, whole or not there.
 //!
 //! `RUN/checkpoints/step-00001000/`: `model.safetensors` (weights, with the configuration), `optimizer.safetensors`, and
-//! `state.json`. Random numbers need no state: a step's depend on the seed and the step alone.
+//! `state.json`, which holds the step and the others' checksums. Random numbers and data need no state: those of a step depend
+//! on the seed and the step alone.
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{ModelDtype, read_weights, replace_dir, save_model, write_atomically, write_weights};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::fs;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "checkpoints";
@@ -20,6 +23,8 @@ const STATE_FILE: &str = "state.json";
 struct State {
     /// Steps done.
     step: u64,
+    /// Sizes in bytes and CRC-32 of the other files, by their names.
+    files: BTreeMap<String, (u64, u32)>,
 }
 
 /// The run's checkpoints, oldest first.
@@ -64,7 +69,10 @@ impl Trainer {
         replace_dir(&path, |folder| {
             save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, ModelDtype::F32)?;
             write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
-            let state = serde_json::to_vec(&State { step: self.step }).expect("a number");
+            let files =
+                [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
+            let files = files.into_iter().collect::<Result<_>>()?;
+            let state = serde_json::to_vec(&State { step: self.step, files }).expect("numbers and names");
             let file = folder.join(STATE_FILE);
             write_atomically(&file, |writer| writer.write_all(&state).map_err(Error::write(&file)))
         })?;
@@ -76,19 +84,52 @@ impl Trainer {
         Ok(path)
     }
 
-    /// Goes on from a checkpoint.
+    /// Goes on from a checkpoint. Weights that don't fit it leave the trainer unusable, all else as it was.
     ///
     /// # Errors
-    /// Files that can't be read, or were written for another model.
+    /// Files that can't be read, were damaged, or were written for another model.
     pub fn load(&mut self, checkpoint: &Path) -> Result<()> {
+        let step = check(checkpoint)?;
         let file = checkpoint.join(MODEL_FILE);
         read_weights(&file)?.load_into(&self.vs, &file)?;
         self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
-        let file = checkpoint.join(STATE_FILE);
-        let state = fs::read(&file).map_err(Error::read(&file))?;
-        let state: State = serde_json::from_slice(&state)
-            .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), "{\"step\": N}"))?;
-        self.step = state.step;
+        self.step = step;
         Ok(())
+    }
+}
+
+/// Whether a checkpoint is whole: its files are as they were written. Returns its step.
+///
+/// # Errors
+/// What is missing or damaged.
+pub(super) fn check(checkpoint: &Path) -> Result<u64> {
+    let file = checkpoint.join(STATE_FILE);
+    let state = fs::read(&file).map_err(Error::read(&file))?;
+    let expected = "what globalsplat train writes";
+    let state: State = serde_json::from_slice(&state)
+        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))?;
+    for (name, (bytes, crc)) in &state.files {
+        let file = checkpoint.join(name);
+        let found = checksum(&file)?;
+        if found != (*bytes, *crc) {
+            let found = format!("damaged ({} bytes, checksum {:08x})", found.0, found.1);
+            return Err(Error::input(&file, "the file", found, format!("{bytes} bytes, checksum {crc:08x}")));
+        }
+    }
+    Ok(state.step)
+}
+
+/// A file's size and CRC-32.
+fn checksum(path: &Path) -> Result<(u64, u32)> {
+    let mut file = fs::File::open(path).map_err(Error::read(path))?;
+    let (mut buffer, mut hasher, mut size) = (vec![0; 1 << 20], crc32fast::Hasher::new(), 0);
+    loop {
+        match file.read(&mut buffer).map_err(Error::read(path))? {
+            0 => return Ok((size, hasher.finalize())),
+            count => {
+                hasher.update(&buffer[..count]);
+                size += count as u64;
+            }
+        }
     }
 }

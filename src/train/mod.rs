@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod curriculum;
+mod lock;
 mod optimizer;
 mod run;
 mod schedule;
@@ -11,7 +12,7 @@ mod trainer;
 pub use checkpoint::{latest_checkpoint, list_checkpoints};
 pub use curriculum::stage_at;
 pub use optimizer::AdamW;
-pub use run::{Outcome, Resume, run};
+pub use run::{Event, Outcome, Resume, run};
 pub use schedule::learning_rate;
 pub use subsets::subsets;
 pub use trainer::{StepReport, Trainer};

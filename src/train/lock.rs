@@ -1,0 +1,44 @@
+//! One process to a run: two would write over each other's checkpoints.
+
+use crate::error::{Error, Result};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{Read, Write};
+use std::path::Path;
+
+const FILE: &str = ".lock";
+
+/// Holds a run's folder until it is dropped, or the process ends in whatever way.
+#[derive(Debug)]
+pub(super) struct RunLock {
+    _file: File,
+}
+
+impl RunLock {
+    /// Takes the folder `run`, which is there.
+    ///
+    /// # Errors
+    /// Another process that holds it, by its number.
+    pub(super) fn take(run: &Path) -> Result<Self> {
+        let path = run.join(FILE);
+        let options = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
+        let mut file = options.map_err(Error::write(&path))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let _ = file.read_to_string(&mut holder);
+                let found = format!("in use by process {}", holder.trim());
+                return Err(Error::input(
+                    run,
+                    "the run",
+                    found,
+                    "one that nobody trains (choose another --out)",
+                ));
+            }
+            Err(TryLockError::Error(e)) => return Err(Error::write(&path)(e)),
+        }
+        let written = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
+        written.map_err(Error::write(&path))?;
+        Ok(RunLock { _file: file })
+    }
+}

@@ -1,0 +1,184 @@
+//! Training runs and what can befall them: being killed, damaged checkpoints, a full disk, a second run in the same place.
+#![cfg(unix)]
+
+mod common;
+
+use common::program::{arg, command, fail, room, succeed, tiny_config};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+/// The last checkpoint's tensors, by file and name.
+fn tensors(run: &Path) -> Vec<(String, tch::Tensor)> {
+    let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
+    let mut all = vec![];
+    for file in ["model.safetensors", "optimizer.safetensors"] {
+        let weights = globalsplat::io::read_weights(&checkpoint.join(file)).unwrap();
+        all.extend(weights.tensors.into_iter().map(|(name, tensor)| (format!("{file} {name}"), tensor)));
+    }
+    all.sort_by(|a, b| a.0.cmp(&b.0));
+    all
+}
+
+#[track_caller]
+fn assert_same_bits(a: &Path, b: &Path) {
+    let (a, b) = (tensors(a), tensors(b));
+    assert!(a.len() > 10 && a.len() == b.len());
+    for ((name, x), (other, y)) in a.iter().zip(&b) {
+        assert!(name == other && x.equal(y), "{name}");
+    }
+}
+
+/// The steps that metrics.jsonl tells of.
+fn steps(run: &Path) -> Vec<u64> {
+    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+    text.lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].as_u64().unwrap())
+        .collect()
+}
+
+#[test]
+fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
+    const STEPS: u64 = 40;
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
+    let (steps_key, every) = (format!("train.steps={STEPS}"), "train.checkpoint_every=1");
+    let run = |out: &Path| {
+        let start = ["train", "--config", arg(&config), "--out", arg(out)];
+        command(&[&start[..], &["--set", &steps_key, "--set", every]].concat())
+    };
+    let begun = std::time::Instant::now();
+    assert!(run(&whole).output().unwrap().status.success());
+    // A checkpoint after every step: about as much time goes into saves as into steps.
+    let longest = begun.elapsed().as_secs_f64() / 3.;
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let mut kills = 0;
+    for _ in 0..10 {
+        let mut child = run(&killed).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        std::thread::sleep(Duration::from_secs_f64(random.random_range(0.0..longest)));
+        child.kill().unwrap();
+        kills += u32::from(!child.wait().unwrap().success());
+    }
+    assert!(kills >= 5, "{kills} kills met a run that was still going on");
+    let output = run(&killed).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_same_bits(&whole, &killed);
+    assert_eq!(steps(&killed), (0..STEPS).collect::<Vec<_>>(), "every step is told of once");
+    let left: Vec<_> = std::fs::read_dir(killed.join("checkpoints")).unwrap().collect();
+    assert_eq!(left.len(), 2, "what the kills left is cleared away: {left:?}");
+}
+
+#[test]
+fn a_broken_checkpoint_is_stepped_over() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let (whole, run) = (folder.path().join("whole"), folder.path().join("run"));
+    let train =
+        |out: &Path| command(&["train", "--config", arg(&config), "--out", arg(out)]).output().unwrap();
+    assert!(train(&whole).status.success() && train(&run).status.success());
+    // One bit of a weight, which no format would notice.
+    let file = run.join("checkpoints/step-00000006/model.safetensors");
+    let mut bytes = std::fs::read(&file).unwrap();
+    let last = bytes.len() - 5;
+    bytes[last] ^= 1;
+    std::fs::write(&file, &bytes).unwrap();
+    let output = train(&run);
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{err}");
+    assert!(err.contains("step-00000006/model.safetensors: the file is damaged"), "{err}");
+    assert!(err.contains("the checkpoint before it is taken"), "{err}");
+    assert_same_bits(&whole, &run);
+
+    for step in ["step-00000004", "step-00000006"] {
+        std::fs::write(run.join("checkpoints").join(step).join("state.json"), "{").unwrap();
+    }
+    let arguments = ["train", "--config", arg(&config), "--out", arg(&run)];
+    let output = command(&arguments).output().unwrap();
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && err.contains("broken, all 2 of them"), "{err}");
+}
+
+/// Training without end.
+fn endless(config: &Path, run: &Path) -> Command {
+    command(&["train", "--config", arg(config), "--out", arg(run), "--set", "train.steps=1000000"])
+}
+
+fn wait_for_steps(child: &mut Child, run: &Path, count: usize) {
+    while std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count()) < count {
+        assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn a_second_run_in_the_same_folder_is_refused() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let mut child = endless(&config, &run).stderr(Stdio::null()).spawn().unwrap();
+    wait_for_steps(&mut child, &run, 1);
+    let error = fail(&["train", "--config", arg(&config), "--out", arg(&run)], 2);
+    assert!(error.contains(&format!("the run is in use by process {}", child.id())), "{error}");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    // The lock goes with the process.
+    succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
+}
+
+fn set_file_size_limit(child: &Child, bytes: libc::rlim_t) {
+    let limit = libc::rlimit { rlim_cur: bytes, rlim_max: libc::RLIM_INFINITY };
+    // SAFETY: the limit of a child that has not been waited for; the old one isn't asked for.
+    let result =
+        unsafe { libc::prlimit(child.id() as i32, libc::RLIMIT_FSIZE, &limit, std::ptr::null_mut()) };
+    assert_eq!(result, 0);
+}
+
+/// Training in a place where no file can grow beyond 8 kB: to it, the disk is full.
+fn on_a_full_disk(config: &Path, run: &Path) -> (Child, BufReader<std::process::ChildStderr>, PathBuf) {
+    // Ignoring SIGXFSZ makes the system refuse the write instead of ending the program.
+    let mut child = Command::new("bash")
+        .args(["-c", "trap '' XFSZ; ulimit -S -f 8; exec \"$@\"", "bash", env!("CARGO_BIN_EXE_globalsplat")])
+        .args(["train", "--config", arg(config), "--out", arg(run)])
+        .env("OMP_NUM_THREADS", "1")
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = BufReader::new(child.stderr.take().unwrap());
+    let mut line = String::new();
+    said.read_line(&mut line).unwrap();
+    assert!(line.starts_with("training pauses: ") && line.contains("can't be written"), "{line}");
+    (child, said, run.join("checkpoints"))
+}
+
+#[test]
+fn a_full_disk_pauses_training_until_there_is_room() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let whole = folder.path().join("whole");
+    succeed(&["train", "--config", arg(&config), "--out", arg(&whole)]);
+    let (mut child, mut said, checkpoints) = on_a_full_disk(&config, &run);
+    assert_eq!(std::fs::read_dir(&checkpoints).map_or(0, Iterator::count), 0, "no half checkpoint");
+    set_file_size_limit(&child, libc::RLIM_INFINITY);
+    let mut line = String::new();
+    said.read_line(&mut line).unwrap();
+    assert_eq!(line, "there is room again: training goes on\n");
+    assert!(child.wait().unwrap().success());
+    assert_same_bits(&whole, &run);
+}
+
+#[test]
+fn a_run_that_waits_for_room_can_be_stopped() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let (mut child, mut said, _) = on_a_full_disk(&config, &run);
+    // SAFETY: sends a signal to a child that has not been waited for.
+    unsafe { libc::kill(child.id() as i32, libc::SIGTERM) };
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    let mut line = String::new();
+    said.read_line(&mut line).unwrap();
+    assert!(line.contains("can't be written"), "{line}");
+}
