@@ -1,11 +1,13 @@
 //! A capture: what every format on disk is read into.
 
 use super::distortion::Distortion;
+use super::planes::Planes;
 use super::preprocess::{ImageSize, fit};
 use super::{cameras_json, colmap, transforms_json};
 use crate::error::{Error, Result};
-use crate::io::{read_photo, tensor_from_rgb};
+use crate::io::read_photo;
 use crate::scene::{Camera, check_pose};
+use image::RgbImage;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
@@ -199,6 +201,23 @@ impl Capture {
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {
+        let image = self.read_photo(frame)?;
+        let (planes, camera) = match size {
+            Some(size) => fit(&image, &frame.camera, size),
+            None => (Planes::from_rgb(&image), frame.camera),
+        };
+        Ok(View { name: frame.name.clone(), image: planes.to_tensor(), camera })
+    }
+
+    /// The photo of view `index` at its camera's size, lens distortion removed.
+    ///
+    /// # Errors
+    /// As [`Capture::load`].
+    pub(super) fn photo(&self, index: usize) -> Result<RgbImage> {
+        self.read_photo(&self.frames[index])
+    }
+
+    fn read_photo(&self, frame: &Frame) -> Result<RgbImage> {
         let Camera { width, height, intrinsics, .. } = frame.camera;
         let image = read_photo(&frame.image, (width, height))?;
         if image.dimensions() != (width, height) {
@@ -210,12 +229,7 @@ impl Capture {
                 format!("{width}×{height} as in {}", self.file.display()),
             ));
         }
-        let image = frame.distortion.remove(image, &intrinsics);
-        let (image, camera) = match size {
-            Some(size) => fit(image, &frame.camera, size),
-            None => (image, frame.camera),
-        };
-        Ok(View { name: frame.name.clone(), image: tensor_from_rgb(&image), camera })
+        Ok(frame.distortion.remove(image, &intrinsics))
     }
 }
 

@@ -6,7 +6,9 @@ mod capture;
 mod colmap;
 mod distortion;
 mod holdout;
+mod planes;
 mod preprocess;
+mod resample;
 mod sampler;
 mod transforms_json;
 
@@ -14,5 +16,7 @@ pub use batch::{ViewBatch, view_batch};
 pub use cameras_json::write_cameras_json;
 pub use capture::{Capture, View, find_captures, open_capture, read_camera_path};
 pub use holdout::{Holdout, spread};
+pub use planes::Planes;
 pub use preprocess::{ImageSize, fit};
+pub use resample::{Region, Resampler};
 pub use sampler::{Sample, Sampler};

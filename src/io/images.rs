@@ -14,7 +14,7 @@ use tch::{Kind, Tensor};
 /// # Errors
 /// A file that is missing or can't be decoded.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
-    Ok(rgb_over_black(&decode(path)?.0))
+    Ok(rgb_over_black(decode(path)?.0))
 }
 
 /// Reads a photo whose capture declares it to be `size` = (width, height), as [`read_image`] does.
@@ -39,7 +39,7 @@ pub fn read_photo(path: &Path, size: (u32, u32)) -> Result<RgbImage> {
     if stored != size && turned == size {
         image.apply_orientation(orientation);
     }
-    Ok(rgb_over_black(&image))
+    Ok(rgb_over_black(image))
 }
 
 /// (width, height) of the pixels as stored, from the image's header alone.
@@ -65,9 +65,9 @@ fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
     move |e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG")
 }
 
-fn rgb_over_black(image: &DynamicImage) -> RgbImage {
+fn rgb_over_black(image: DynamicImage) -> RgbImage {
     if !image.color().has_alpha() {
-        return image.to_rgb8();
+        return image.into_rgb8();
     }
     let image = image.to_rgba8();
     RgbImage::from_fn(image.width(), image.height(), |x, y| {
