@@ -2,7 +2,7 @@ use super::{device, print_json, progress};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{Capture, Holdout, find_captures};
+use globalsplat::data::{BadData, Capture, Holdout, find_captures};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
 use globalsplat::io::{check_writable_dir, load_model};
@@ -66,7 +66,7 @@ impl Train {
             .into());
         }
         check_writable_dir(&self.out)?;
-        let mut trainer = Trainer::new(&config, &captures, device)?;
+        let mut trainer = Trainer::new(&config, Arc::new(captures.clone()), device)?;
 
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &resume)?;
@@ -78,7 +78,7 @@ impl Train {
             );
         }
         let validation = validate(&outcome, &config, &captures)?;
-        self.report(&outcome, seconds, &validation);
+        self.report(&outcome, seconds, &validation, &trainer.bad_data());
         Ok(())
     }
 
@@ -112,7 +112,7 @@ impl Train {
         Ok(outcome)
     }
 
-    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation]) {
+    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation], bad_data: &BadData) {
         let mean = |value: fn(&Validation) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
@@ -121,6 +121,7 @@ impl Train {
                 "checkpoint": outcome.checkpoint,
                 "seconds": seconds,
                 "skipped_steps": outcome.skipped,
+                "skipped_scenes": bad_data,
             });
             if !validation.is_empty() {
                 object["held_out"] = json!({
@@ -137,6 +138,9 @@ impl Train {
         println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
         if outcome.skipped > 0 {
             println!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
+        }
+        if bad_data.total() > 0 {
+            println!("{bad_data}");
         }
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
