@@ -158,6 +158,10 @@ impl Eval {
                 },
             )?;
             bar.finish_and_clear();
+            if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
+                let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
+                eprintln!("{}", why.expect("a scene without a distance"));
+            }
             write_evaluation(&folder, &evaluation)?;
             write_csv(&folder.join("scores.csv"), &evaluation)?;
             evaluations.push((folder, evaluation));
