@@ -31,8 +31,7 @@ fn main() {
     let torch_lib = env::var("DEP_TCH_LIBTORCH_LIB").expect("torch-sys tells where libtorch is");
     let torch_include = Path::new(&torch_lib).parent().expect("libtorch/lib has a parent").join("include");
 
-    let mut splat = cxx_build::bridge("src/render/bridge.rs");
-    splat
+    cxx_build::bridges(["src/render/bridge.rs", "src/data/chunk/bridge.rs"])
         .std("c++17")
         .opt_level(2)
         .flag("-isystem")
@@ -40,8 +39,8 @@ fn main() {
         .flag("-isystem")
         .flag(torch_include.join("torch/csrc/api/include").to_str().expect("an UTF-8 path"))
         .include("csrc")
-        .files(["csrc/splat.cpp", "csrc/projection.cpp", "csrc/marshal.cpp"])
-        .compile("globalsplat_splat");
+        .files(["csrc/splat.cpp", "csrc/projection.cpp", "csrc/marshal.cpp", "csrc/chunk.cpp"])
+        .compile("globalsplat_torch");
 
     cpp()
         .files(["csrc/raster/raster.cpp", "csrc/raster/parallel.cpp", "csrc/raster/kernels.cpp"])
@@ -60,4 +59,5 @@ fn main() {
     println!("cargo:rustc-link-arg=-Wl,-rpath,{}", torch_lib.display());
     println!("cargo:rerun-if-changed=csrc");
     println!("cargo:rerun-if-changed=src/render/bridge.rs");
+    println!("cargo:rerun-if-changed=src/data/chunk/bridge.rs");
 }

@@ -1,41 +1,63 @@
-use super::{device, print_json};
+use super::{device, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Holdout, View, open_capture};
+use globalsplat::data::{Dataset, Holdout, Split, View, open_capture};
+use globalsplat::error::Error;
 use globalsplat::eval::{
-    CaptureScores, Perceptual, Rendered, contact_sheet, peak_memory_bytes, score_model, score_renders,
-    score_splat,
+    CaptureScores, Evaluation, EvaluationIndex, Perceptual, Rendered, Subject, Sweep, contact_sheet, machine,
+    peak_memory_bytes, score_model, score_renders, score_splat, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_file, load_model, read_ply, write_png};
-use std::path::PathBuf;
-use tch::Tensor;
+use globalsplat::io::{check_writable_dir, check_writable_file, load_model, read_ply, write_png};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use tch::{Device, Tensor};
 
-/// Score a model, a splat or pictures against a capture's photos: PSNR, SSIM, and LPIPS where `make weights` was run.
+/// Score a model, splats or pictures against photos: PSNR, SSIM, and LPIPS where `make weights` was run.
 ///
-/// With --weights the model sees the views that are not held out and is asked for the others; with --splat or --renders
-/// all views are asked for.
+/// Of one capture (--scene): with --weights the model sees the views that are not held out and is asked for the others; with
+/// --splat or --renders all views are asked for.
+///
+/// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
+/// asked for. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
+/// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, anybody's pictures
+/// DIR/SCENE/000012.png, named by the frame.
 #[derive(Args)]
 #[command(group(ArgGroup::new("subject").required(true)))]
+#[command(group(ArgGroup::new("photos").required(true)))]
 #[command(after_help = "Examples:\n  globalsplat eval --splat scene.ply --scene captures/room --json\n  \
-    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png")]
+    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png\n  \
+    globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k")]
 pub struct Eval {
     /// Weights that `globalsplat export` wrote
     #[arg(long, value_name = "FILE", group = "subject")]
     weights: Option<PathBuf>,
-    /// A 3DGS splat in the capture's world
-    #[arg(long, value_name = "FILE.ply", group = "subject")]
+    /// A 3DGS splat in the capture's world; with --data a folder of them
+    #[arg(long, value_name = "FILE.ply|DIR", group = "subject")]
     splat: Option<PathBuf>,
-    /// A folder of pictures named as the photos
+    /// A folder of pictures named as the photos; with --data a folder of these
     #[arg(long, value_name = "DIR", group = "subject")]
     renders: Option<PathBuf>,
-    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model
-    #[arg(long, value_name = "PATH")]
-    scene: PathBuf,
+    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    #[arg(long, value_name = "PATH", group = "photos")]
+    scene: Option<PathBuf>,
+    /// The data set: a folder of chunks with an index.json, one with such a folder named test, or one of captures
+    #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
+    data: Option<PathBuf>,
+    /// Which frames of its scenes are shown and asked for; may be given more than once
+    #[arg(long, value_name = "FILE.json", requires = "data")]
+    index: Vec<PathBuf>,
+    /// Folder for the report and the scores
+    #[arg(long, value_name = "DIR", requires = "data")]
+    out: Option<PathBuf>,
+    /// How the report calls what is scored; by default as its file or folder
+    #[arg(long, requires = "data")]
+    name: Option<String>,
     /// Views the model is asked for: every:N or every:N+K; by default as it was trained
-    #[arg(long, value_name = "WHICH", requires = "weights")]
+    #[arg(long, value_name = "WHICH", requires_all = ["weights", "scene"])]
     holdout: Option<String>,
     /// Also write a picture: photo, render and depth side by side, a row per view
-    #[arg(long, value_name = "FILE.png", conflicts_with = "renders")]
+    #[arg(long, value_name = "FILE.png", conflicts_with = "renders", requires = "scene")]
     sheet: Option<PathBuf>,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
@@ -48,16 +70,23 @@ pub struct Eval {
 impl Eval {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
+        match &self.scene {
+            Some(scene) => self.run_scene(scene, device),
+            None => self.run_dataset(device),
+        }
+    }
+
+    fn run_scene(&self, scene: &Path, device: Device) -> Result<()> {
         if let Some(sheet) = &self.sheet {
             check_writable_file(sheet)?;
         }
-        let capture = open_capture(&self.scene)?;
+        let capture = open_capture(scene)?;
         let (mut scores, views, pictures, rendered) = if let Some(path) = &self.splat {
             with_pictures(score_splat(&read_ply(path)?.gaussians, &capture)?)
         } else if let Some(path) = &self.weights {
             let loaded = load_model(path, device)?;
             let holdout = match &self.holdout {
-                Some(text) => text.parse::<Holdout>().map_err(globalsplat::Error::Request)?,
+                Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
                 None => loaded.config.data.holdout,
             };
             with_pictures(score_model(&loaded, &capture, holdout)?)
@@ -84,6 +113,134 @@ impl Eval {
         }
         Ok(())
     }
+}
+
+/// The data set's side of the command.
+impl Eval {
+    fn run_dataset(&self, device: Device) -> Result<()> {
+        let (Some(data), Some(out)) = (&self.data, &self.out) else { unreachable!("clap asks for both") };
+        let indices =
+            self.index.iter().map(|file| EvaluationIndex::read(file)).collect::<Result<Vec<_>, _>>()?;
+        let folders = folders(out, &indices)?;
+        let dataset = Dataset::open(data, Split::Test)?;
+        check_writable_dir(out)?;
+        let loaded = self.weights.as_ref().map(|path| load_model(path, device)).transpose()?;
+        let stop = stop_flag()?;
+
+        let mut evaluations = vec![];
+        for (index, folder) in indices.iter().zip(folders) {
+            let (subject, path) = match (&loaded, &self.weights, &self.splat, &self.renders) {
+                (Some(loaded), Some(path), ..) => (Subject::Model(loaded), path),
+                (.., Some(path), _) => (Subject::Splats(path.clone()), path),
+                (.., Some(path)) => (Subject::Renders(path.clone()), path),
+                _ => unreachable!("clap asks for one of the three"),
+            };
+            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let sweep = Sweep {
+                subject,
+                method: self.name.clone().unwrap_or(stem),
+                fingerprint: fingerprint(path)?,
+                dataset: &dataset,
+                index,
+                image_size: loaded
+                    .as_ref()
+                    .map_or(PROTOCOL_SIZE.into(), |loaded| loaded.config.data.image_size),
+                machine: machine(device)?,
+                out: &folder,
+            };
+            let bar = progress::bar(0, "scenes");
+            let evaluation = sweep.run(
+                || Perceptual::find(device),
+                |done, of| {
+                    bar.set_length(of as u64);
+                    bar.set_position(done as u64);
+                    !stop.load(Ordering::Relaxed)
+                },
+            )?;
+            bar.finish_and_clear();
+            if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
+                let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
+                eprintln!("{}", why.expect("a scene without a distance"));
+            }
+            write_evaluation(&folder, &evaluation)?;
+            write_csv(&folder.join("scores.csv"), &evaluation)?;
+            evaluations.push((folder, evaluation));
+        }
+        let report = out.join("report.html");
+        write_report(&report, &evaluations)?;
+        self.tell(&report, &evaluations)
+    }
+
+    fn tell(&self, report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
+        if self.json {
+            let summaries: Vec<_> = evaluations
+                .iter()
+                .map(|(folder, e)| {
+                    json!({
+                        "folder": folder, "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
+                        "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
+                        "efficiency": e.efficiency, "failures": e.failures,
+                    })
+                })
+                .collect();
+            print_json(&json!({ "report": report, "evaluations": summaries }));
+        } else {
+            for (_, e) in evaluations {
+                let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
+                println!(
+                    "{}, {} of {} scenes: PSNR {:.2}, SSIM {:.4}, LPIPS-VGG {}, LPIPS-Alex {}",
+                    e.index,
+                    e.scenes.len(),
+                    e.indexed_scenes,
+                    e.summary.psnr,
+                    e.summary.ssim,
+                    shown(e.summary.lpips_vgg),
+                    shown(e.summary.lpips_alex)
+                );
+            }
+            println!("{}", report.display());
+        }
+        let failures: Vec<_> = evaluations.iter().flat_map(|(_, e)| &e.failures).collect();
+        for failure in &failures {
+            eprintln!("{}: {}", failure.scene, failure.error);
+        }
+        match failures.len() {
+            0 => Ok(()),
+            count => {
+                Err(Error::Failed(format!("{count} scenes could not be scored, the means are of the others"))
+                    .into())
+            }
+        }
+    }
+}
+
+/// [height, width] of the protocol's pictures (SPEC section 9).
+const PROTOCOL_SIZE: [u32; 2] = [256, 256];
+
+/// Where each index's scores go: into `out` itself where there is one alone.
+fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
+    let stem = |index: &EvaluationIndex| out.join(index.file.file_stem().unwrap_or_default());
+    let folders: Vec<_> = match indices {
+        [_] => vec![out.to_owned()],
+        several => several.iter().map(stem).collect(),
+    };
+    match folders.iter().enumerate().find(|(i, folder)| folders[..*i].contains(folder)) {
+        Some((_, twice)) => Err(Error::Request(format!(
+            "--index: two of them would go to {}, expected other names",
+            twice.display()
+        ))
+        .into()),
+        None => Ok(folders),
+    }
+}
+
+/// Tells this file, or folder, from others.
+fn fingerprint(path: &Path) -> Result<String> {
+    if path.is_dir() {
+        return Ok(path.canonicalize()?.display().to_string());
+    }
+    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    Ok(format!("{} {:08x}", path.file_name().unwrap_or_default().display(), crc32fast::hash(&bytes)))
 }
 
 type Scored = (CaptureScores, Vec<View>, Vec<Rendered>);

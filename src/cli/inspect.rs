@@ -1,18 +1,18 @@
 use super::print_json;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
+use globalsplat::data::{Chunk, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{CONFIG_KEY, read_ply, read_weights};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
-/// Tell what is in a splat, a weights file or a capture.
+/// Tell what is in a splat, a weights file, a chunk or a capture.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat inspect room.ply")]
 pub struct Inspect {
-    /// A .ply, a .safetensors, or a capture
+    /// A .ply, a .safetensors, a .torch, or a capture
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
     /// Print it as one JSON object
@@ -25,11 +25,11 @@ impl Inspect {
         let object = match self.path.extension().and_then(|e| e.to_str()) {
             Some("ply") => splat(&self.path)?,
             Some("safetensors") => weights(&self.path)?,
-            _ if self.path.is_dir() || self.path.extension().is_some_and(|e| e == "json") => {
-                capture(&self.path)?
-            }
+            Some("torch") => chunk(&self.path)?,
+            Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
+            _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
-                let expected = "a .ply, a .safetensors or a capture's folder";
+                let expected = "a .ply, a .safetensors, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
             }
         };
@@ -88,6 +88,20 @@ fn weights(path: &Path) -> Result<Value> {
         "types": kinds,
         "bytes": std::fs::metadata(path)?.len(),
         "configuration": weights.metadata.get(CONFIG_KEY),
+    }))
+}
+
+fn chunk(path: &Path) -> Result<Value> {
+    let chunk = Chunk::read(path)?;
+    let mut scenes = serde_json::Map::new();
+    for key in chunk.keys() {
+        scenes.insert(key.into(), chunk.capture(key)?.len().into());
+    }
+    Ok(json!({
+        "kind": "chunk",
+        "bytes": std::fs::metadata(path)?.len(),
+        "scenes": scenes.len(),
+        "views": scenes,
     }))
 }
 

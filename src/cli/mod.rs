@@ -9,10 +9,12 @@ mod doctor;
 mod eval;
 mod export;
 mod inspect;
+mod pack;
 mod parity;
 mod progress;
 mod reconstruct;
 mod render;
+mod report;
 mod synth;
 mod train;
 
@@ -21,6 +23,8 @@ use globalsplat::Error;
 use globalsplat::data::ImageSize;
 use std::panic;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 const DONE: u8 = 0;
 const FAILED: u8 = 1;
@@ -38,10 +42,12 @@ struct Cli {
 enum Command {
     Train(train::Train),
     Eval(eval::Eval),
+    Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
     Render(render::Render),
     Export(export::Export),
     Synth(synth::Synth),
+    Pack(pack::Pack),
     Inspect(inspect::Inspect),
     Bench(bench::Bench),
     Doctor(doctor::Doctor),
@@ -64,10 +70,12 @@ pub fn main() -> ExitCode {
     let result = panic::catch_unwind(|| match cli.command {
         Command::Train(command) => command.run(),
         Command::Eval(command) => command.run(),
+        Command::Report(command) => command.run(),
         Command::Reconstruct(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Synth(command) => command.run(),
+        Command::Pack(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Doctor(command) => command.run(),
@@ -101,6 +109,14 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
         _ => Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
     }
+}
+
+/// Becomes true when the user or the system asks the program to stop.
+fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
+    Ok(stop)
 }
 
 /// Prints a result as one JSON object.

@@ -1,4 +1,4 @@
-use super::{device, print_json, progress};
+use super::{device, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -10,7 +10,7 @@ use globalsplat::train::{Outcome, Resume, Trainer, run};
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Instant;
 use tch::Device;
 
@@ -83,9 +83,7 @@ impl Train {
     }
 
     fn train(&self, config: &Config, trainer: &mut Trainer, resume: &Resume) -> Result<Outcome> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let handler = stop.clone();
-        ctrlc::set_handler(move || handler.store(true, Ordering::Relaxed))?;
+        let stop = stop_flag()?;
         let bar = progress::bar(config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut first = true;

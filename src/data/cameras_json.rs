@@ -1,6 +1,6 @@
 //! `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}.
 
-use super::capture::{Capture, Frame, check_cameras, folder_name};
+use super::capture::{Capture, Frame, Photo, check_cameras, folder_name};
 use super::distortion::Distortion;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
@@ -46,7 +46,12 @@ pub(super) fn read(file: &Path) -> Result<Capture> {
                 expected,
             ));
         }
-        frames.push(Frame { image, name: view.image, camera, distortion: Distortion::default() });
+        frames.push(Frame {
+            photo: Photo::File(image),
+            name: view.image,
+            camera,
+            distortion: Distortion::default(),
+        });
     }
     Capture::new(folder_name(root), file.to_owned(), frames)
 }

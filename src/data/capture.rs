@@ -1,21 +1,22 @@
 //! A capture: what every format on disk is read into.
 
+use super::chunk::{self, Chunk, EncodedPhoto};
 use super::distortion::Distortion;
 use super::planes::Planes;
 use super::preprocess::{ImageSize, fit};
 use super::{cameras_json, colmap, transforms_json};
 use crate::error::{Error, Result};
-use crate::io::read_photo;
+use crate::io;
 use crate::scene::{Camera, check_pose};
 use image::RgbImage;
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
 /// A view without its pixels.
 #[derive(Debug, Clone)]
 pub(super) struct Frame {
-    /// The image file.
-    pub image: PathBuf,
+    pub photo: Photo,
     /// As the capture names the image.
     pub name: String,
     /// At the size of the file; a pinhole camera, which the image is once `distortion` is removed.
@@ -24,10 +25,35 @@ pub(super) struct Frame {
     pub distortion: Distortion,
 }
 
+/// Where a view's encoded image is.
+#[derive(Debug, Clone)]
+pub(super) enum Photo {
+    /// An image file.
+    File(PathBuf),
+    /// A part of a chunk, and how errors call it.
+    Encoded(EncodedPhoto, PathBuf),
+}
+
+impl Photo {
+    /// As errors call it.
+    fn file(&self) -> &Path {
+        match self {
+            Photo::File(path) | Photo::Encoded(_, path) => path,
+        }
+    }
+
+    fn read(&self) -> Result<Cow<'_, [u8]>> {
+        match self {
+            Photo::File(path) => Ok(std::fs::read(path).map_err(Error::read(path))?.into()),
+            Photo::Encoded(photo, _) => Ok(photo.bytes().into()),
+        }
+    }
+}
+
 /// Posed photos of one scene. The images are read when they are asked for.
 #[derive(Debug, Clone)]
 pub struct Capture {
-    /// The folder's name.
+    /// The folder's name, or the key in a chunk.
     pub name: String,
     file: PathBuf,
     frames: Vec<Frame>,
@@ -45,21 +71,30 @@ pub struct View {
 }
 
 /// What is expected where nothing known is found.
-const KNOWN: &str = "a cameras.json, a transforms.json or a COLMAP model (sparse/0) in it";
+const KNOWN: &str =
+    "a cameras.json, a transforms.json or a COLMAP model (sparse/0) in it, or a CHUNK.torch#KEY";
 
 /// What a capture is read from.
 enum Source {
     CamerasJson(PathBuf),
     TransformsJson(PathBuf),
     Colmap(colmap::Model),
+    /// A chunk, and which of its scenes.
+    Chunk(PathBuf, Option<String>),
 }
 
 /// The capture at `path`, a folder or the file that describes it; of several in a folder, the first of
 /// [`open_capture`]'s list.
 fn recognize(path: &Path) -> Option<Source> {
+    if let Some((file, key)) = path.to_str().and_then(|path| path.rsplit_once('#'))
+        && is_chunk(Path::new(file))
+    {
+        return Some(Source::Chunk(file.into(), Some(key.into())));
+    }
     if path.is_file() {
         let name = path.file_name()?.to_str()?;
         return match name {
+            _ if is_chunk(path) => Some(Source::Chunk(path.to_owned(), None)),
             cameras_json::FILE_NAME => Some(Source::CamerasJson(path.to_owned())),
             _ if name.starts_with("transforms") && name.ends_with(".json") => {
                 Some(Source::TransformsJson(path.to_owned()))
@@ -74,26 +109,35 @@ fn recognize(path: &Path) -> Option<Source> {
         .or_else(|| colmap::Model::find(path).map(Source::Colmap))
 }
 
+/// Whether `path` is a file of scenes, by its name.
+fn is_chunk(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == chunk::EXTENSION) && path.is_file()
+}
+
 /// Opens whatever capture is at `path`; the format is recognized by what is on disk. In this order:
 ///
 /// 1. a folder with a `cameras.json`, or that file;
 /// 2. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named
 ///    `transforms_train.json` and the like;
 /// 3. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `dense/0/sparse`, `dense/sparse` or the folder
-///    itself, and the photos in `images` beside it.
+///    itself, and the photos in `images` beside it;
+/// 4. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk; `CHUNK.torch` where it has one alone.
 ///
 /// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
 ///
 /// # Errors
 /// Nothing that is known there, or a capture that breaks its format's rules.
 pub fn open_capture(path: &Path) -> Result<Capture> {
-    if !path.exists() {
+    let source = recognize(path);
+    if source.is_none() && !path.exists() {
         return Err(Error::Request(format!("{}: no such capture", path.display())));
     }
-    match recognize(path) {
+    match source {
         Some(Source::CamerasJson(file)) => cameras_json::read(&file),
         Some(Source::TransformsJson(file)) => transforms_json::read(&file),
         Some(Source::Colmap(model)) => colmap::read(path, &model),
+        Some(Source::Chunk(file, Some(key))) => Chunk::read(&file)?.capture(&key),
+        Some(Source::Chunk(file, None)) => Chunk::read(&file)?.only_capture(),
         None => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
     }
 }
@@ -121,18 +165,19 @@ const DEPTH: usize = 2;
 /// # Errors
 /// A folder that can't be read or holds no capture.
 pub fn find_captures(path: &Path) -> Result<Vec<Capture>> {
+    capture_folders(path)?.iter().map(|folder| open_capture(folder)).collect()
+}
+
+/// Where [`find_captures`] finds them.
+pub(super) fn capture_folders(path: &Path) -> Result<Vec<PathBuf>> {
     let mut folders = vec![];
     collect_folders(path, DEPTH, &mut folders)?;
     if folders.is_empty() {
-        return Err(Error::input(
-            path,
-            "the folder",
-            "without captures",
-            format!("{KNOWN} or in folders below it"),
-        ));
+        let expected = format!("{KNOWN} or in folders below it");
+        return Err(Error::input(path, "the folder", "without captures", expected));
     }
     folders.sort();
-    folders.iter().map(|folder| open_capture(folder)).collect()
+    Ok(folders)
 }
 
 fn collect_folders(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<()> {
@@ -218,18 +263,32 @@ impl Capture {
     }
 
     fn read_photo(&self, frame: &Frame) -> Result<RgbImage> {
-        let Camera { width, height, intrinsics, .. } = frame.camera;
-        let image = read_photo(&frame.image, (width, height))?;
-        if image.dimensions() != (width, height) {
-            let found = format!("{}×{} pixels", image.width(), image.height());
-            return Err(Error::input(
-                &frame.image,
-                "the image",
-                found,
-                format!("{width}×{height} as in {}", self.file.display()),
-            ));
+        let photo = self.decode(frame, &frame.photo.read()?)?;
+        Ok(frame.distortion.remove(photo.pixels, &frame.camera.intrinsics))
+    }
+
+    fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<io::Photo> {
+        let Camera { width, height, .. } = frame.camera;
+        let photo = io::decode_photo(encoded, frame.photo.file(), (width, height))?;
+        if photo.pixels.dimensions() == (width, height) {
+            return Ok(photo);
         }
-        Ok(frame.distortion.remove(image, &intrinsics))
+        let found = format!("{}×{} pixels", photo.pixels.width(), photo.pixels.height());
+        let expected = format!("{width}×{height} as in {}", self.file.display());
+        Err(Error::input(frame.photo.file(), "the image", found, expected))
+    }
+
+    /// The image file of view `index` as a pinhole camera would have written it: its own bytes where it is 8-bit RGB, upright
+    /// and free of distortion.
+    pub(super) fn encoded(&self, index: usize) -> Result<Vec<u8>> {
+        let frame = &self.frames[index];
+        let bytes = frame.photo.read()?;
+        let photo = self.decode(frame, &bytes)?;
+        if photo.as_stored && frame.distortion == Distortion::default() {
+            return Ok(bytes.into_owned());
+        }
+        let pixels = frame.distortion.remove(photo.pixels, &frame.camera.intrinsics);
+        io::encode_photo(&pixels, photo.is_jpeg)
     }
 }
 

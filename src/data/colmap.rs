@@ -1,7 +1,7 @@
 //! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. Pixel
 //! (0, 0) has its centre at (½, ½), as everywhere here. The points are not needed.
 
-use super::capture::{Capture, Frame, folder_name};
+use super::capture::{Capture, Frame, Photo, folder_name};
 use super::distortion::Distortion;
 use crate::error::{Error, Result};
 use crate::scene::{Camera, Intrinsics};
@@ -122,7 +122,7 @@ pub(super) fn read(folder: &Path, model: &Model) -> Result<Capture> {
         let inverse = rotation.normalize().conjugate();
         let c2w = DMat4::from_rotation_translation(inverse, -(inverse * translation));
         let camera = Camera { c2w, ..*camera };
-        frames.push(Frame { image: photo, name: image.name, camera, distortion: *distortion });
+        frames.push(Frame { photo: Photo::File(photo), name: image.name, camera, distortion: *distortion });
     }
     frames.sort_by(|a, b| a.name.cmp(&b.name));
     Capture::new(folder_name(folder), model.images.clone(), frames)

@@ -3,7 +3,7 @@
 //! and `camera_angle_y` in radians, and the distortion `k1` to `k4`, `p1`, `p2`.
 
 use super::cameras_json::null_for_not_a_number;
-use super::capture::{Capture, Frame, folder_name};
+use super::capture::{Capture, Frame, Photo, folder_name};
 use super::distortion::Distortion;
 use crate::error::{Error, Result};
 use crate::io::read_image_size;
@@ -142,7 +142,7 @@ impl<'a> Fields<'a> {
         let intrinsics = camera.intrinsics.check(width, height);
         intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
         distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
-        Ok(Frame { image, name: name.to_string(), camera, distortion })
+        Ok(Frame { photo: Photo::File(image), name: name.to_string(), camera, distortion })
     }
 
     /// A focal length that isn't given follows from the angle of view, and else equals that of the other axis; a principal

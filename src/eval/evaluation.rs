@@ -52,7 +52,7 @@ pub struct Summary {
 /// What reconstructing a scene costs.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Efficiency {
-    /// Mean seconds of the forward pass from views in memory to Gaussians; the first scene's is discarded where there are
+    /// Mean seconds of the forward pass from views in memory to Gaussians, without scenes that warmed up, where there are
     /// others.
     pub forward_seconds: f64,
     /// Scenes that the mean is of.
@@ -76,10 +76,16 @@ pub struct SceneScores {
     pub context: Vec<usize>,
     /// Frames that were asked for.
     pub target: Vec<usize>,
+    /// Size of the splat as a PLY, where there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub splat_bytes: Option<u64>,
     /// Of the forward pass, where a model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_seconds: Option<f64>,
-    /// The largest resident size of the process up to then, in bytes, where a model was run.
+    /// Whether the scene was the process's first, whose time includes that of warming up.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub warm_up: bool,
+    /// The largest resident size of the process up to then, in bytes, where a model was run and nothing else yet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_memory_bytes: Option<u64>,
 }
@@ -107,5 +113,23 @@ impl Summary {
             lpips_alex: mean(&|s| s.lpips_alex),
             gaussians: mean(&|s| s.gaussians.map(|n| n as f64)),
         }
+    }
+}
+
+/// What a scene's files are called, before the ending: its name with `_` for everything that a file system, a shell or a
+/// web page could read as more than a name.
+pub fn scene_file_name(scene: &str) -> String {
+    let harmless = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
+    scene.chars().map(|c| if harmless(c) { c } else { '_' }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn odd_scene_names_make_plain_file_names() {
+        assert_eq!(scene_file_name("a0-B_9.x"), "a0-B_9.x");
+        assert_eq!(scene_file_name("../up/<b>é \n"), ".._up__b____");
     }
 }

@@ -1,7 +1,7 @@
 //! Pictures against photos, view by view.
 
 use super::metrics::{psnr, ssim};
-use super::reconstruct::reconstruct;
+use super::reconstruct::{Reconstruction, reconstruct};
 use crate::data::{Capture, Holdout, View};
 use crate::error::{Error, Result};
 use crate::io::{LoadedModel, read_image, tensor_from_rgb};
@@ -125,8 +125,7 @@ pub fn score_splat(
 ) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
     let views = capture.load_all(None)?;
     let rendered = render_views(gaussians, &capture.cameras())?;
-    let pictures: Vec<Tensor> = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
-    let scores = score(&capture.name, &pictures, &views, Some(gaussians.count()))?;
+    let scores = score(&capture.name, &colours(&rendered), &views, Some(gaussians.count()))?;
     Ok((scores, views, rendered))
 }
 
@@ -140,17 +139,29 @@ pub fn score_model(
     holdout: Holdout,
 ) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
     let (context, held_out) = load_split(capture, holdout, loaded)?;
-    let poses: Vec<_> = held_out.iter().map(|view| view.camera.c2w).collect();
-    let reconstruction = reconstruct(loaded, &context, &poses)?;
-    let cameras: Vec<Camera> = held_out
-        .iter()
-        .zip(&reconstruction.target_poses)
-        .map(|(view, &c2w)| Camera { c2w, ..view.camera })
-        .collect();
-    let rendered = render_views(&reconstruction.gaussians, &cameras)?;
-    let pictures: Vec<Tensor> = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
-    let scores = score(&capture.name, &pictures, &held_out, Some(reconstruction.gaussians.count()))?;
+    let (reconstruction, rendered) = ask(loaded, &context, &held_out)?;
+    let count = reconstruction.gaussians.count();
+    let scores = score(&capture.name, &colours(&rendered), &held_out, Some(count))?;
     Ok((scores, held_out, rendered))
+}
+
+/// What a model that sees `context` takes the cameras of `target` to see.
+pub(super) fn ask(
+    loaded: &LoadedModel,
+    context: &[View],
+    target: &[View],
+) -> Result<(Reconstruction, Vec<Rendered>)> {
+    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
+    let reconstruction = reconstruct(loaded, context, &poses)?;
+    let normalized = target.iter().zip(&reconstruction.target_poses);
+    let cameras: Vec<Camera> = normalized.map(|(view, &c2w)| Camera { c2w, ..view.camera }).collect();
+    let rendered = render_views(&reconstruction.gaussians, &cameras)?;
+    Ok((reconstruction, rendered))
+}
+
+/// [3, H, W] each.
+pub(super) fn colours(rendered: &[Rendered]) -> Vec<Tensor> {
+    rendered.iter().map(|rendered| rendered.rgb.shallow_clone()).collect()
 }
 
 /// What answering with the context photo taken nearest (by camera centre) would score for the held-out views.
@@ -178,22 +189,23 @@ pub fn nearest_context_baseline(
 /// A picture that is missing or has another size.
 pub fn score_renders(folder: &Path, capture: &Capture) -> Result<(CaptureScores, Vec<View>, Vec<Tensor>)> {
     let views = capture.load_all(None)?;
-    let mut pictures = vec![];
-    for view in &views {
-        let stem = Path::new(&view.name).file_stem().unwrap_or_default();
-        let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(stem).with_extension(ending));
-        let Some(path) = candidates.iter().find(|path| path.is_file()) else {
-            return Err(Error::input(
-                folder,
-                format!("the picture for {}", view.name),
-                "absent",
-                candidates[0].display().to_string(),
-            ));
-        };
-        pictures.push(tensor_from_rgb(&read_image(path)?));
-    }
+    let stem =
+        |view: &View| Path::new(&view.name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let pictures = views.iter().map(|view| read_picture(folder, &stem(view))).collect::<Result<Vec<_>>>()?;
     let scores = score(&capture.name, &pictures, &views, None)?;
     Ok((scores, views, pictures))
+}
+
+/// The picture `name` in `folder`, whatever its ending, [3, H, W].
+pub(super) fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
+    let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(format!("{name}.{ending}")));
+    match candidates.iter().find(|path| path.is_file()) {
+        Some(path) => Ok(tensor_from_rgb(&read_image(path)?)),
+        None => {
+            let expected = candidates[0].display().to_string();
+            Err(Error::input(folder, format!("the picture for {name}"), "absent", expected))
+        }
+    }
 }
 
 fn load_split(capture: &Capture, holdout: Holdout, loaded: &LoadedModel) -> Result<(Vec<View>, Vec<View>)> {

@@ -2,8 +2,9 @@
 
 use super::write_atomically;
 use crate::error::{Error, Result};
+use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Rgb, RgbImage};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Rgb, RgbImage};
 use std::io::{BufReader, Cursor};
 use std::path::Path;
 use tch::{Kind, Tensor};
@@ -14,10 +15,23 @@ use tch::{Kind, Tensor};
 /// # Errors
 /// A file that is missing or can't be decoded.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
-    Ok(rgb_over_black(decode(path)?.0))
+    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    Ok(rgb_over_black(decode(&bytes, path)?.image))
 }
 
-/// Reads a photo whose capture declares it to be `size` = (width, height), as [`read_image`] does.
+/// A photo's pixels.
+#[derive(Debug)]
+pub struct Photo {
+    /// 8-bit RGB.
+    pub pixels: RgbImage,
+    /// Whether they are just what its file holds, not turned and not converted.
+    pub as_stored: bool,
+    /// Whether its file is a JPEG.
+    pub is_jpeg: bool,
+}
+
+/// Decodes the photo that `file` holds, `encoded`, whose capture declares it to be `size` = (width, height), as
+/// [`read_image`] does.
 ///
 /// Cameras turned on their side store the pixels as the sensor has them, and which way is up as EXIF orientation. Most tools
 /// that make captures, COLMAP among them, don't look at it, so their intrinsics refer to the pixels as stored; some turn the
@@ -26,8 +40,8 @@ pub fn read_image(path: &Path) -> Result<RgbImage> {
 ///
 /// # Errors
 /// As [`read_image`].
-pub fn read_photo(path: &Path, size: (u32, u32)) -> Result<RgbImage> {
-    let (mut image, orientation) = decode(path)?;
+pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Photo> {
+    let Decoded { mut image, orientation, format } = decode(encoded, file)?;
     let stored = (image.width(), image.height());
     let turned = match orientation {
         Orientation::Rotate90
@@ -36,10 +50,32 @@ pub fn read_photo(path: &Path, size: (u32, u32)) -> Result<RgbImage> {
         | Orientation::Rotate270FlipH => (stored.1, stored.0),
         _ => stored,
     };
-    if stored != size && turned == size {
+    let turn = stored != size && turned == size;
+    if turn {
         image.apply_orientation(orientation);
     }
-    Ok(rgb_over_black(image))
+    let as_stored = !turn && matches!(image, DynamicImage::ImageRgb8(_));
+    Ok(Photo { pixels: rgb_over_black(image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
+}
+
+/// A photo as a JPEG of high quality, or as a PNG.
+///
+/// # Errors
+/// A size that the format doesn't know.
+pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
+    const QUALITY: u8 = 95;
+    let mut bytes = Cursor::new(vec![]);
+    let encoded = match as_jpeg {
+        true => pixels.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY)),
+        false => pixels.write_to(&mut bytes, ImageFormat::Png),
+    };
+    encoded.map_err(|e| Error::Failed(format!("an image can't be encoded: {e}")))?;
+    Ok(bytes.into_inner())
+}
+
+/// As [`read_image_size`], of an image in memory; `None` for what is no image.
+pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
+    ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok()
 }
 
 /// (width, height) of the pixels as stored, from the image's header alone.
@@ -52,13 +88,28 @@ pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(undecodable(path))
 }
 
-fn decode(path: &Path) -> Result<(DynamicImage, Orientation)> {
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(Error::read(path))?;
-    let mut decoder = reader.into_decoder().map_err(undecodable(path))?;
+struct Decoded {
+    image: DynamicImage,
+    orientation: Orientation,
+    format: Option<ImageFormat>,
+}
+
+fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
+    let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
+    let format = reader.format();
+    let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
+    // A few bytes can claim any size.
+    let limits = Limits::default();
+    limits.check_dimensions(decoder.dimensions().0, decoder.dimensions().1).map_err(undecodable(file))?;
+    if decoder.total_bytes() > limits.max_alloc.unwrap_or(u64::MAX) {
+        let (width, height) = decoder.dimensions();
+        return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
+    }
+    decoder.set_limits(limits).map_err(undecodable(file))?;
     // EXIF that can't be read is no reason to refuse the pixels.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    Ok((DynamicImage::from_decoder(decoder).map_err(undecodable(path))?, orientation))
+    let image = DynamicImage::from_decoder(decoder).map_err(undecodable(file))?;
+    Ok(Decoded { image, orientation, format })
 }
 
 fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
@@ -106,12 +157,20 @@ pub(super) fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
 /// # Errors
 /// The system's refusal to write.
 pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
-    let image = rgb_from_tensor(picture)?;
-    let mut bytes = Cursor::new(vec![]);
-    image
-        .write_to(&mut bytes, ImageFormat::Png)
-        .map_err(|e| Error::Failed(format!("{}: the image can't be encoded: {e}", path.display())))?;
-    write_atomically(path, |writer| writer.write_all(bytes.get_ref()).map_err(Error::write(path)))
+    write_picture(path, picture, false)
+}
+
+/// As [`write_png`], in fewer bytes and not quite the same.
+///
+/// # Errors
+/// As there.
+pub fn write_jpeg(path: &Path, picture: &Tensor) -> Result<()> {
+    write_picture(path, picture, true)
+}
+
+fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
+    let bytes = encode_photo(&rgb_from_tensor(picture)?, as_jpeg)?;
+    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
 /// Depth [H, W] as colours [3, H, W]: near is bright, far dark, by inverse depth between the picture's own 2nd and 98th

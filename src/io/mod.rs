@@ -11,10 +11,10 @@ mod weights;
 pub use atomic::{check_writable_dir, check_writable_file, replace_dir, write_atomically};
 pub use film::write_film;
 pub use images::{
-    colourize_depth, enlarge, read_image, read_image_size, read_photo, tensor_from_rgb, tile_horizontally,
-    tile_vertically, write_png,
+    Photo, colourize_depth, decode_photo, encode_photo, encoded_image_size, enlarge, read_image,
+    read_image_size, tensor_from_rgb, tile_horizontally, tile_vertically, write_jpeg, write_png,
 };
 pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, load_model, save_model};
-pub use ply::{Ply, read_ply, write_ply};
+pub use ply::{Ply, ply_size, read_ply, write_ply};
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
 pub use weights::{Weights, read_weights, write_weights};

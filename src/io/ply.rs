@@ -121,6 +121,16 @@ pub fn write_ply(path: &Path, gaussians: &Gaussians) -> Result<()> {
         return Err(Error::Failed(format!("{}: the splat has numbers that aren't finite", path.display())));
     }
 
+    let header = header(n, bases);
+    let values = Vec::<f32>::try_from(table.flatten(0, 1))?;
+    write_atomically(path, |writer| {
+        writer.write_all(header.as_bytes()).map_err(Error::write(path))?;
+        values.iter().try_for_each(|v| writer.write_all(&v.to_le_bytes())).map_err(Error::write(path))
+    })
+}
+
+/// What [`write_ply`] writes before the numbers of `n` Gaussians with `bases` spherical harmonics.
+fn header(n: i64, bases: i64) -> String {
     let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(String::from).into();
     let mut numbered = |prefix: &str, count: i64| names.extend((0..count).map(|k| format!("{prefix}{k}")));
     numbered("f_dc_", 3);
@@ -134,12 +144,15 @@ pub fn write_ply(path: &Path, gaussians: &Gaussians) -> Result<()> {
         header.push_str(&format!("property float {name}\n"));
     }
     header.push_str("end_header\n");
+    header
+}
 
-    let values = Vec::<f32>::try_from(table.flatten(0, 1))?;
-    write_atomically(path, |writer| {
-        writer.write_all(header.as_bytes()).map_err(Error::write(path))?;
-        values.iter().try_for_each(|v| writer.write_all(&v.to_le_bytes())).map_err(Error::write(path))
-    })
+/// Bytes of the file that [`write_ply`] would write.
+pub fn ply_size(gaussians: &Gaussians) -> u64 {
+    /// Position, normal, opacity, scale and rotation.
+    const NUMBERS: i64 = 14;
+    let (n, bases) = (gaussians.count(), gaussians.sh.size()[2]);
+    header(n, bases).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64
 }
 
 /// A number type of the PLY format.

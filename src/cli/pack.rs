@@ -1,0 +1,60 @@
+use super::{print_json, progress};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::data::{ChunkWriter, find_captures};
+use globalsplat::error::Error;
+use globalsplat::io::check_writable_dir;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Pack captures into the chunks that RealEstate10K, ACID and DL3DV come in.
+///
+/// The folder gets an index.json and files that Python's torch.load reads. JPEG and PNG photos are taken bit for bit, unless
+/// lens distortion has to be removed.
+#[derive(Args)]
+#[command(after_help = "Example:\n  globalsplat pack captures/room captures/garden --out chunks/train")]
+pub struct Pack {
+    /// Captures of any format, or folders of captures
+    #[arg(value_name = "SCENE", required = true)]
+    scenes: Vec<PathBuf>,
+    /// Folder for index.json, 000000.torch, …
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Megabytes of photos in a chunk, about
+    #[arg(long, value_name = "MB", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=2000))]
+    chunk_size: u32,
+    /// Print what was written as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Pack {
+    pub fn run(self) -> Result<()> {
+        let mut captures = vec![];
+        for scene in &self.scenes {
+            if !scene.exists() && !scene.to_string_lossy().contains('#') {
+                return Err(Error::Request(format!("{}: no such capture", scene.display())).into());
+            }
+            captures.extend(find_captures(scene)?);
+        }
+        check_writable_dir(&self.out)?;
+        let mut writer = ChunkWriter::new(&self.out, self.chunk_size as usize * 1_000_000)?;
+        let bar = progress::bar(captures.len() as u64, "scenes");
+        let mut views = 0;
+        for capture in &captures {
+            writer.add(capture)?;
+            views += capture.len();
+            bar.inc(1);
+        }
+        let chunks = writer.finish()?;
+        bar.finish_and_clear();
+        if self.json {
+            print_json(
+                &json!({ "out": self.out, "scenes": captures.len(), "views": views, "chunks": chunks }),
+            );
+        } else {
+            println!("{}: {} scenes, {views} views in {chunks} chunks", self.out.display(), captures.len());
+        }
+        Ok(())
+    }
+}

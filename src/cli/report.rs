@@ -1,0 +1,55 @@
+use super::print_json;
+use anyhow::Result;
+use clap::Args;
+use globalsplat::eval::{read_evaluation, write_report};
+use globalsplat::io::check_writable_file;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Show evaluations beside what the paper published: one HTML page, pictures and plots included.
+#[derive(Args)]
+#[command(
+    after_help = "Example:\n  globalsplat report runs/mine/eval_24 runs/other/eval_24 --out report.html"
+)]
+pub struct Report {
+    /// Folders that `globalsplat eval --out` wrote
+    #[arg(value_name = "DIR", required = true)]
+    folders: Vec<PathBuf>,
+    /// The page
+    #[arg(long, value_name = "FILE.html")]
+    out: PathBuf,
+    /// Print what the page shows as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Report {
+    pub fn run(self) -> Result<()> {
+        check_writable_file(&self.out)?;
+        let mut evaluations = vec![];
+        for folder in self.folders {
+            let evaluation = read_evaluation(&folder)?;
+            evaluations.push((folder, evaluation));
+        }
+        write_report(&self.out, &evaluations)?;
+        let bytes = std::fs::metadata(&self.out)?.len();
+        if self.json {
+            let shown = evaluations.iter().map(|(folder, evaluation)| {
+                json!({
+                    "folder": folder.display().to_string(),
+                    "method": evaluation.method,
+                    "dataset": evaluation.dataset,
+                    "context_views": evaluation.context_views,
+                    "scenes": evaluation.scenes.len(),
+                    "failures": evaluation.failures.len(),
+                    "summary": evaluation.summary,
+                })
+            });
+            let shown: Vec<_> = shown.collect();
+            print_json(&json!({"out": self.out.display().to_string(), "bytes": bytes, "evaluations": shown}));
+        } else {
+            println!("{}", self.out.display());
+        }
+        Ok(())
+    }
+}

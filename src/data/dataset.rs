@@ -1,0 +1,146 @@
+//! Data sets: many captures under one name.
+
+use super::capture::{Capture, capture_folders, folder_name, open_capture};
+use super::chunk::{Chunk, INDEX_FILE};
+use crate::error::{Error, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The part of a data set that a model learns from, or the one it is judged by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// The folder `train`.
+    Train,
+    /// The folder `test`.
+    Test,
+}
+
+impl Split {
+    fn folder(self) -> &'static str {
+        match self {
+            Split::Train => "train",
+            Split::Test => "test",
+        }
+    }
+}
+
+/// Captures that are read from disk together, and their names.
+#[derive(Debug, Clone)]
+pub struct SceneGroup {
+    /// A chunk, or a capture's folder.
+    path: PathBuf,
+    is_chunk: bool,
+    /// Which of a chunk's scenes belong to the data set; a folder's own name.
+    pub keys: Vec<String>,
+}
+
+/// The captures of one split, which are found now and read later.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    /// The folder's name.
+    pub name: String,
+    groups: Vec<SceneGroup>,
+}
+
+/// A group in memory, images still encoded.
+#[derive(Debug, Clone)]
+pub enum OpenGroup {
+    /// Scenes of a chunk.
+    Chunk(Chunk),
+    /// A capture of another format.
+    Capture(Box<Capture>),
+}
+
+impl Dataset {
+    /// The data set at `root`: a folder of chunks with an `index.json`, {key: chunk}, or one with such folders named `train`
+    /// and `test`, of which `split` is taken; else every capture in it, as by [`super::find_captures`].
+    ///
+    /// # Errors
+    /// Nothing of that kind there, or an index that is no such object. Chunks that the index names are looked for when they
+    /// are opened.
+    pub fn open(root: &Path, split: Split) -> Result<Self> {
+        let name = folder_name(root);
+        let indexed =
+            [root.to_owned(), root.join(split.folder())].into_iter().find(|f| f.join(INDEX_FILE).is_file());
+        let groups = match indexed {
+            Some(folder) => chunk_groups(&folder)?,
+            None => {
+                let part = Some(root.join(split.folder())).filter(|folder| folder.is_dir());
+                capture_groups(&part.unwrap_or(root.to_owned()))?
+            }
+        };
+        Ok(Dataset { name, groups })
+    }
+
+    /// Every group, in the order of their paths.
+    pub fn groups(&self) -> &[SceneGroup] {
+        &self.groups
+    }
+
+    /// The number of scenes.
+    pub fn scenes(&self) -> usize {
+        self.groups.iter().map(|group| group.keys.len()).sum()
+    }
+}
+
+impl SceneGroup {
+    /// Reads the group.
+    ///
+    /// # Errors
+    /// A chunk or capture that is missing or broken.
+    pub fn open(&self) -> Result<OpenGroup> {
+        match self.is_chunk {
+            true => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
+            false => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
+        }
+    }
+
+    /// The chunk, or the capture's folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl OpenGroup {
+    /// The scene `key`.
+    ///
+    /// # Errors
+    /// One that isn't there, or breaks what every capture has to hold.
+    pub fn capture(&self, key: &str) -> Result<Capture> {
+        match self {
+            OpenGroup::Chunk(chunk) => chunk.capture(key),
+            OpenGroup::Capture(capture) => Ok(Capture::clone(capture)),
+        }
+    }
+}
+
+fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
+    let file = folder.join(INDEX_FILE);
+    let text = std::fs::read(&file).map_err(Error::read(&file))?;
+    let index: BTreeMap<String, String> = serde_json::from_slice(&text).map_err(|e| {
+        Error::input(&file, "the index", format!("unusable ({e})"), "{scene: chunk's file name}")
+    })?;
+    let mut chunks: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for (key, chunk) in index {
+        let plain = Path::new(&chunk).file_name().is_some_and(|name| name == chunk.as_str());
+        if !plain {
+            return Err(Error::input(
+                &file,
+                format!("the chunk of {key}"),
+                chunk,
+                "the name of a file beside it",
+            ));
+        }
+        chunks.entry(chunk).or_default().push(key);
+    }
+    let group = |(chunk, keys)| SceneGroup { path: folder.join(chunk), is_chunk: true, keys };
+    Ok(chunks.into_iter().map(group).collect())
+}
+
+fn capture_groups(root: &Path) -> Result<Vec<SceneGroup>> {
+    let folders = capture_folders(root)?;
+    Ok(folders
+        .into_iter()
+        .map(|path| SceneGroup { keys: vec![folder_name(&path)], path, is_chunk: false })
+        .collect())
+}

@@ -1,0 +1,113 @@
+//! Evaluation indices: which frames of which scenes are shown, and which are asked for.
+
+use crate::error::{Error, Result};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The frames of one scene.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct SceneFrames {
+    /// Shown to the model.
+    pub context: Vec<usize>,
+    /// Asked for.
+    pub target: Vec<usize>,
+}
+
+/// The contents of an index file: {scene: {"context": [frames], "target": [frames]}}, where null stands for a scene that is
+/// left out.
+#[derive(Debug, Clone)]
+pub struct EvaluationIndex {
+    /// The file.
+    pub file: PathBuf,
+    /// By the scene's key.
+    pub scenes: BTreeMap<String, SceneFrames>,
+}
+
+impl EvaluationIndex {
+    /// Reads an index.
+    ///
+    /// # Errors
+    /// A file that can't be read, is no index, or has a scene with fewer than two context frames or no target.
+    pub fn read(file: &Path) -> Result<Self> {
+        let text = std::fs::read(file).map_err(Error::read(file))?;
+        let expected = "{scene: {\"context\": [frames], \"target\": [frames]} or null}";
+        let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_slice(&text)
+            .map_err(|e| Error::input(file, "the index", format!("unusable ({e})"), expected))?;
+        let scenes: BTreeMap<_, _> =
+            scenes.into_iter().filter_map(|(key, frames)| Some((key, frames?))).collect();
+        if scenes.is_empty() {
+            return Err(Error::input(file, "the index", "one without scenes", expected));
+        }
+        for (key, frames) in &scenes {
+            let (context, target) = (frames.context.len(), frames.target.len());
+            if context < 2 || target == 0 {
+                let found = format!("{context} context and {target} target frames");
+                return Err(Error::input(file, format!("scene {key}"), found, "2 and 1 at least"));
+            }
+        }
+        Ok(EvaluationIndex { file: file.to_owned(), scenes })
+    }
+
+    /// The file's name.
+    pub fn name(&self) -> String {
+        self.file.file_name().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// Context frames of a scene: of the first, as indices have as many for each.
+    pub fn context_views(&self) -> usize {
+        self.scenes.values().next().map_or(0, |frames| frames.context.len())
+    }
+
+    /// The frames of scene `key`, which has `count`.
+    ///
+    /// # Errors
+    /// A frame that isn't there.
+    pub(super) fn frames(&self, key: &str, count: usize) -> Result<&SceneFrames> {
+        let frames = &self.scenes[key];
+        match frames.context.iter().chain(&frames.target).find(|&&frame| frame >= count) {
+            None => Ok(frames),
+            Some(frame) => {
+                let expected = format!("one of the scene's {count}, 0 to {}", count.saturating_sub(1));
+                Err(Error::input(&self.file, format!("a frame of scene {key}"), frame, expected))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<EvaluationIndex> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        EvaluationIndex::read(file.path())
+    }
+
+    #[test]
+    fn null_scenes_are_left_out() {
+        let index = read(r#"{"b": null, "a": {"context": [3, 0], "target": [1], "overlap": 0.5}}"#).unwrap();
+        assert_eq!(index.scenes.keys().collect::<Vec<_>>(), ["a"]);
+        assert_eq!(index.frames("a", 4).unwrap().context, [3, 0]);
+        let error = index.frames("a", 3).unwrap_err().to_string();
+        assert!(error.contains("a frame of scene a is 3, expected one of the scene's 3, 0 to 2"), "{error}");
+    }
+
+    #[test]
+    fn what_is_no_index_is_refused() {
+        for (text, found) in [
+            ("{}", "one without scenes"),
+            ("{\"a\": null}", "one without scenes"),
+            ("[1]", "unusable"),
+            ("{\"a\": {\"context\": [1, -2], \"target\": [1]}}", "unusable"),
+            ("{\"a\": {\"context\": [1, 2.5], \"target\": [1]}}", "unusable"),
+            ("{\"a\": {\"context\": [1, 2]}}", "missing field `target`"),
+            ("{\"a\": {\"context\": [1], \"target\": [1]}}", "scene a is 1 context and 1 target frames"),
+            ("{\"a\": {\"context\": [1, 2], \"target\": []}}", "scene a is 2 context and 0 target frames"),
+        ] {
+            let error = read(text).unwrap_err().to_string();
+            assert!(error.contains(found), "{error}");
+        }
+    }
+}

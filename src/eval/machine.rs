@@ -1,0 +1,21 @@
+//! What the figures were measured on.
+
+use crate::error::Result;
+use crate::render::simd_level;
+use tch::Device;
+
+/// Processor, cores and device, as `Intel(R) Xeon(R), 2 cores, avx512`.
+///
+/// # Errors
+/// A SIMD level that is forced and not there.
+pub fn machine(device: Device) -> Result<String> {
+    let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let named = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    let processor = named.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let gpu = match device {
+        Device::Cpu => String::new(),
+        other => format!(", {other:?}"),
+    };
+    Ok(format!("{processor}, {cores} cores, {}{gpu}", simd_level()?))
+}

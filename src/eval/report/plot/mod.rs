@@ -1,0 +1,46 @@
+//! Plots as inline SVG. Colours come from the page's style sheet, so that they follow light and dark.
+
+mod axes;
+mod distribution;
+mod labels;
+mod quality_by_size;
+mod quality_by_views;
+
+pub use distribution::distributions;
+pub use quality_by_size::quality_by_size;
+pub use quality_by_views::quality_by_views;
+
+use super::subject::Subject;
+use super::table::swatch;
+use maud::{Markup, html};
+
+/// A plot's own pixels, which the page scales.
+const WIDTH: f64 = 500.;
+const HEIGHT: f64 = 340.;
+
+/// A figure: title, plot, legend. `about` tells what it shows to those who don't see it.
+fn figure(title: &str, about: &str, drawing: Markup, legend: Markup) -> Markup {
+    html! {
+        figure.plot {
+            figcaption { (title) }
+            div.scroll tabindex="0" role="region" aria-label=(title) {
+                svg role="img" aria-label=(about) viewBox={ "0 0 " (WIDTH) " " (HEIGHT) } { (drawing) }
+            }
+            ul.legend { (legend) }
+        }
+    }
+}
+
+/// What the colours stand for, of what is drawn.
+fn legend<'a>(published: bool, globalsplat: bool, measured: impl Iterator<Item = &'a Subject<'a>>) -> Markup {
+    html! {
+        @if published { li { span.swatch.published aria-hidden="true" {} "published" } }
+        @if globalsplat { li { span.swatch.paper aria-hidden="true" {} "published GlobalSplat" } }
+        @for subject in measured { li { (swatch(subject)) (subject.name) ", measured here" } }
+    }
+}
+
+/// A coordinate: a tenth of a pixel is enough.
+fn px(value: f64) -> String {
+    format!("{value:.1}")
+}

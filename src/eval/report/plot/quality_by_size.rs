@@ -1,0 +1,76 @@
+//! PSNR against the number of Gaussians: how much quality a method gets out of its size.
+
+use super::super::comparison::Row;
+use super::super::numbers::{decimal, short};
+use super::axes::{Axis, Margins, frame};
+use super::labels::{Area, beside_points};
+use super::{HEIGHT, WIDTH, figure, legend, px};
+use maud::{Markup, html};
+
+const MARGINS: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
+
+/// A point for each row that has both numbers; nothing where no measured row has, or no other.
+pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
+    let point = |row: &'_ Row| Some((row.kilo_gaussians? * 1e3, row.psnr?));
+    // Measured rows first: their names get the best places.
+    let mut shown: Vec<(&Row, (f64, f64))> = rows.iter().filter_map(|row| Some((row, point(row)?))).collect();
+    shown.sort_by_key(|(row, _)| row.measured.is_none());
+    if shown.len() < 2 || shown[0].0.measured.is_none() {
+        return html! {};
+    }
+    let range = |values: &dyn Fn(&(f64, f64)) -> f64| {
+        let values = shown.iter().map(|(_, point)| values(point));
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), v| (least.min(v), most.max(v)))
+    };
+    let (fewest, most) = range(&|point| point.0.max(1.));
+    let (worst, best) = range(&|point| point.1);
+    let x = Axis::logarithmic(fewest, most, MARGINS.left, WIDTH - MARGINS.right);
+    let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
+    let points: Vec<(f64, f64)> =
+        shown.iter().map(|(_, (n, psnr))| (x.pixel(n.max(1.)), y.pixel(*psnr))).collect();
+    let names: Vec<&str> = shown.iter().map(|(row, _)| row.name).collect();
+    let within = Area { left: MARGINS.left, top: 20., right: WIDTH, bottom: HEIGHT - MARGINS.bottom };
+    let begins = beside_points(&points, &names, within);
+
+    let drawing = html! {
+        (frame(&x, &y, "Gaussians, logarithmic", "PSNR (dB)", count))
+        // Names first, so that no name covers a point.
+        @for ((row, _), (left, base)) in shown.iter().zip(&begins) {
+            text.name.emphasis[row.measured.is_some() || row.is_published_globalsplat()] x=(px(*left)) y=(px(*base)) {
+                (row.name)
+            }
+        }
+        // Measured points come first above, and are drawn last.
+        @for ((row, (_, psnr)), (cx, cy)) in shown.iter().zip(&points).rev() {
+            @let told = format!("{}: {} dB with {}K Gaussians", row.name, decimal(*psnr, 2), short(row.kilo_gaussians.unwrap_or(0.)));
+            (mark(row, *cx, *cy, &told))
+        }
+    };
+    let published = |globalsplat: bool| {
+        shown.iter().any(|(row, _)| row.measured.is_none() && row.is_published_globalsplat() == globalsplat)
+    };
+    let legend = legend(published(false), published(true), shown.iter().filter_map(|(row, _)| row.measured));
+    let title = format!("Quality by size: {setting}");
+    let about =
+        format!("PSNR against the number of Gaussians, {setting}; the numbers are in the table beside it.");
+    figure(&title, &about, drawing, legend)
+}
+
+fn mark(row: &Row, cx: f64, cy: f64, told: &str) -> Markup {
+    html! {
+        @match row.measured {
+            Some(subject) => circle.point.(subject.colour) cx=(px(cx)) cy=(px(cy)) r="6.5" { title { (told) } },
+            None if row.is_published_globalsplat() => circle.point.paper cx=(px(cx)) cy=(px(cy)) r="5" { title { (told) } },
+            None => circle.point.published cx=(px(cx)) cy=(px(cy)) r="4.5" { title { (told) } },
+        }
+    }
+}
+
+/// `10K`, `1M`.
+fn count(value: f64) -> String {
+    match value {
+        v if v >= 1e6 => format!("{}M", short(v * 1e-6)),
+        v if v >= 1e3 => format!("{}K", short(v * 1e-3)),
+        v => short(v),
+    }
+}

@@ -1,0 +1,102 @@
+//! PSNR against the number of context views: what more photos bring.
+
+use super::super::comparison::{rows, view_counts};
+use super::super::numbers::decimal;
+use super::super::subject::{Subject, dataset_name};
+use super::axes::{Axis, Margins, frame};
+use super::labels::spread;
+use super::{HEIGHT, WIDTH, figure, legend, px};
+use maud::{Markup, html};
+
+/// On the right there is room for names.
+const MARGINS: Margins = Margins { left: 46., top: 34., right: 138., bottom: 48. };
+/// Names longer than the room for them are cut; the legend and the tooltips have them whole.
+const LONGEST_NAME: usize = 18;
+
+/// One method over numbers of context views.
+struct Line<'a> {
+    name: &'a str,
+    measured: Option<&'a Subject<'a>>,
+    class: String,
+    points: Vec<(usize, f64)>,
+}
+
+/// A line for each method, published and measured; nothing where there is one number of views only.
+pub fn quality_by_views(subjects: &[Subject], dataset: &str) -> Markup {
+    let counts = view_counts(subjects, dataset);
+    if counts.len() < 2 {
+        return html! {};
+    }
+    let by_views: Vec<_> = counts.iter().map(|&views| (views, rows(subjects, dataset, views))).collect();
+    let mut lines: Vec<Line> = vec![];
+    for (views, row) in by_views.iter().flat_map(|(views, rows)| rows.iter().map(move |row| (*views, row))) {
+        let Some(psnr) = row.psnr else { continue };
+        let same =
+            |line: &&mut Line| line.name == row.name && line.measured.is_some() == row.measured.is_some();
+        match lines.iter_mut().find(same) {
+            Some(line) => line.points.push((views, psnr)),
+            None => lines.push(Line {
+                name: row.name,
+                measured: row.measured,
+                class: match row.measured {
+                    Some(subject) => subject.colour.clone(),
+                    None if row.is_published_globalsplat() => "paper".into(),
+                    None => "published".into(),
+                },
+                points: vec![(views, psnr)],
+            }),
+        }
+    }
+    // What was measured is drawn last, above the others.
+    lines.sort_by_key(|line| line.measured.is_some());
+    let values = lines.iter().flat_map(|line| line.points.iter().map(|point| point.1));
+    let (worst, best) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    let ticks = counts.iter().map(|&views| views as f64).collect();
+    let x = Axis::at(ticks, MARGINS.left, WIDTH - MARGINS.right);
+    let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
+    let last = |line: &Line| line.points[line.points.len() - 1];
+    let ends: Vec<f64> = lines.iter().map(|line| y.pixel(last(line).1)).collect();
+    let heights = spread(&ends, MARGINS.top, HEIGHT - MARGINS.bottom);
+    let names_at = WIDTH - MARGINS.right + 14.;
+
+    let drawing = html! {
+        (frame(&x, &y, "Context views", "PSNR (dB)", |views| decimal(views, 0)))
+        @for ((line, end), height) in lines.iter().zip(&ends).zip(&heights) {
+            @let from = x.pixel(last(line).0 as f64);
+            line.leader x1=(px(from + 6.)) y1=(px(*end)) x2=(px(names_at - 3.)) y2=(px(*height)) {}
+            text.name.emphasis[line.class != "published"] x=(px(names_at)) y=(px(height + 4.)) { (short_name(line.name)) }
+        }
+        @for line in &lines {
+            @if line.points.len() > 1 { polyline.line.(line.class) points=(path(line, &x, &y)) {} }
+            @for &(views, psnr) in &line.points {
+                circle.point.(line.class) cx=(px(x.pixel(views as f64))) cy=(px(y.pixel(psnr)))
+                    r=(if line.measured.is_some() { "6" } else { "4" }) {
+                    title { (line.name) ", " (views) " context views: " (decimal(psnr, 2)) " dB" }
+                }
+            }
+        }
+    };
+    let published = |class: &str| lines.iter().any(|line| line.class == class);
+    let measured = lines.iter().filter_map(|line| line.measured);
+    let legend = legend(published("published"), published("paper"), measured);
+    let dataset = dataset_name(dataset);
+    let about = format!(
+        "PSNR against the number of context views on {dataset}; the numbers are in the tables below."
+    );
+    figure(&format!("Quality by context views: {dataset}"), &about, drawing, legend)
+}
+
+fn path(line: &Line, x: &Axis, y: &Axis) -> String {
+    let points = line.points.iter();
+    points
+        .map(|&(views, psnr)| format!("{},{}", px(x.pixel(views as f64)), px(y.pixel(psnr))))
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+fn short_name(name: &str) -> String {
+    match name.chars().count() > LONGEST_NAME {
+        true => name.chars().take(LONGEST_NAME - 1).chain(['…']).collect(),
+        false => name.into(),
+    }
+}

@@ -1,0 +1,192 @@
+//! Scene by scene, the worst first: pictures of the worst, numbers of all.
+
+use super::numbers::{absent, count, decimal, thousands};
+use super::subject::{Subject, dataset_name};
+use super::table::{Head, cell, swatch, table};
+use crate::error::{Error, Result};
+use crate::eval::evaluation::SceneScores;
+use crate::eval::protocol::{CaptureScores, ViewScore};
+use crate::eval::scores_file::strip_path;
+use crate::io::read_image_size;
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use maud::{Markup, html};
+use std::collections::BTreeMap;
+
+/// The page carries no more pictures than this: they are most of its bytes.
+const PICTURES: usize = 60;
+/// Views of one scene whose scores are told one by one.
+const LISTED_VIEWS: usize = 12;
+const PARTS: [&str; 4] = ["Photo", "Render", "Error", "Depth"];
+
+/// A scene in every evaluation that scored it.
+struct Scene<'a> {
+    name: &'a str,
+    dataset: &'a str,
+    scored: Vec<(&'a Subject<'a>, &'a SceneScores)>,
+}
+
+impl Scene<'_> {
+    fn worst(&self) -> f64 {
+        self.scored.iter().map(|(_, scene)| scene.scores.psnr).fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// Evaluations of one data set share their scenes, so that pictures of one scene stand together.
+fn worst_first<'a>(subjects: &'a [Subject<'a>]) -> Vec<Scene<'a>> {
+    let mut scenes: BTreeMap<(&str, &str), Vec<_>> = BTreeMap::new();
+    for subject in subjects {
+        for scene in &subject.evaluation.scenes {
+            let key = (subject.dataset.as_str(), scene.scores.scene.as_str());
+            scenes.entry(key).or_default().push((subject, scene));
+        }
+    }
+    let mut scenes: Vec<Scene> =
+        scenes.into_iter().map(|((dataset, name), scored)| Scene { name, dataset, scored }).collect();
+    scenes.sort_by(|a, b| a.worst().total_cmp(&b.worst()));
+    scenes
+}
+
+/// Cards with pictures for the worst scenes, a table for the others.
+pub fn scenes(subjects: &[Subject]) -> Result<Markup> {
+    let scenes = worst_first(subjects);
+    let mut pictures = 0;
+    let shown = scenes
+        .iter()
+        .take_while(|scene| {
+            pictures += scene.scored.len();
+            pictures <= PICTURES
+        })
+        .count();
+    let (shown, others) = scenes.split_at(shown);
+    let cards = shown.iter().map(|scene| card(scene, subjects.len() > 1)).collect::<Result<Vec<_>>>()?;
+    Ok(html! {
+        section.scenes {
+            h2 { "Scenes, worst first" }
+            p { "Each strip shows the view with the lowest PSNR: photo, render, error and depth." }
+            @for card in &cards { (card) }
+            @if !others.is_empty() { (rest(others)) }
+        }
+    })
+}
+
+fn card(scene: &Scene, compares: bool) -> Result<Markup> {
+    let parts = scene.scored.iter().map(|&(subject, scores)| scored(subject, scores, compares));
+    let parts = parts.collect::<Result<Vec<_>>>()?;
+    Ok(html! {
+        article.scene {
+            h3 { (scene.name) @if compares { " " span.fine { (dataset_name(scene.dataset)) } } }
+            @for part in &parts { (part) }
+        }
+    })
+}
+
+/// One scene of one evaluation.
+fn scored(subject: &Subject, scene: &SceneScores, compares: bool) -> Result<Markup> {
+    Ok(html! {
+        div.scored {
+            p.scores {
+                @if compares {
+                    span.who { (swatch(subject)) (subject.name) ", " (count(scene.context.len(), "context view")) }
+                }
+                (measures(&scene.scores))
+                @if let Some(seconds) = scene.forward_seconds { span { "time " b { (decimal(seconds, 2)) } " s" } }
+            }
+            (strip(subject, &scene.scores)?)
+            dl.frames {
+                dt { "Views" }
+                dd { (views(&scene.scores.views)) }
+                dt { "Context frames" }
+                dd { (frames(&scene.context)) }
+                dt { "Target frames" }
+                dd { (frames(&scene.target)) }
+            }
+        }
+    })
+}
+
+fn measures(scores: &CaptureScores) -> Markup {
+    html! {
+        span { "PSNR " b { (decimal(scores.psnr, 2)) } " dB" }
+        span { "SSIM " b { (decimal(scores.ssim, 4)) } }
+        span { "LPIPS-VGG " @match scores.lpips_vgg { Some(v) => { b { (decimal(v, 4)) } } None => (absent()) } }
+        @if let Some(v) = scores.lpips_alex { span { "LPIPS-Alex " b { (decimal(v, 4)) } } }
+        @if let Some(n) = scores.gaussians { span { b { (thousands(n.unsigned_abs())) } " Gaussians" } }
+    }
+}
+
+/// The picture, in the page itself.
+fn strip(subject: &Subject, scores: &CaptureScores) -> Result<Markup> {
+    let path = strip_path(subject.folder, &scores.scene);
+    if !path.is_file() {
+        return Ok(html! { p.missing { "No picture: the evaluation's folder has none of this scene." } });
+    }
+    let (width, height) = read_image_size(&path)?;
+    let bytes = std::fs::read(&path).map_err(Error::read(&path))?;
+    let source = format!("data:image/jpeg;base64,{}", BASE64_STANDARD.encode(bytes));
+    let worst = scores.views.iter().min_by(|a, b| a.psnr.total_cmp(&b.psnr));
+    let view = worst.map_or(String::new(), |view| format!(", view {}", view.image));
+    let alt =
+        format!("{}{view}, by {}: photo, render, error and depth side by side", scores.scene, subject.name);
+    Ok(html! {
+        div.scroll.strip tabindex="0" role="region" aria-label={ "Pictures of " (scores.scene) } {
+            figure {
+                div.parts aria-hidden="true" { @for part in PARTS { span { (part) } } }
+                img src=(source) width=(width) height=(height) alt=(alt) decoding="async";
+            }
+        }
+    })
+}
+
+/// Scores of the views, the worst first: the one that the strip shows.
+fn views(views: &[ViewScore]) -> Markup {
+    let mut views: Vec<&ViewScore> = views.iter().collect();
+    views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
+    html! {
+        @for (i, view) in views.iter().take(LISTED_VIEWS).enumerate() {
+            @if i > 0 { ", " }
+            (view.image) " " span.nowrap { (decimal(view.psnr, 2)) " dB" } @if i == 0 { " (shown)" }
+        }
+        @if views.len() > LISTED_VIEWS { " and " (count(views.len() - LISTED_VIEWS, "better one")) }
+    }
+}
+
+fn frames(frames: &[usize]) -> String {
+    frames.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
+}
+
+fn rest(scenes: &[Scene]) -> Markup {
+    let head = [
+        Head::Text("Scene"),
+        Head::Text("Method"),
+        Head::Text("Setting"),
+        Head::Number("PSNR (dB)\u{a0}↑"),
+        Head::Number("SSIM\u{a0}↑"),
+        Head::Number("LPIPS-VGG\u{a0}↓"),
+        Head::Number("LPIPS-Alex\u{a0}↓"),
+        Head::Number("Gaussians"),
+        Head::Text("Target frames"),
+    ];
+    let body = html! {
+        @for scene in scenes {
+            @for (subject, scored) in &scene.scored {
+                @let scores = &scored.scores;
+                tr {
+                    th scope="row" { (scene.name) }
+                    td { (swatch(subject)) (subject.name) }
+                    td { (subject.setting()) }
+                    (cell(Some(decimal(scores.psnr, 2))))
+                    (cell(Some(decimal(scores.ssim, 4))))
+                    (cell(scores.lpips_vgg.map(|v| decimal(v, 4))))
+                    (cell(scores.lpips_alex.map(|v| decimal(v, 4))))
+                    (cell(scores.gaussians.map(|n| thousands(n.unsigned_abs()))))
+                    td { (frames(&scored.target)) }
+                }
+            }
+        }
+    };
+    html! {
+        h3 { "The other scenes" }
+        (table(&format!("{} without pictures", count(scenes.len(), "further scene")), &head, body))
+    }
+}

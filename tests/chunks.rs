@@ -1,0 +1,314 @@
+//! Chunks: written and read back, and what is refused.
+
+mod common;
+
+use common::formats::assert_same_cameras;
+use common::program::{arg, refuse, succeed};
+use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
+use globalsplat::synth::write_room;
+use serde_json::Value;
+use std::io::{Cursor, Write};
+use std::path::{Path, PathBuf};
+use zip::write::FileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+const SCENES: [&str; 3] = ["room_0", "room_1", "room_2"];
+
+/// Three small captures in `folder`, and chunks of two scenes and of one in `folder/chunks`.
+fn packed(folder: &Path) -> PathBuf {
+    let chunks = folder.join("chunks");
+    std::fs::create_dir(&chunks).unwrap();
+    let mut bytes = 0;
+    for (seed, name) in SCENES.iter().enumerate() {
+        write_room(&folder.join(name), seed as u64, 3, [24, 32].into()).unwrap();
+        if seed < 2 {
+            let images = std::fs::read_dir(folder.join(name).join("images")).unwrap();
+            bytes += images.map(|image| image.unwrap().metadata().unwrap().len() as usize).sum::<usize>();
+        }
+    }
+    let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
+    for name in SCENES {
+        writer.add(&open_capture(&folder.join(name)).unwrap()).unwrap();
+    }
+    assert_eq!(writer.finish().unwrap(), 2);
+    chunks
+}
+
+#[test]
+fn a_packed_capture_comes_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let dataset = Dataset::open(&chunks, Split::Test).unwrap();
+    assert_eq!((dataset.scenes(), dataset.groups().len()), (3, 2));
+    for group in dataset.groups() {
+        let open = group.open().unwrap();
+        for key in &group.keys {
+            let (found, expected) =
+                (open.capture(key).unwrap(), open_capture(&folder.path().join(key)).unwrap());
+            assert_eq!(&found.name, key);
+            // The numbers of a chunk are float32.
+            let cameras: Vec<_> = expected.cameras();
+            for (a, b) in found.cameras().iter().zip(&cameras) {
+                assert!(a.c2w.abs_diff_eq(b.c2w, 1e-6));
+                let (k, l) = (a.intrinsics.to_rows(), b.intrinsics.to_rows());
+                assert!(k.iter().zip(l).all(|(a, b)| (a - b).abs() < 1e-4), "{k:?} {l:?}");
+            }
+            for (a, b) in found.load_all(None).unwrap().iter().zip(expected.load_all(None).unwrap()) {
+                assert_eq!(a.image, b.image);
+            }
+        }
+    }
+    let one =
+        open_capture(&PathBuf::from(format!("{}#room_1", chunks.join("000000.torch").display()))).unwrap();
+    assert_eq!(one.names().collect::<Vec<_>>(), ["000000", "000001", "000002"]);
+    let alone = open_capture(&chunks.join("000001.torch")).unwrap();
+    assert_same_cameras(&alone, &dataset.groups()[1].open().unwrap().capture("room_2").unwrap().cameras());
+}
+
+#[test]
+fn a_data_set_is_found_split_by_split() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let root = folder.path().join("set");
+    std::fs::create_dir(&root).unwrap();
+    std::fs::rename(&chunks, root.join("test")).unwrap();
+    let dataset = Dataset::open(&root, Split::Test).unwrap();
+    assert_eq!((dataset.name.as_str(), dataset.scenes()), ("set", 3));
+    // Folders of captures are data sets as well.
+    let captures = Dataset::open(folder.path(), Split::Train).unwrap();
+    assert!(captures.groups().iter().any(|group| group.keys == ["room_0"]));
+}
+
+#[test]
+fn pack_and_inspect_tell_what_they_did() {
+    let folder = tempfile::tempdir().unwrap();
+    write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
+    let (room, out) = (folder.path().join("room"), folder.path().join("out"));
+    let told: Value =
+        serde_json::from_str(&succeed(&["pack", arg(&room), "--out", arg(&out), "--json"])).unwrap();
+    assert_eq!(
+        (told["scenes"].as_u64(), told["views"].as_u64(), told["chunks"].as_u64()),
+        (Some(1), Some(3), Some(1))
+    );
+    let chunk = out.join("000000.torch");
+    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&chunk), "--json"])).unwrap();
+    assert_eq!((told["kind"].as_str(), told["views"]["room"].as_u64()), (Some("chunk"), Some(3)));
+    let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
+    assert!(again.contains("a folder of chunks already"), "{again}");
+    let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
+    assert!(twice.contains("which 000000.torch holds already"), "{twice}");
+}
+
+/// A torch.save archive with `pickle` and one tensor's bytes.
+fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
+    let mut zip = ZipWriter::new(Cursor::new(vec![]));
+    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
+        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
+        zip.write_all(contents).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+fn refusal(bytes: Vec<u8>) -> String {
+    let error = Chunk::parse(Path::new("chunk.torch"), bytes).expect_err("a refusal");
+    assert!(error.is_request(), "{error}");
+    error.to_string()
+}
+
+#[track_caller]
+fn assert_refused(pickle: &[u8], for_what: &str) {
+    let error = refusal(archive(pickle, &[0; 64], CompressionMethod::Stored));
+    assert!(error.contains(for_what), "{error:?} lacks {for_what:?}");
+}
+
+/// BINUNICODE.
+fn text(text: &str) -> Vec<u8> {
+    [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// A tensor of `storage` with `size` numbers by `stride` at `offset` of a storage that claims to have 64.
+fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
+    let int = |v: u32| [b"J", &v.to_le_bytes()[..]].concat();
+    let tuple = |values: &[u32]| {
+        [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
+    };
+    [
+        b"ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
+        text("storage"),
+        format!("ctorch\n{storage}\n").into_bytes(),
+        text("0"),
+        text("cpu"),
+        int(64),
+        b"tQ".to_vec(),
+        int(offset),
+        tuple(size),
+        tuple(stride),
+        b"\x89ccollections\nOrderedDict\n)RtR".to_vec(),
+    ]
+    .concat()
+}
+
+/// A list of one scene with one view, its fields given.
+fn scene(cameras: &[u8], timestamps: &[u8], image: &[u8]) -> Vec<u8> {
+    let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+    [
+        b"\x80\x02](}(".to_vec(),
+        entry("key", &text("a")),
+        entry("url", &text("")),
+        entry("cameras", cameras),
+        entry("timestamps", timestamps),
+        entry("images", &[b"](", image, b"e"].concat()),
+        b"ue.".to_vec(),
+    ]
+    .concat()
+}
+
+fn good_cameras() -> Vec<u8> {
+    tensor("FloatStorage", 0, &[1, 18], &[18, 1])
+}
+
+fn good_timestamps() -> Vec<u8> {
+    tensor("LongStorage", 0, &[1], &[1])
+}
+
+#[test]
+fn what_a_pickle_may_not_do_is_not_done() {
+    let folder = tempfile::tempdir().unwrap();
+    let trap = folder.path().join("trap");
+    // What Python would run: os.system("touch trap").
+    let command = format!("touch {}", trap.display());
+    for module in ["os", "posix"] {
+        let program =
+            [format!("\x02c{module}\nsystem\n").into_bytes(), text(&command), b"\x85R.".to_vec()].concat();
+        let program = [b"\x80", program.as_slice()].concat();
+        assert_refused(&program, &format!("asks for {module}.system"));
+    }
+    assert_refused(b"\x80\x02c__builtin__\neval\n.", "asks for __builtin__.eval");
+    assert_refused(
+        b"\x80\x02ctorch.jit._pickle\nbuild_intlist\n.",
+        "asks for torch.jit._pickle.build_intlist",
+    );
+    assert!(!trap.exists());
+}
+
+#[test]
+fn unsound_pickles_are_refused() {
+    let nested = [b"\x80\x02".to_vec(), b"]".repeat(100_000), b"a".repeat(99_999), b".".to_vec()].concat();
+    assert_refused(&nested, "lists in each other");
+    assert_refused(b"\x80\x02]r\xff\xff\xff\xff.", "memo 4294967295");
+    assert_refused(b"\x80\x02]q\x00h\x00a.", "changes a list inside another");
+    assert_refused(b"\x80\x02]q\x00(h\x00e.", "changes a list inside another");
+    assert_refused(b"\x80\x02}(X\x01\x00\x00\x00au.", "a key without a value");
+    assert_refused(b"\x80\x02}(K\x01K\x02u.", "a Scalar where a Text belongs");
+    assert_refused(b"\x80\x02a.", "takes what isn't there");
+    assert_refused(b"\x80\x02t.", "without a mark");
+    assert_refused(b"\x80\x02K\x01K\x02.", "ends with 2 values");
+    assert_refused(b"\x80\x02X\xff\xff\xff\x7fabc.", "cut off");
+    assert_refused(b"\x80\x04N.", "protocol 4");
+    assert_refused(b"\x80\x02K\x01.", "a Int, expected a list of scenes");
+    assert_refused(b"\x80\x02](K\x01e.", "scene 0 is a Int, expected a dict");
+    assert_refused(b"\x80\x02](}e.", "scene 0 has no cameras");
+}
+
+#[test]
+fn tensors_stay_inside_their_data() {
+    let image = |offset, size, stride| tensor("ByteStorage", offset, &[size], &[stride]);
+    // 64 bytes are there: 18 floats aren't, whatever the pickle says about the storage.
+    assert_refused(
+        &scene(&good_cameras(), &good_timestamps(), &image(0, 4, 1)),
+        "cameras of scene 0 reaches beyond its data of 64 bytes",
+    );
+    let whole = |image: &[u8]| {
+        let bytes = scene(&good_cameras(), &good_timestamps(), image);
+        archive(&bytes, &[0; 72], CompressionMethod::Stored)
+    };
+    for (image, found) in [
+        (image(0, 73, 1), "images of scene 0 reaches beyond its data of 72 bytes"),
+        (image(70, 3, 1), "reaches beyond"),
+        (image(u32::MAX, 3, 1), "images of scene 0 is no plain tensor"),
+        (image(1 << 30, 3, 1), "reaches beyond"),
+        (image(0, 8, 2), "is no plain tensor"),
+        (image(0, 1 << 30, 0), "is no plain tensor"),
+        (image(0, u32::MAX, 1), ""),
+        (tensor("FloatStorage", 0, &[4], &[1]), "expected the bytes of a JPEG"),
+        (text("x"), "images of scene 0 holds a String, expected tensors"),
+    ] {
+        let error = refusal(whole(&image));
+        assert!(error.contains(found), "{error:?} lacks {found:?}");
+    }
+    let double = tensor("DoubleStorage", 0, &[1, 17], &[17, 1]);
+    assert_refused(&scene(&double, &good_timestamps(), &image(0, 4, 1)), "expected Float [1, 18]");
+    // As much as there is passes, and is then no image.
+    let chunk = Chunk::parse(Path::new("chunk.torch"), whole(&image(0, 72, 1))).unwrap();
+    assert_eq!(chunk.keys().collect::<Vec<_>>(), ["a"]);
+    let error = chunk.capture("a").unwrap_err().to_string();
+    assert!(error.contains("chunk.torch#a: every image is undecodable"), "{error}");
+}
+
+#[test]
+fn archives_that_inflate_are_refused() {
+    let pickle = scene(&good_cameras(), &good_timestamps(), &text("x"));
+    let error = refusal(archive(&pickle, &[0; 1 << 20], CompressionMethod::Deflated));
+    assert!(error.contains("archive/data.pkl is compressed"), "{error}");
+    let mut bytes = archive(&pickle, &[0; 64], CompressionMethod::Stored);
+    // The central directory's second entry claims 4 GB, from where it is.
+    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
+    assert!(refusal(bytes).contains("expected inside the file"));
+}
+
+#[test]
+fn damage_is_noticed() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = packed(folder.path()).join("000001.torch");
+    let bytes = std::fs::read(&file).unwrap();
+    for length in (0..bytes.len()).step_by(97) {
+        refusal(bytes[..length].to_vec());
+    }
+    // Whatever bit flips in what a chunk holds: a reader may not crash, and images may not change unnoticed.
+    let image = bytes.windows(4).position(|window| window == b"\x89PNG").unwrap();
+    for position in (0..bytes.len()).step_by(31).chain(image..image + 64) {
+        let mut flipped = bytes.clone();
+        flipped[position] ^= 1 << (position % 8);
+        let read = Chunk::parse(Path::new("chunk.torch"), flipped);
+        if (image..image + 64).contains(&position) {
+            assert!(read.unwrap_err().to_string().contains("its checksum differs"));
+        }
+    }
+}
+
+#[test]
+fn what_is_wrong_with_a_scene_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let chunk = chunks.join("000000.torch");
+    let named = format!("{}#room_9", chunk.display());
+    let error = refuse(&["inspect", &named]);
+    let expected = "the scene is \"room_9\", which is not there, expected one of its 2: room_0, room_1";
+    assert!(error.contains(expected), "{error}");
+    let error = open_capture(&chunk).unwrap_err().to_string();
+    assert!(error.contains("it holds 2 scenes, expected") && error.contains("#KEY"), "{error}");
+
+    // NaN in a camera: 18 float32 and an image.
+    let cameras = [f32::NAN; 18].map(f32::to_le_bytes).concat();
+    let png = std::fs::read(folder.path().join("room_0/images/000.png")).unwrap();
+    let image = tensor("ByteStorage", 72, &[png.len() as u32], &[1]);
+    let program = scene(&good_cameras(), &good_timestamps(), &image);
+    let bytes = archive(&program, &[cameras, png].concat(), CompressionMethod::Stored);
+    let error = Chunk::parse(Path::new("c.torch"), bytes).unwrap().capture("a").unwrap_err().to_string();
+    assert!(error.contains("c.torch#a: the number of views is 1, expected two or more"), "{error}");
+
+    std::fs::remove_file(&chunk).unwrap();
+    let dataset = Dataset::open(&chunks, Split::Train).unwrap();
+    let error = dataset.groups()[0].open().unwrap_err().to_string();
+    assert!(error.contains("000000.torch can't be read"), "{error}");
+    for (index, found) in [
+        ("[]", "unusable"),
+        ("{\"a\": \"../b.torch\"}", "the chunk of a is ../b.torch"),
+        ("{\"a\": 3}", "unusable"),
+    ] {
+        std::fs::write(chunks.join("index.json"), index).unwrap();
+        let error = Dataset::open(&chunks, Split::Train).unwrap_err().to_string();
+        assert!(error.contains("index.json") && error.contains(found), "{error}");
+    }
+}

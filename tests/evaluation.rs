@@ -1,0 +1,202 @@
+//! The protocol over a data set: `eval --data ROOT --index FILE --out DIR`.
+
+mod common;
+
+use common::program::{arg, command, fail, refuse, succeed, tiny_weights};
+use globalsplat::eval::read_evaluation;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// Three rooms of five 256×256 photos in `captures/`, the same in `chunks/`, their splats in `splats/`, and an index of two of
+/// them that also names a scene that isn't there.
+struct Set {
+    folder: TempDir,
+}
+
+impl Set {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let captures = folder.path().join("captures");
+        succeed(&["synth", "--out", arg(&captures), "--scenes", "3", "--frames", "5"]);
+        succeed(&["pack", arg(&captures), "--out", arg(&folder.path().join("chunks"))]);
+        std::fs::create_dir(folder.path().join("splats")).unwrap();
+        for room in ["room_000", "room_001", "room_002"] {
+            let splat = folder.path().join(format!("splats/{room}.ply"));
+            std::fs::copy(captures.join(room).join("truth.ply"), splat).unwrap();
+        }
+        let set = Set { folder };
+        let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
+        set.write_index(&json!({"room_002": frames, "room_000": frames, "absent": frames, "left_out": null}));
+        set
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn write_index(&self, index: &Value) {
+        std::fs::write(self.path("re10k_3v.json"), index.to_string()).unwrap();
+    }
+
+    /// The arguments for a subject and a data set.
+    fn arguments(&self, subject: &[&str], data: &str) -> Vec<String> {
+        let (data, index, out) = (self.path(data), self.path("re10k_3v.json"), self.path("out"));
+        let rest = ["--data", arg(&data), "--index", arg(&index), "--out", arg(&out)];
+        ["eval"].iter().chain(subject).chain(&rest).map(|argument| argument.to_string()).collect()
+    }
+}
+
+fn strs(arguments: &[String]) -> Vec<&str> {
+    arguments.iter().map(String::as_str).collect()
+}
+
+/// Runs without LPIPS, which takes longer than all the rest.
+fn run(arguments: &[String], folder: &Path) -> (Option<i32>, String, String) {
+    let output = command(&strs(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
+}
+
+#[test]
+fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    for data in ["chunks", "captures"] {
+        let (code, out, err) = run(&set.arguments(&["--splat", arg(&splats)], data), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        assert!(out.contains("2 of 3 scenes") && out.contains("LPIPS-VGG absent"), "{out}");
+        let evaluation = read_evaluation(&set.path("out")).unwrap();
+        let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
+        assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));
+        // The splats that the photos were made from, but for the photos' 8 bits.
+        assert!(evaluation.summary.psnr > 50. && evaluation.summary.ssim > 0.999, "{:?}", evaluation.summary);
+        assert_eq!((evaluation.dataset.as_str(), evaluation.context_views), ("re10k", 3));
+        let views: Vec<&str> =
+            evaluation.scenes[0].scores.views.iter().map(|view| view.image.as_str()).collect();
+        assert_eq!(views, ["000001", "000003"]);
+        for file in ["report.html", "scores.json", "scores.csv", "scenes/room_000.jpg"] {
+            assert!(set.path("out").join(file).is_file(), "{file}");
+        }
+        let csv = std::fs::read_to_string(set.path("out/scores.csv")).unwrap();
+        assert_eq!(csv.lines().count(), 1 + 2 * 2);
+        std::fs::remove_dir_all(set.path("out")).unwrap();
+    }
+}
+
+#[test]
+fn a_stopped_sweep_goes_on_with_what_it_has() {
+    let set = Set::new();
+    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
+    let arguments = set.arguments(&["--weights", arg(&weights)], "chunks");
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let first = read_evaluation(&set.path("out")).unwrap();
+    let efficiency = first.efficiency.expect("a model's cost");
+    assert_eq!(efficiency.timed_scenes, 1, "the first scene warms up");
+    assert!(efficiency.forward_seconds > 0. && efficiency.peak_memory_bytes > 1_000_000);
+    assert_eq!(first.image_size, [32, 32]);
+
+    // One scene is gone, as if it hadn't been done yet; the other one is believed, whatever it says.
+    let kept = set.path("out/scenes/room_000.json");
+    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
+    scores["psnr"] = json!(99.5);
+    std::fs::write(&kept, scores.to_string()).unwrap();
+    std::fs::write(set.path("out/scenes/room_002.json"), "{\"scene\": \"room_002\", \"psn").unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!(second.scenes[0].scores.psnr, 99.5);
+    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+
+    // Another subject's scores don't go with these.
+    let splats = set.path("splats");
+    let error = refuse(&strs(&set.arguments(&["--splat", arg(&splats)], "chunks")));
+    assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
+    let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
+    set.write_index(&index);
+    let error = refuse(&strs(&arguments));
+    assert!(error.contains("choose another --out"), "{error}");
+}
+
+#[test]
+fn anybodys_pictures_are_scored_by_an_index() {
+    let set = Set::new();
+    for (room, folder) in [("room_000", "renders/room_000"), ("room_002", "renders/room_002/color")] {
+        let folder = set.path(folder);
+        std::fs::create_dir_all(&folder).unwrap();
+        for frame in [1, 3] {
+            let photo = set.path(&format!("captures/{room}/images/{frame:03}.png"));
+            std::fs::copy(photo, folder.join(format!("{frame:06}.png"))).unwrap();
+        }
+    }
+    let renders = set.path("renders");
+    let arguments = set.arguments(&["--renders", arg(&renders), "--name", "the photos", "--json"], "chunks");
+    let (code, out, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(0), "{err}");
+    let told: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(told["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
+    assert_eq!(read_evaluation(&set.path("out")).unwrap().method, "the photos");
+}
+
+#[test]
+fn a_scene_that_fails_is_named_and_the_others_are_scored() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
+    let photo = set.path("captures/room_002/images/003.png");
+    let bytes = std::fs::read(&photo).unwrap();
+    std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
+    let (code, _, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("room_002: ") && err.contains("images/003.png: the image is undecodable"), "{err}");
+    assert!(err.contains("1 scenes could not be scored"), "{err}");
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (1, 1));
+    assert_eq!(evaluation.failures[0].scene, "room_002");
+
+    // Once it is mended, the same command does the rest.
+    std::fs::write(&photo, bytes).unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 0));
+}
+
+#[test]
+fn several_indices_make_one_report() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let more = set.path("acid_2v.json");
+    std::fs::write(&more, json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string()).unwrap();
+    let mut arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
+    arguments.extend(["--index".into(), arg(&more).into()]);
+    let (code, _, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(0), "{err}");
+    let report = std::fs::read_to_string(set.path("out/report.html")).unwrap();
+    assert!(report.contains("room_001") && report.contains("room_002"));
+    assert_eq!(read_evaluation(&set.path("out/acid_2v")).unwrap().dataset, "acid");
+    let twice = set.path("other/acid_2v.json");
+    std::fs::create_dir(set.path("other")).unwrap();
+    std::fs::copy(&more, &twice).unwrap();
+    arguments.extend(["--index".into(), arg(&twice).into()]);
+    assert!(refuse(&strs(&arguments)).contains("two of them would go to"));
+}
+
+#[test]
+fn what_an_index_gets_wrong_is_named() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
+    set.write_index(&json!({"room_000": {"context": [0, 7], "target": [1]}}));
+    let error = fail(&strs(&arguments), 1);
+    let expected = "re10k_3v.json: a frame of scene room_000 is 7, expected one of the scene's 5, 0 to 4";
+    assert!(error.contains(expected), "{error}");
+    set.write_index(&json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
+    let error = refuse(&strs(&arguments));
+    assert!(error.contains("none of the 3 in the data set chunks"), "{error}");
+    std::fs::remove_file(set.path("splats/room_000.ply")).unwrap();
+    set.write_index(&json!({"room_000": {"context": [0, 3], "target": [1]}}));
+    let error = fail(&strs(&arguments), 1);
+    assert!(error.contains("room_000: ") && error.contains("room_000.ply can't be read"), "{error}");
+    std::fs::remove_file(set.path("chunks/000000.torch")).unwrap();
+    let error = fail(&strs(&arguments), 1);
+    assert!(error.contains("room_000: ") && error.contains("000000.torch can't be read"), "{error}");
+}
