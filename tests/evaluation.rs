@@ -66,6 +66,7 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
         let (code, out, err) = run(&set.arguments(&["--splat", arg(&splats)], data), set.folder.path());
         assert_eq!(code, Some(0), "{err}");
         assert!(out.contains("2 of 3 scenes") && out.contains("LPIPS-VGG absent"), "{out}");
+        assert!(err.contains("left out: lpips_vgg and lpips_alex") && err.contains("make weights"), "{err}");
         let evaluation = read_evaluation(&set.path("out")).unwrap();
         let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
         assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));

@@ -159,8 +159,9 @@ impl Eval {
             )?;
             bar.finish_and_clear();
             if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
+                let perceptual = Perceptual::find(device)?;
                 let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
-                eprintln!("{}", why.expect("a scene without a distance"));
+                why.iter().for_each(|line| eprintln!("{line}"));
             }
             write_evaluation(&folder, &evaluation)?;
             write_csv(&folder.join("scores.csv"), &evaluation)?;

@@ -1,6 +1,7 @@
 //! Where real data and golden tensors are found, and how tensors are compared.
 #![allow(dead_code)] // every test binary uses its own part
 
+pub mod browser;
 pub mod formats;
 pub mod program;
 

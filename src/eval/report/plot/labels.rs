@@ -29,8 +29,16 @@ impl Area {
     }
 }
 
+/// A name of so many characters at most; legends and tooltips have it whole.
+pub fn shortened(name: &str, longest: usize) -> String {
+    match name.chars().count() > longest {
+        true => name.chars().take(longest - 1).chain(['…']).collect(),
+        false => name.into(),
+    }
+}
+
 /// Where each name's text begins, on its base line, for points in the order of their importance.
-pub fn beside_points(points: &[(f64, f64)], names: &[&str], within: Area) -> Vec<(f64, f64)> {
+pub fn beside_points(points: &[(f64, f64)], names: &[String], within: Area) -> Vec<(f64, f64)> {
     let marks: Vec<Area> = points.iter().map(|&(x, y)| Area::around(x, y, 7.)).collect();
     let mut taken: Vec<Area> = vec![];
     let mut begins = vec![];
@@ -92,7 +100,7 @@ mod tests {
     fn names_keep_clear_of_each_other() {
         let within = Area { left: 0., top: 0., right: 400., bottom: 300. };
         let points = [(200., 150.), (203., 152.), (380., 10.)];
-        let begins = beside_points(&points, &["first", "second", "at the edge"], within);
+        let begins = beside_points(&points, &["first", "second", "at the edge"].map(String::from), within);
         let areas: Vec<Area> = begins
             .iter()
             .zip([5., 6., 11.])

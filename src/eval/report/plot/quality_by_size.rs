@@ -3,11 +3,13 @@
 use super::super::comparison::Row;
 use super::super::numbers::{decimal, short};
 use super::axes::{Axis, Margins, frame};
-use super::labels::{Area, beside_points};
+use super::labels::{Area, beside_points, shortened};
 use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
 const MARGINS: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
+/// Longer names are cut.
+const LONGEST_NAME: usize = 24;
 
 /// A point for each row that has both numbers; nothing where no measured row has, or no other.
 pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
@@ -28,16 +30,16 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
     let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
     let points: Vec<(f64, f64)> =
         shown.iter().map(|(_, (n, psnr))| (x.pixel(n.max(1.)), y.pixel(*psnr))).collect();
-    let names: Vec<&str> = shown.iter().map(|(row, _)| row.name).collect();
+    let names: Vec<String> = shown.iter().map(|(row, _)| shortened(row.name, LONGEST_NAME)).collect();
     let within = Area { left: MARGINS.left, top: 20., right: WIDTH, bottom: HEIGHT - MARGINS.bottom };
     let begins = beside_points(&points, &names, within);
 
     let drawing = html! {
         (frame(&x, &y, "Gaussians, logarithmic", "PSNR (dB)", count))
         // Names first, so that no name covers a point.
-        @for ((row, _), (left, base)) in shown.iter().zip(&begins) {
+        @for (((row, _), name), (left, base)) in shown.iter().zip(&names).zip(&begins) {
             text.name.emphasis[row.measured.is_some() || row.is_published_globalsplat()] x=(px(*left)) y=(px(*base)) {
-                (row.name)
+                (name)
             }
         }
         // Measured points come first above, and are drawn last.

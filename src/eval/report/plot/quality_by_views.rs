@@ -4,14 +4,14 @@ use super::super::comparison::{rows, view_counts};
 use super::super::numbers::decimal;
 use super::super::subject::{Subject, dataset_name};
 use super::axes::{Axis, Margins, frame};
-use super::labels::spread;
+use super::labels::{shortened, spread};
 use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
 /// On the right there is room for names.
 const MARGINS: Margins = Margins { left: 46., top: 34., right: 138., bottom: 48. };
 /// Names longer than the room for them are cut; the legend and the tooltips have them whole.
-const LONGEST_NAME: usize = 18;
+const LONGEST_NAME: usize = 14;
 
 /// One method over numbers of context views.
 struct Line<'a> {
@@ -64,7 +64,7 @@ pub fn quality_by_views(subjects: &[Subject], dataset: &str) -> Markup {
         @for ((line, end), height) in lines.iter().zip(&ends).zip(&heights) {
             @let from = x.pixel(last(line).0 as f64);
             line.leader x1=(px(from + 6.)) y1=(px(*end)) x2=(px(names_at - 3.)) y2=(px(*height)) {}
-            text.name.emphasis[line.class != "published"] x=(px(names_at)) y=(px(height + 4.)) { (short_name(line.name)) }
+            text.name.emphasis[line.class != "published"] x=(px(names_at)) y=(px(height + 4.)) { (shortened(line.name, LONGEST_NAME)) }
         }
         @for line in &lines {
             @if line.points.len() > 1 { polyline.line.(line.class) points=(path(line, &x, &y)) {} }
@@ -92,11 +92,4 @@ fn path(line: &Line, x: &Axis, y: &Axis) -> String {
         .map(|&(views, psnr)| format!("{},{}", px(x.pixel(views as f64)), px(y.pixel(psnr))))
         .collect::<Vec<_>>()
         .join(" ")
-}
-
-fn short_name(name: &str) -> String {
-    match name.chars().count() > LONGEST_NAME {
-        true => name.chars().take(LONGEST_NAME - 1).chain(['…']).collect(),
-        false => name.into(),
-    }
 }
