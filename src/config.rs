@@ -26,7 +26,7 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Captures, or folders of captures. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    /// Captures, folders of captures, or data sets of chunks, of which the part `train` is taken. `${NAME}` and `${NAME:-default}` stand for environment variables.
     pub captures: Vec<String>,
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,

@@ -2,7 +2,7 @@ use super::{device, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{BadData, Capture, Holdout, find_captures};
+use globalsplat::data::{BadData, Capture, Holdout, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
 use globalsplat::io::{check_writable_dir, load_model};
@@ -14,7 +14,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 use tch::Device;
 
-/// Train a model on captures.
+/// Train a model on captures, or on chunks of RealEstate10K and the like.
 ///
 /// Ctrl-C saves a checkpoint and stops; the same command goes on from there. At the end the views that were held out are
 /// rendered and scored, beside the answer "the nearest photo that was shown".
@@ -52,21 +52,18 @@ impl Train {
             "never" => Resume::Never,
             path => Resume::From(path.into()),
         };
-        let mut captures = vec![];
-        for path in config.data.capture_paths()? {
-            captures.extend(find_captures(&path)?);
-        }
-        if captures.is_empty() {
+        let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths()?)?);
+        if scenes.sizes().is_empty() {
             return Err(Error::input(
                 &self.config,
                 "data.captures",
                 "empty",
-                "a capture, or a folder of captures",
+                "a capture, a folder of captures, or a data set",
             )
             .into());
         }
         check_writable_dir(&self.out)?;
-        let mut trainer = Trainer::new(&config, Arc::new(captures.clone()), device)?;
+        let mut trainer = Trainer::new(&config, scenes.clone(), device)?;
 
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &resume)?;
@@ -77,7 +74,7 @@ impl Train {
                 outcome.checkpoint.display()
             );
         }
-        let validation = validate(&outcome, &config, &captures)?;
+        let validation = validate(&outcome, &config, scenes.captures())?;
         self.report(&outcome, seconds, &validation, &trainer.bad_data());
         Ok(())
     }
@@ -167,7 +164,7 @@ struct Validation {
 
 fn validate(outcome: &Outcome, config: &Config, captures: &[Capture]) -> Result<Vec<Validation>> {
     let holdout = config.data.holdout;
-    if holdout == Holdout::None {
+    if holdout == Holdout::None || captures.is_empty() {
         return Ok(vec![]);
     }
     let loaded = load_model(&outcome.checkpoint.join("model.safetensors"), Device::Cpu)?;

@@ -155,6 +155,11 @@ impl Loader {
         Ok(loader)
     }
 
+    /// Threads that load.
+    pub fn threads(&self) -> usize {
+        self.threads.len()
+    }
+
     /// The number of the next sample.
     pub fn position(&self) -> u64 {
         self.next

@@ -38,4 +38,4 @@ pub use preprocess::{ImageSize, fit};
 pub use resample::{Region, Resampler};
 pub use sample::Sample;
 pub use sampler::{ChosenViews, Sampling, choose_views};
-pub use scenes::SceneGroups;
+pub use scenes::{SceneGroups, TrainingScenes};
