@@ -1,6 +1,6 @@
 //! A run's configuration: one TOML file, every key with the paper's value as its default. Unknown keys are errors.
 
-use crate::data::{Holdout, ImageSize};
+use crate::data::{Holdout, ImageSize, JitterConfig, Sampling};
 use crate::error::{Error, Result};
 use crate::io::{find_pretrained, pretrained_folders};
 use crate::loss::{LpipsNetwork, PerceptualKind};
@@ -28,16 +28,35 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Captures, or folders of captures. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    /// Captures, folders of captures, or data sets of chunks, of which the part `train` is taken. `${NAME}` and `${NAME:-default}` stand for environment variables.
     pub captures: Vec<String>,
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,
-    /// Views the model sees in a training step, at most.
+    /// Views the model sees of a scene in a training step.
     pub context_views: usize,
-    /// Views it is asked for in a training step, at most.
+    /// Views it is asked for of a scene in a training step.
     pub target_views: usize,
+    /// [shortest, longest] part of a video, in frames, that the views of a training step are from. A video that is shorter
+    /// than the longest one counts as a whole; one that is shorter than the shortest is skipped.
+    pub window: [usize; 2],
+    /// How context views are chosen: `uniform` or `farthest`.
+    pub sampling: Sampling,
+    /// The part of a photo that is shown in training is smaller than it could be by a factor of 1 to 1 + this.
+    pub extra_crop: f64,
+    /// Whether every other sample in training is mirrored.
+    pub flip: bool,
+    /// How far training changes colours.
+    pub jitter: JitterConfig,
     /// Views never shown in training, which validation asks for.
     pub holdout: Holdout,
+    /// Share of the scenes that may be unusable before training fails: too short, or broken in any way.
+    pub max_bad_share: f64,
+    /// Threads that load; 0 for one a core.
+    pub threads: usize,
+    /// Scenes that are loaded ahead.
+    pub ahead: usize,
+    /// Decoded photos are kept where all of them together take no more than this, in 10⁶ bytes.
+    pub photo_megabytes: u64,
 }
 
 impl Default for DataConfig {
@@ -47,7 +66,16 @@ impl Default for DataConfig {
             image_size: [256, 256].into(),
             context_views: 24,
             target_views: 12,
+            window: [40, 220],
+            sampling: Sampling::Uniform,
+            extra_crop: 0.1,
+            flip: false,
+            jitter: JitterConfig::default(),
             holdout: Holdout::None,
+            max_bad_share: 0.25,
+            threads: 0,
+            ahead: 32,
+            photo_megabytes: 1000,
         }
     }
 }
@@ -249,8 +277,6 @@ impl Config {
             return refuse("curriculum.boundaries", format!("{boundaries:?}"), "ascending steps".into());
         }
         for (field, value) in [
-            ("data.context_views", self.data.context_views),
-            ("data.target_views", self.data.target_views),
             ("train.batch", self.train.batch),
             ("train.checkpoint_every", self.train.checkpoint_every as usize),
             ("train.keep_checkpoints", self.train.keep_checkpoints),
@@ -265,6 +291,32 @@ impl Config {
         ] {
             if !(value > 0. && value.is_finite()) {
                 return refuse(field, value.to_string(), "a number above 0".into());
+            }
+        }
+        let DataConfig { window: [shortest, longest], jitter, .. } = self.data;
+        if shortest > longest {
+            return refuse("data.window", format!("[{shortest}, {longest}]"), "[shortest, longest]".into());
+        }
+        for (field, views) in
+            [("data.context_views", self.data.context_views), ("data.target_views", self.data.target_views)]
+        {
+            if !(1..=shortest).contains(&views) {
+                let expected = format!("1 to the {shortest} frames of the shortest window, data.window");
+                return refuse(field, views.to_string(), expected);
+            }
+        }
+        for (field, value, largest) in [
+            ("data.extra_crop", self.data.extra_crop, 4.),
+            ("data.jitter.brightness", jitter.brightness, f64::MAX),
+            ("data.jitter.contrast", jitter.contrast, f64::MAX),
+            ("data.jitter.saturation", jitter.saturation, f64::MAX),
+            ("data.jitter.hue", jitter.hue, 0.5),
+            ("data.max_bad_share", self.data.max_bad_share, 1.),
+        ] {
+            if !(0. ..=largest).contains(&value) {
+                let expected =
+                    if largest < f64::MAX { format!("0 to {largest}") } else { "0 or more".into() };
+                return refuse(field, value.to_string(), expected);
             }
         }
         if !(0. ..=1.).contains(&self.train.warmup) {

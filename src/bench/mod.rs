@@ -1,7 +1,10 @@
 //! How fast things are: measured by commands that anyone can run, never by tests.
 
+mod loader;
 mod raster;
+mod video;
 
+pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use raster::{RasterReport, Stage, bench_raster, made_up_scene};
 
 use serde::Serialize;

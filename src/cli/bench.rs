@@ -1,12 +1,14 @@
 use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use globalsplat::bench::{RasterReport, Spread, bench_raster, made_up_scene};
-use globalsplat::data::{ImageSize, open_capture, view_batch};
+use globalsplat::bench::{RasterReport, Spread, bench_loader, bench_raster, made_up_scene, made_up_videos};
+use globalsplat::config::DataConfig;
+use globalsplat::data::{ImageSize, TrainingScenes, open_capture, view_batch};
 use globalsplat::error::Error;
-use globalsplat::io::read_ply;
+use globalsplat::io::{check_writable_dir, read_ply};
 use globalsplat::render::Cameras;
 use std::path::PathBuf;
+use std::sync::Arc;
 use tch::Device;
 
 /// Measure how fast this machine runs the parts.
@@ -19,12 +21,14 @@ pub struct Bench {
 #[derive(Subcommand)]
 enum Part {
     Raster(Raster),
+    Loader(Loader),
 }
 
 impl Bench {
     pub fn run(self) -> Result<()> {
         match self.part {
             Part::Raster(raster) => raster.run(),
+            Part::Loader(loader) => loader.run(),
         }
     }
 }
@@ -96,6 +100,78 @@ impl Raster {
         } else {
             print_report(&report);
         }
+        Ok(())
+    }
+}
+
+/// The loader, from chunks of JPEGs to augmented training samples in tensors, stage by stage.
+///
+/// Without --data the input is made up: chunks of 640x360 video. Samples are the paper's, 24 context and 12 target views of
+/// 256x256.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat bench loader\n  \
+    globalsplat bench loader --data datasets/re10k --threads 8 --samples 10000 --json")]
+pub struct Loader {
+    /// A data set, of which the part `train` is taken, or captures
+    #[arg(long, value_name = "ROOT")]
+    data: Option<PathBuf>,
+    /// Write the made-up data into this folder and leave them there
+    #[arg(long, value_name = "DIR", conflicts_with = "data")]
+    keep: Option<PathBuf>,
+    /// Threads that load; by default one a core
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
+    threads: u16,
+    /// Samples that are measured
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
+    samples: u64,
+    /// Print the measurements as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Loader {
+    pub fn run(self) -> Result<()> {
+        let temporary = tempfile::tempdir()?;
+        let root = match (&self.data, &self.keep) {
+            (Some(data), _) => data.clone(),
+            (None, keep) => {
+                let root = keep.as_deref().unwrap_or(temporary.path());
+                check_writable_dir(root)?;
+                made_up_videos(root)?;
+                root.to_owned()
+            }
+        };
+        let scenes = Arc::new(TrainingScenes::find(&[root])?);
+        let config = DataConfig { threads: self.threads.into(), ..Default::default() };
+        let report = bench_loader(&config, scenes, self.samples)?;
+        if self.json {
+            print_json(&serde_json::to_value(&report)?);
+            return Ok(());
+        }
+        let [height, width] = report.size;
+        println!(
+            "{:.2} samples/s, {:.0} views/s of {width}x{height}, {} threads, {} samples",
+            report.samples_per_second, report.views_per_second, report.threads, report.samples
+        );
+        let times = &report.milliseconds;
+        println!("{:<12} {:>8}", "stage", "ms");
+        for (stage, milliseconds) in [
+            ("read", times.read),
+            ("decode", times.decode),
+            ("resize", times.resize),
+            ("augment", times.augment),
+            ("to tensor", times.to_tensor),
+        ] {
+            println!("{stage:<12} {milliseconds:>8.3}");
+        }
+        println!("per decoded photo of a thread; {} photos for {} views", report.photos, report.views);
+        let megabytes = |bytes: u64| bytes as f64 * 1e-6;
+        println!(
+            "resident memory {:.0} MB after the first samples, {:.0} MB after the last, {:.0} MB at the most",
+            megabytes(report.resident_at_start),
+            megabytes(report.resident_at_end),
+            megabytes(report.resident_peak)
+        );
         Ok(())
     }
 }

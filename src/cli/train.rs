@@ -2,18 +2,19 @@ use super::{device, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{Capture, Holdout, find_captures};
+use globalsplat::data::{BadData, Capture, Holdout, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
 use globalsplat::io::{check_writable_dir, load_model};
 use globalsplat::train::{Event, Outcome, Resume, Trainer, run};
 use serde_json::json;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 use tch::Device;
 
-/// Train a model on captures.
+/// Train a model on captures, or on chunks of RealEstate10K and the like.
 ///
 /// Ctrl-C saves a checkpoint and stops; the same command goes on from there. At the end the views that were held out are
 /// rendered and scored, beside the answer "the nearest photo that was shown".
@@ -51,21 +52,18 @@ impl Train {
             "never" => Resume::Never,
             path => Resume::From(path.into()),
         };
-        let mut captures = vec![];
-        for path in config.data.capture_paths()? {
-            captures.extend(find_captures(&path)?);
-        }
-        if captures.is_empty() {
+        let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths()?)?);
+        if scenes.sizes().is_empty() {
             return Err(Error::input(
                 &self.config,
                 "data.captures",
                 "empty",
-                "a capture, or a folder of captures",
+                "a capture, a folder of captures, or a data set",
             )
             .into());
         }
         check_writable_dir(&self.out)?;
-        let mut trainer = Trainer::new(&config, &captures, device)?;
+        let mut trainer = Trainer::new(&config, scenes.clone(), device)?;
 
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &resume)?;
@@ -76,8 +74,8 @@ impl Train {
                 outcome.checkpoint.display()
             );
         }
-        let validation = validate(&outcome, &config, &captures)?;
-        self.report(&outcome, seconds, &validation);
+        let validation = validate(&outcome, &config, scenes.captures())?;
+        self.report(&outcome, seconds, &validation, &trainer.bad_data());
         Ok(())
     }
 
@@ -118,7 +116,7 @@ impl Train {
         Ok(outcome)
     }
 
-    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation]) {
+    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation], bad_data: &BadData) {
         let mean = |value: fn(&Validation) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
@@ -127,6 +125,7 @@ impl Train {
                 "checkpoint": outcome.checkpoint,
                 "seconds": seconds,
                 "skipped_steps": outcome.skipped,
+                "skipped_scenes": bad_data,
             });
             if !validation.is_empty() {
                 object["held_out"] = json!({
@@ -143,6 +142,9 @@ impl Train {
         println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
         if outcome.skipped > 0 {
             println!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
+        }
+        if bad_data.total() > 0 {
+            println!("{bad_data}");
         }
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
@@ -171,7 +173,7 @@ struct Validation {
 
 fn validate(outcome: &Outcome, config: &Config, captures: &[Capture]) -> Result<Vec<Validation>> {
     let holdout = config.data.holdout;
-    if holdout == Holdout::None {
+    if holdout == Holdout::None || captures.is_empty() {
         return Ok(vec![]);
     }
     let loaded = load_model(&outcome.checkpoint.join("model.safetensors"), Device::Cpu)?;

@@ -1,7 +1,7 @@
 //! Views as the tensors that model and renderer take.
 
 use super::capture::View;
-use crate::scene::pose_to_rows;
+use crate::scene::{Camera, pose_to_rows};
 use glam::DMat4;
 use std::borrow::Borrow;
 use tch::{Device, Kind, Tensor};
@@ -21,20 +21,33 @@ pub struct ViewBatch {
 
 /// Puts views of one size together; `poses` (camera-to-world) stand for the views' own, as after normalization.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
-    let count = views.len() as i64;
     let images: Vec<&Tensor> = views.iter().map(|view| &view.borrow().image).collect();
+    let cameras = views.iter().zip(poses).map(|(view, &c2w)| Camera { c2w, ..view.borrow().camera });
+    let images = Tensor::stack(&images, 0).unsqueeze(0).to_device(device);
+    ViewBatch::with_images(images, &[view_matrices(&cameras.collect::<Vec<_>>(), device)])
+}
+
+/// c2w, w2c and intrinsics, [1, V, …] each.
+pub(super) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
+    let count = cameras.len() as i64;
     let matrices = |rows: Vec<f64>, size: i64| {
         Tensor::from_slice(&rows).view([1, count, size, size]).to_kind(Kind::Float).to_device(device)
     };
-    ViewBatch {
-        images: Tensor::stack(&images, 0).unsqueeze(0).to_device(device),
-        c2w: matrices(poses.iter().flat_map(pose_to_rows).collect(), 4),
-        w2c: matrices(poses.iter().flat_map(|pose| pose_to_rows(&pose.inverse())).collect(), 4),
-        intrinsics: matrices(views.iter().flat_map(|v| v.borrow().camera.intrinsics.to_rows()).collect(), 3),
-    }
+    [
+        matrices(cameras.iter().flat_map(|camera| pose_to_rows(&camera.c2w)).collect(), 4),
+        matrices(cameras.iter().flat_map(|camera| pose_to_rows(&camera.c2w.inverse())).collect(), 4),
+        matrices(cameras.iter().flat_map(|camera| camera.intrinsics.to_rows()).collect(), 3),
+    ]
 }
 
 impl ViewBatch {
+    /// `images` [B, V, 3, H, W] of B scenes whose cameras are `matrices`, as [`view_matrices`] makes them.
+    pub(super) fn with_images(images: Tensor, matrices: &[[Tensor; 3]]) -> Self {
+        let cat =
+            |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
+        ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
+    }
+
     /// The views at `positions`, of every scene.
     pub fn select(&self, positions: &[usize]) -> Self {
         let index: Vec<i64> = positions.iter().map(|&p| p as i64).collect();

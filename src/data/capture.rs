@@ -2,11 +2,13 @@
 
 use super::chunk::{self, Chunk, EncodedPhoto};
 use super::distortion::Distortion;
+use super::planes::Planes;
 use super::preprocess::{ImageSize, fit};
 use super::{cameras_json, colmap, transforms_json};
 use crate::error::{Error, Result};
-use crate::io::{self, tensor_from_rgb};
+use crate::io;
 use crate::scene::{Camera, check_pose};
+use image::RgbImage;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
@@ -244,13 +246,25 @@ impl Capture {
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {
-        let photo = self.decode(frame, &frame.photo.read()?)?;
-        let image = frame.distortion.remove(photo.pixels, &frame.camera.intrinsics);
-        let (image, camera) = match size {
-            Some(size) => fit(image, &frame.camera, size),
-            None => (image, frame.camera),
+        let image = self.read_photo(frame)?;
+        let (planes, camera) = match size {
+            Some(size) => fit(&image, &frame.camera, size),
+            None => (Planes::from_rgb(&image), frame.camera),
         };
-        Ok(View { name: frame.name.clone(), image: tensor_from_rgb(&image), camera })
+        Ok(View { name: frame.name.clone(), image: planes.to_tensor(), camera })
+    }
+
+    /// The photo of view `index` at its camera's size, lens distortion removed.
+    ///
+    /// # Errors
+    /// As [`Capture::load`].
+    pub(super) fn photo(&self, index: usize) -> Result<RgbImage> {
+        self.read_photo(&self.frames[index])
+    }
+
+    fn read_photo(&self, frame: &Frame) -> Result<RgbImage> {
+        let photo = self.decode(frame, &frame.photo.read()?)?;
+        Ok(frame.distortion.remove(photo.pixels, &frame.camera.intrinsics))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<io::Photo> {

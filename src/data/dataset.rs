@@ -95,6 +95,11 @@ impl SceneGroup {
         }
     }
 
+    /// Whether it is a chunk, of one scene or more, and no capture of another format.
+    pub fn is_chunk(&self) -> bool {
+        self.is_chunk
+    }
+
     /// The chunk, or the capture's folder.
     pub fn path(&self) -> &Path {
         &self.path

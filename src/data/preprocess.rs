@@ -1,8 +1,9 @@
 //! Fitting an image to the model's size (SPEC section 9), with exact intrinsics.
 
+use super::planes::Planes;
+use super::resample::{Region, Resampler};
 use crate::scene::Camera;
 use image::RgbImage;
-use image::imageops::{self, FilterType};
 use serde::{Deserialize, Serialize};
 
 /// The width after the first resize is a multiple of it.
@@ -32,35 +33,45 @@ impl From<ImageSize> for [u32; 2] {
 
 /// Resizes to `size`'s height keeping the aspect (width rounded to a multiple of 8), cuts the largest centred rectangle of
 /// `size`'s aspect, and resizes once more where that isn't `size` yet.
-pub fn fit(image: RgbImage, camera: &Camera, size: ImageSize) -> (RgbImage, Camera) {
+pub fn fit(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
     if (camera.height, camera.width) == (size.height, size.width) {
-        return (image, *camera);
+        return (Planes::from_rgb(image), *camera);
     }
     let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
     let scaled = full_width * f64::from(size.height) / full_height;
     let width = ((scaled / WIDTH_MULTIPLE).round() * WIDTH_MULTIPLE).max(WIDTH_MULTIPLE);
     let height = f64::from(size.height);
-    let image = resize(image, width as u32, size.height);
-    let intrinsics = camera.intrinsics.resized(width / full_width, height / full_height);
+    let (scale_x, scale_y) = (width / full_width, height / full_height);
 
     let aspect = f64::from(size.width) / height;
     let (cut_width, cut_height) =
         ((height * aspect).min(width).round(), (width / aspect).min(height).round());
     let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
-    let image =
-        imageops::crop_imm(&image, left as u32, top as u32, cut_width as u32, cut_height as u32).to_image();
-    let intrinsics = intrinsics.cropped(left, top);
+    // What will be cut away isn't made.
+    let region = Region {
+        left: left / scale_x,
+        top: top / scale_y,
+        width: cut_width / scale_x,
+        height: cut_height / scale_y,
+    };
+    let cut = ImageSize { height: cut_height as u32, width: cut_width as u32 };
+    let planes = resample(image, region, cut);
+    let intrinsics = camera.intrinsics.resized(scale_x, scale_y).cropped(left, top);
 
-    let image = resize(image, size.width, size.height);
-    let intrinsics = intrinsics.resized(f64::from(size.width) / cut_width, height / cut_height);
-    (image, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })
+    let (planes, intrinsics) = if cut == size {
+        (planes, intrinsics)
+    } else {
+        let region = Region { left: 0., top: 0., width: cut_width, height: cut_height };
+        let scale = (f64::from(size.width) / cut_width, height / cut_height);
+        (resample(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
+    };
+    (planes, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })
 }
 
-fn resize(image: RgbImage, width: u32, height: u32) -> RgbImage {
-    match image.dimensions() == (width, height) {
-        true => image,
-        false => imageops::resize(&image, width, height, FilterType::Lanczos3),
-    }
+fn resample(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
+    let mut planes = Planes::new(size.width, size.height);
+    Resampler::default().resample(image, region, size, planes.bytes_mut());
+    planes
 }
 
 #[cfg(test)]
@@ -77,8 +88,8 @@ mod tests {
 
     #[test]
     fn a_wide_image_is_cut_to_a_square() {
-        let (image, fitted) = fit(RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
-        assert_eq!(image.dimensions(), (256, 256));
+        let (image, fitted) = fit(&RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
+        assert_eq!(image.to_rgb().dimensions(), (256, 256));
         // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
         let k = fitted.intrinsics;
         assert!((k.fx - 500. * 456. / 640.).abs() < 1e-9 && (k.fy - 510. * 256. / 360.).abs() < 1e-9);
@@ -87,8 +98,8 @@ mod tests {
 
     #[test]
     fn a_tall_image_is_cut_too() {
-        let (image, fitted) = fit(RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
-        assert_eq!(image.dimensions(), (192, 128));
+        let (image, fitted) = fit(&RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
+        assert_eq!(image.to_rgb().dimensions(), (192, 128));
         assert!((fitted.intrinsics.cx - 96.).abs() < 1e-9);
         assert!((fitted.intrinsics.cy - 64.).abs() < 1.); // cut at a whole pixel
     }
@@ -104,9 +115,9 @@ mod tests {
             }
         }
         let before = camera(640, 360);
-        let (fitted, after) = fit(image, &before, [128, 128].into());
+        let (fitted, after) = fit(&image, &before, [128, 128].into());
         let (mut weight, mut sx, mut sy) = (0., 0., 0.);
-        for (px, py, p) in fitted.enumerate_pixels() {
+        for (px, py, p) in fitted.to_rgb().enumerate_pixels() {
             let v = f64::from(p.0[0]);
             (weight, sx, sy) = (weight + v, sx + v * (f64::from(px) + 0.5), sy + v * (f64::from(py) + 0.5));
         }

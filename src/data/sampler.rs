@@ -1,127 +1,138 @@
-//! What a training step looks at. A sample depends on the seed and the step alone, so a run can go on from any step.
+//! Which views of a video a training sample looks at (SPEC section 8).
 
-use super::batch::{ViewBatch, view_batch};
-use super::capture::View;
-use crate::error::{Error, Result};
-use crate::scene::normalize;
-use glam::DMat4;
+use crate::config::DataConfig;
+use glam::DVec3;
+use rand::Rng;
 use rand::seq::index;
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use tch::{Device, Kind, Tensor};
+use serde::{Deserialize, Serialize};
 
-/// The views of one training step, B scenes.
-#[derive(Debug)]
-pub struct Sample {
+/// How context views are chosen from a window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Sampling {
+    /// All frames alike, as the paper says.
+    Uniform,
+    /// A random one first, then always the frame whose camera is farthest from those chosen, as the published code does.
+    Farthest,
+}
+
+/// Positions in a video, ascending.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ChosenViews {
     /// What the model sees.
-    pub context: ViewBatch,
-    /// What it is asked for.
-    pub target: ViewBatch,
-    /// Far end of the input views' frusta in each normalized scene, [B].
-    pub far: Tensor,
-    /// Whether the second half of the batch is the first half's scenes again, seen through other photos.
-    pub paired: bool,
+    pub context: Vec<usize>,
+    /// What it is asked for; may be among the context.
+    pub target: Vec<usize>,
 }
 
-impl Sample {
-    /// Every scene twice, along the batch: first with the context views at `subsets[0]`, then with those at `subsets[1]`.
-    pub fn paired(&self, subsets: &[Vec<usize>; 2]) -> Self {
-        let twice = |batch: &ViewBatch| ViewBatch::stack(&[batch, batch]);
-        Sample {
-            context: ViewBatch::stack(&[self.context.select(&subsets[0]), self.context.select(&subsets[1])]),
-            target: twice(&self.target),
-            far: Tensor::cat(&[&self.far, &self.far], 0),
-            paired: true,
+/// Views of a random window of a video whose cameras stand at `centres`; none where the video is shorter than the shortest
+/// window. The configuration's numbers of views are at most that window's length.
+pub fn choose_views(config: &DataConfig, centres: &[DVec3], random: &mut impl Rng) -> Option<ChosenViews> {
+    let [shortest, longest] = config.window;
+    if centres.len() < shortest {
+        return None;
+    }
+    let length = random.random_range(shortest..=longest).min(centres.len());
+    let start = random.random_range(0..=centres.len() - length);
+    let context = match config.sampling {
+        Sampling::Uniform => uniform(length, config.context_views, random),
+        Sampling::Farthest => farthest(&centres[start..][..length], config.context_views, random),
+    };
+    let target = uniform(length, config.target_views, random);
+    let in_video = |mut positions: Vec<usize>| {
+        positions.sort_unstable();
+        positions.iter_mut().for_each(|position| *position += start);
+        positions
+    };
+    Some(ChosenViews { context: in_video(context), target: in_video(target) })
+}
+
+fn uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usize> {
+    index::sample(random, length, count).into_vec()
+}
+
+fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
+    let mut chosen = vec![random.random_range(0..centres.len())];
+    // Of each frame to the nearest chosen one; below 0 for those that are chosen.
+    let mut distances = vec![f64::INFINITY; centres.len()];
+    while chosen.len() < count {
+        let last = chosen[chosen.len() - 1];
+        for (distance, centre) in distances.iter_mut().zip(centres) {
+            *distance = distance.min(centre.distance_squared(centres[last]));
+        }
+        distances[last] = -1.;
+        // The first of equally far ones, so that nothing is left to the machine.
+        let next = (0..centres.len()).rev().max_by(|&a, &b| distances[a].total_cmp(&distances[b]));
+        chosen.push(next.expect("more frames than views"));
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    fn config(sampling: Sampling) -> DataConfig {
+        DataConfig { window: [40, 220], context_views: 24, target_views: 12, sampling, ..Default::default() }
+    }
+
+    fn line(count: usize) -> Vec<DVec3> {
+        (0..count).map(|i| DVec3::new(i as f64, 0., 0.)).collect()
+    }
+
+    fn is_ascending(positions: &[usize]) -> bool {
+        positions.windows(2).all(|pair| pair[0] < pair[1])
+    }
+
+    #[test]
+    fn windows_are_as_long_as_they_may_be() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        for sampling in [Sampling::Uniform, Sampling::Farthest] {
+            let (mut shortest, mut longest, mut last) = (usize::MAX, 0, 0);
+            for _ in 0..2000 {
+                let views = choose_views(&config(sampling), &line(300), &mut random).unwrap();
+                assert_eq!((views.context.len(), views.target.len()), (24, 12));
+                assert!(is_ascending(&views.context) && is_ascending(&views.target));
+                let all = || views.context.iter().chain(&views.target);
+                let (first, end) = (*all().min().unwrap(), *all().max().unwrap());
+                shortest = shortest.min(end - first + 1);
+                longest = longest.max(end - first + 1);
+                last = last.max(end);
+            }
+            assert!((24..=40).contains(&shortest), "{shortest}");
+            assert!((200..=220).contains(&longest), "{longest}");
+            assert!(last > 290, "{last}");
         }
     }
 
-    /// Photos that the model sees of every scene.
-    pub fn context_views(&self) -> usize {
-        self.context.images.size()[1] as usize
-    }
-}
-
-/// Far end of a frustum in units of the capture: these data sets have no metric scale (SPEC section 2).
-const FAR: f64 = 4. * 10.;
-
-/// Draws context and target views from captures held in memory.
-#[derive(Debug)]
-pub struct Sampler {
-    captures: Vec<Vec<View>>,
-    context_views: usize,
-    target_views: usize,
-    seed: u64,
-}
-
-impl Sampler {
-    /// `captures` are the views that may be drawn, of each scene, in the order they were taken. A scene with fewer than
-    /// `context_views` lowers that number for all, as a batch needs one.
-    ///
-    /// # Errors
-    /// No captures, or one with fewer than two views.
-    pub fn new(
-        captures: Vec<Vec<View>>,
-        context_views: usize,
-        target_views: usize,
-        seed: u64,
-    ) -> Result<Self> {
-        let fewest = captures.iter().map(Vec::len).min().unwrap_or(0);
-        if fewest < 2 {
-            return Err(Error::Request(format!(
-                "training needs captures with two views or more that are not held out, found one with {fewest}"
-            )));
-        }
-        Ok(Sampler {
-            captures,
-            context_views: context_views.min(fewest),
-            target_views: target_views.min(fewest),
-            seed,
-        })
+    #[test]
+    fn a_short_clip_is_its_own_window_and_a_shorter_one_is_skipped() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        assert_eq!(choose_views(&config(Sampling::Uniform), &line(39), &mut random), None);
+        let views = choose_views(&config(Sampling::Uniform), &line(40), &mut random).unwrap();
+        assert!(views.context.iter().all(|&view| view < 40));
     }
 
-    /// The `batch` scenes of `step`.
-    ///
-    /// # Errors
-    /// Cameras that have no mean direction.
-    pub fn sample(&self, step: u64, batch: usize, device: Device) -> Result<Sample> {
-        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
-        random.set_stream(step);
-        // Different captures as far as there are enough.
-        let count = self.captures.len();
-        let mut drawn = vec![];
-        while drawn.len() < batch {
-            drawn.extend(index::sample(&mut random, count, count.min(batch - drawn.len())));
-        }
-        let scenes = drawn.into_iter().map(|capture| self.scene(capture, &mut random, device));
-        let scenes = scenes.collect::<Result<Vec<_>>>()?;
-        let (views, far): (Vec<_>, Vec<f64>) = scenes.into_iter().unzip();
-        let (contexts, targets): (Vec<_>, Vec<_>) = views.into_iter().unzip();
-        Ok(Sample {
-            context: ViewBatch::stack(&contexts),
-            target: ViewBatch::stack(&targets),
-            far: Tensor::from_slice(&far).to_kind(Kind::Float).to_device(device),
-            paired: false,
-        })
-    }
-
-    /// (context, target) and the far end of the frusta.
-    fn scene(
-        &self,
-        capture: usize,
-        random: &mut impl Rng,
-        device: Device,
-    ) -> Result<((ViewBatch, ViewBatch), f64)> {
-        let views = &self.captures[capture];
-        let mut draw = |count: usize| {
-            let mut drawn = index::sample(random, views.len(), count).into_vec();
-            drawn.sort_unstable();
-            drawn.into_iter().map(|i| &views[i]).collect::<Vec<_>>()
+    #[test]
+    fn farthest_views_are_spread_over_the_window() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        let config = DataConfig {
+            window: [64, 64],
+            context_views: 9,
+            target_views: 1,
+            sampling: Sampling::Farthest,
+            ..Default::default()
         };
-        let (context, target) = (draw(self.context_views), draw(self.target_views));
-        let poses: Vec<DMat4> = context.iter().chain(&target).map(|view| view.camera.c2w).collect();
-        let normalization = normalize(&poses)?;
-        let (context_poses, target_poses) = normalization.c2w.split_at(context.len());
-        let views = (view_batch(&context, context_poses, device), view_batch(&target, target_poses, device));
-        Ok((views, FAR / normalization.world_from_normalized.scale))
+        for _ in 0..50 {
+            let context = choose_views(&config, &line(64), &mut random).unwrap().context;
+            assert!(context[0] <= 10 && context[8] >= 53, "{context:?}");
+            let widest = context.windows(2).map(|pair| pair[1] - pair[0]).max();
+            assert!(widest <= Some(16), "{context:?}");
+        }
+        // Cameras in one place are told apart all the same.
+        let still = choose_views(&config, &[DVec3::ONE; 64], &mut random).unwrap();
+        assert!(is_ascending(&still.context));
     }
 }

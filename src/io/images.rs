@@ -16,7 +16,7 @@ use tch::{Kind, Tensor};
 /// A file that is missing or can't be decoded.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    Ok(rgb_over_black(&decode(&bytes, path)?.image))
+    Ok(rgb_over_black(decode(&bytes, path)?.image))
 }
 
 /// A photo's pixels.
@@ -55,7 +55,7 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Pho
         image.apply_orientation(orientation);
     }
     let as_stored = !turn && matches!(image, DynamicImage::ImageRgb8(_));
-    Ok(Photo { pixels: rgb_over_black(&image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
+    Ok(Photo { pixels: rgb_over_black(image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
 }
 
 /// A photo as a JPEG of high quality, or as a PNG.
@@ -116,9 +116,9 @@ fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
     move |e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG")
 }
 
-fn rgb_over_black(image: &DynamicImage) -> RgbImage {
+fn rgb_over_black(image: DynamicImage) -> RgbImage {
     if !image.color().has_alpha() {
-        return image.to_rgb8();
+        return image.into_rgb8();
     }
     let image = image.to_rgba8();
     RgbImage::from_fn(image.width(), image.height(), |x, y| {

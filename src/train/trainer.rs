@@ -4,11 +4,12 @@ use super::optimizer::AdamW;
 use super::schedule::learning_rate;
 use super::{stage_at, subsets};
 use crate::config::Config;
-use crate::data::{Capture, Sampler, View};
+use crate::data::{BadData, Loader, SceneGroups};
 use crate::error::Result;
 use crate::loss::{PerceptualLoss, losses};
 use crate::model::{GlobalSplat, Stage};
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use std::sync::Arc;
 use tch::{Device, nn};
 
 /// Model, optimizer and data of a run.
@@ -21,7 +22,9 @@ pub struct Trainer {
     perceptual: Option<PerceptualLoss>,
     /// Steps done.
     pub(super) step: u64,
-    sampler: Sampler,
+    scenes: Arc<dyn SceneGroups>,
+    /// Begins with the first step that is done, wherever that is.
+    loader: Option<Loader>,
 }
 
 /// What a step did.
@@ -52,24 +55,18 @@ pub struct StepReport {
 }
 
 impl Trainer {
-    /// Fresh weights by the configuration's seed. The captures' views that aren't held out are read into memory.
+    /// Fresh weights by the configuration's seed. `scenes` are what is learned; views held out aren't shown.
     ///
     /// # Errors
-    /// Images that can't be read, too few views, or no weights for the perceptual loss.
-    pub fn new(config: &Config, captures: &[Capture], device: Device) -> Result<Self> {
+    /// A model that can't be built, or no weights for the perceptual loss.
+    pub fn new(config: &Config, scenes: Arc<dyn SceneGroups>, device: Device) -> Result<Self> {
         let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?;
-        let training_views = |capture: &Capture| -> Result<Vec<View>> {
-            let (shown, _) = config.data.holdout.split(capture.len());
-            capture.load(&shown, Some(config.data.image_size))
-        };
-        let views = captures.iter().map(training_views).collect::<Result<Vec<_>>>()?;
-        let sampler =
-            Sampler::new(views, config.data.context_views, config.data.target_views, config.train.seed)?;
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);
         let model = GlobalSplat::new(&vs.root(), &config.model)?;
         let optimizer = AdamW::new(&vs, config.train.weight_decay);
-        Ok(Trainer { config: config.clone(), vs, model, optimizer, perceptual, step: 0, sampler })
+        let config = config.clone();
+        Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, scenes, loader: None })
     }
 
     /// Draws a sample, renders what the model makes of it, and follows the gradient.
@@ -80,7 +77,9 @@ impl Trainer {
         let config = &self.config;
         let stage = stage_at(&config.curriculum, self.step);
         let learning_rate = learning_rate(&config.train, self.step);
-        let mut sample = self.sampler.sample(self.step, config.train.batch, self.vs.device())?;
+        let (batch, device) = (config.train.batch, self.vs.device());
+        let mut sample = self.loader()?.next_batch(batch, device)?;
+        let config = &self.config;
         if config.loss.has_consistency() && sample.context_views() >= 2 {
             sample = sample.paired(&subsets(sample.context_views(), self.step));
         }
@@ -113,6 +112,21 @@ impl Trainer {
         };
         self.step += 1;
         Ok(report)
+    }
+
+    /// Where the next step's samples come from.
+    fn loader(&mut self) -> Result<&mut Loader> {
+        let first = self.step * self.config.train.batch as u64;
+        let loader = match self.loader.take() {
+            Some(loader) if loader.position() == first => loader,
+            _ => Loader::start(&self.config.data, self.config.train.seed, self.scenes.clone(), first)?,
+        };
+        Ok(self.loader.insert(loader))
+    }
+
+    /// Scenes that were skipped since the run was begun or resumed.
+    pub fn bad_data(&self) -> BadData {
+        self.loader.as_ref().map(Loader::bad_data).unwrap_or_default()
     }
 
     /// The model as it is now.

@@ -21,6 +21,7 @@ candidates = 4
 image_size = [32, 32]
 context_views = 3
 target_views = 2
+window = [3, 220]
 holdout = "every:3+1"
 
 [curriculum]

@@ -1,0 +1,227 @@
+//! What training is fed with: the same samples whatever the number of threads, from anywhere, past everything broken.
+
+use glam::{DMat4, DVec3};
+use globalsplat::config::DataConfig;
+use globalsplat::data::{
+    Capture, JitterConfig, LoadedScene, Loader, SceneGroups, open_capture, write_cameras_json,
+};
+use globalsplat::error::{Error, Result};
+use globalsplat::scene::{Camera, Intrinsics};
+use image::{Rgb, RgbImage};
+use std::path::Path;
+use std::sync::Arc;
+use tch::Device;
+
+/// Of the photos.
+const WIDTH: u32 = 48;
+const HEIGHT: u32 = 36;
+
+/// A capture of `views` JPEGs whose blue tells the scene.
+fn write_capture(folder: &Path, scene: u8, views: usize) -> Capture {
+    std::fs::create_dir_all(folder).unwrap();
+    let names: Vec<String> = (0..views).map(|view| format!("{view:03}.jpg")).collect();
+    for (view, name) in names.iter().enumerate() {
+        let photo = RgbImage::from_fn(WIDTH, HEIGHT, |x, y| {
+            Rgb([x as u8 * 5, (y + view as u32) as u8 * 4, scene * 40])
+        });
+        photo.save(folder.join(name)).unwrap();
+    }
+    let intrinsics = Intrinsics { fx: 40., fy: 41., cx: 23., cy: 18.5 };
+    let at = |view: usize| DMat4::from_translation(DVec3::new(view as f64, 0.1 * (view % 3) as f64, 0.));
+    let cameras: Vec<Camera> =
+        (0..views).map(|view| Camera { intrinsics, c2w: at(view), width: WIDTH, height: HEIGHT }).collect();
+    write_cameras_json(&folder.join("cameras.json"), &names, &cameras).unwrap();
+    open_capture(folder).unwrap()
+}
+
+fn config() -> DataConfig {
+    DataConfig {
+        image_size: [16, 24].into(),
+        context_views: 4,
+        target_views: 2,
+        window: [6, 9],
+        flip: true,
+        ahead: 5,
+        max_bad_share: 0.,
+        ..Default::default()
+    }
+}
+
+/// Captures in groups; a group that holds none is broken, and so is a capture that isn't there.
+#[derive(Debug)]
+struct Groups(Vec<Vec<Option<Capture>>>);
+
+impl SceneGroups for Groups {
+    fn sizes(&self) -> Vec<usize> {
+        self.0.iter().map(|group| group.len().max(2)).collect()
+    }
+
+    fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
+        if self.0[group].is_empty() {
+            return Err(Error::Failed(format!("group {group} is broken")));
+        }
+        let broken = || Error::Failed("a camera is NaN".into());
+        Ok(self.0[group].iter().map(|capture| capture.clone().ok_or_else(broken)).collect())
+    }
+
+    fn decoded_bytes(&self) -> Option<u64> {
+        None
+    }
+}
+
+fn groups(folder: &Path, sizes: &[usize]) -> Groups {
+    let mut scene = 0;
+    let mut group = |count: usize| {
+        let captures = (0..count).map(|_| {
+            scene += 1;
+            Some(write_capture(&folder.join(format!("{scene}")), scene, 12))
+        });
+        captures.collect()
+    };
+    Groups(sizes.iter().map(|&count| group(count)).collect())
+}
+
+fn scenes(loader: &mut Loader, count: usize) -> Vec<LoadedScene> {
+    (0..count).map(|_| loader.next_scene().unwrap()).collect()
+}
+
+fn assert_same(a: &[LoadedScene], b: &[LoadedScene]) {
+    assert_eq!(a.len(), b.len());
+    for (a, b) in a.iter().zip(b) {
+        assert_eq!((&a.context, &a.target), (&b.context, &b.target));
+        assert!(a.images == b.images && a.far == b.far);
+        for (a, b) in a.cameras.iter().zip(&b.cameras) {
+            assert!(a.c2w == b.c2w && a.intrinsics == b.intrinsics);
+        }
+    }
+}
+
+#[test]
+fn samples_depend_on_seed_and_number_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(groups(folder.path(), &[2, 3, 2]));
+    let load = |seed: u64, threads: usize, first: u64, count: usize| {
+        let config = DataConfig { threads, ..config() };
+        scenes(&mut Loader::start(&config, seed, data.clone(), first).unwrap(), count)
+    };
+    let all = load(3, 1, 0, 17);
+    assert_same(&load(3, 3, 0, 17), &all);
+    assert_same(&load(3, 2, 5, 12), &all[5..]);
+    assert_ne!(load(4, 2, 0, 17)[0].images, all[0].images);
+    // The same scene looks different in another epoch.
+    assert!(
+        all.iter().enumerate().all(|(i, scene)| all[..i].iter().all(|other| other.images != scene.images))
+    );
+}
+
+#[test]
+fn decoded_photos_that_are_kept_change_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let captures: Vec<Capture> =
+        (0..3).map(|i| write_capture(&folder.path().join(format!("{i}")), i, 12)).collect();
+    let data = Arc::new(captures);
+    let load = |photo_megabytes: u64| {
+        let config = DataConfig { photo_megabytes, ..config() };
+        scenes(&mut Loader::start(&config, 0, data.clone(), 0).unwrap(), 9)
+    };
+    assert_same(&load(0), &load(1));
+}
+
+#[test]
+fn batches_are_what_the_scenes_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(groups(folder.path(), &[4]));
+    let loader = || Loader::start(&config(), 0, data.clone(), 0).unwrap();
+    let batch = loader().next_batch(3, Device::Cpu).unwrap();
+    assert_eq!(batch.context.images.size(), [3, 4, 3, 16, 24]);
+    assert_eq!(batch.target.w2c.size(), [3, 2, 4, 4]);
+    for (b, scene) in scenes(&mut loader(), 3).iter().enumerate() {
+        for (v, &image) in scene.target.iter().enumerate() {
+            let bytes = &scene.images[image * 3 * 16 * 24..][..3 * 16 * 24];
+            let expected: Vec<f32> = bytes.iter().map(|&byte| f32::from(byte) / 255.).collect();
+            let found = batch.target.images.get(b as i64).get(v as i64).flatten(0, -1);
+            assert_eq!(Vec::<f32>::try_from(found).unwrap(), expected);
+            let cx = batch.target.intrinsics.double_value(&[b as i64, v as i64, 0, 2]);
+            assert!((cx - scene.cameras[image].intrinsics.cx).abs() < 1e-5);
+        }
+    }
+}
+
+#[test]
+fn without_augmentation_every_view_is_the_same_in_every_sample() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(vec![write_capture(folder.path(), 1, 6)]);
+    let config = DataConfig {
+        context_views: 6,
+        window: [6, 6],
+        jitter: JitterConfig::OFF,
+        extra_crop: 0.,
+        flip: false,
+        ..config()
+    };
+    let shown = scenes(&mut Loader::start(&config, 0, data, 0).unwrap(), 4);
+    assert!(shown.iter().all(|scene| scene.images == shown[0].images && scene.context == [0, 1, 2, 3, 4, 5]));
+}
+
+/// Seven good scenes, a broken group, a scene with broken cameras, a short one, and one with a broken photo.
+fn with_bad_data(folder: &Path) -> Groups {
+    let mut data = groups(folder, &[3, 2, 2]);
+    data.0[0].push(None);
+    data.0[1].push(Some(write_capture(&folder.join("short"), 0, 5)));
+    let broken = folder.join("broken");
+    data.0[2].push(Some(write_capture(&broken, 0, 12)));
+    for view in 0..12 {
+        let photo = broken.join(format!("{view:03}.jpg"));
+        let bytes = std::fs::read(&photo).unwrap();
+        std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
+    }
+    data.0.push(vec![]);
+    data
+}
+
+#[test]
+fn bad_data_are_counted_and_skipped() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(with_bad_data(folder.path()));
+    let load = |threads: usize, first: u64, count: usize| {
+        let config = DataConfig { max_bad_share: 0.5, threads, ..config() };
+        let mut loader = Loader::start(&config, 0, data.clone(), first).unwrap();
+        (scenes(&mut loader, count), loader.bad_data())
+    };
+    let (all, bad) = load(1, 0, 24);
+    assert!(all.iter().all(|scene| scene.images.iter().any(|&byte| byte > 0)));
+    let counts = [bad.scenes, bad.in_broken_files, bad.broken, bad.too_short, bad.with_broken_images];
+    assert_eq!(counts, [12, 2, 1, 1, 1]);
+    let line = bad.to_string();
+    assert!(
+        line.starts_with("5 of 12 scenes were skipped: 1 too short, 2 in broken files, 1 with"),
+        "{line}"
+    );
+    assert_eq!(line.lines().count(), 1);
+    // Those that stand in for bad ones follow from the number, too.
+    assert_same(&load(3, 7, 17).0, &all[7..]);
+}
+
+#[test]
+fn too_much_bad_data_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(with_bad_data(folder.path()));
+    let config = DataConfig { max_bad_share: 0.2, threads: 2, ..config() };
+    let mut loader = Loader::start(&config, 0, data, 0).unwrap();
+    let error = (0..24).find_map(|_| loader.next_scene().err()).expect("3 of 12 are too many").to_string();
+    assert!(
+        error.contains("of 12 scenes were skipped") && error.contains("data.max_bad_share allows 0.2"),
+        "{error}"
+    );
+}
+
+#[test]
+fn nothing_but_bad_data_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(vec![write_capture(folder.path(), 0, 5)]);
+    let config = DataConfig { max_bad_share: 1., ..config() };
+    let error = Loader::start(&config, 0, data, 0).unwrap().next_scene().unwrap_err().to_string();
+    assert!(error.contains("no scene can be trained on: 1 of 1 scenes were skipped: 1 too short"), "{error}");
+    let none = Arc::new(Vec::<Capture>::new());
+    assert!(Loader::start(&config, 0, none, 0).unwrap_err().to_string().contains("no scenes"));
+}
