@@ -38,6 +38,8 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         scores,
         context: vec![0, 9, 20],
         target: vec![4, 12, 17],
+        splat_bytes: None,
+        warm_up: false,
         forward_seconds,
         peak_memory_bytes: None,
     }
