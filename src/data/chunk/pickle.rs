@@ -141,7 +141,7 @@ impl<'a> Walk<'a> {
             return Err("a pickle that changes a list inside another".into());
         }
         if kind == Kind::Dict {
-            if values.len() % 2 != 0 {
+            if !values.len().is_multiple_of(2) {
                 return Err("a pickle with a key without a value".into());
             }
             values.iter().step_by(2).try_for_each(|&key| self.expect(key, Kind::Text))?;
