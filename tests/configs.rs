@@ -1,8 +1,12 @@
 //! Every configuration that ships.
 
 use globalsplat::config::Config;
+use globalsplat::data::TrainingScenes;
 use globalsplat::model::{GlobalSplat, Streams};
+use globalsplat::synth::write_room;
+use globalsplat::train::Trainer;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use tch::{Device, nn};
 
 fn folder() -> PathBuf {
@@ -26,7 +30,48 @@ fn every_configuration_builds_its_model() {
         GlobalSplat::new(&vs.root(), &config.model).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         count += 1;
     }
-    assert!(count >= 10);
+    assert!(count >= 11);
+}
+
+/// Of a configuration, everything but what makes it one of its kind made small.
+const SHRUNKEN: [&str; 17] = [
+    "model.latents=16",
+    "model.width=32",
+    "model.rgb_width=32",
+    "model.ray_width=16",
+    "model.rounds=1",
+    "model.self_attention_blocks=1",
+    "model.heads=4",
+    "data.image_size=[32, 32]",
+    "data.window=[4, 9]",
+    "data.context_views=4",
+    "data.target_views=2",
+    "data.threads=1",
+    "curriculum.boundaries=[1, 2, 2, 2]",
+    "curriculum.transition=1",
+    "loss.perceptual=none",
+    "train.batch=1",
+    "train.steps=3",
+];
+
+#[test]
+fn every_configuration_trains() {
+    let rooms = tempfile::tempdir().expect("a folder");
+    write_room(&rooms.path().join("room"), 1, 9, [40, 40].into()).expect("a room");
+    let scenes = Arc::new(TrainingScenes::find(&[rooms.path().into()]).expect("a capture"));
+    for entry in std::fs::read_dir(folder()).expect("configs/") {
+        let path = entry.expect("an entry").path();
+        let config = Config::read(&path, &SHRUNKEN.map(String::from)).unwrap_or_else(|e| panic!("{e}"));
+        let mut trainer = Trainer::new(&config, scenes.clone(), Device::Cpu).expect("a trainer");
+        let reports: Vec<_> = (0..3).map(|_| trainer.step().expect("a step")).collect();
+        let name = path.display();
+        assert!(reports.iter().all(|r| !r.skipped && r.loss.is_finite() && r.gradient_norm > 0.), "{name}");
+        let (first, last) = (reports[0].stage, reports[2].stage);
+        assert_eq!(last.index, config.curriculum.final_stage, "{name}");
+        assert!(config.curriculum.full_capacity || first.index == 0, "{name}");
+        let consistent = reports.iter().any(|r| r.consistency > 0.);
+        assert_eq!(consistent, config.loss.has_consistency(), "{name}: {reports:?}");
+    }
 }
 
 #[test]
