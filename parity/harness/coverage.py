@@ -12,6 +12,8 @@ CASES_OF = {
     "src/model/rotation.rs": ["rotation_matrix", "quaternion"],
     "src/model/stream.rs": ["stream_round", "self_attention_block"],
     "src/model/tokens.rs": ["patchify", "rgb_tokens", "ray_tokens", "tokens"],
+    "src/data/jitter.rs": ["jitter"],
+    "src/data/resample.rs": ["resample"],
     "src/loss/consistency.rs": ["consistency"],
     "src/loss/decoder_regularization.rs": ["decoder_regularization", "sh_soft_cap"],
     "src/loss/frustum.rs": ["frustum"],

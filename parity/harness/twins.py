@@ -5,6 +5,7 @@
 
 import reference.decoder
 import reference.encoder
+import reference.jitter
 import reference.loss.consistency
 import reference.loss.decoder_regularization
 import reference.loss.frustum
@@ -15,6 +16,7 @@ import reference.loss.subsets
 import reference.model
 import reference.normalize
 import reference.rays
+import reference.resample
 import reference.rotation
 import reference.schedule
 import reference.splat
@@ -329,6 +331,21 @@ def perceptual(config, params, inputs):
         *halves, truth = (t.flatten(0, 1) for t in (*halves, inputs["truth"]))
         losses = [reference.loss.lpips.lpips(config["kind"], inputs, half, truth).mean() for half in halves]
     return {"loss": sum(losses) / 2.0}
+
+
+# ---- photos ----------------------------------------------------------------------------------------------------------
+
+
+@twin
+def resample(config, params, inputs):
+    height, width = config["size"]
+    return {"image": reference.resample.resample(inputs["image"], config["region"], height, width)}
+
+
+@twin
+def jitter(config, params, inputs):
+    adjustments = [next(iter(adjustment.items())) for adjustment in config["adjustments"]]
+    return {"image": reference.jitter.jitter(inputs["image"], adjustments)}
 
 
 # ---- training --------------------------------------------------------------------------------------------------------

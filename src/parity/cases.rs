@@ -2,7 +2,7 @@
 
 use super::{Answer, Request, Tensors};
 use crate::config::{CurriculumConfig, TrainConfig};
-use crate::data::ViewBatch;
+use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
@@ -12,6 +12,7 @@ use crate::render::{self, Cameras};
 use crate::scene;
 use crate::train;
 use glam::DMat4;
+use image::RgbImage;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 use tch::{Kind, Tensor, nn};
@@ -45,6 +46,8 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "vgg19" => vgg19(request),
         "perceptual" => perceptual(request),
         "consistency" => consistency(request),
+        "resample" => resample(request),
+        "jitter" => jitter(request),
         "subsets" => subsets(request),
         "learning_rate" => learning_rate(request),
         "stages" => stages(request),
@@ -359,6 +362,27 @@ fn perceptual(request: &Request) -> Result<Answer> {
     Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&request.case))?;
     vs.freeze();
     loss_of(network.loss(request.input("rendered")?, request.input("truth")?))
+}
+
+fn resample(request: &Request) -> Result<Answer> {
+    let image = request.input("image")?;
+    let (height, width) = (image.size()[0] as u32, image.size()[1] as u32);
+    let bytes = Vec::<u8>::try_from(image.flatten(0, -1))?;
+    let image = RgbImage::from_raw(width, height, bytes).expect("three bytes a pixel");
+    let [left, top, region_width, region_height] = request.number("region")?;
+    let region = data::Region { left, top, width: region_width, height: region_height };
+    let size: data::ImageSize = request.number("size")?;
+    let mut planes = vec![0u8; 3 * size.height as usize * size.width as usize];
+    data::Resampler::default().resample(&image, region, size, &mut planes);
+    let shape = [3, i64::from(size.height), i64::from(size.width)];
+    outputs([("image", Tensor::from_slice(&planes).view(shape).to_kind(Kind::Float))])
+}
+
+fn jitter(request: &Request) -> Result<Answer> {
+    let image = request.input("image")?;
+    let mut planes = Vec::<f32>::try_from(image.flatten(0, -1))?;
+    data::Jitter { adjustments: request.number("adjustments")? }.apply(&mut planes);
+    outputs([("image", Tensor::from_slice(&planes).view_as(image))])
 }
 
 fn steps(request: &Request) -> Result<Vec<u64>> {
