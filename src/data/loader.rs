@@ -82,6 +82,9 @@ pub struct Loader {
     next: u64,
 }
 
+/// Decoded photos by place and view.
+type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
+
 /// What all threads work with.
 #[derive(Debug)]
 struct Shared {
@@ -90,8 +93,8 @@ struct Shared {
     order: Order,
     groups: OpenGroups,
     ledger: Ledger,
-    /// Decoded photos by place and view, where there is memory for all of them.
-    photos: Option<Mutex<HashMap<(Place, usize), Arc<RgbImage>>>>,
+    /// Where there is memory for all of them.
+    photos: Option<Mutex<DecodedPhotos>>,
     stopped: AtomicBool,
 }
 
