@@ -35,8 +35,9 @@ parity: venv build
 	.venv/bin/python -m pytest -q parity
 	.venv/bin/python parity/run.py --self-test
 
-# How fast this machine runs the rasterizer, and how time grows with Gaussians and pixels.
+# How fast this machine runs the rasterizer, how its time grows with Gaussians and pixels, and how fast training data load.
 bench: build
+	@target/release/globalsplat bench loader
 	@target/release/globalsplat bench raster
 	@target/release/globalsplat bench raster --scaling --repeats 5
 

@@ -38,10 +38,8 @@ pub struct LoaderReport {
     pub views_per_second: f64,
     /// Milliseconds of a thread per decoded photo.
     pub milliseconds: StageMilliseconds,
-    /// Resident bytes after the first samples.
-    pub resident_at_start: u64,
-    /// Resident bytes after the last one.
-    pub resident_at_end: u64,
+    /// Resident memory after each tenth of the samples, in bytes: the first holds what a run holds, the last no more.
+    pub resident_by_tenth: Vec<u64>,
     /// Resident bytes at the most.
     pub resident_peak: u64,
 }
@@ -86,13 +84,16 @@ pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: 
     for _ in 0..WARM_UP {
         next(&mut loader)?;
     }
-    let resident_at_start = resident_memory_bytes();
     let (mut views, mut photos, mut times, mut to_tensor) = (0, 0, LoadTimes::default(), 0.);
+    let mut resident_by_tenth = vec![];
     let start = Instant::now();
-    for _ in 0..samples {
+    for sample in 0..samples {
         let (its_views, its_photos, its_times, seconds) = next(&mut loader)?;
         (views, photos, to_tensor) = (views + its_views, photos + its_photos, to_tensor + seconds);
         times += its_times;
+        if (sample + 1) * 10 / samples > sample * 10 / samples {
+            resident_by_tenth.push(resident_memory_bytes());
+        }
     }
     let seconds = start.elapsed().as_secs_f64();
     let per_photo = |seconds: f64| 1e3 * seconds / photos as f64;
@@ -111,8 +112,7 @@ pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: 
             augment: per_photo(times.augment),
             to_tensor: per_photo(to_tensor),
         },
-        resident_at_start,
-        resident_at_end: resident_memory_bytes(),
+        resident_by_tenth,
         resident_peak: peak_memory_bytes(),
     })
 }

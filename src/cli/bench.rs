@@ -167,9 +167,13 @@ impl Loader {
         println!("per decoded photo of a thread; {} photos for {} views", report.photos, report.views);
         let megabytes = |bytes: u64| bytes as f64 * 1e-6;
         println!(
-            "resident memory {:.0} MB after the first samples, {:.0} MB after the last, {:.0} MB at the most",
-            megabytes(report.resident_at_start),
-            megabytes(report.resident_at_end),
+            "resident memory after each tenth of the samples {} MB, {:.0} MB at the most",
+            report
+                .resident_by_tenth
+                .iter()
+                .map(|&bytes| format!("{:.0}", megabytes(bytes)))
+                .collect::<Vec<_>>()
+                .join(" "),
             megabytes(report.resident_peak)
         );
         Ok(())
