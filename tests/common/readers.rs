@@ -10,8 +10,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+/// Reads whatever it is given.
+pub type Reader = fn(&[u8]);
+
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, fn(&[u8])); 11] = [
+pub const READERS: [(&str, Reader); 11] = [
     ("cameras_json", cameras_json),
     ("chunk", chunk),
     ("colmap_binary", colmap_binary),
