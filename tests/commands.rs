@@ -3,8 +3,8 @@
 mod common;
 
 use common::program::{arg, command, fail, globalsplat, room, succeed, tiny_config, tiny_weights};
-use serde_json::Value;
-use std::path::Path;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
 
 fn json(arguments: &[&str]) -> Value {
     let out = succeed(arguments);
@@ -362,5 +362,53 @@ fn wrong_usage_is_exit_code_2() {
     for arguments in [&["nonsense"][..], &["eval", "--scene", "x"], &["render", "--splat", "x", "--out", "y"]]
     {
         assert_eq!(globalsplat(arguments).status.code(), Some(2), "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_data_set_of_chunks_is_learned_from_and_told_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let (captures, set) = (folder.path().join("captures"), folder.path().join("set/train"));
+    succeed(&["synth", "--out", arg(&captures), "--scenes", "3", "--frames", "6", "--size", "40"]);
+    // The smallest chunks that there are: two of the rooms share one.
+    let rooms: Vec<PathBuf> = (0..3).map(|room| captures.join(format!("room_{room:03}"))).collect();
+    succeed(&["pack", arg(&rooms[0]), arg(&rooms[1]), "--out", arg(&set)]);
+    let more = folder.path().join("more");
+    succeed(&["pack", arg(&rooms[2]), "--out", arg(&more)]);
+    std::fs::rename(more.join("000000.torch"), set.join("000001.torch")).unwrap();
+    let index = json!({"room_000": "000000.torch", "room_001": "000000.torch", "room_002": "000001.torch"});
+    std::fs::write(set.join("index.json"), index.to_string()).unwrap();
+
+    let config = tiny_config(folder.path(), &folder.path().join("set"));
+    let text = std::fs::read_to_string(&config).unwrap().replace("holdout = \"every:3+1\"", "");
+    std::fs::write(&config, text).unwrap();
+    let train = |run: &str, share: &str| {
+        let (run, share) = (folder.path().join(run), format!("data.max_bad_share={share}"));
+        globalsplat(&["train", "--config", arg(&config), "--out", arg(&run), "--json", "--set", &share])
+    };
+    let told: Value = serde_json::from_slice(&train("whole", "0").stdout).unwrap();
+    assert_eq!((told["skipped_scenes"]["scenes"].as_u64(), told["held_out"].as_object()), (Some(3), None));
+
+    let chunk = set.join("000001.torch");
+    let mut bytes = std::fs::read(&chunk).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&chunk, bytes).unwrap();
+    let told: Value = serde_json::from_slice(&train("part", "0.5").stdout).unwrap();
+    assert_eq!(told["skipped_scenes"]["in_broken_files"].as_u64(), Some(1));
+    assert!(told["skipped_scenes"]["first"].as_str().unwrap().contains("000001.torch"));
+    let refused = train("none", "0.1");
+    let err = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(1), "{err}");
+    assert!(err.contains("1 of 3 scenes were skipped") && err.contains("data.max_bad_share"), "{err}");
+}
+
+#[test]
+fn bench_loader_tells_where_time_goes() {
+    let report = json(&["bench", "loader", "--samples", "10", "--json"]);
+    assert!(report["views_per_second"].as_f64().unwrap() > 1.);
+    assert_eq!(report["resident_by_tenth"].as_array().unwrap().len(), 10);
+    for stage in ["read", "decode", "resize", "augment", "to_tensor"] {
+        assert!(report["milliseconds"][stage].as_f64().unwrap() > 0., "{stage}");
     }
 }
