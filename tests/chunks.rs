@@ -93,6 +93,8 @@ fn pack_and_inspect_tell_what_they_did() {
     let chunk = out.join("000000.torch");
     let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&chunk), "--json"])).unwrap();
     assert_eq!((told["kind"].as_str(), told["views"]["room"].as_u64()), (Some("chunk"), Some(3)));
+    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&out), "--json"])).unwrap();
+    assert_eq!((told["kind"].as_str(), told["scenes"].as_u64()), (Some("data set"), Some(1)));
     let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
     assert!(again.contains("a folder of chunks already"), "{again}");
     let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);

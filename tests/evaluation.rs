@@ -185,6 +185,9 @@ fn several_indices_make_one_report() {
 fn what_an_index_gets_wrong_is_named() {
     let set = Set::new();
     let splats = set.path("splats");
+    let one = splats.join("room_000.ply");
+    let error = refuse(&strs(&set.arguments(&["--splat", arg(&one)], "chunks")));
+    assert!(error.contains("room_000.ply: what is to be scored is no folder"), "{error}");
     let arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
     set.write_index(&json!({"room_000": {"context": [0, 7], "target": [1]}}));
     let error = fail(&strs(&arguments), 1);

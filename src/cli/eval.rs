@@ -125,6 +125,10 @@ impl Eval {
         let indices =
             self.index.iter().map(|file| EvaluationIndex::read(file)).collect::<Result<Vec<_>, _>>()?;
         let folders = folders(out, &indices)?;
+        if let Some(path) = self.splat.as_ref().or(self.renders.as_ref()).filter(|path| !path.is_dir()) {
+            let expected = "a folder with those of every scene, for --data";
+            return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
+        }
         let dataset = Dataset::open(data, Split::Test)?;
         check_writable_dir(out)?;
         let loaded = self.weights.as_ref().map(|path| load_model(path, device)).transpose()?;

@@ -1,18 +1,18 @@
 use super::print_json;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Chunk, open_capture};
+use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{CONFIG_KEY, read_ply, read_weights};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
-/// Tell what is in a splat, a weights file, a chunk or a capture.
+/// Tell what is in a splat, a weights file, a capture, a chunk, or a folder of chunks.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat inspect room.ply")]
 pub struct Inspect {
-    /// A .ply, a .safetensors, a .torch, or a capture
+    /// A .ply, a .safetensors, a .torch, a capture, or a folder with an index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
     /// Print it as one JSON object
@@ -27,6 +27,7 @@ impl Inspect {
             Some("safetensors") => weights(&self.path)?,
             Some("torch") => chunk(&self.path)?,
             Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
+            _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
                 let expected = "a .ply, a .safetensors, a .torch or a capture";
@@ -102,6 +103,18 @@ fn chunk(path: &Path) -> Result<Value> {
         "bytes": std::fs::metadata(path)?.len(),
         "scenes": scenes.len(),
         "views": scenes,
+    }))
+}
+
+fn dataset(path: &Path) -> Result<Value> {
+    let dataset = Dataset::open(path, Split::Test)?;
+    let groups = dataset.groups().iter();
+    let absent: Vec<_> = groups.filter(|group| !group.path().is_file()).map(|group| group.path()).collect();
+    Ok(json!({
+        "kind": "data set",
+        "scenes": dataset.scenes(),
+        "chunks": dataset.groups().len(),
+        "absent_chunks": absent,
     }))
 }
 
