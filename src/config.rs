@@ -186,6 +186,9 @@ pub struct TrainConfig {
     pub steps: u64,
     /// Scenes in a step.
     pub batch: usize,
+    /// Scenes that go through the model at a time, for less memory; the gradient is that of the whole step. 0 for all at
+    /// once. With `loss.consistency_depth`, whose mean is over pixels that only pictures tell, it takes a forward pass more.
+    pub micro_batch: usize,
     /// Peak learning rate.
     pub learning_rate: f64,
     /// Share of the steps over which the learning rate rises.
@@ -206,6 +209,7 @@ impl Default for TrainConfig {
             seed: 0,
             steps: 220_000,
             batch: 16,
+            micro_batch: 0,
             learning_rate: 5e-4,
             warmup: 0.03,
             weight_decay: 1e-6,

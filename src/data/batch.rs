@@ -61,6 +61,17 @@ impl ViewBatch {
         }
     }
 
+    /// `count` of the scenes, from `first` on.
+    pub fn scenes(&self, first: i64, count: i64) -> Self {
+        let narrow = |t: &Tensor| t.narrow(0, first, count);
+        ViewBatch {
+            images: narrow(&self.images),
+            c2w: narrow(&self.c2w),
+            w2c: narrow(&self.w2c),
+            intrinsics: narrow(&self.intrinsics),
+        }
+    }
+
     /// Scenes with equally many views along the batch.
     pub fn stack<B: Borrow<ViewBatch>>(scenes: &[B]) -> Self {
         let cat = |field: fn(&ViewBatch) -> &Tensor| {

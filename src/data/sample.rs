@@ -51,6 +51,22 @@ impl Sample {
         }
     }
 
+    /// Scenes, those of a paired sample counted twice.
+    pub fn scenes(&self) -> usize {
+        self.far.size()[0] as usize
+    }
+
+    /// `count` scenes from `first` on, or as many as there are, of a sample that isn't paired.
+    pub fn slice(&self, first: usize, count: usize) -> Self {
+        let (first, count) = (first as i64, count.min(self.scenes() - first) as i64);
+        Sample {
+            context: self.context.scenes(first, count),
+            target: self.target.scenes(first, count),
+            far: self.far.narrow(0, first, count),
+            paired: false,
+        }
+    }
+
     /// Photos that the model sees of every scene.
     pub fn context_views(&self) -> usize {
         self.context.images.size()[1] as usize

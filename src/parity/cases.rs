@@ -326,7 +326,8 @@ fn decoder_regularization(request: &Request) -> Result<Answer> {
 fn consistency(request: &Request) -> Result<Answer> {
     let alpha = [request.input("alpha_a")?, request.input("alpha_b")?];
     let depth = [request.input("depth_a")?, request.input("depth_b")?];
-    loss_of(loss::consistency(alpha, depth, request.number("alpha_factor")?, request.number("depth_factor")?))
+    let factors = (request.number("alpha_factor")?, request.number("depth_factor")?);
+    loss_of(loss::consistency(alpha, depth, factors.0, factors.1, &loss::Share::WHOLE))
 }
 
 fn subsets(request: &Request) -> Result<Answer> {

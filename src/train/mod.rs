@@ -4,8 +4,11 @@ mod checkpoint;
 mod curriculum;
 mod lock;
 mod optimizer;
+mod pass;
 mod run;
 mod schedule;
+#[cfg(test)]
+mod step_tests;
 mod subsets;
 mod trainer;
 

@@ -1,16 +1,16 @@
 //! One training step, and the state that steps change.
 
 use super::optimizer::AdamW;
+use super::pass::{LossValues, Pass};
 use super::schedule::learning_rate;
 use super::{stage_at, subsets};
 use crate::config::Config;
-use crate::data::{BadData, Loader, SceneGroups};
+use crate::data::{BadData, Loader, Sample, SceneGroups};
 use crate::error::Result;
-use crate::loss::{PerceptualLoss, losses};
+use crate::loss::{PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
-use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use std::sync::Arc;
-use tch::{Device, nn};
+use tch::{Device, Kind, Tensor, nn};
 
 /// Model, optimizer and data of a run.
 #[derive(Debug)]
@@ -69,31 +69,26 @@ impl Trainer {
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, scenes, loader: None })
     }
 
-    /// Draws a sample, renders what the model makes of it, and follows the gradient.
+    /// Draws a sample and follows its gradient.
     ///
     /// # Errors
     /// A sample or a picture that can't be made.
     pub fn step(&mut self) -> Result<StepReport> {
-        let config = &self.config;
-        let stage = stage_at(&config.curriculum, self.step);
-        let learning_rate = learning_rate(&config.train, self.step);
-        let (batch, device) = (config.train.batch, self.vs.device());
-        let mut sample = self.loader()?.next_batch(batch, device)?;
-        let config = &self.config;
-        if config.loss.has_consistency() && sample.context_views() >= 2 {
-            sample = sample.paired(&subsets(sample.context_views(), self.step));
-        }
+        let (batch, device) = (self.config.train.batch, self.vs.device());
+        let sample = self.loader()?.next_batch(batch, device)?;
+        self.learn(&sample)
+    }
 
-        let context = &sample.context;
-        let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, stage);
-        let pictures = render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D)?;
-        let losses = losses(&config.loss, self.perceptual.as_ref(), &sample, &decoded, &pictures);
-        let loss = losses.total.double_value(&[]);
-
-        self.optimizer.zero_grad();
-        losses.total.backward();
-        let gradient_norm = self.optimizer.clip_gradients(config.train.gradient_clip);
-        let skipped = !(loss.is_finite() && gradient_norm.is_finite());
+    /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient.
+    ///
+    /// # Errors
+    /// A picture that can't be made.
+    pub fn learn(&mut self, sample: &Sample) -> Result<StepReport> {
+        let stage = stage_at(&self.config.curriculum, self.step);
+        let learning_rate = learning_rate(&self.config.train, self.step);
+        let values = self.gradients(sample, stage)?;
+        let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
+        let skipped = !(values.total.is_finite() && gradient_norm.is_finite());
         if !skipped {
             self.optimizer.step(learning_rate);
         }
@@ -101,17 +96,50 @@ impl Trainer {
             step: self.step,
             stage,
             learning_rate,
-            loss,
-            mse: losses.mse.double_value(&[]),
-            perceptual: losses.perceptual.double_value(&[]),
-            consistency: losses.consistency.double_value(&[]),
-            frustum: losses.frustum.double_value(&[]),
-            decoder: losses.decoder.double_value(&[]),
+            loss: values.total,
+            mse: values.mse,
+            perceptual: values.perceptual,
+            consistency: values.consistency,
+            frustum: values.frustum,
+            decoder: values.decoder,
             gradient_norm,
             skipped,
         };
         self.step += 1;
         Ok(report)
+    }
+
+    /// Leaves the gradient of the sample's loss in the variables, and returns the loss.
+    pub(super) fn gradients(&mut self, sample: &Sample, stage: Stage) -> Result<LossValues> {
+        let pass =
+            Pass { config: &self.config, model: &self.model, perceptual: self.perceptual.as_ref(), stage };
+        let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
+        let halves = pair.then(|| subsets(sample.context_views(), self.step));
+        let scenes = sample.scenes();
+        let count = match self.config.train.micro_batch {
+            0 => scenes,
+            count => count,
+        };
+        let slice = |first: usize| {
+            let slice = sample.slice(first, count);
+            match &halves {
+                Some(halves) => slice.paired(halves),
+                None => slice,
+            }
+        };
+        let mut share = Share::WHOLE;
+        if pair && self.config.loss.consistency_depth > 0. && count < scenes {
+            let pixels = (0..scenes).step_by(count).map(|first| pass.depth_pixels(&slice(first)));
+            share.depth_pixels =
+                Some(Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>));
+        }
+        self.optimizer.zero_grad();
+        let mut values = LossValues::default();
+        for first in (0..scenes).step_by(count) {
+            share.scenes = count.min(scenes - first) as f64 / scenes as f64;
+            values += pass.gradients(&slice(first), &share)?;
+        }
+        Ok(values)
     }
 
     /// Where the next step's samples come from.

@@ -1,0 +1,128 @@
+//! A step's gradient, however it is computed.
+
+use super::pass::LossValues;
+use super::trainer::Trainer;
+use crate::config::{Config, LossConfig, TrainConfig};
+use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
+use crate::loss::PerceptualKind;
+use crate::model::{ModelConfig, Stage};
+use crate::scene::{Camera, Intrinsics};
+use glam::{DMat4, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tch::{Device, Kind, Tensor};
+
+const SIZE: u32 = 32;
+
+/// Three scenes of five context and two target views, pictures of noise.
+fn sample() -> Sample {
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let intrinsics = Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. };
+    let mut scene = |number: usize| {
+        let at = |view: usize| DVec3::new(0.1 * view as f64 - 0.2 + 0.3 * number as f64, 0., 0.);
+        let camera =
+            |view| Camera { intrinsics, c2w: DMat4::from_translation(at(view)), width: SIZE, height: SIZE };
+        LoadedScene {
+            images: (0..5 * 3 * SIZE * SIZE).map(|_| random.random()).collect(),
+            size: [SIZE, SIZE].into(),
+            cameras: (0..5).map(camera).collect(),
+            context: vec![0, 1, 2, 3, 4],
+            target: vec![1, 3],
+            far: 10. + number as f64,
+            times: LoadTimes::default(),
+        }
+    };
+    Sample::of(&[scene(0), scene(1), scene(2)], Device::Cpu)
+}
+
+fn config(model: ModelConfig, train: TrainConfig) -> Config {
+    // Factors that let every term count.
+    let loss = LossConfig {
+        perceptual: PerceptualKind::None,
+        consistency_alpha: 0.5,
+        consistency_depth: 0.5,
+        frustum: 0.5,
+        decoder_opacity: true,
+        ..Default::default()
+    };
+    Config { model, train, loss, ..Default::default() }
+}
+
+fn small() -> ModelConfig {
+    ModelConfig {
+        latents: 12,
+        width: 32,
+        rgb_width: 24,
+        ray_width: 16,
+        rounds: 2,
+        self_attention_blocks: 1,
+        heads: 4,
+        candidates: 4,
+        ..Default::default()
+    }
+}
+
+/// Loss and gradients.
+type Step = (LossValues, BTreeMap<String, Tensor>);
+
+/// Of a model whose weights are far enough from the start for its parts to matter.
+fn gradients(config: &Config, sample: &Sample) -> Step {
+    let scenes = Arc::new(Vec::<Capture>::new());
+    let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let mut variables: BTreeMap<String, Tensor> = trainer.vs.variables().into_iter().collect();
+    variables.retain(|_, variable| variable.requires_grad());
+    for variable in variables.values_mut() {
+        let noise: Vec<f32> = (0..variable.numel()).map(|_| random.random_range(-0.15..0.15)).collect();
+        let noise = Tensor::from_slice(&noise).view(variable.size().as_slice());
+        let _ = tch::no_grad(|| variable.g_add_(&noise));
+    }
+    // Some Gaussians outside of all frusta; opacities begin at 0.007, which would hardly be seen.
+    let _ = tch::no_grad(|| {
+        variables["gaussian_decoder.geo_pos_readout.bias"].shallow_clone().g_mul_scalar_(20.)
+    });
+    let mut opacities = variables["gaussian_decoder.geo_param_readout.bias"].view([-1, 10]).select(1, 9);
+    let _ = tch::no_grad(|| opacities.g_add_scalar_(4.));
+    let values = trainer.gradients(sample, Stage { index: 2, mix: 0.4 }).expect("a step");
+    (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
+}
+
+/// Holds losses and gradients against those of another way to compute them; key biases, whose gradient is zero in exact
+/// arithmetic, as a share of the largest.
+fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
+    let ((loss, found), (expected_loss, expected)) = (found, expected);
+    for (name, term) in TERMS {
+        let (found, expected) = (term(loss), term(expected_loss));
+        assert!(expected > 0., "{name} counts");
+        assert!((found / expected - 1.).abs() <= tolerance, "{name}: {found}, expected {expected}");
+    }
+    let norm = |t: &Tensor| t.to_kind(Kind::Double).norm().double_value(&[]);
+    let largest = expected.values().map(norm).fold(0., f64::max);
+    for (name, expected) in expected {
+        let scale = if name.ends_with("mem_k.bias") { largest } else { norm(expected) };
+        assert!(scale > 0., "{name} has a gradient");
+        let error = norm(&(&found[name] - expected)) / scale;
+        assert!(error <= tolerance, "{name}: relative error {error:.1e}");
+    }
+}
+
+type Term = fn(&LossValues) -> f64;
+const TERMS: [(&str, Term); 5] = [
+    ("total", |l| l.total),
+    ("mse", |l| l.mse),
+    ("consistency", |l| l.consistency),
+    ("frustum", |l| l.frustum),
+    ("decoder", |l| l.decoder),
+];
+
+#[test]
+fn slices_of_a_step_add_up_to_it() {
+    let sample = sample();
+    let whole = gradients(&config(small(), TrainConfig::default()), &sample);
+    for micro_batch in [1, 2] {
+        let sliced = config(small(), TrainConfig { micro_batch, ..Default::default() });
+        assert_same(&gradients(&sliced, &sample), &whole, 1e-5);
+    }
+}
