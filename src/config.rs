@@ -189,6 +189,9 @@ pub struct TrainConfig {
     /// Scenes that go through the model at a time, for less memory; the gradient is that of the whole step. 0 for all at
     /// once. With `loss.consistency_depth`, whose mean is over pixels that only pictures tell, it takes a forward pass more.
     pub micro_batch: usize,
+    /// Whether the encoder keeps nothing of a round but what it began with, and computes the round again in the backward
+    /// pass: less memory for a third of the time.
+    pub checkpoint_rounds: bool,
     /// Peak learning rate.
     pub learning_rate: f64,
     /// Share of the steps over which the learning rate rises.
@@ -210,6 +213,7 @@ impl Default for TrainConfig {
             steps: 220_000,
             batch: 16,
             micro_batch: 0,
+            checkpoint_rounds: false,
             learning_rate: 5e-4,
             warmup: 0.03,
             weight_decay: 1e-6,

@@ -61,6 +61,39 @@ pub struct Decoded {
     pub raw: RawOutputs,
 }
 
+impl Decoded {
+    /// Applies `f` to every tensor.
+    pub(crate) fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
+        Decoded {
+            gaussians: self.gaussians.map(&f),
+            rotations_6d: f(&self.rotations_6d),
+            raw: RawOutputs {
+                log_scales: f(&self.raw.log_scales),
+                rotations: f(&self.raw.rotations),
+                sh: f(&self.raw.sh),
+                opacity_logits: f(&self.raw.opacity_logits),
+            },
+        }
+    }
+
+    /// Every tensor beside the same of `other`.
+    pub(crate) fn beside<'a>(&'a self, other: &'a Decoded) -> [(&'a Tensor, &'a Tensor); 10] {
+        let (ours, theirs) = (&self.gaussians, &other.gaussians);
+        [
+            (&ours.means, &theirs.means),
+            (&ours.scales, &theirs.scales),
+            (&ours.quaternions, &theirs.quaternions),
+            (&ours.opacities, &theirs.opacities),
+            (&ours.sh, &theirs.sh),
+            (&self.rotations_6d, &other.rotations_6d),
+            (&self.raw.log_scales, &other.raw.log_scales),
+            (&self.raw.rotations, &other.raw.rotations),
+            (&self.raw.sh, &other.raw.sh),
+            (&self.raw.opacity_logits, &other.raw.opacity_logits),
+        ]
+    }
+}
+
 /// Scene tokens to Gaussians.
 #[derive(Debug)]
 pub struct Decoder {

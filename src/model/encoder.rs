@@ -22,6 +22,18 @@ pub struct Encoded {
     pub appearance: Tensor,
 }
 
+impl Encoded {
+    /// Applies `f` to both.
+    pub(crate) fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
+        Encoded { geometry: f(&self.geometry), appearance: f(&self.appearance) }
+    }
+
+    /// Both, each beside the same of `other`.
+    pub(crate) fn beside<'a>(&'a self, other: &'a Encoded) -> [(&'a Tensor, &'a Tensor); 2] {
+        [(&self.geometry, &other.geometry), (&self.appearance, &other.appearance)]
+    }
+}
+
 /// Slots, streams and mixers.
 #[derive(Debug)]
 pub struct Encoder {
@@ -73,33 +85,71 @@ impl Encoder {
 
     /// `scene_tokens` [M, d], `tokens` [B, V·P, token width].
     pub fn forward(&self, scene_tokens: &Tensor, tokens: &Tensor) -> Encoded {
+        let (mut slots, memory) = self.start(scene_tokens, tokens);
+        for round in 0..self.rounds() {
+            slots = self.round(round, &slots, &memory);
+        }
+        self.decoded(&slots)
+    }
+
+    /// Every stream's own view of the slots, and the memory [B, 4 + V·P, token width] that all rounds read.
+    pub(super) fn start(&self, scene_tokens: &Tensor, tokens: &Tensor) -> (Slots, Tensor) {
         let batch = tokens.size()[0];
         let expand = |t: &Tensor| t.expand([batch, -1, -1], false);
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
         let slots = expand(&Tensor::cat(&slots, 1)); // [B, 4 + M + 1 + 4, d]
         let memory = Tensor::cat(&[expand(&self.memory_registers), tokens.shallow_clone()], 1);
+        let slots = Slots {
+            geometry: self.geometry_start.forward(&slots),
+            appearance: self.appearance.as_ref().map(|branch| branch.start.forward(&slots)),
+        };
+        (slots, memory)
+    }
 
-        let decoded = |slots: &Tensor| slots.narrow(1, AUXILIARIES, self.latents);
-        let mut geometry = self.geometry_start.forward(&slots);
-        match &self.appearance {
-            None => {
-                for round in &self.geometry_rounds {
-                    geometry = round.forward(&geometry, &memory);
-                }
-                Encoded { geometry: decoded(&geometry), appearance: decoded(&geometry) }
+    /// Both streams read and think, each by itself, then they meet.
+    pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Tensor) -> Slots {
+        let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory);
+        match (&self.appearance, &slots.appearance) {
+            (Some(branch), Some(appearance)) => {
+                let appearance = branch.rounds[round].forward(appearance, memory);
+                let (geometry, appearance) = branch.mixers[round].forward(&geometry, &appearance);
+                Slots { geometry, appearance: Some(appearance) }
             }
-            Some(branch) => {
-                let mut appearance = branch.start.forward(&slots);
-                for ((round, appearance_round), mixer) in
-                    self.geometry_rounds.iter().zip(&branch.rounds).zip(&branch.mixers)
-                {
-                    geometry = round.forward(&geometry, &memory);
-                    appearance = appearance_round.forward(&appearance, &memory);
-                    (geometry, appearance) = mixer.forward(&geometry, &appearance);
-                }
-                Encoded { geometry: decoded(&geometry), appearance: decoded(&appearance) }
-            }
+            _ => Slots { geometry, appearance: None },
         }
+    }
+
+    /// The scene tokens among the slots.
+    pub(super) fn decoded(&self, slots: &Slots) -> Encoded {
+        let decoded = |slots: &Tensor| slots.narrow(1, AUXILIARIES, self.latents);
+        Encoded {
+            geometry: decoded(&slots.geometry),
+            appearance: decoded(slots.appearance.as_ref().unwrap_or(&slots.geometry)),
+        }
+    }
+
+    pub(super) fn rounds(&self) -> usize {
+        self.geometry_rounds.len()
+    }
+}
+
+/// What goes from round to round: both streams, or the only one, [B, 4 + M + 1 + 4, d] each.
+#[derive(Debug)]
+pub(super) struct Slots {
+    geometry: Tensor,
+    appearance: Option<Tensor>,
+}
+
+impl Slots {
+    /// Applies `f` to every stream.
+    pub fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
+        Slots { geometry: f(&self.geometry), appearance: self.appearance.as_ref().map(f) }
+    }
+
+    /// Every stream beside the same of `other`.
+    pub fn beside<'a>(&'a self, other: &'a Slots) -> Vec<(&'a Tensor, &'a Tensor)> {
+        let appearance = self.appearance.as_ref().zip(other.appearance.as_ref());
+        std::iter::once((&self.geometry, &other.geometry)).chain(appearance).collect()
     }
 }
 

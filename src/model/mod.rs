@@ -9,8 +9,10 @@ mod decoder;
 mod encoder;
 mod gaussians;
 mod layers;
+mod leaves;
 mod merge;
 mod mixer;
+mod recompute;
 mod rotation;
 mod stream;
 mod tokens;
@@ -22,6 +24,10 @@ pub use gaussians::Gaussians;
 pub use merge::Stage;
 pub use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub use tokens::{Tokenizer, patchify};
+
+// For training, which goes through the model in parts.
+pub(crate) use leaves::{leaf, pull_back};
+pub(crate) use recompute::KeptRounds;
 
 // For the parity checks, which run every module by itself.
 pub(crate) use camera_code::CameraCode;
@@ -77,6 +83,11 @@ impl GlobalSplat {
     /// The second third: scene tokens that have seen every view.
     pub fn encode(&self, tokens: &Tensor) -> Encoded {
         self.encoder.forward(&self.scene_tokens, &tokens.flatten(1, 2))
+    }
+
+    /// As [`GlobalSplat::encode`], but every round is computed again in the backward pass.
+    pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (Encoded, KeptRounds<'_>) {
+        self.encoder.forward_keeping_rounds(&self.scene_tokens, &tokens.flatten(1, 2))
     }
 
     /// The last third.

@@ -1,11 +1,15 @@
-//! Forward and backward pass of a slice of a step.
+//! Forward and backward pass of a slice of a step, part by part.
+//!
+//! Every part begins with leaves that hold what the part before gave, and its backward pass with the gradients that these
+//! leaves got. So what one part kept is freed before the backward pass of the one before it begins, the encoder may choose
+//! to keep nothing and compute its rounds again, and one can tell how long each part takes.
 
 use crate::config::Config;
 use crate::data::Sample;
 use crate::error::Result;
 use crate::loss::{Losses, PerceptualLoss, Share, depth_pixels, losses};
-use crate::model::{GlobalSplat, Stage};
-use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use crate::model::{GlobalSplat, Stage, leaf, pull_back};
+use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
 use std::ops::AddAssign;
 use tch::{Tensor, no_grad};
 
@@ -30,7 +34,7 @@ pub(super) struct LossValues {
 }
 
 impl LossValues {
-    fn of(losses: &Losses) -> Self {
+    pub fn of(losses: &Losses) -> Self {
         let value = |t: &Tensor| t.double_value(&[]);
         LossValues {
             total: value(&losses.total),
@@ -58,10 +62,31 @@ impl Pass<'_> {
     /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own.
     pub fn gradients(&self, sample: &Sample, share: &Share) -> Result<LossValues> {
         let context = &sample.context;
-        let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, self.stage);
-        let pictures = render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D)?;
-        let losses = losses(&self.config.loss, self.perceptual, sample, &decoded, &pictures, share);
+        let tokens = self.model.tokens(&context.images, &context.c2w, &context.intrinsics);
+        let tokens_leaf = leaf(&tokens);
+        let (encoded, kept) = match self.config.train.checkpoint_rounds {
+            true => {
+                let (encoded, kept) = self.model.encode_keeping_rounds(&tokens_leaf);
+                (encoded, Some(kept))
+            }
+            false => (self.model.encode(&tokens_leaf), None),
+        };
+        let encoded_leaves = encoded.map(leaf);
+        let decoded = self.model.decode(&encoded_leaves, self.stage);
+        let decoded_leaves = decoded.map(leaf);
+        let Pictures { rgb, alpha, depth } =
+            render(&decoded_leaves.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D)?;
+        let pictures = Pictures { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+        let losses = losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, share);
+
         losses.total.backward();
+        pull_back(&[(&rgb, &pictures.rgb), (&alpha, &pictures.alpha), (&depth, &pictures.depth)]);
+        pull_back(&decoded.beside(&decoded_leaves));
+        pull_back(&encoded.beside(&encoded_leaves));
+        if let Some(kept) = kept {
+            kept.backward();
+        }
+        pull_back(&[(&tokens, &tokens_leaf)]);
         Ok(LossValues::of(&losses))
     }
 

@@ -1,11 +1,13 @@
 //! A step's gradient, however it is computed.
 
 use super::pass::LossValues;
+use super::subsets;
 use super::trainer::Trainer;
 use crate::config::{Config, LossConfig, TrainConfig};
-use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
-use crate::loss::PerceptualKind;
-use crate::model::{ModelConfig, Stage};
+use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
+use crate::loss::{PerceptualKind, Share, losses};
+use crate::model::{ModelConfig, Stage, Streams};
+use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
 use rand::{Rng, SeedableRng};
@@ -15,6 +17,7 @@ use std::sync::Arc;
 use tch::{Device, Kind, Tensor};
 
 const SIZE: u32 = 32;
+const STAGE: Stage = Stage { index: 2, mix: 0.4 };
 
 /// Three scenes of five context and two target views, pictures of noise.
 fn sample() -> Sample {
@@ -67,17 +70,25 @@ fn small() -> ModelConfig {
 /// Loss and gradients.
 type Step = (LossValues, BTreeMap<String, Tensor>);
 
-/// Of a model whose weights are far enough from the start for its parts to matter.
+/// By the trainer.
 fn gradients(config: &Config, sample: &Sample) -> Step {
+    of_model(config, |trainer| trainer.gradients(sample, STAGE).expect("a step"))
+}
+
+/// What `pass` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.
+fn of_model(config: &Config, pass: impl FnOnce(&mut Trainer) -> LossValues) -> Step {
     let scenes = Arc::new(Vec::<Capture>::new());
     let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let mut variables: BTreeMap<String, Tensor> = trainer.vs.variables().into_iter().collect();
     variables.retain(|_, variable| variable.requires_grad());
-    for variable in variables.values_mut() {
+    for (name, variable) in &mut variables {
         let noise: Vec<f32> = (0..variable.numel()).map(|_| random.random_range(-0.15..0.15)).collect();
         let noise = Tensor::from_slice(&noise).view(variable.size().as_slice());
-        let _ = tch::no_grad(|| variable.g_add_(&noise));
+        // Nothing is left of the numbers drawn for a fresh model: other tests draw from the same generator.
+        let is_norm = name.ends_with(".weight") && noise.dim() == 1;
+        let value = if is_norm { noise + 1. } else { noise };
+        tch::no_grad(|| variable.copy_(&value));
     }
     // Some Gaussians outside of all frusta; opacities begin at 0.007, which would hardly be seen.
     let _ = tch::no_grad(|| {
@@ -85,7 +96,7 @@ fn gradients(config: &Config, sample: &Sample) -> Step {
     });
     let mut opacities = variables["gaussian_decoder.geo_param_readout.bias"].view([-1, 10]).select(1, 9);
     let _ = tch::no_grad(|| opacities.g_add_scalar_(4.));
-    let values = trainer.gradients(sample, Stage { index: 2, mix: 0.4 }).expect("a step");
+    let values = pass(&mut trainer);
     (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
 }
 
@@ -124,5 +135,39 @@ fn slices_of_a_step_add_up_to_it() {
     for micro_batch in [1, 2] {
         let sliced = config(small(), TrainConfig { micro_batch, ..Default::default() });
         assert_same(&gradients(&sliced, &sample), &whole, 1e-5);
+    }
+}
+
+#[test]
+fn rounds_that_are_computed_again_give_the_same_gradients() {
+    let sample = sample();
+    for streams in [Streams::Dual, Streams::Single] {
+        let model = ModelConfig { streams, ..small() };
+        let [kept, again] = [false, true].map(|checkpoint_rounds| {
+            gradients(
+                &config(model.clone(), TrainConfig { checkpoint_rounds, ..Default::default() }),
+                &sample,
+            )
+        });
+        assert_same(&again, &kept, 1e-6);
+    }
+}
+
+#[test]
+fn a_pass_in_parts_is_the_plain_one() {
+    let sample = sample();
+    for streams in [Streams::Dual, Streams::Single] {
+        let config = config(ModelConfig { streams, ..small() }, TrainConfig::default());
+        let plain = of_model(&config, |trainer| {
+            let sample = sample.paired(&subsets(sample.context_views(), 0));
+            let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
+            let decoded = trainer.model.forward(images, c2w, intrinsics, STAGE);
+            let pictures =
+                render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D).expect("pictures");
+            let losses = losses(&config.loss, None, &sample, &decoded, &pictures, &Share::WHOLE);
+            losses.total.backward();
+            LossValues::of(&losses)
+        });
+        assert_same(&gradients(&config, &sample), &plain, 1e-6);
     }
 }
