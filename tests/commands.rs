@@ -73,6 +73,39 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
 }
 
 #[test]
+fn bench_train_tells_where_a_step_goes() {
+    let (folder, capture) = room();
+    let config = tiny_config(folder.path(), &capture);
+    let bench = |options: &[&str]| {
+        json(
+            &[
+                &["bench", "train", "--config", arg(&config), "--batch", "3", "--steps", "2", "--json"],
+                options,
+            ]
+            .concat(),
+        )
+    };
+    let names = |report: &Value| -> Vec<String> {
+        let sections = report["sections"].as_array().unwrap();
+        let time = |section: &Value| section["milliseconds"]["least"].as_f64().unwrap();
+        assert!(sections.iter().all(|section| time(section) > 0.));
+        assert!(sections.iter().map(time).sum::<f64>() <= report["milliseconds"]["median"].as_f64().unwrap());
+        sections.iter().map(|section| section["name"].as_str().unwrap().to_string()).collect()
+    };
+    let parts = ["tokens", "encoder", "decoder", "render", "losses"];
+    let backward: Vec<String> = parts.iter().rev().map(|part| format!("{part} backward")).collect();
+    let backward: Vec<&str> = backward.iter().map(String::as_str).collect();
+    let whole = bench(&[]);
+    assert_eq!(names(&whole), [&["data", "zero gradients"], &parts[..], &backward, &["optimizer"]].concat());
+    assert_eq!((&whole["scenes"], &whole["gaussians"]), (&Value::from(3), &Value::from(64)));
+    let sliced = bench(&["--set", "train.micro_batch=2", "--set", "train.checkpoint_rounds=true"]);
+    assert_eq!(
+        names(&sliced),
+        [&["data", "depth pixels", "zero gradients"], &parts[..], &backward, &["optimizer"]].concat()
+    );
+}
+
+#[test]
 fn bench_tells_where_time_goes() {
     let report =
         json(&["bench", "raster", "--gaussians", "500", "--cameras", "2", "--repeats", "3", "--json"]);

@@ -2,10 +2,12 @@
 
 mod loader;
 mod raster;
+mod train;
 mod video;
 
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use raster::{RasterReport, Stage, bench_raster, made_up_scene};
+pub use train::{TrainReport, bench_train};
 
 use serde::Serialize;
 

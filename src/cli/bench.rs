@@ -1,3 +1,4 @@
+use super::bench_train::Train;
 use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
@@ -22,6 +23,7 @@ pub struct Bench {
 enum Part {
     Raster(Raster),
     Loader(Loader),
+    Train(Train),
 }
 
 impl Bench {
@@ -29,6 +31,7 @@ impl Bench {
         match self.part {
             Part::Raster(raster) => raster.run(),
             Part::Loader(loader) => loader.run(),
+            Part::Train(train) => train.run(),
         }
     }
 }

@@ -4,6 +4,7 @@
 //! object), everything else to standard error.
 
 mod bench;
+mod bench_train;
 mod device;
 mod doctor;
 mod eval;

@@ -9,6 +9,7 @@ mod run;
 mod schedule;
 #[cfg(test)]
 mod step_tests;
+mod stopwatch;
 mod subsets;
 mod trainer;
 
@@ -17,5 +18,6 @@ pub use curriculum::stage_at;
 pub use optimizer::AdamW;
 pub use run::{Event, Outcome, Resume, run};
 pub use schedule::learning_rate;
+pub use stopwatch::Stopwatch;
 pub use subsets::subsets;
 pub use trainer::{StepReport, Trainer};

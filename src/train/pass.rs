@@ -4,6 +4,7 @@
 //! leaves got. So what one part kept is freed before the backward pass of the one before it begins, the encoder may choose
 //! to keep nothing and compute its rounds again, and one can tell how long each part takes.
 
+use super::stopwatch::Stopwatch;
 use crate::config::Config;
 use crate::data::Sample;
 use crate::error::Result;
@@ -60,33 +61,42 @@ impl AddAssign for LossValues {
 
 impl Pass<'_> {
     /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own.
-    pub fn gradients(&self, sample: &Sample, share: &Share) -> Result<LossValues> {
+    pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<LossValues> {
         let context = &sample.context;
-        let tokens = self.model.tokens(&context.images, &context.c2w, &context.intrinsics);
+        let model = self.model;
+        let tokens =
+            watch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
         let tokens_leaf = leaf(&tokens);
-        let (encoded, kept) = match self.config.train.checkpoint_rounds {
+        let (encoded, kept) = watch.time("encoder", || match self.config.train.checkpoint_rounds {
             true => {
-                let (encoded, kept) = self.model.encode_keeping_rounds(&tokens_leaf);
+                let (encoded, kept) = model.encode_keeping_rounds(&tokens_leaf);
                 (encoded, Some(kept))
             }
-            false => (self.model.encode(&tokens_leaf), None),
-        };
+            false => (model.encode(&tokens_leaf), None),
+        });
         let encoded_leaves = encoded.map(leaf);
-        let decoded = self.model.decode(&encoded_leaves, self.stage);
+        let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));
         let decoded_leaves = decoded.map(leaf);
+        let cameras = Cameras::of(&sample.target);
         let Pictures { rgb, alpha, depth } =
-            render(&decoded_leaves.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D)?;
+            watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
         let pictures = Pictures { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
-        let losses = losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, share);
+        let losses = watch.time("losses", || {
+            losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, share)
+        });
 
-        losses.total.backward();
-        pull_back(&[(&rgb, &pictures.rgb), (&alpha, &pictures.alpha), (&depth, &pictures.depth)]);
-        pull_back(&decoded.beside(&decoded_leaves));
-        pull_back(&encoded.beside(&encoded_leaves));
-        if let Some(kept) = kept {
-            kept.backward();
-        }
-        pull_back(&[(&tokens, &tokens_leaf)]);
+        watch.time("losses backward", || losses.total.backward());
+        watch.time("render backward", || {
+            pull_back(&[(&rgb, &pictures.rgb), (&alpha, &pictures.alpha), (&depth, &pictures.depth)]);
+        });
+        watch.time("decoder backward", || pull_back(&decoded.beside(&decoded_leaves)));
+        watch.time("encoder backward", || {
+            pull_back(&encoded.beside(&encoded_leaves));
+            if let Some(kept) = kept {
+                kept.backward();
+            }
+        });
+        watch.time("tokens backward", || pull_back(&[(&tokens, &tokens_leaf)]));
         Ok(LossValues::of(&losses))
     }
 

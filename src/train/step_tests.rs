@@ -1,8 +1,8 @@
 //! A step's gradient, however it is computed.
 
 use super::pass::LossValues;
-use super::subsets;
 use super::trainer::Trainer;
+use super::{Stopwatch, subsets};
 use crate::config::{Config, LossConfig, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
 use crate::loss::{PerceptualKind, Share, losses};
@@ -72,7 +72,7 @@ type Step = (LossValues, BTreeMap<String, Tensor>);
 
 /// By the trainer.
 fn gradients(config: &Config, sample: &Sample) -> Step {
-    of_model(config, |trainer| trainer.gradients(sample, STAGE).expect("a step"))
+    of_model(config, |trainer| trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
 }
 
 /// What `pass` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.

@@ -3,6 +3,7 @@
 use super::optimizer::AdamW;
 use super::pass::{LossValues, Pass};
 use super::schedule::learning_rate;
+use super::stopwatch::Stopwatch;
 use super::{stage_at, subsets};
 use crate::config::Config;
 use crate::data::{BadData, Loader, Sample, SceneGroups};
@@ -76,22 +77,26 @@ impl Trainer {
     pub fn step(&mut self) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
-        self.learn(&sample)
+        self.learn(&sample, &mut Stopwatch::default())
     }
 
-    /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient.
+    /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient. `watch` hears of
+    /// every part of the step.
     ///
     /// # Errors
     /// A picture that can't be made.
-    pub fn learn(&mut self, sample: &Sample) -> Result<StepReport> {
+    pub fn learn(&mut self, sample: &Sample, watch: &mut Stopwatch) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
-        let values = self.gradients(sample, stage)?;
-        let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
-        let skipped = !(values.total.is_finite() && gradient_norm.is_finite());
-        if !skipped {
-            self.optimizer.step(learning_rate);
-        }
+        let values = self.gradients(sample, stage, watch)?;
+        let (gradient_norm, skipped) = watch.time("optimizer", || {
+            let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
+            let skipped = !(values.total.is_finite() && gradient_norm.is_finite());
+            if !skipped {
+                self.optimizer.step(learning_rate);
+            }
+            (gradient_norm, skipped)
+        });
         let report = StepReport {
             step: self.step,
             stage,
@@ -110,7 +115,12 @@ impl Trainer {
     }
 
     /// Leaves the gradient of the sample's loss in the variables, and returns the loss.
-    pub(super) fn gradients(&mut self, sample: &Sample, stage: Stage) -> Result<LossValues> {
+    pub(super) fn gradients(
+        &mut self,
+        sample: &Sample,
+        stage: Stage,
+        watch: &mut Stopwatch,
+    ) -> Result<LossValues> {
         let pass =
             Pass { config: &self.config, model: &self.model, perceptual: self.perceptual.as_ref(), stage };
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
@@ -129,15 +139,19 @@ impl Trainer {
         };
         let mut share = Share::WHOLE;
         if pair && self.config.loss.consistency_depth > 0. && count < scenes {
-            let pixels = (0..scenes).step_by(count).map(|first| pass.depth_pixels(&slice(first)));
+            let pixels = (0..scenes).step_by(count).map(|first| {
+                let slice = watch.time("data", || slice(first));
+                watch.time("depth pixels", || pass.depth_pixels(&slice))
+            });
             share.depth_pixels =
                 Some(Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>));
         }
-        self.optimizer.zero_grad();
+        watch.time("zero gradients", || self.optimizer.zero_grad());
         let mut values = LossValues::default();
         for first in (0..scenes).step_by(count) {
             share.scenes = count.min(scenes - first) as f64 / scenes as f64;
-            values += pass.gradients(&slice(first), &share)?;
+            let slice = watch.time("data", || slice(first));
+            values += pass.gradients(&slice, &share, watch)?;
         }
         Ok(values)
     }

@@ -1,0 +1,71 @@
+use super::{device, print_json};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::bench::{Spread, TrainReport, bench_train};
+use globalsplat::config::Config;
+use std::path::PathBuf;
+
+/// A training step, part by part, on made-up scenes: pictures of noise, all Gaussians shown.
+///
+/// Without --config it is the paper's main model, 24 context and 12 target views of 256x256. L_perc takes part where its
+/// weights are there.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat bench train\n  \
+    globalsplat bench train --config configs/first_light.toml --steps 20\n  \
+    globalsplat bench train --set train.checkpoint_rounds=true --json")]
+pub struct Train {
+    /// Configuration file; see configs/
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of it, as in train.checkpoint_rounds=true
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Scenes in a step, in place of train.batch
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    batch: u16,
+    /// Steps that are measured
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: u32,
+    /// cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Print the measurements as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Train {
+    pub fn run(self) -> Result<()> {
+        let device = device::parse(&self.device)?;
+        let mut config = match &self.config {
+            Some(file) => Config::read(file, &self.set)?,
+            None => Config::parse("", &self.set, "the defaults".as_ref())?,
+        };
+        config.train.batch = self.batch.into();
+        let report = bench_train(&config, self.steps as usize, device)?;
+        if self.json {
+            print_json(&serde_json::to_value(&report)?);
+        } else {
+            print_report(&report);
+        }
+        Ok(())
+    }
+}
+
+fn print_report(r: &TrainReport) {
+    let [height, width] = r.size;
+    println!(
+        "{} scenes of {} context and {} target views of {width}x{height}, {} Gaussians, {} threads, {} steps",
+        r.scenes, r.context_views, r.target_views, r.gaussians, r.threads, r.steps
+    );
+    println!("{:<18} {:>10} {:>10} {:>10} {:>7}", "ms per step", "median", "least", "3 of 4", "share");
+    let row = |name: &str, s: &Spread| {
+        let share = 1e2 * s.median / r.milliseconds.median;
+        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
+    };
+    for section in &r.sections {
+        row(section.name, &section.milliseconds);
+    }
+    row("step", &r.milliseconds);
+    println!("resident memory {:.2} GB at the most", r.resident_peak as f64 * 1e-9);
+}
