@@ -19,7 +19,9 @@ const MIN_MSE: f64 = 1e-10;
 /// Peak signal-to-noise ratio in dB of two pictures of one shape.
 pub fn psnr(picture: &Tensor, truth: &Tensor) -> f64 {
     let mse = (prepare(picture) - prepare(truth)).square().mean(Kind::Double).double_value(&[]);
-    -10. * mse.max(MIN_MSE).log10()
+    // f64::max would take NaN for the smallest error of all.
+    let mse = if mse < MIN_MSE { MIN_MSE } else { mse };
+    -10. * mse.log10()
 }
 
 /// Structural similarity of two pictures [3, H, W], H and W at least 11: the mean over channels and over the pixels whose
@@ -56,6 +58,7 @@ mod tests {
         assert!((psnr(&(&a + 0.1), &a) - 20.).abs() < 1e-5);
         assert_eq!(psnr(&a, &a), 100.);
         assert!((psnr(&(&a - 3.), &(&a + 0.1)) - 20.).abs() < 1e-5); // clamped
+        assert!(psnr(&(&a * f64::NAN), &a).is_nan());
     }
 
     #[test]
