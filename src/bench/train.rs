@@ -115,6 +115,7 @@ fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
     let is_target = |view: &usize| (view + 1) * data.target_views / views > view * data.target_views / views;
     let (target, context) = (0..views).partition(is_target);
     LoadedScene {
+        name: String::new(),
         images,
         size,
         cameras: (0..views).map(camera).collect(),

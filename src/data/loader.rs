@@ -57,6 +57,8 @@ impl AddAssign for LoadTimes {
 /// A scene of a training sample: N photos, each of them context, target or both.
 #[derive(Debug, Clone)]
 pub struct LoadedScene {
+    /// The capture's.
+    pub name: String,
     /// [N, 3, H, W].
     pub images: Vec<u8>,
     /// Of all images.
@@ -304,7 +306,8 @@ impl Shared {
                 ..Default::default()
             };
         }
-        Ok(LoadedScene { images, size, cameras, context, target, far, times: tools.times })
+        let (name, times) = (capture.name.clone(), tools.times);
+        Ok(LoadedScene { name, images, size, cameras, context, target, far, times })
     }
 
     fn photo(&self, place: Place, capture: &Capture, view: usize) -> Result<Arc<RgbImage>> {

@@ -11,6 +11,8 @@ const LEVELS: f32 = 255.;
 /// The views of one training step, B scenes.
 #[derive(Debug)]
 pub struct Sample {
+    /// The scenes', B.
+    pub names: Vec<String>,
     /// What the model sees.
     pub context: ViewBatch,
     /// What it is asked for.
@@ -33,6 +35,7 @@ impl Sample {
             ViewBatch::with_images(images(scenes, chosen, device), &matrices.collect::<Vec<_>>())
         };
         Sample {
+            names: scenes.iter().map(|scene| scene.name.clone()).collect(),
             context: batch(|scene| &scene.context),
             target: batch(|scene| &scene.target),
             far: Tensor::from_slice(&far).to_kind(Kind::Float).to_device(device),
@@ -44,6 +47,7 @@ impl Sample {
     pub fn paired(&self, subsets: &[Vec<usize>; 2]) -> Self {
         let twice = |batch: &ViewBatch| ViewBatch::stack(&[batch, batch]);
         Sample {
+            names: [&self.names[..], &self.names].concat(),
             context: ViewBatch::stack(&[self.context.select(&subsets[0]), self.context.select(&subsets[1])]),
             target: twice(&self.target),
             far: Tensor::cat(&[&self.far, &self.far], 0),
@@ -58,8 +62,11 @@ impl Sample {
 
     /// `count` scenes from `first` on, or as many as there are, of a sample that isn't paired.
     pub fn slice(&self, first: usize, count: usize) -> Self {
-        let (first, count) = (first as i64, count.min(self.scenes() - first) as i64);
+        let count = count.min(self.scenes() - first);
+        let names = self.names[first..first + count].to_vec();
+        let (first, count) = (first as i64, count as i64);
         Sample {
+            names,
             context: self.context.scenes(first, count),
             target: self.target.scenes(first, count),
             far: self.far.narrow(0, first, count),

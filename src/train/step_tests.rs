@@ -28,6 +28,7 @@ fn sample() -> Sample {
         let camera =
             |view| Camera { intrinsics, c2w: DMat4::from_translation(at(view)), width: SIZE, height: SIZE };
         LoadedScene {
+            name: String::new(),
             images: (0..5 * 3 * SIZE * SIZE).map(|_| random.random()).collect(),
             size: [SIZE, SIZE].into(),
             cameras: (0..5).map(camera).collect(),
