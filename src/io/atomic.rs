@@ -56,6 +56,18 @@ pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Resul
     Ok(())
 }
 
+/// Brings back the folder that [`replace_dir`] had moved away from `path` when its process was ended.
+///
+/// # Errors
+/// The system's refusal to rename.
+pub fn recover_dir(path: &Path) -> Result<()> {
+    let retired = sibling(path, "old");
+    match !path.exists() && retired.exists() {
+        true => fs::rename(&retired, path).map_err(Error::write(path)),
+        false => Ok(()),
+    }
+}
+
 /// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
 ///
 /// # Errors

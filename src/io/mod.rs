@@ -1,6 +1,8 @@
-//! Files: splats (PLY), weights (safetensors), images and films. Writing never leaves half a file.
+//! Files: splats (PLY), weights (safetensors), images, films and TensorBoard's events. Writing never leaves half a file.
 
+mod append;
 mod atomic;
+mod event_file;
 mod film;
 mod images;
 mod model_file;
@@ -8,7 +10,9 @@ mod ply;
 mod pretrained;
 mod weights;
 
-pub use atomic::{check_writable_dir, check_writable_file, replace_dir, write_atomically};
+pub use append::AppendFile;
+pub use atomic::{check_writable_dir, check_writable_file, recover_dir, replace_dir, write_atomically};
+pub use event_file::EventFile;
 pub use film::write_film;
 pub use images::{
     Photo, colourize_depth, decode_photo, encode_photo, encoded_image_size, enlarge, read_image,

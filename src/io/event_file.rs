@@ -1,0 +1,177 @@
+//! Event files, which TensorBoard shows: TFRecords of `Event` messages, of which this is all that we need.
+//!
+//!     message Event   { double wall_time = 1; int64 step = 2; string file_version = 3; Summary summary = 5;
+//!                       SessionLog session_log = 7; }
+//!     message SessionLog { enum { START = 1 } status = 1; }
+//!     message Summary { message Value { string tag = 1; float simple_value = 2; Image image = 4; }
+//!                       repeated Value value = 1; }
+//!     message Image   { int32 height = 1; int32 width = 2; int32 colorspace = 3; bytes encoded_image_string = 4; }
+
+use super::append::AppendFile;
+use super::images::{encode_photo, rgb_from_tensor};
+use crate::error::Result;
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+use tch::Tensor;
+
+/// What readers know the format by.
+const VERSION: &str = "brain.Event:2";
+/// `SessionLog.START`.
+const START: u64 = 1;
+/// `Image.colorspace`.
+const RGB: u64 = 3;
+
+/// A file of events, written by one process.
+#[derive(Debug)]
+pub struct EventFile {
+    file: AppendFile,
+}
+
+impl EventFile {
+    /// Makes the file at `path`, whose name has to contain `tfevents`.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn create(path: &Path) -> Result<Self> {
+        Ok(EventFile { file: AppendFile::open(path)? })
+    }
+
+    /// The first thing to write: whatever files before this one tell of `step` and later steps is void.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn start(&mut self, step: u64) -> Result<()> {
+        let version = record(&Message::event(0).bytes(3, VERSION.as_bytes()));
+        let session = record(&Message::event(step).message(7, &Message::default().varint(1, START)));
+        self.file.append(&[version, session].concat())
+    }
+
+    /// Numbers of one step, by their tags.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
+        let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
+            summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
+        });
+        self.file.append(&record(&Message::event(step).message(5, &summary)))
+    }
+
+    /// A picture [3, H, W] in [0, 1].
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn picture(&mut self, step: u64, tag: &str, picture: &Tensor) -> Result<()> {
+        let pixels = rgb_from_tensor(picture)?;
+        let image = Message::default()
+            .varint(1, u64::from(pixels.height()))
+            .varint(2, u64::from(pixels.width()))
+            .varint(3, RGB)
+            .bytes(4, &encode_photo(&pixels, false)?);
+        let value = Message::default().bytes(1, tag.as_bytes()).message(4, &image);
+        let summary = Message::default().message(1, &value);
+        self.file.append(&record(&Message::event(step).message(5, &summary)))
+    }
+}
+
+/// A protobuf message in its wire format.
+#[derive(Debug, Default)]
+struct Message(Vec<u8>);
+
+impl Message {
+    /// An `Event` of `step`, now.
+    fn event(step: u64) -> Self {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
+        let mut event = Message::default();
+        event.key(1, 1);
+        event.0.extend(now.to_le_bytes());
+        event.varint(2, step)
+    }
+
+    /// Wire types: 0 varint, 1 eight bytes, 2 length and bytes, 5 four bytes.
+    fn key(&mut self, field: u64, wire_type: u64) {
+        push_varint(&mut self.0, field << 3 | wire_type);
+    }
+
+    fn varint(mut self, field: u64, value: u64) -> Self {
+        self.key(field, 0);
+        push_varint(&mut self.0, value);
+        self
+    }
+
+    fn float(mut self, field: u64, value: f32) -> Self {
+        self.key(field, 5);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    fn bytes(mut self, field: u64, value: &[u8]) -> Self {
+        self.key(field, 2);
+        push_varint(&mut self.0, value.len() as u64);
+        self.0.extend(value);
+        self
+    }
+
+    fn message(self, field: u64, value: &Message) -> Self {
+        self.bytes(field, &value.0)
+    }
+}
+
+fn push_varint(bytes: &mut Vec<u8>, mut value: u64) {
+    while value >= 0x80 {
+        bytes.push(value as u8 | 0x80);
+        value >>= 7;
+    }
+    bytes.push(value as u8);
+}
+
+/// A TFRecord: the length, its checksum, the message, its checksum.
+fn record(message: &Message) -> Vec<u8> {
+    let length = (message.0.len() as u64).to_le_bytes();
+    let sums = [masked_crc32c(&length), masked_crc32c(&message.0)].map(u32::to_le_bytes);
+    [&length[..], &sums[0], &message.0, &sums[1]].concat()
+}
+
+/// A checksum of data that may hold checksums themselves.
+fn masked_crc32c(bytes: &[u8]) -> u32 {
+    crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+/// CRC-32 with Castagnoli's polynomial.
+fn crc32c(bytes: &[u8]) -> u32 {
+    const TABLE: [u32; 256] = {
+        const POLYNOMIAL: u32 = 0x82f6_3b78; // bits reversed
+        let mut table = [0; 256];
+        let mut byte = 0;
+        while byte < 256 {
+            let mut crc = byte as u32;
+            let mut bit = 0;
+            while bit < 8 {
+                crc = if crc & 1 == 1 { crc >> 1 ^ POLYNOMIAL } else { crc >> 1 };
+                bit += 1;
+            }
+            table[byte] = crc;
+            byte += 1;
+        }
+        table
+    };
+    !bytes.iter().fold(!0, |crc, &byte| crc >> 8 ^ TABLE[usize::from(crc as u8 ^ byte)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn checksums_are_those_of_rfc_3720() {
+        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+    }
+
+    #[test]
+    fn numbers_are_in_the_wire_format() {
+        let message = Message::default().varint(1, 150).bytes(2, b"testing").float(3, 1.);
+        assert_eq!(message.0, b"\x08\x96\x01\x12\x07testing\x1d\x00\x00\x80\x3f");
+    }
+}
