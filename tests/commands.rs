@@ -357,6 +357,13 @@ fn a_stopped_run_ends_with_the_same_bits() {
 
 #[test]
 fn interrupted_training_saves_a_checkpoint() {
+    // What Ctrl-C sends, and what kill and schedulers do.
+    for signal in [libc::SIGINT, libc::SIGTERM] {
+        interrupt_training(signal);
+    }
+}
+
+fn interrupt_training(signal: i32) {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
@@ -372,7 +379,7 @@ fn interrupted_training_saves_a_checkpoint() {
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
     // SAFETY: sends a signal to a child that has not been waited for.
-    unsafe { libc::kill(child.id() as i32, libc::SIGINT) };
+    unsafe { libc::kill(child.id() as i32, signal) };
     let output = child.wait_with_output().expect("a child");
     let err = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{err}");
