@@ -49,6 +49,10 @@ pub struct DataConfig {
     pub jitter: JitterConfig,
     /// Views never shown in training, which validation asks for.
     pub holdout: Holdout,
+    /// What validation asks for besides: captures, folders of captures, or data sets, of which the part `test` is taken.
+    pub validation: Vec<String>,
+    /// Scenes of `validation` at most, spread evenly over all of them.
+    pub validation_scenes: usize,
     /// Share of the scenes that may be unusable before training fails: too short, or broken in any way.
     pub max_bad_share: f64,
     /// Threads that load; 0 for one a core.
@@ -72,6 +76,8 @@ impl Default for DataConfig {
             flip: false,
             jitter: JitterConfig::default(),
             holdout: Holdout::None,
+            validation: vec![],
+            validation_scenes: 8,
             max_bad_share: 0.25,
             threads: 0,
             ahead: 32,
@@ -204,6 +210,14 @@ pub struct TrainConfig {
     pub checkpoint_every: u64,
     /// Checkpoints kept.
     pub keep_checkpoints: usize,
+    /// Steps between validations; 0 for one at the end alone.
+    pub validate_every: u64,
+    /// Steps in a row that may be skipped, because their loss or gradient isn't finite, before training fails.
+    pub max_skipped: u64,
+    /// Steps between numbers for TensorBoard; `metrics.jsonl` has those of every step.
+    pub log_every: u64,
+    /// Steps between pictures for TensorBoard; 0 for none.
+    pub pictures_every: u64,
 }
 
 impl Default for TrainConfig {
@@ -220,6 +234,10 @@ impl Default for TrainConfig {
             gradient_clip: 1.,
             checkpoint_every: 1_000,
             keep_checkpoints: 2,
+            validate_every: 5_000,
+            max_skipped: 20,
+            log_every: 10,
+            pictures_every: 1_000,
         }
     }
 }
@@ -288,6 +306,8 @@ impl Config {
             ("train.batch", self.train.batch),
             ("train.checkpoint_every", self.train.checkpoint_every as usize),
             ("train.keep_checkpoints", self.train.keep_checkpoints),
+            ("train.max_skipped", self.train.max_skipped as usize),
+            ("train.log_every", self.train.log_every as usize),
         ] {
             if value == 0 {
                 return refuse(field, "0".into(), "1 or more".into());
@@ -340,8 +360,20 @@ impl DataConfig {
     /// # Errors
     /// A variable that isn't set and has no default.
     pub fn capture_paths(&self) -> Result<Vec<PathBuf>> {
-        self.captures.iter().map(|path| expand(path).map(PathBuf::from)).collect()
+        expand_paths(&self.captures)
     }
+
+    /// `validation` with environment variables filled in.
+    ///
+    /// # Errors
+    /// As [`DataConfig::capture_paths`].
+    pub fn validation_paths(&self) -> Result<Vec<PathBuf>> {
+        expand_paths(&self.validation)
+    }
+}
+
+fn expand_paths(paths: &[String]) -> Result<Vec<PathBuf>> {
+    paths.iter().map(|path| expand(path).map(PathBuf::from)).collect()
 }
 
 /// Fills in `${NAME}` and `${NAME:-default}`.

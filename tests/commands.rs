@@ -290,7 +290,8 @@ fn a_run_goes_from_photos_to_a_splat() {
     assert!(report["held_out"]["psnr"].is_f64() && report["held_out"]["nearest_photo_psnr"].is_f64());
     assert_eq!(report["held_out"]["scenes"][0]["ours"]["views"].as_array().unwrap().len(), 3);
     assert!(run.join("config.toml").is_file());
-    assert_eq!(std::fs::read_to_string(run.join("metrics.jsonl")).unwrap().lines().count(), 6);
+    // A line for each of six steps, and one for the validation at the end.
+    assert_eq!(std::fs::read_to_string(run.join("metrics.jsonl")).unwrap().lines().count(), 7);
 
     let (weights, half) = (folder.path().join("model.safetensors"), folder.path().join("half.safetensors"));
     succeed(&["export", "--run", arg(&run), "--out", arg(&weights)]);

@@ -65,11 +65,14 @@ fn every_configuration_trains() {
         let mut trainer = Trainer::new(&config, scenes.clone(), Device::Cpu).expect("a trainer");
         let reports: Vec<_> = (0..3).map(|_| trainer.step().expect("a step")).collect();
         let name = path.display();
-        assert!(reports.iter().all(|r| !r.skipped && r.loss.is_finite() && r.gradient_norm > 0.), "{name}");
+        assert!(
+            reports.iter().all(|r| !r.skipped && r.losses.total.is_finite() && r.gradient_norm > 0.),
+            "{name}"
+        );
         let (first, last) = (reports[0].stage, reports[2].stage);
         assert_eq!(last.index, config.curriculum.final_stage, "{name}");
         assert!(config.curriculum.full_capacity || first.index == 0, "{name}");
-        let consistent = reports.iter().any(|r| r.consistency > 0.);
+        let consistent = reports.iter().any(|r| r.losses.consistency > 0.);
         assert_eq!(consistent, config.loss.has_consistency(), "{name}: {reports:?}");
     }
 }

@@ -96,7 +96,7 @@ fn every_stage_matches_in_values_and_gradients() {
                 ("quats_wxyz", g.quaternions.shallow_clone()),
                 ("opacities", g.opacities.unsqueeze(-1)),
                 ("sh", g.sh.shallow_clone()),
-                ("reg", decoder_regularization(&decoded.raw, false).view([1])),
+                ("reg", decoder_regularization(&decoded.raw, false).total.view([1])),
             ];
             let mut objective = Tensor::zeros([], (Kind::Float, Device::Cpu));
             for (output, ours) in &outputs {

@@ -6,6 +6,7 @@ mod common;
 use common::program::{arg, command, fail, room, succeed, tiny_config};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -32,12 +33,22 @@ fn assert_same_bits(a: &Path, b: &Path) {
     }
 }
 
-/// The steps that metrics.jsonl tells of.
-fn steps(run: &Path) -> Vec<u64> {
+fn metrics(run: &Path) -> Vec<Value> {
     let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
-    text.lines()
-        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].as_u64().unwrap())
-        .collect()
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+/// The steps that metrics.jsonl tells of, and those after which it tells of a validation.
+fn steps(run: &Path) -> (Vec<u64>, Vec<u64>) {
+    let (validations, steps): (Vec<_>, Vec<_>) =
+        metrics(run).into_iter().partition(|line| line["validation"].is_object());
+    let numbers = |lines: Vec<Value>| lines.iter().map(|line| line["step"].as_u64().unwrap()).collect();
+    (numbers(steps), numbers(validations))
+}
+
+fn checkpoints(run: &Path) -> Vec<String> {
+    let paths = globalsplat::train::list_checkpoints(run).unwrap();
+    paths.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect()
 }
 
 #[test]
@@ -47,9 +58,10 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     let config = tiny_config(folder.path(), &room);
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
     let (steps_key, every) = (format!("train.steps={STEPS}"), "train.checkpoint_every=1");
+    let validate = "train.validate_every=5";
     let run = |out: &Path| {
         let start = ["train", "--config", arg(&config), "--out", arg(out)];
-        command(&[&start[..], &["--set", &steps_key, "--set", every]].concat())
+        command(&[&start[..], &["--set", &steps_key, "--set", every, "--set", validate]].concat())
     };
     let begun = std::time::Instant::now();
     assert!(run(&whole).output().unwrap().status.success());
@@ -67,7 +79,10 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     let output = run(&killed).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert_same_bits(&whole, &killed);
-    assert_eq!(steps(&killed), (0..STEPS).collect::<Vec<_>>(), "every step is told of once");
+    let validated = (1..=STEPS / 5).map(|i| 5 * i - 1).collect();
+    assert_eq!(steps(&killed), ((0..STEPS).collect(), validated), "everything is told of once");
+    let of = |run: &Path| std::fs::read(run.join("best/state.json")).unwrap();
+    assert_eq!(of(&whole), of(&killed), "the best checkpoint, by the same score");
     let left: Vec<_> = std::fs::read_dir(killed.join("checkpoints")).unwrap().collect();
     assert_eq!(left.len(), 2, "what the kills left is cleared away: {left:?}");
 }
@@ -181,4 +196,112 @@ fn a_run_that_waits_for_room_can_be_stopped() {
     let mut line = String::new();
     said.read_line(&mut line).unwrap();
     assert!(line.contains("can't be written"), "{line}");
+}
+
+/// The tiny model's training in `run`, with `settings`.
+fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
+    let mut arguments = vec!["train", "--config", arg(config), "--out", arg(run)];
+    arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
+    arguments.into_iter().map(String::from).collect()
+}
+
+fn text(arguments: &[String]) -> Vec<&str> {
+    arguments.iter().map(String::as_str).collect()
+}
+
+#[test]
+fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&text(&train(&config, &run, &["train.steps=4"])));
+    let good = tensors(&run);
+    // One step is enough to ruin all weights. Every step would be saved, and wouldn't be the last to be kept.
+    let ruin =
+        ["train.steps=40", "train.learning_rate=1e30", "train.checkpoint_every=2", "train.max_skipped=5"];
+    let error = fail(&text(&train(&config, &run, &ruin)), 1);
+    for part in ["the last 5 steps was not finite", "step 9 showed room_000", "step-00000004 is from before"]
+    {
+        assert!(error.contains(part), "{part}: {error}");
+    }
+    assert_eq!(checkpoints(&run), ["step-00000002", "step-00000004"]);
+    assert!(tensors(&run).iter().zip(&good).all(|((_, x), (_, y))| x.equal(y)));
+    let told = metrics(&run);
+    let skipped: Vec<bool> = told.iter().filter_map(|line| line["skipped"].as_bool()).collect();
+    assert_eq!(skipped, [[false; 5], [true; 5]].concat());
+    assert_eq!(told.last().unwrap()["scenes"], serde_json::json!(["room_000"]));
+
+    // With a learning rate that makes sense it goes on from there.
+    succeed(&text(&train(&config, &run, &["train.steps=8"])));
+    assert_eq!(steps(&run), ((0..8).collect(), vec![3, 7]));
+}
+
+#[test]
+fn a_run_that_ends_in_trouble_is_saved_as_it_was_before() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let ruin = ["train.steps=6", "train.learning_rate=1e30", "train.checkpoint_every=100"];
+    let out = succeed(&text(&train(&config, &run, &ruin)));
+    assert!(out.contains("5 steps were skipped"), "{out}");
+    // Five of six steps changed nothing.
+    assert_eq!(checkpoints(&run), ["step-00000001"]);
+}
+
+#[test]
+fn the_best_checkpoint_is_kept_and_exported() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    // Learning that goes well at first, and then not at all: the best is not the last.
+    let all = ["train.validate_every=2", "train.keep_checkpoints=1", "data.holdout=none"];
+    let scenes = format!("data.validation=[{:?}]", arg(&room));
+    let settings = [&all[..], &[&scenes]].concat();
+    succeed(&text(&train(
+        &config,
+        &run,
+        &[&settings[..], &["train.steps=20", "train.learning_rate=3e-3"]].concat(),
+    )));
+    succeed(&text(&train(
+        &config,
+        &run,
+        &[&settings[..], &["train.steps=30", "train.learning_rate=1"]].concat(),
+    )));
+    let validations: Vec<(u64, f64)> = metrics(&run)
+        .iter()
+        .filter(|line| line["validation"].is_object())
+        .map(|line| (line["step"].as_u64().unwrap(), line["validation"]["psnr"].as_f64().unwrap()))
+        .collect();
+    assert_eq!(
+        validations.iter().map(|v| v.0).collect::<Vec<_>>(),
+        (0..15).map(|i| 2 * i + 1).collect::<Vec<_>>()
+    );
+    let best = validations.iter().fold(validations[0], |a, b| if b.1 > a.1 { *b } else { a });
+    assert!(best.0 < 29, "{validations:?}");
+    let state: Value = serde_json::from_slice(&std::fs::read(run.join("best/state.json")).unwrap()).unwrap();
+    assert_eq!((state["step"].as_u64(), state["validation_psnr"].as_f64()), (Some(best.0 + 1), Some(best.1)));
+    assert_eq!(checkpoints(&run), ["step-00000030"], "the best one is kept beside them");
+
+    let weights = folder.path().join("best.safetensors");
+    succeed(&["export", "--run", arg(&run), "--best", "--out", arg(&weights)]);
+    let read = |path: &Path| globalsplat::io::read_weights(path).unwrap().tensors;
+    let (exported, kept) = (read(&weights), read(&run.join("best/model.safetensors")));
+    assert!(exported.iter().zip(&kept).all(|((_, x), (_, y))| x.equal(y)));
+    let last = read(&globalsplat::train::latest_checkpoint(&run).unwrap().join("model.safetensors"));
+    assert!(!exported.iter().zip(&last).all(|((_, x), (_, y))| x.equal(y)));
+
+    let bare = folder.path().join("bare");
+    succeed(&text(&train(&config, &bare, &["data.holdout=none"])));
+    let error = fail(&["export", "--run", arg(&bare), "--best", "--out", arg(&weights)], 2);
+    assert!(error.contains("without a best checkpoint") && error.contains("data.validation"), "{error}");
+}
+
+#[test]
+fn held_out_scenes_are_checked_before_training() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let error = fail(&text(&train(&config, &run, &["data.validation=[\"nowhere\"]"])), 2);
+    assert!(error.contains("nowhere"), "{error}");
+    // The views that are held out of what is learned, and a scene that is held out as a whole.
+    let scenes = format!("data.validation=[{:?}]", arg(folder.path()));
+    let out = succeed(&text(&train(&config, &run, &[&scenes, "train.steps=1"])));
+    assert_eq!(out.lines().filter(|line| line.starts_with("room_000")).count(), 2, "{out}");
+    assert_eq!(metrics(&run).last().unwrap()["validation"]["scenes"], 2);
 }

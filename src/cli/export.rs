@@ -4,12 +4,12 @@ use clap::{ArgGroup, Args, ValueEnum};
 use globalsplat::config::Config;
 use globalsplat::io::{ModelDtype, check_writable_file, load_model, save_model};
 use globalsplat::model::GlobalSplat;
-use globalsplat::train::latest_checkpoint;
+use globalsplat::train::{best_checkpoint, latest_checkpoint};
 use serde_json::json;
 use std::path::PathBuf;
 use tch::{Device, nn};
 
-/// Write a run's newest weights, with their configuration, as one safetensors file.
+/// Write a run's newest or best weights, with their configuration, as one safetensors file.
 #[derive(Args)]
 #[command(group(ArgGroup::new("source").required(true)))]
 #[command(
@@ -19,6 +19,9 @@ pub struct Export {
     /// Folder of a run
     #[arg(long, value_name = "RUN", group = "source")]
     run: Option<PathBuf>,
+    /// Of the run, the weights that validation found best, instead of the newest
+    #[arg(long, requires = "run")]
+    best: bool,
     /// Fresh weights of a configuration instead, as training would begin with
     #[arg(long, value_name = "FILE", group = "source")]
     config: Option<PathBuf>,
@@ -44,7 +47,8 @@ impl Export {
         check_writable_file(&self.out)?;
         let (vs, config) = match (&self.run, &self.config) {
             (Some(run), _) => {
-                let loaded = load_model(&latest_checkpoint(run)?.join("model.safetensors"), Device::Cpu)?;
+                let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };
+                let loaded = load_model(&checkpoint.join("model.safetensors"), Device::Cpu)?;
                 (loaded.vs, loaded.config)
             }
             (None, config) => {

@@ -2,22 +2,22 @@ use super::{device, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{BadData, Capture, Holdout, SceneGroups, TrainingScenes};
+use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
-use globalsplat::eval::{CaptureScores, nearest_context_baseline, score_model};
-use globalsplat::io::{check_writable_dir, load_model};
-use globalsplat::train::{Event, Outcome, Resume, Trainer, run};
+use globalsplat::eval::{HeldOut, HeldOutScores};
+use globalsplat::io::check_writable_dir;
+use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
-use tch::Device;
 
 /// Train a model on captures, or on chunks of RealEstate10K and the like.
 ///
-/// Ctrl-C saves a checkpoint and stops; the same command goes on from there. At the end the views that were held out are
-/// rendered and scored, beside the answer "the nearest photo that was shown".
+/// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command goes on from there. Now and then, and at the end, views
+/// and scenes that are held out are rendered and scored, beside the answer "the nearest photo that was shown"; RUN/best is
+/// the checkpoint that did best. TensorBoard shows RUN/tensorboard.
 #[derive(Args)]
 #[command(
     after_help = "Example:\n  globalsplat train --config configs/first_light.toml --out runs/first_light"
@@ -29,7 +29,7 @@ pub struct Train {
     /// Override a key of it, as in train.steps=100
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Folder of the run: checkpoints, the resolved configuration, metrics.jsonl
+    /// Folder of the run: checkpoints, best, the resolved configuration, metrics.jsonl, tensorboard
     #[arg(long, value_name = "RUN")]
     out: PathBuf,
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
@@ -63,10 +63,11 @@ impl Train {
             .into());
         }
         check_writable_dir(&self.out)?;
-        let mut trainer = Trainer::new(&config, scenes.clone(), device)?;
+        let mut held_out = HeldOut::find(&config.data, scenes.captures())?;
+        let mut trainer = Trainer::new(&config, scenes, device)?;
 
         let start = Instant::now();
-        let outcome = self.train(&config, &mut trainer, &resume)?;
+        let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         if !outcome.complete {
             anyhow::bail!(
@@ -74,20 +75,31 @@ impl Train {
                 outcome.checkpoint.display()
             );
         }
-        let validation = validate(&outcome, &config, scenes.captures())?;
-        self.report(&outcome, seconds, &validation, &trainer.bad_data());
+        self.report(&outcome, seconds, held_out.scores(), &trainer.bad_data());
         Ok(())
     }
 
-    fn train(&self, config: &Config, trainer: &mut Trainer, resume: &Resume) -> Result<Outcome> {
+    fn train(
+        &self,
+        config: &Config,
+        trainer: &mut Trainer,
+        held_out: &mut HeldOut,
+        resume: &Resume,
+    ) -> Result<Outcome> {
         let stop = stop_flag()?;
         let bar = progress::bar(config.train.steps, "steps");
         let mut smooth_mse = None;
+        let mut validation = String::new();
         let mut first = true;
-        let outcome = run(trainer, &self.out, resume, |event| {
+        let validator = (!held_out.is_empty()).then_some(held_out as &mut dyn Validator);
+        let outcome = run(trainer, &self.out, resume, validator, |event| {
             let go_on = !stop.load(Ordering::Relaxed);
-            let report = match event {
-                Event::Step(report) => report,
+            let (report, samples_per_second) = match event {
+                Event::Step { report, samples_per_second } => (report, samples_per_second),
+                Event::Validation(score) => {
+                    validation = format!(" held out {:.2} dB", score.psnr);
+                    return go_on;
+                }
                 Event::Notice(text) => {
                     bar.suspend(|| eprintln!("{text}"));
                     return go_on;
@@ -100,11 +112,13 @@ impl Train {
                 first = false;
             }
             bar.set_position(report.step + 1);
-            let mse = smooth_mse.map_or(report.mse, |old: f64| 0.98 * old + 0.02 * report.mse);
-            smooth_mse = Some(mse);
+            let mse = report.losses.mse;
+            let mse = smooth_mse.map_or(mse, |old: f64| 0.98 * old + 0.02 * mse);
+            // What a skipped step was off by is no number.
+            smooth_mse = Some(mse).filter(|mse| mse.is_finite()).or(smooth_mse);
             bar.set_message(format!(
-                "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e}",
-                report.loss,
+                "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e} {samples_per_second:.1} samples/s{validation}",
+                report.losses.total,
                 -10. * mse.log10(),
                 report.stage.index,
                 report.stage.mix,
@@ -116,8 +130,8 @@ impl Train {
         Ok(outcome)
     }
 
-    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[Validation], bad_data: &BadData) {
-        let mean = |value: fn(&Validation) -> f64| {
+    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[HeldOutScores], bad_data: &BadData) {
+        let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
         if self.json {
@@ -163,25 +177,4 @@ impl Train {
             );
         }
     }
-}
-
-/// One capture's held-out views.
-struct Validation {
-    ours: CaptureScores,
-    nearest: CaptureScores,
-}
-
-fn validate(outcome: &Outcome, config: &Config, captures: &[Capture]) -> Result<Vec<Validation>> {
-    let holdout = config.data.holdout;
-    if holdout == Holdout::None || captures.is_empty() {
-        return Ok(vec![]);
-    }
-    let loaded = load_model(&outcome.checkpoint.join("model.safetensors"), Device::Cpu)?;
-    captures
-        .iter()
-        .map(|capture| {
-            let (ours, ..) = score_model(&loaded, capture, holdout, None)?;
-            Ok(Validation { ours, nearest: nearest_context_baseline(&loaded, capture, holdout)? })
-        })
-        .collect()
 }

@@ -1,8 +1,8 @@
 //! Pictures against photos, view by view.
 
 use super::metrics::{psnr, ssim};
-use super::reconstruct::{Reconstruction, reconstruct};
-use crate::data::{Capture, Holdout, View, spread_over_path};
+use super::reconstruct::{Model, Reconstruction, reconstruct};
+use crate::data::{Capture, Holdout, ImageSize, View, spread_over_path};
 use crate::error::{Error, Result};
 use crate::io::{LoadedModel, read_image, tensor_from_rgb};
 use crate::model::Gaussians;
@@ -140,7 +140,7 @@ pub fn score_model(
     holdout: Holdout,
     views: Option<usize>,
 ) -> Result<(CaptureScores, Vec<View>, Vec<Rendered>)> {
-    let (context, held_out) = load_split(capture, holdout, views, loaded)?;
+    let (context, held_out) = load_split(capture, holdout, views, loaded.config.data.image_size)?;
     let (reconstruction, rendered) = ask(loaded, &context, &held_out)?;
     let count = reconstruction.gaussians.count();
     let scores = score(&capture.name, &colours(&rendered), &held_out, Some(count))?;
@@ -148,13 +148,13 @@ pub fn score_model(
 }
 
 /// What a model that sees `context` takes the cameras of `target` to see.
-pub(super) fn ask(
-    loaded: &LoadedModel,
+pub(super) fn ask<'a>(
+    model: impl Into<Model<'a>>,
     context: &[View],
     target: &[View],
 ) -> Result<(Reconstruction, Vec<Rendered>)> {
     let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
-    let reconstruction = reconstruct(loaded, context, &poses)?;
+    let reconstruction = reconstruct(model, context, &poses)?;
     let normalized = target.iter().zip(&reconstruction.target_poses);
     let cameras: Vec<Camera> = normalized.map(|(view, &c2w)| Camera { c2w, ..view.camera }).collect();
     let rendered = render_views(&reconstruction.gaussians, &cameras)?;
@@ -167,22 +167,18 @@ pub(super) fn colours(rendered: &[Rendered]) -> Vec<Tensor> {
 }
 
 /// What answering with the context photo taken nearest (by camera centre) would score for the held-out views.
-///
-/// # Errors
-/// As [`score_model`].
-pub fn nearest_context_baseline(
-    loaded: &LoadedModel,
-    capture: &Capture,
-    holdout: Holdout,
+pub(super) fn nearest_context_baseline(
+    scene: &str,
+    context: &[View],
+    held_out: &[View],
 ) -> Result<CaptureScores> {
-    let (context, held_out) = load_split(capture, holdout, None, loaded)?;
     let centre = |view: &View| view.camera.c2w.w_axis.truncate();
     let nearest = |target: &View| {
         let distance = |view: &&View| centre(view).distance(centre(target));
         let view = context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a context view");
         view.image.shallow_clone()
     };
-    score(&capture.name, &held_out.iter().map(nearest).collect::<Vec<_>>(), &held_out, None)
+    score(scene, &held_out.iter().map(nearest).collect::<Vec<_>>(), held_out, None)
 }
 
 /// Pictures that somebody else rendered: one in `folder` for every view, found by the name of the photo's file.
@@ -210,11 +206,12 @@ pub(super) fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
     }
 }
 
-fn load_split(
+/// The views that `holdout` leaves, or so many of them, and those that it holds out, at `size`.
+pub(super) fn load_split(
     capture: &Capture,
     holdout: Holdout,
     views: Option<usize>,
-    loaded: &LoadedModel,
+    size: ImageSize,
 ) -> Result<(Vec<View>, Vec<View>)> {
     let (mut context, held_out) = holdout.split(capture.len());
     if let Some(views) = views {
@@ -229,6 +226,5 @@ fn load_split(
             "2 and 1 at least (--holdout every:N)",
         ));
     }
-    let size = Some(loaded.config.data.image_size);
-    Ok((capture.load(&context, size)?, capture.load(&held_out, size)?))
+    Ok((capture.load(&context, Some(size))?, capture.load(&held_out, Some(size))?))
 }

@@ -1,13 +1,37 @@
 //! Posed photos to a splat: one forward pass.
 
+use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::LoadedModel;
-use crate::model::Gaussians;
+use crate::model::{Gaussians, GlobalSplat};
 use crate::render::transform;
 use crate::scene::{Similarity, normalize};
+use crate::train::Trainer;
 use glam::DMat4;
 use std::time::{Duration, Instant};
+use tch::Device;
+
+/// A model to be used: one from a file, or one that is being trained.
+#[derive(Debug, Clone, Copy)]
+pub struct Model<'a> {
+    network: &'a GlobalSplat,
+    config: &'a Config,
+    /// Where the weights are.
+    device: Device,
+}
+
+impl<'a> From<&'a LoadedModel> for Model<'a> {
+    fn from(loaded: &'a LoadedModel) -> Self {
+        Model { network: &loaded.model, config: &loaded.config, device: loaded.vs.device() }
+    }
+}
+
+impl<'a> From<&'a Trainer> for Model<'a> {
+    fn from(trainer: &'a Trainer) -> Self {
+        Model { network: trainer.model(), config: trainer.config(), device: trainer.device() }
+    }
+}
 
 /// A splat in the normalized world, and the way to the capture's own.
 #[derive(Debug)]
@@ -34,7 +58,12 @@ impl Reconstruction {
 ///
 /// # Errors
 /// Fewer than two views, images that the model's patches don't divide, cameras without a mean direction.
-pub fn reconstruct(loaded: &LoadedModel, context: &[View], targets: &[DMat4]) -> Result<Reconstruction> {
+pub fn reconstruct<'a>(
+    model: impl Into<Model<'a>>,
+    context: &[View],
+    targets: &[DMat4],
+) -> Result<Reconstruction> {
+    let Model { network, config, device } = model.into();
     if context.len() < 2 {
         return Err(Error::Request(format!(
             "a reconstruction needs two views or more, found {}",
@@ -45,12 +74,12 @@ pub fn reconstruct(loaded: &LoadedModel, context: &[View], targets: &[DMat4]) ->
         context.iter().map(|view| view.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
     let (context_poses, target_poses) = normalization.c2w.split_at(context.len());
-    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(context, context_poses, loaded.vs.device());
-    loaded.config.model.check_image(images.size()[3], images.size()[4])?;
+    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(context, context_poses, device);
+    config.model.check_image(images.size()[3], images.size()[4])?;
 
     let start = Instant::now();
-    let stage = loaded.config.curriculum.final_stage();
-    let decoded = tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage));
+    let stage = config.curriculum.final_stage();
+    let decoded = tch::no_grad(|| network.forward(&images, &c2w, &intrinsics, stage));
     // Bringing the Gaussians to the host also waits for a GPU.
     let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);
     Ok(Reconstruction {

@@ -238,7 +238,7 @@ impl Sweep<'_> {
     fn answer(&self, key: &str, scene: &LoadedScene) -> Result<Answer> {
         match &self.subject {
             Subject::Model(loaded) => {
-                let (reconstruction, rendered) = ask(loaded, &scene.context, &scene.target)?;
+                let (reconstruction, rendered) = ask(*loaded, &scene.context, &scene.target)?;
                 let gaussians = &reconstruction.gaussians;
                 Ok(Answer {
                     pictures: colours(&rendered),

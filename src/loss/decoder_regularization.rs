@@ -1,6 +1,7 @@
 //! L_dec: keeps the decoder's raw numbers in a range where they can be learned (SPEC section 7).
 
 use crate::model::RawOutputs;
+use std::ops::Mul;
 use tch::{Kind, Tensor};
 
 /// The term's own factor.
@@ -10,18 +11,50 @@ const SH_CAP: f64 = 5.;
 /// Opacities beyond it are penalized.
 const OPACITY_THRESHOLD: f64 = 0.2;
 
-/// 1e-2 · (L_scale + L_rot + L_SH), and L_opacity in the sum when `opacity` is set. A scalar.
-pub fn decoder_regularization(raw: &RawOutputs, opacity: bool) -> Tensor {
+/// L_dec and what it is made of, all scalars.
+#[derive(Debug)]
+pub struct DecoderRegularization {
+    /// 1e-2 times the sum of the others.
+    pub total: Tensor,
+    /// L_opacity; 0 where it is left out.
+    pub opacity: Tensor,
+    /// L_scale.
+    pub scale: Tensor,
+    /// L_rot.
+    pub rotation: Tensor,
+    /// L_SH.
+    pub sh: Tensor,
+}
+
+/// 1e-2 · (L_scale + L_rot + L_SH), and L_opacity in the sum when `opacity` is set.
+pub fn decoder_regularization(raw: &RawOutputs, opacity: bool) -> DecoderRegularization {
     let mean = |t: Tensor| t.mean(None::<Kind>);
     let scale = mean((&raw.log_scales - crate::model::MAX_SCALE.ln()).relu().square());
     let rotation = mean(raw.rotations.square());
     let sh = sh_soft_cap(&raw.sh);
-    let mut sum = scale + rotation + sh;
-    if opacity {
-        let logit = (OPACITY_THRESHOLD / (1. - OPACITY_THRESHOLD)).ln();
-        sum = sum + mean(raw.opacity_logits.sigmoid()) + mean((&raw.opacity_logits - logit).relu().square());
+    let opacity = match opacity {
+        true => {
+            let logit = (OPACITY_THRESHOLD / (1. - OPACITY_THRESHOLD)).ln();
+            mean(raw.opacity_logits.sigmoid()) + mean((&raw.opacity_logits - logit).relu().square())
+        }
+        false => scale.zeros_like(),
+    };
+    let total = (&scale + &rotation + &sh + &opacity) * FACTOR;
+    DecoderRegularization { total, opacity, scale, rotation, sh }
+}
+
+impl Mul<f64> for DecoderRegularization {
+    type Output = Self;
+
+    fn mul(self, factor: f64) -> Self {
+        DecoderRegularization {
+            total: self.total * factor,
+            opacity: self.opacity * factor,
+            scale: self.scale * factor,
+            rotation: self.rotation * factor,
+            sh: self.sh * factor,
+        }
     }
-    sum * FACTOR
 }
 
 /// mean softplus(|c| − 5)².

@@ -9,7 +9,7 @@ mod perceptual;
 mod vgg19;
 
 pub use consistency::{consistency, depth_pixels};
-pub use decoder_regularization::{decoder_regularization, sh_soft_cap};
+pub use decoder_regularization::{DecoderRegularization, decoder_regularization, sh_soft_cap};
 pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
 pub use mse::mse;
@@ -50,7 +50,7 @@ pub struct Losses {
     /// L_fru, before its factor.
     pub frustum: Tensor,
     /// L_dec, before its factor.
-    pub decoder: Tensor,
+    pub decoder: DecoderRegularization,
 }
 
 /// What `decoded` is worth, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
@@ -85,6 +85,6 @@ pub fn losses(
         + &perceptual * config.perceptual_factor
         + &consistency
         + &frustum * config.frustum
-        + &decoder * config.decoder;
+        + &decoder.total * config.decoder;
     Losses { total, mse, perceptual, consistency, frustum, decoder }
 }

@@ -320,7 +320,7 @@ fn decoder_regularization(request: &Request) -> Result<Answer> {
         sh: request.input("sh")?.shallow_clone(),
         opacity_logits: request.input("opacity_logits")?.shallow_clone(),
     };
-    loss_of(loss::decoder_regularization(&raw, request.number("opacity")?))
+    loss_of(loss::decoder_regularization(&raw, request.number("opacity")?).total)
 }
 
 fn consistency(request: &Request) -> Result<Answer> {

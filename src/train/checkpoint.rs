@@ -1,12 +1,15 @@
 //! Checkpoints: a folder per step, whole or not there.
 //!
 //! `RUN/checkpoints/step-00001000/`: `model.safetensors` (weights, with the configuration), `optimizer.safetensors`, and
-//! `state.json`, which holds the step and the others' checksums. Random numbers and data need no state: those of a step depend
+//! `state.json`, which holds the step and the others' checksums. `RUN/best/` is the one that validation found best, with its
+//! score. Random numbers and data need no state: those of a step depend
 //! on the seed and the step alone.
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
-use crate::io::{ModelDtype, read_weights, replace_dir, save_model, write_atomically, write_weights};
+use crate::io::{
+    ModelDtype, read_weights, recover_dir, replace_dir, save_model, write_atomically, write_weights,
+};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,6 +17,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "checkpoints";
+const BEST: &str = "best";
 const PREFIX: &str = "step-";
 pub(crate) const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
@@ -25,6 +29,9 @@ struct State {
     step: u64,
     /// Sizes in bytes and CRC-32 of the other files, by their names.
     files: BTreeMap<String, (u64, u32)>,
+    /// Of the best checkpoint: what validation found, in dB.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    validation_psnr: Option<f64>,
 }
 
 /// The run's checkpoints, oldest first.
@@ -59,6 +66,53 @@ pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
     list_checkpoints(run)?.pop().ok_or_else(none)
 }
 
+/// The one that validation found best.
+///
+/// # Errors
+/// A run that has none.
+pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
+    let best = run.join(BEST);
+    match best.is_dir() {
+        true => Ok(best),
+        false => {
+            let expected = "one with held-out views (data.holdout) or scenes (data.validation)";
+            Err(Error::input(run, "the run", "without a best checkpoint", expected))
+        }
+    }
+}
+
+/// What validation found the run's best checkpoint to be worth, in dB.
+///
+/// # Errors
+/// One that can't be read.
+pub(super) fn best_score(run: &Path) -> Result<Option<f64>> {
+    let best = run.join(BEST);
+    recover_dir(&best)?;
+    match best.is_dir() {
+        true => Ok(read_state(&best)?.validation_psnr),
+        false => Ok(None),
+    }
+}
+
+/// Makes `checkpoint` the run's best one, which validation found to be worth so many dB. The files are shared where the file
+/// system can.
+///
+/// # Errors
+/// The system's refusal to write; the best one before is left whole.
+pub(super) fn keep_best(run: &Path, checkpoint: &Path, psnr: f64) -> Result<()> {
+    let state = State { validation_psnr: Some(psnr), ..read_state(checkpoint)? };
+    replace_dir(&run.join(BEST), |folder| {
+        for name in state.files.keys() {
+            let (from, to) = (checkpoint.join(name), folder.join(name));
+            if fs::hard_link(&from, &to).is_err() {
+                fs::copy(&from, &to).map_err(Error::write(&to))?;
+                fs::File::open(&to).and_then(|file| file.sync_all()).map_err(Error::write(&to))?;
+            }
+        }
+        write_state(folder, &state)
+    })
+}
+
 impl Trainer {
     /// Saves a checkpoint under `run`, drops the oldest beyond those to keep, and returns where it is.
     ///
@@ -72,9 +126,7 @@ impl Trainer {
             let files =
                 [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;
-            let state = serde_json::to_vec(&State { step: self.step, files }).expect("numbers and names");
-            let file = folder.join(STATE_FILE);
-            write_atomically(&file, |writer| writer.write_all(&state).map_err(Error::write(&file)))
+            write_state(folder, &State { step: self.step, files, validation_psnr: None })
         })?;
         let all = list_checkpoints(run)?;
         let surplus = all.len().saturating_sub(self.config.train.keep_checkpoints);
@@ -103,11 +155,7 @@ impl Trainer {
 /// # Errors
 /// What is missing or damaged.
 pub(super) fn check(checkpoint: &Path) -> Result<u64> {
-    let file = checkpoint.join(STATE_FILE);
-    let state = fs::read(&file).map_err(Error::read(&file))?;
-    let expected = "what globalsplat train writes";
-    let state: State = serde_json::from_slice(&state)
-        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))?;
+    let state = read_state(checkpoint)?;
     for (name, (bytes, crc)) in &state.files {
         let file = checkpoint.join(name);
         let found = checksum(&file)?;
@@ -117,6 +165,19 @@ pub(super) fn check(checkpoint: &Path) -> Result<u64> {
         }
     }
     Ok(state.step)
+}
+
+fn read_state(checkpoint: &Path) -> Result<State> {
+    let file = checkpoint.join(STATE_FILE);
+    let state = fs::read(&file).map_err(Error::read(&file))?;
+    let expected = "what globalsplat train writes";
+    serde_json::from_slice(&state)
+        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))
+}
+
+fn write_state(checkpoint: &Path, state: &State) -> Result<()> {
+    let (file, json) = (checkpoint.join(STATE_FILE), serde_json::to_vec(state).expect("numbers and names"));
+    write_atomically(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))
 }
 
 /// A file's size and CRC-32.

@@ -25,17 +25,31 @@ pub(super) struct Pass<'a> {
 
 /// [`Losses`] as numbers.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct LossValues {
+pub struct LossValues {
+    /// The weighted sum.
     pub total: f64,
+    /// Mean squared error of colours.
     pub mse: f64,
+    /// L_perc before its factor; 0 where it is left out.
     pub perceptual: f64,
+    /// L_con with its factors; 0 without subsets.
     pub consistency: f64,
+    /// L_fru before its factor.
     pub frustum: f64,
+    /// L_dec before its factor.
     pub decoder: f64,
+    /// L_opacity, a part of L_dec, before all factors; 0 where it is left out.
+    pub decoder_opacity: f64,
+    /// L_scale, as the part before.
+    pub decoder_scale: f64,
+    /// L_rot.
+    pub decoder_rotation: f64,
+    /// L_SH.
+    pub decoder_sh: f64,
 }
 
 impl LossValues {
-    pub fn of(losses: &Losses) -> Self {
+    pub(super) fn of(losses: &Losses) -> Self {
         let value = |t: &Tensor| t.double_value(&[]);
         LossValues {
             total: value(&losses.total),
@@ -43,7 +57,11 @@ impl LossValues {
             perceptual: value(&losses.perceptual),
             consistency: value(&losses.consistency),
             frustum: value(&losses.frustum),
-            decoder: value(&losses.decoder),
+            decoder: value(&losses.decoder.total),
+            decoder_opacity: value(&losses.decoder.opacity),
+            decoder_scale: value(&losses.decoder.scale),
+            decoder_rotation: value(&losses.decoder.rotation),
+            decoder_sh: value(&losses.decoder.sh),
         }
     }
 }
@@ -56,6 +74,10 @@ impl AddAssign for LossValues {
         self.consistency += other.consistency;
         self.frustum += other.frustum;
         self.decoder += other.decoder;
+        self.decoder_opacity += other.decoder_opacity;
+        self.decoder_scale += other.decoder_scale;
+        self.decoder_rotation += other.decoder_rotation;
+        self.decoder_sh += other.decoder_sh;
     }
 }
 

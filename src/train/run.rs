@@ -1,14 +1,17 @@
 //! A whole run: from where it stands to the last step, with checkpoints on the way.
 
-use super::checkpoint::{check, list_checkpoints};
+use super::board::Board;
+use super::checkpoint::{best_score, check, keep_best, latest_checkpoint, list_checkpoints};
+use super::is_due;
 use super::lock::RunLock;
+use super::metrics::Metrics;
 use super::trainer::{StepReport, Trainer};
+use super::validator::{Score, Validator};
+use crate::config::TrainConfig;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
-use std::fs::{File, OpenOptions};
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Where a run begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,10 +28,17 @@ pub enum Resume {
 #[derive(Debug)]
 pub enum Event<'a> {
     /// A step was done.
-    Step(&'a StepReport),
+    Step {
+        /// What it did.
+        report: &'a StepReport,
+        /// How fast.
+        samples_per_second: f64,
+    },
+    /// What is held out was asked for.
+    Validation(&'a Score),
     /// Something a person should know, in one sentence.
     Notice(String),
-    /// Nothing has changed: the run waits for room on the disk.
+    /// Nothing has changed: the run waits for room on the disk, or is in the middle of a validation.
     Waiting,
 }
 
@@ -44,14 +54,16 @@ pub struct Outcome {
 }
 
 /// Trains into the folder `out`, which nobody else may train into meanwhile. `observe` hears what happens and says whether to
-/// go on: a stopped run is saved first.
+/// go on: a stopped run is saved first. `validator` is asked now and then, and at the end.
 ///
 /// # Errors
-/// A run that is in use, a checkpoint that doesn't fit, or whatever a step or a save fails with. A full disk is waited for.
+/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, or whatever a step, a
+/// save or the last validation fails with. A full disk is waited for.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
     resume: &Resume,
+    validator: Option<&mut dyn Validator>,
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
     let _lock = RunLock::take(out)?;
@@ -59,28 +71,120 @@ pub fn run(
     let config = out.join("config.toml");
     let toml = trainer.config.to_toml();
     write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
-    let mut metrics = Metrics::open(&out.join("metrics.jsonl"), trainer.step)?;
-    let (steps, every) = (trainer.config.train.steps, trainer.config.train.checkpoint_every);
-    let (mut skipped, mut saved) = (0, None);
-    while trainer.step < steps {
-        let report = trainer.step()?;
-        skipped += u64::from(report.skipped);
-        let line = format!("{}\n", to_json(&report));
-        patiently(&mut observe, || metrics.append(&line))?;
-        let go_on = observe(Event::Step(&report));
-        saved = None;
-        if !go_on || trainer.step.is_multiple_of(every) {
-            saved = Some(patiently(&mut observe, || trainer.save(out))?);
+    let metrics = Metrics::open(&out.join("metrics.jsonl"), trainer.step)?;
+    let mut board = Board::create(out, trainer.config.train.log_every)?;
+    patiently(&mut observe, || board.start(trainer.step))?;
+    let best = best_score(out)?;
+    Run { trainer, out, validator, observe, metrics, board, best }.train()
+}
+
+/// A run that goes on.
+struct Run<'a, 'v, O> {
+    trainer: &'a mut Trainer,
+    out: &'a Path,
+    validator: Option<&'v mut dyn Validator>,
+    observe: O,
+    metrics: Metrics,
+    board: Board,
+    /// Of the best checkpoint, in dB.
+    best: Option<f64>,
+}
+
+impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
+    fn train(mut self) -> Result<Outcome> {
+        let TrainConfig { steps, batch, checkpoint_every, validate_every, max_skipped, .. } =
+            self.trainer.config.train;
+        let (mut skipped, mut go_on) = (0, true);
+        // Steps that were skipped since the last one that wasn't.
+        let mut trouble = 0;
+        // The checkpoint of the state as it is.
+        let mut saved = None;
+        while self.trainer.step < steps {
+            let step = self.trainer.step;
+            let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
+            if validates && trouble == 0 && !self.metrics.tells_validation(step - 1) {
+                let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
+                go_on = match self.validate(&checkpoint) {
+                    Err(e) => (self.observe)(Event::Notice(format!("a validation is left out: {e}"))),
+                    go_on => go_on?,
+                };
+                saved = Some(checkpoint);
+            }
+            if !go_on {
+                break;
+            }
+
+            let start = Instant::now();
+            let report = self.trainer.step()?;
+            let samples_per_second = batch as f64 / start.elapsed().as_secs_f64();
+            saved = None;
+            patiently(&mut self.observe, || self.metrics.tell_step(&report, samples_per_second))?;
+            patiently(&mut self.observe, || self.board.tell_step(&report, samples_per_second))?;
+            patiently(&mut self.observe, || self.board.tell_picture(&report))?;
+            go_on = (self.observe)(Event::Step { report: &report, samples_per_second });
+            if report.skipped {
+                skipped += 1;
+                trouble += 1;
+                if trouble == max_skipped {
+                    return Err(self.hopeless(trouble, &report));
+                }
+            } else {
+                trouble = 0;
+                if self.trainer.step.is_multiple_of(checkpoint_every) {
+                    saved = Some(self.save()?);
+                }
+            }
+            if !go_on {
+                break;
+            }
         }
-        if !go_on {
-            break;
+        let complete = self.trainer.step >= steps;
+        // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
+        self.trainer.step -= trouble;
+        let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
+        if complete && go_on {
+            self.validate(&checkpoint)?;
         }
+        Ok(Outcome { checkpoint, complete, skipped })
     }
-    let checkpoint = match saved {
-        Some(path) => path,
-        None => patiently(&mut observe, || trainer.save(out))?,
-    };
-    Ok(Outcome { checkpoint, complete: trainer.step >= steps, skipped })
+
+    fn save(&mut self) -> Result<PathBuf> {
+        patiently(&mut self.observe, || self.trainer.save(self.out))
+    }
+
+    /// Has the state that `checkpoint` holds judged. It is told last of all, so that a run that is killed meanwhile repeats
+    /// all of this. Returns whether to go on.
+    fn validate(&mut self, checkpoint: &Path) -> Result<bool> {
+        let Some(validator) = &mut self.validator else { return Ok(true) };
+        let observe = &mut self.observe;
+        let Some(score) = validator.validate(self.trainer, &mut || observe(Event::Waiting))? else {
+            return Ok(false);
+        };
+        if score.psnr > self.best.unwrap_or(f64::NEG_INFINITY) {
+            patiently(observe, || keep_best(self.out, checkpoint, score.psnr))?;
+            self.best = Some(score.psnr);
+        }
+        let step = self.trainer.step.saturating_sub(1);
+        if !self.metrics.tells_validation(step) {
+            patiently(observe, || self.board.tell_validation(step, &score))?;
+            patiently(observe, || self.metrics.tell_validation(step, &score))?;
+        }
+        Ok(observe(Event::Validation(&score)))
+    }
+
+    /// Why nothing is learned any more.
+    fn hopeless(&self, steps: u64, last: &StepReport) -> Error {
+        let before = match latest_checkpoint(self.out) {
+            Ok(checkpoint) => format!("{} is from before", checkpoint.display()),
+            Err(_) => "no checkpoint was saved before".into(),
+        };
+        Error::Failed(format!(
+            "training stops: loss or gradient of the last {steps} steps was not finite (train.max_skipped); step {} showed {}; \
+             {before}",
+            last.step,
+            last.scenes.join(", ")
+        ))
+    }
 }
 
 /// Brings the trainer to where the run begins.
@@ -149,61 +253,4 @@ fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut()
             }
         }
     }
-}
-
-/// `metrics.jsonl`: a line for every step.
-struct Metrics {
-    path: PathBuf,
-    file: File,
-    /// Of whole lines, in bytes.
-    length: u64,
-}
-
-impl Metrics {
-    /// Opens the file and takes away what a run that was stopped wrote after the checkpoint it goes on from.
-    fn open(path: &Path, step: u64) -> Result<Self> {
-        if path.is_file() {
-            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
-            let before = |line: &&str| {
-                let step_of: Option<u64> = serde_json::from_str::<serde_json::Value>(line)
-                    .ok()
-                    .and_then(|json| json["step"].as_u64());
-                step_of.is_some_and(|of| of < step)
-            };
-            let kept: String = text.lines().filter(before).flat_map(|line| [line, "\n"]).collect();
-            if kept != text {
-                write_atomically(path, |writer| {
-                    writer.write_all(kept.as_bytes()).map_err(Error::write(path))
-                })?;
-            }
-        }
-        let file = OpenOptions::new().create(true).append(true).open(path).map_err(Error::write(path))?;
-        let length = file.metadata().map_err(Error::read(path))?.len();
-        Ok(Metrics { path: path.to_owned(), file, length })
-    }
-
-    /// A line that can't be written leaves no part of itself.
-    fn append(&mut self, line: &str) -> Result<()> {
-        let written = self.file.set_len(self.length).and_then(|()| self.file.write_all(line.as_bytes()));
-        written.map_err(Error::write(&self.path))?;
-        self.length += line.len() as u64;
-        Ok(())
-    }
-}
-
-fn to_json(report: &StepReport) -> serde_json::Value {
-    serde_json::json!({
-        "step": report.step,
-        "stage": report.stage.index,
-        "mix": report.stage.mix,
-        "learning_rate": report.learning_rate,
-        "loss": report.loss,
-        "mse": report.mse,
-        "perceptual": report.perceptual,
-        "consistency": report.consistency,
-        "frustum": report.frustum,
-        "decoder": report.decoder,
-        "gradient_norm": report.gradient_norm,
-        "skipped": report.skipped,
-    })
 }

@@ -1,10 +1,11 @@
 //! One training step, and the state that steps change.
 
+use super::glance::glance;
 use super::optimizer::AdamW;
 use super::pass::{LossValues, Pass};
 use super::schedule::learning_rate;
 use super::stopwatch::Stopwatch;
-use super::{stage_at, subsets};
+use super::{is_due, stage_at, subsets};
 use crate::config::Config;
 use crate::data::{BadData, Loader, Sample, SceneGroups};
 use crate::error::Result;
@@ -29,7 +30,7 @@ pub struct Trainer {
 }
 
 /// What a step did.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug)]
 pub struct StepReport {
     /// Counted from 0.
     pub step: u64,
@@ -37,22 +38,27 @@ pub struct StepReport {
     pub stage: Stage,
     /// The learning rate used.
     pub learning_rate: f64,
-    /// The weighted sum.
-    pub loss: f64,
-    /// Mean squared error of colours.
-    pub mse: f64,
-    /// L_perc before its factor; 0 where it is left out.
-    pub perceptual: f64,
-    /// L_con with its factors; 0 without subsets.
-    pub consistency: f64,
-    /// L_fru before its factor.
-    pub frustum: f64,
-    /// L_dec before its factor.
-    pub decoder: f64,
+    /// The loss and its terms.
+    pub losses: LossValues,
     /// Of the gradient, before clipping.
     pub gradient_norm: f64,
     /// Loss or gradient wasn't finite, so nothing was changed.
     pub skipped: bool,
+    /// Names of the scenes it looked at.
+    pub scenes: Vec<String>,
+    /// What the first of them looked like before the step, at the steps that `train.pictures_every` chooses, [3, H, W].
+    pub picture: Option<Tensor>,
+}
+
+/// Mean squared errors below it count as it, so that there is a PSNR.
+const MIN_MSE: f64 = 1e-10;
+
+impl StepReport {
+    /// Of all pictures together, in dB.
+    pub fn psnr(&self) -> f64 {
+        let mse = self.losses.mse;
+        -10. * if mse < MIN_MSE { MIN_MSE.log10() } else { mse.log10() }
+    }
 }
 
 impl Trainer {
@@ -77,7 +83,11 @@ impl Trainer {
     pub fn step(&mut self) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
-        self.learn(&sample, &mut Stopwatch::default())
+        let stage = stage_at(&self.config.curriculum, self.step);
+        let picture = is_due(self.config.train.pictures_every, self.step)
+            .then(|| glance(&self.model, &sample, stage))
+            .transpose()?;
+        Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default())? })
     }
 
     /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient. `watch` hears of
@@ -88,10 +98,10 @@ impl Trainer {
     pub fn learn(&mut self, sample: &Sample, watch: &mut Stopwatch) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
-        let values = self.gradients(sample, stage, watch)?;
+        let losses = self.gradients(sample, stage, watch)?;
         let (gradient_norm, skipped) = watch.time("optimizer", || {
             let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
-            let skipped = !(values.total.is_finite() && gradient_norm.is_finite());
+            let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());
             if !skipped {
                 self.optimizer.step(learning_rate);
             }
@@ -101,14 +111,11 @@ impl Trainer {
             step: self.step,
             stage,
             learning_rate,
-            loss: values.total,
-            mse: values.mse,
-            perceptual: values.perceptual,
-            consistency: values.consistency,
-            frustum: values.frustum,
-            decoder: values.decoder,
+            losses,
             gradient_norm,
             skipped,
+            scenes: sample.names.clone(),
+            picture: None,
         };
         self.step += 1;
         Ok(report)
@@ -169,6 +176,11 @@ impl Trainer {
     /// Scenes that were skipped since the run was begun or resumed.
     pub fn bad_data(&self) -> BadData {
         self.loader.as_ref().map(Loader::bad_data).unwrap_or_default()
+    }
+
+    /// What it was made from.
+    pub fn config(&self) -> &Config {
+        &self.config
     }
 
     /// The model as it is now.

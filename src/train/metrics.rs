@@ -1,0 +1,104 @@
+//! What a run writes down: `metrics.jsonl`, a line for every step and for every validation.
+
+use super::trainer::StepReport;
+use super::validator::Score;
+use crate::error::{Error, Result};
+use crate::io::{AppendFile, write_atomically};
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// How a step went, by name: not what it minimized.
+pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
+    [
+        ("loss", report.losses.total),
+        ("psnr", report.psnr()),
+        ("learning_rate", report.learning_rate),
+        ("gradient_norm", report.gradient_norm),
+        ("stage", f64::from(report.stage.index)),
+        ("mix", report.stage.mix),
+        ("samples_per_second", samples_per_second),
+    ]
+}
+
+/// The terms of a step's loss, by name.
+pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); 9] {
+    let losses = &report.losses;
+    [
+        ("mse", losses.mse),
+        ("perceptual", losses.perceptual),
+        ("consistency", losses.consistency),
+        ("frustum", losses.frustum),
+        ("decoder", losses.decoder),
+        ("decoder_opacity", losses.decoder_opacity),
+        ("decoder_scale", losses.decoder_scale),
+        ("decoder_rotation", losses.decoder_rotation),
+        ("decoder_sh", losses.decoder_sh),
+    ]
+}
+
+/// `metrics.jsonl`, which steps and validations are added to.
+#[derive(Debug)]
+pub(super) struct Metrics {
+    file: AppendFile,
+    /// The last steps before the validations that it tells of.
+    validated: BTreeSet<u64>,
+}
+
+impl Metrics {
+    /// Opens the file and takes away what a run that was stopped wrote after the checkpoint it goes on from, before which
+    /// `step` steps were done.
+    pub fn open(path: &Path, step: u64) -> Result<Self> {
+        let mut validated = BTreeSet::new();
+        if path.is_file() {
+            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
+            let mut kept = String::new();
+            for line in text.lines() {
+                let line_value: Value = serde_json::from_str(line).unwrap_or_default();
+                if let Some(of) = line_value["step"].as_u64().filter(|of| *of < step) {
+                    kept.extend([line, "\n"]);
+                    if line_value["validation"].is_object() {
+                        validated.insert(of);
+                    }
+                }
+            }
+            if kept != text {
+                write_atomically(path, |writer| {
+                    writer.write_all(kept.as_bytes()).map_err(Error::write(path))
+                })?;
+            }
+        }
+        Ok(Metrics { file: AppendFile::open(path)?, validated })
+    }
+
+    pub fn tell_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+        let mut line = json!({ "step": report.step, "skipped": report.skipped });
+        for (name, value) in progress(report, samples_per_second).into_iter().chain(loss_terms(report)) {
+            line[name] = value.into();
+        }
+        line["stage"] = report.stage.index.into();
+        if report.skipped {
+            line["scenes"] = report.scenes.clone().into();
+        }
+        self.append(&line)
+    }
+
+    /// Scores after step `step`.
+    pub fn tell_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+        let Score { psnr, ssim, scenes } = score;
+        self.append(
+            &json!({ "step": step, "validation": { "psnr": psnr, "ssim": ssim, "scenes": scenes } }),
+        )?;
+        self.validated.insert(step);
+        Ok(())
+    }
+
+    /// Whether it tells of a validation after step `step`.
+    pub fn tells_validation(&self, step: u64) -> bool {
+        self.validated.contains(&step)
+    }
+
+    fn append(&mut self, line: &Value) -> Result<()> {
+        self.file.append(format!("{line}\n").as_bytes())
+    }
+}

@@ -1,0 +1,24 @@
+//! Whom a run asks how good the model has become.
+
+use super::trainer::Trainer;
+use crate::error::Result;
+
+/// Means over everything that is held out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Score {
+    /// In dB, the mean over the scenes.
+    pub psnr: f64,
+    /// The mean over the scenes.
+    pub ssim: f64,
+    /// How many there are.
+    pub scenes: usize,
+}
+
+/// Judges a model by what training never shows.
+pub trait Validator {
+    /// The score of the model as it is now; none where `go_on`, which is asked now and then, says no.
+    ///
+    /// # Errors
+    /// Scenes that can't be read, or whatever the model fails with.
+    fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>>;
+}
