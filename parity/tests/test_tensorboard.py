@@ -1,0 +1,128 @@
+"""TensorBoard's own reader finds in a run's event files what metrics.jsonl tells, each step once."""
+
+import io
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PROGRAM = REPOSITORY / "target/release/globalsplat"
+SIZE, GAP = 32, 4
+CONFIG = """
+model = { latents = 16, width = 32, rgb_width = 32, ray_width = 16, rounds = 1, self_attention_blocks = 1, heads = 4, candidates = 4 }
+curriculum = { final_stage = 2, boundaries = [2, 4], transition = 2 }
+loss = { perceptual = "none", decoder_opacity = true }
+train = { steps = 12, batch = 2, checkpoint_every = 4, validate_every = 4, log_every = 3, pictures_every = 5 }
+[data]
+captures = ["CAPTURES"]
+image_size = [32, 32]
+context_views = 3
+target_views = 2
+window = [3, 220]
+holdout = "every:3+1"
+"""
+PROGRESS = ["loss", "psnr", "learning_rate", "gradient_norm", "stage", "mix", "samples_per_second"]
+TERMS = ["mse", "perceptual", "consistency", "frustum", "decoder"]
+PARTS = ["decoder_opacity", "decoder_scale", "decoder_rotation", "decoder_sh"]
+
+
+def run(*arguments):
+    done = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run that was killed after step 10, and then went on from the checkpoint before step 8."""
+    folder = tmp_path_factory.mktemp("tensorboard")
+    run("synth", "--out", folder / "captures", "--frames", 9, "--size", 40)
+    (folder / "config.toml").write_text(CONFIG.replace("CAPTURES", str(folder / "captures")))
+    train = ["train", "--config", folder / "config.toml", "--out", folder / "run"]
+    run(*train, "--set", "train.steps=11", "--set", "train.checkpoint_every=4")
+    shutil.rmtree(folder / "run/checkpoints/step-00000011")
+    run(*train)
+    return folder / "run"
+
+
+def lines(run):
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def events(run):
+    # 0: everything is kept
+    found = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
+    return found.Reload()
+
+
+def test_every_start_has_a_file_of_its_own(trained):
+    names = sorted(path.name for path in (trained / "tensorboard").iterdir())
+    assert names == ["events.out.tfevents.0000000000", "events.out.tfevents.0000000001"]
+    starts = []
+    for name in names:
+        found = list(EventFileLoader(str(trained / "tensorboard" / name)).Load())
+        assert found[0].file_version == "brain.Event:2"
+        starts += [event.step for event in found if event.HasField("session_log")]
+        assert all(a.wall_time <= b.wall_time for a, b in zip(found, found[1:]))
+    assert starts == [0, 8]
+
+
+def test_scalars_are_those_of_metrics_jsonl(trained):
+    found, told = events(trained), lines(trained)
+    steps = [line for line in told if "validation" not in line]
+    assert [line["step"] for line in steps] == list(range(12))
+    tags = {f"train/{name}": name for name in PROGRESS} | {f"loss/{name}": name for name in TERMS + PARTS}
+    assert set(found.Tags()["scalars"]) == set(tags) | {"validation/psnr", "validation/ssim"}
+    for tag, name in tags.items():
+        events_of = found.Scalars(tag)
+        assert [event.step for event in events_of] == [0, 3, 6, 9], tag
+        expected = [steps[event.step][name] for event in events_of]
+        np.testing.assert_allclose([event.value for event in events_of], expected, rtol=1e-6, err_msg=tag)
+    for line in steps:
+        parts = sum(line[part] for part in PARTS)
+        np.testing.assert_allclose(line["decoder"], 1e-2 * parts, rtol=1e-5)
+        np.testing.assert_allclose(line["psnr"], -10 * np.log10(line["mse"]), rtol=1e-9)
+        assert line["decoder_opacity"] > 0 and line["samples_per_second"] > 0
+
+    validations = [line for line in told if "validation" in line]
+    assert [line["step"] for line in validations] == [3, 7, 11]
+    for name in ["psnr", "ssim"]:
+        events_of = found.Scalars(f"validation/{name}")
+        assert [event.step for event in events_of] == [3, 7, 11]
+        expected = [line["validation"][name] for line in validations]
+        np.testing.assert_allclose([event.value for event in events_of], expected, rtol=1e-6)
+
+
+def test_pictures_are_strips_of_five(trained):
+    found = events(trained)
+    assert found.Tags()["images"] == ["train/views"]
+    pictures = found.Images("train/views")
+    assert [picture.step for picture in pictures] == [0, 5, 10]
+    seen = []
+    for picture in pictures:
+        assert (picture.width, picture.height) == (5 * SIZE + 4 * GAP, SIZE)
+        decoded = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+        assert decoded.shape == (SIZE, 5 * SIZE + 4 * GAP, 3)
+        photo, truth, render, depth, alpha = (
+            decoded[:, i * (SIZE + GAP) : i * (SIZE + GAP) + SIZE] for i in range(5)
+        )
+        assert photo.std() > 5 and truth.std() > 5 and not np.array_equal(photo, truth)
+        assert (alpha == alpha[..., :1]).all(), "grey"
+        seen.append([render.any(), depth.any(), alpha.any()])
+    # A model that has learned nothing yet leaves some pictures black.
+    assert np.any(seen, axis=0).all()
+
+
+def test_a_broken_byte_is_noticed(trained, tmp_path):
+    original = sorted((trained / "tensorboard").iterdir())[0].read_bytes()
+    whole = len(list(EventFileLoader(str(sorted((trained / "tensorboard").iterdir())[0])).Load()))
+    broken = bytearray(original)
+    broken[len(broken) // 2] ^= 1
+    (tmp_path / "events.out.tfevents.0").write_bytes(broken)
+    assert len(list(EventFileLoader(str(tmp_path / "events.out.tfevents.0")).Load())) < whole
