@@ -190,9 +190,10 @@ pub struct TrainConfig {
     /// once. With `loss.consistency_depth`, whose mean is over pixels that only pictures tell, it takes a forward pass more.
     pub micro_batch: usize,
     /// Whether the encoder keeps nothing of a round but what it began with, and computes the round again in the backward
-    /// pass: less memory for a third of the time.
+    /// pass: less memory, a fifth more time.
     pub checkpoint_rounds: bool,
-    /// `f32`, or `bf16` for the encoder's matrix products, which is faster where the machine has instructions for it.
+    /// `f32`, or `bf16` for the encoder's matrix products, which is faster for wide models where the machine has instructions
+    /// for it.
     pub precision: Precision,
     /// Peak learning rate.
     pub learning_rate: f64,
