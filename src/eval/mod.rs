@@ -19,7 +19,7 @@ pub use contact_sheet::contact_sheet;
 pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary, scene_file_name};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use machine::machine;
-pub use memory::{peak_memory_bytes, resident_memory_bytes};
+pub use memory::{device_memory_bytes, peak_memory_bytes, resident_memory_bytes};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
 pub use protocol::{
