@@ -281,6 +281,19 @@ fn weights_that_are_something_else() {
 }
 
 #[test]
+fn precisions_that_are_unknown() {
+    let (folder, room) = room();
+    let (weights, splat) = (tiny_weights(folder.path(), &room), folder.path().join("out.ply"));
+    let files = ["--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)];
+    let error = refuse(&[&["reconstruct", "--precision", "f16"], &files[..]].concat());
+    assert_says(&error, &["--precision: f16", "f32 or bf16"]);
+    let (config, run) = (folder.path().join("tiny.toml"), folder.path().join("run"));
+    let config = ["--config", arg(&config), "--out", arg(&run)];
+    let error = refuse(&[&["train", "--set", "train.precision=f16"], &config[..]].concat());
+    assert_says(&error, &["--set train.precision=f16", "f32", "bf16"]);
+}
+
+#[test]
 fn configurations_with_unknown_or_ill_typed_keys() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);

@@ -300,9 +300,11 @@ fn a_run_goes_from_photos_to_a_splat() {
     assert!(bytes(&half) < bytes(&weights) * 2 / 3);
 
     let splat = folder.path().join("room.ply");
-    for file in [&weights, &half] {
+    for (file, precision) in [(&weights, "f32"), (&half, "f32"), (&weights, "bf16")] {
         let report = json(&[
             "reconstruct",
+            "--precision",
+            precision,
             "--weights",
             arg(file),
             "--scene",

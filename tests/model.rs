@@ -2,7 +2,7 @@
 
 mod common;
 
-use globalsplat::model::{GlobalSplat, ModelConfig, Stage, Streams};
+use globalsplat::model::{GlobalSplat, ModelConfig, Precision, Stage, Streams};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -132,6 +132,48 @@ fn a_transition_starts_where_the_stage_before_ended() {
     assert!(common::largest_error(&after.sh, &twice(&before.sh)) < 1e-6);
     let ratio = after.scales / twice(&before.scales);
     assert!((ratio - 0.5f64.cbrt()).abs().max().double_value(&[]) < 1e-6);
+}
+
+#[test]
+fn bf16_is_float32_but_for_its_rounding() {
+    for streams in [Streams::Dual, Streams::Single] {
+        let (vs, mut model) = build(&ModelConfig { streams, ..small() });
+        let mut random = common::Random::new(3);
+        for (name, variable) in &mut vs.variables() {
+            // So that every layer matters: LayerScale begins at a thousandth.
+            let is_norm = name.ends_with(".weight") && variable.dim() == 1;
+            let value = random.symmetric(&variable.size()) * 0.3 + if is_norm { 1. } else { 0. };
+            tch::no_grad(|| variable.copy_(&value));
+        }
+        let [_, c2w, intrinsics] = inputs(3, 16, 24);
+        let images = random.uniform(&[1, 3, 3, 16, 24]).to_kind(Kind::Float);
+        let mut run = |precision| {
+            model.set_precision(precision);
+            let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+            let g = decoded.gaussians.map(Tensor::shallow_clone);
+            vs.trainable_variables().iter_mut().for_each(|variable| variable.zero_grad());
+            (g.means.square().sum(Kind::Float) + g.sh.square().sum(Kind::Float)).backward();
+            let gradients = vs.trainable_variables().into_iter().map(|variable| variable.grad());
+            let gradient: Vec<Tensor> =
+                gradients.filter(Tensor::defined).map(|gradient| gradient.flatten(0, -1)).collect();
+            (g, Tensor::cat(&gradient, 0))
+        };
+        let (exact, exact_gradient) = run(Precision::F32);
+        let (rounded, rounded_gradient) = run(Precision::Bf16);
+        let pairs = [
+            ("means", &rounded.means, &exact.means),
+            ("scales", &rounded.scales, &exact.scales),
+            ("quaternions", &rounded.quaternions, &exact.quaternions),
+            ("opacities", &rounded.opacities, &exact.opacities),
+            ("sh", &rounded.sh, &exact.sh),
+            ("gradient", &rounded_gradient, &exact_gradient),
+        ];
+        for (name, rounded, exact) in pairs {
+            assert_eq!(rounded.kind(), Kind::Float, "{name}");
+            let error = common::relative_error(rounded, exact);
+            assert!((1e-5..2e-2).contains(&error), "{streams:?}, {name}: relative error {error:.1e}");
+        }
+    }
 }
 
 #[test]

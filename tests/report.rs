@@ -42,6 +42,7 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         warm_up: false,
         forward_seconds,
         peak_memory_bytes: None,
+        peak_device_memory_bytes: None,
     }
 }
 

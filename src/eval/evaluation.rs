@@ -88,6 +88,9 @@ pub struct SceneScores {
     /// The largest resident size of the process up to then, in bytes, where a model was run and nothing else yet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_memory_bytes: Option<u64>,
+    /// The memory of the GPU that the process held then, in bytes, where one was used and tells.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_device_memory_bytes: Option<u64>,
 }
 
 /// A scene that couldn't be scored.

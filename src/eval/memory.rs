@@ -1,5 +1,8 @@
 //! How much memory the process has taken.
 
+use std::process::Command;
+use tch::Device;
+
 /// The resident size now, in bytes; where the system doesn't tell, the largest so far.
 pub fn resident_memory_bytes() -> u64 {
     let from_linux = || -> Option<u64> {
@@ -9,6 +12,25 @@ pub fn resident_memory_bytes() -> u64 {
         Some(pages * u64::try_from(page).ok()?)
     };
     from_linux().unwrap_or_else(peak_memory_bytes)
+}
+
+/// The memory of `device` that this process holds, in bytes; none for the CPU, and where `nvidia-smi` doesn't tell. libtorch keeps
+/// what it once took, so it is also the largest amount so far.
+pub fn device_memory_bytes(device: Device) -> Option<u64> {
+    if !matches!(device, Device::Cuda(_)) {
+        return None;
+    }
+    let query = ["--query-compute-apps=pid,used_gpu_memory", "--format=csv,noheader,nounits"];
+    let told = Command::new("nvidia-smi").args(query).output().ok()?;
+    of_process(&String::from_utf8_lossy(&told.stdout), std::process::id())
+}
+
+/// From lines of a process's number and its MiB.
+fn of_process(table: &str, process: u32) -> Option<u64> {
+    table.lines().find_map(|line| {
+        let (pid, mebibytes) = line.split_once(',')?;
+        (pid.trim().parse() == Ok(process)).then(|| Some(mebibytes.trim().parse::<u64>().ok()? << 20))?
+    })
 }
 
 /// The largest resident size so far, in bytes.
@@ -22,4 +44,17 @@ pub fn peak_memory_bytes() -> u64 {
     // Linux counts kibibytes, macOS bytes.
     let unit = if cfg!(target_os = "macos") { 1 } else { 1024 };
     usage.ru_maxrss as u64 * unit
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_is_found_in_what_nvidia_smi_tells() {
+        let table = "812, 1500\n4711, 1832\n9, [N/A]\n";
+        assert_eq!(of_process(table, 4711), Some(1832 << 20));
+        assert_eq!((of_process(table, 47), of_process(table, 9), of_process("", 1)), (None, None, None));
+        assert_eq!(device_memory_bytes(Device::Cpu), None);
+    }
 }

@@ -21,7 +21,7 @@ pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary, scen
 pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use machine::machine;
-pub use memory::{peak_memory_bytes, resident_memory_bytes};
+pub use memory::{device_memory_bytes, peak_memory_bytes, resident_memory_bytes};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
 pub use protocol::{

@@ -3,7 +3,7 @@
 
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary, scene_file_name};
 use super::index::{EvaluationIndex, SceneFrames};
-use super::memory::peak_memory_bytes;
+use super::memory::{device_memory_bytes, peak_memory_bytes};
 use super::perceptual::Perceptual;
 use super::protocol::{Rendered, ask, colours, read_picture, render_views, score};
 use super::scores_file::strip_path;
@@ -115,13 +115,13 @@ impl Sweep<'_> {
             while go_on && let Ok((key, loaded)) = receiver.recv() {
                 let answered = loaded.and_then(|scene| Ok((self.answer(&key, &scene)?, scene)));
                 let first = judges.take();
-                let peak_memory = first.is_some().then(peak_memory_bytes);
+                let memory = first.is_some().then(|| self.memory()).flatten();
                 if let Some(judges) = first {
                     perceptual = Some(judges()?);
                 }
                 let judged = answered.and_then(|(answer, scene)| {
                     let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    self.judge(&key, &scene, answer, peak_memory, perceptual)
+                    self.judge(&key, &scene, answer, memory, perceptual)
                 });
                 match judged {
                     Ok(scene) => scenes.push(scene),
@@ -277,12 +277,23 @@ impl Sweep<'_> {
         }
     }
 
+    /// So far; none where no model is judged.
+    fn memory(&self) -> Option<Memory> {
+        match self.subject {
+            Subject::Model(loaded) => {
+                let device = device_memory_bytes(loaded.vs.device());
+                Some(Memory { host: peak_memory_bytes(), device })
+            }
+            _ => None,
+        }
+    }
+
     fn judge(
         &self,
         key: &str,
         scene: &LoadedScene,
         answer: Answer,
-        peak_memory_bytes: Option<u64>,
+        memory: Option<Memory>,
         perceptual: &Perceptual,
     ) -> Result<SceneScores> {
         let Answer { pictures, rendered, gaussians, splat_bytes, forward_seconds } = answer;
@@ -295,19 +306,26 @@ impl Sweep<'_> {
         let worst = (0..pictures.len()).min_by(|a, b| psnr(a).total_cmp(&psnr(b))).expect("a target view");
         let strip = strip(&scene.target[worst].image, &pictures[worst], rendered.get(worst));
         write_jpeg(&strip_path(self.out, key), &strip)?;
-        let is_model = matches!(self.subject, Subject::Model(_));
         let scores = SceneScores {
             scores,
             context: scene.frames.context.clone(),
             target: scene.frames.target.clone(),
             splat_bytes,
             forward_seconds,
-            warm_up: is_model && peak_memory_bytes.is_some(),
-            peak_memory_bytes: peak_memory_bytes.filter(|_| is_model),
+            warm_up: memory.is_some(),
+            peak_memory_bytes: memory.map(|memory| memory.host),
+            peak_device_memory_bytes: memory.and_then(|memory| memory.device),
         };
         write_json(&self.kept_file(key), &scores)?;
         Ok(scores)
     }
+}
+
+/// What a model took, in bytes.
+#[derive(Clone, Copy)]
+struct Memory {
+    host: u64,
+    device: Option<u64>,
 }
 
 /// Reads scenes, beside the thread that judges them.
@@ -361,7 +379,7 @@ impl Efficiency {
             forward_seconds: mean(&times),
             timed_scenes: times.len(),
             peak_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_memory_bytes).max().unwrap_or(0),
-            peak_device_memory_bytes: None,
+            peak_device_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_device_memory_bytes).max(),
             splat_bytes: mean(&bytes),
         })
     }

@@ -3,6 +3,7 @@
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, randn};
 use super::mixer::Mixer;
+use super::precision::Precision;
 use super::stream::StreamRound;
 use tch::{Tensor, nn, nn::Module};
 
@@ -45,6 +46,8 @@ pub struct Encoder {
     geometry_rounds: Vec<StreamRound>,
     appearance: Option<Appearance>,
     latents: i64,
+    /// Of the rounds' products.
+    pub(super) precision: Precision,
 }
 
 /// What the dual-branch encoder has beyond a single stream.
@@ -80,6 +83,7 @@ impl Encoder {
                 }),
             },
             latents: config.latents,
+            precision: Precision::default(),
         }
     }
 
@@ -108,11 +112,12 @@ impl Encoder {
 
     /// Both streams read and think, each by itself, then they meet.
     pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Tensor) -> Slots {
-        let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory);
+        let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory, self.precision);
         match (&self.appearance, &slots.appearance) {
             (Some(branch), Some(appearance)) => {
-                let appearance = branch.rounds[round].forward(appearance, memory);
-                let (geometry, appearance) = branch.mixers[round].forward(&geometry, &appearance);
+                let appearance = branch.rounds[round].forward(appearance, memory, self.precision);
+                let mixer = &branch.mixers[round];
+                let (geometry, appearance) = mixer.forward(&geometry, &appearance, self.precision);
                 Slots { geometry, appearance: Some(appearance) }
             }
             _ => Slots { geometry, appearance: None },

@@ -1,6 +1,7 @@
 //! The pieces that streams and mixer are made of, with the initializations of SPEC section 4.
 
-use tch::{Tensor, nn, nn::Module};
+use super::precision::Precision;
+use tch::{Tensor, nn};
 
 /// Of encoder linears and learnable tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
@@ -30,7 +31,7 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
     nn::layer_norm(vs, vec![width], Default::default())
 }
 
-/// x ↦ γ ⊙ x.
+/// x ↦ γ ⊙ x, in float32.
 #[derive(Debug)]
 pub(super) struct LayerScale {
     gamma: Tensor,
@@ -62,12 +63,12 @@ impl Mlp {
         }
     }
 
-    pub fn forward(&self, xs: &Tensor) -> Tensor {
-        self.contract.forward(&self.expand.forward(xs).gelu("none"))
+    pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
+        precision.linear(&self.contract, &precision.linear(&self.expand, xs).gelu("none"))
     }
 }
 
-/// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d].
+/// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
 pub(super) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let split = |t: &Tensor| {
         let (b, n, d) = t.size3().expect("[B, n, d]");

@@ -1,6 +1,7 @@
 //! Where the two streams meet, once per round (SPEC section 4).
 
 use super::layers::{LayerScale, Mlp, layer_norm};
+use super::precision::Precision;
 use tch::{Tensor, nn, nn::Module};
 
 const MIXER_LAYER_SCALE: f64 = 1e-3;
@@ -27,9 +28,9 @@ impl Mixer {
     }
 
     /// Both streams [B, S, d], and so the results.
-    pub fn forward(&self, geometry: &Tensor, appearance: &Tensor) -> (Tensor, Tensor) {
+    pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
         let both = [self.geometry_norm.forward(geometry), self.appearance_norm.forward(appearance)];
-        let mixed = self.mlp.forward(&Tensor::cat(&both, -1)).chunk(2, -1);
+        let mixed = self.mlp.forward(&Tensor::cat(&both, -1), precision).chunk(2, -1);
         (
             geometry + self.geometry_scale.forward(&mixed[0]),
             appearance + self.appearance_scale.forward(&mixed[1]),

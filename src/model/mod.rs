@@ -12,6 +12,7 @@ mod layers;
 mod leaves;
 mod merge;
 mod mixer;
+mod precision;
 mod recompute;
 mod rotation;
 mod stream;
@@ -22,6 +23,7 @@ pub use decoder::{Decoded, Decoder, RawOutputs};
 pub use encoder::{Encoded, Encoder};
 pub use gaussians::Gaussians;
 pub use merge::Stage;
+pub use precision::Precision;
 pub use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub use tokens::{Tokenizer, patchify};
 
@@ -93,6 +95,11 @@ impl GlobalSplat {
     /// The last third.
     pub fn decode(&self, encoded: &Encoded, stage: Stage) -> Decoded {
         self.decoder.forward(encoded, stage)
+    }
+
+    /// What the encoder's products are computed in from now on; float32 at first.
+    pub fn set_precision(&mut self, precision: Precision) {
+        self.encoder.precision = precision;
     }
 
     /// What the model was built from.

@@ -3,6 +3,7 @@
 use super::config::ModelConfig;
 use super::encoder::REGISTERS;
 use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear};
+use super::precision::Precision;
 use tch::{Tensor, nn, nn::Module};
 
 const MLP_RATIO: i64 = 4;
@@ -48,20 +49,22 @@ impl StreamRound {
     }
 
     /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width]; result [B, S, d].
-    pub fn forward(&self, slots: &Tensor, memory: &Tensor) -> Tensor {
+    pub fn forward(&self, slots: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
         // Registers neither look at the images nor pass the MLP: they only change in self-attention.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
 
         let memory = self.memory_norm.forward(memory);
-        let query = self.query.forward(&self.slots_norm.forward(&slots));
-        let seen = attention(&query, &self.key.forward(&memory), &self.value.forward(&memory), self.heads);
-        let slots = slots + self.attention_scale.forward(&self.output.forward(&seen));
-        let slots = &slots + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&slots)));
+        let query = precision.linear(&self.query, &self.slots_norm.forward(&slots));
+        let [key, value] = [&self.key, &self.value].map(|layer| precision.linear(layer, &memory));
+        let seen = attention(&query, &key, &value, self.heads);
+        let slots = slots + self.attention_scale.forward(&precision.linear(&self.output, &seen));
+        let thought = self.mlp.forward(&self.mlp_norm.forward(&slots), precision);
+        let slots = slots + self.mlp_scale.forward(&thought);
 
         let slots = Tensor::cat(&[slots, registers], 1);
-        self.blocks.iter().fold(slots, |slots, block| block.forward(&slots))
+        self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
     }
 }
 
@@ -93,10 +96,10 @@ impl SelfAttentionBlock {
     }
 
     /// [B, S, d], and so the result.
-    pub fn forward(&self, xs: &Tensor) -> Tensor {
-        let qkv = self.qkv.forward(&self.attention_norm.forward(xs)).chunk(3, -1);
+    pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
+        let qkv = precision.linear(&self.qkv, &self.attention_norm.forward(xs)).chunk(3, -1);
         let mixed = attention(&qkv[0], &qkv[1], &qkv[2], self.heads);
-        let xs = xs + self.attention_scale.forward(&self.project.forward(&mixed));
-        &xs + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&xs)))
+        let xs = xs + self.attention_scale.forward(&precision.linear(&self.project, &mixed));
+        &xs + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&xs), precision))
     }
 }

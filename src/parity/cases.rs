@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
 use crate::model::Gaussians;
-use crate::model::{self, Encoded, GlobalSplat, ModelConfig, RawOutputs, Stage};
+use crate::model::{self, Encoded, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::render::{self, Cameras};
 use crate::scene;
 use crate::train;
@@ -158,20 +158,22 @@ fn camera_code(request: &Request) -> Result<Answer> {
 fn stream_round(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
-    with_params([("slots", module.forward(request.input("slots")?, request.input("memory")?))], params)
+    let (slots, memory) = (request.input("slots")?, request.input("memory")?);
+    with_params([("slots", module.forward(slots, memory, Precision::F32))], params)
 }
 
 fn self_attention_block(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) =
         request.build(|vs| model::SelfAttentionBlock::new(vs, config.width, config.heads))?;
-    with_params([("slots", module.forward(request.input("slots")?))], params)
+    with_params([("slots", module.forward(request.input("slots")?, Precision::F32))], params)
 }
 
 fn mixer(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::Mixer::new(vs, config.width))?;
-    let (geometry, appearance) = module.forward(request.input("geometry")?, request.input("appearance")?);
+    let (geometry, appearance) =
+        module.forward(request.input("geometry")?, request.input("appearance")?, Precision::F32);
     with_params([("geometry", geometry), ("appearance", appearance)], params)
 }
 

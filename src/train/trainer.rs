@@ -70,7 +70,8 @@ impl Trainer {
         let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?;
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);
-        let model = GlobalSplat::new(&vs.root(), &config.model)?;
+        let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
+        model.set_precision(config.train.precision);
         let optimizer = AdamW::new(&vs, config.train.weight_decay);
         let config = config.clone();
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, scenes, loader: None })

@@ -1,0 +1,43 @@
+//! What the encoder's matrix products are computed in.
+
+use serde::{Deserialize, Serialize};
+use std::str::FromStr;
+use tch::{Kind, Tensor, nn, nn::Module};
+
+/// Of products in the encoder: linear layers and attention. All else is float32, whatever this says: weights and their
+/// gradients, norms, the sums inside of softmax and products, residual streams; tokens and heads, whose products are few
+/// and which read and say where things are; geometry and rendering.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// 24 bits of mantissa.
+    #[default]
+    F32,
+    /// 8 bits of mantissa, as with torch's autocast: faster where the machine has instructions for it (AMX, tensor cores).
+    Bf16,
+}
+
+impl Precision {
+    /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
+    pub(super) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
+        match self {
+            Precision::F32 => layer.forward(xs),
+            Precision::Bf16 => {
+                let half = |t: &Tensor| t.to_kind(Kind::BFloat16);
+                half(xs).linear(&half(&layer.ws), layer.bs.as_ref().map(half).as_ref())
+            }
+        }
+    }
+}
+
+impl FromStr for Precision {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "f32" => Ok(Precision::F32),
+            "bf16" => Ok(Precision::Bf16),
+            _ => Err(format!("{text} is no precision, expected f32 or bf16")),
+        }
+    }
+}
