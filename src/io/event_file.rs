@@ -1,11 +1,13 @@
 //! Event files, which TensorBoard shows: TFRecords of `Event` messages, of which this is all that we need.
 //!
-//!     message Event   { double wall_time = 1; int64 step = 2; string file_version = 3; Summary summary = 5;
-//!                       SessionLog session_log = 7; }
-//!     message SessionLog { enum { START = 1 } status = 1; }
-//!     message Summary { message Value { string tag = 1; float simple_value = 2; Image image = 4; }
-//!                       repeated Value value = 1; }
-//!     message Image   { int32 height = 1; int32 width = 2; int32 colorspace = 3; bytes encoded_image_string = 4; }
+//! ```text
+//! message Event   { double wall_time = 1; int64 step = 2; string file_version = 3; Summary summary = 5;
+//!                   SessionLog session_log = 7; }
+//! message SessionLog { enum { START = 1 } status = 1; }
+//! message Summary { message Value { string tag = 1; float simple_value = 2; Image image = 4; }
+//!                   repeated Value value = 1; }
+//! message Image   { int32 height = 1; int32 width = 2; int32 colorspace = 3; bytes encoded_image_string = 4; }
+//! ```
 
 use super::append::AppendFile;
 use super::images::{encode_photo, rgb_from_tensor};
