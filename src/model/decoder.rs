@@ -5,6 +5,7 @@ use super::encoder::Encoded;
 use super::gaussians::Gaussians;
 use super::layers::linear;
 use super::merge::{Candidates, Stage};
+use super::precision::Precision;
 use super::rotation::{normalize, quaternion_from_6d};
 use std::f64::consts::LN_2;
 use tch::{Tensor, nn, nn::Module};
@@ -104,6 +105,8 @@ pub struct Decoder {
     sh: nn::Linear,
     candidates: i64,
     sh_bases: i64,
+    /// Of the product of the appearance head, the largest one. The others say where things are and stay in float32.
+    pub(super) precision: Precision,
 }
 
 impl Decoder {
@@ -120,6 +123,7 @@ impl Decoder {
             sh: linear(vs / "sh_readout", d, 3 * config.sh_bases() * k, SH_STD),
             candidates: k,
             sh_bases: config.sh_bases(),
+            precision: Precision::default(),
         }
     }
 
@@ -128,13 +132,14 @@ impl Decoder {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
         let parameters = self.parameters.forward(&encoded.geometry).view([b, m, k, PARAMETERS]);
+        let sh = self.precision.linear(&self.sh, &encoded.appearance).to_kind(encoded.appearance.kind());
         Heads {
             positions: self.positions.forward(&encoded.geometry).view([b, m, k, 3]),
             log_scales: parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET,
             rotations: parameters.narrow(-1, 3, 6),
             opacity_logits: parameters.narrow(-1, 9, 1),
             gate: self.gate.forward(&encoded.geometry),
-            sh: self.sh.forward(&encoded.appearance).view([b, m, k, self.sh_bases * 3]),
+            sh: sh.view([b, m, k, self.sh_bases * 3]),
         }
     }
 

@@ -97,9 +97,10 @@ impl GlobalSplat {
         self.decoder.forward(encoded, stage)
     }
 
-    /// What the encoder's products are computed in from now on; float32 at first.
+    /// What matrix products are computed in from now on; float32 at first.
     pub fn set_precision(&mut self, precision: Precision) {
         self.encoder.precision = precision;
+        self.decoder.precision = precision;
     }
 
     /// What the model was built from.

@@ -1,12 +1,12 @@
-//! What the encoder's matrix products are computed in.
+//! What matrix products are computed in.
 
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Of products in the encoder: linear layers and attention. All else is float32, whatever this says: weights and their
-/// gradients, norms, the sums inside of softmax and products, residual streams; tokens and heads, whose products are few
-/// and which read and say where things are; geometry and rendering.
+/// Of the encoder's linear layers and attention, and of the decoder's appearance head. All else is float32, whatever this
+/// says: weights and their gradients, norms, the sums inside of softmax and products, residual streams; tokens and geometry
+/// heads, whose products are few and which read and say where things are; geometry and rendering.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
