@@ -41,8 +41,8 @@ pub fn save_model(path: &Path, vs: &nn::VarStore, config: &Config, dtype: ModelD
         ModelDtype::BF16 => t.to_kind(Kind::BFloat16),
     };
     let tensors = vs.variables().into_iter().map(|(name, t)| (name, stored(t))).collect();
-    let metadata =
-        HashMap::from([("format".to_string(), "pt".to_string()), (CONFIG_KEY.to_string(), config.to_toml())]);
+    // A second key would stand before or after it by chance, and the same model wouldn't be the same bytes.
+    let metadata = HashMap::from([(CONFIG_KEY.to_string(), config.to_toml())]);
     write_weights(path, &tensors, metadata)
 }
 
