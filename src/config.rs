@@ -6,6 +6,7 @@ use crate::io::{find_pretrained, pretrained_folders};
 use crate::loss::{LpipsNetwork, PerceptualKind};
 use crate::model::{ModelConfig, Precision, Stage};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Everything a run depends on.
@@ -392,6 +393,37 @@ fn expand(text: &str) -> Result<String> {
     let value =
         value.ok_or_else(|| Error::Request(format!("{text}: the environment variable {name} is not set")))?;
     Ok(format!("{before}{value}{}", expand(after)?))
+}
+
+/// The keys at which two configurations differ, both with every key written out, as "train.batch 2 → 4".
+pub(crate) fn changed_keys(before: &str, after: &str) -> Vec<String> {
+    let keys = |text: &str| {
+        let mut keys = BTreeMap::new();
+        flatten("", toml::Value::Table(text.parse().unwrap_or_default()), &mut keys);
+        keys
+    };
+    let (before, after) = (keys(before), keys(after));
+    let changed = after.iter().filter_map(|(key, value)| match before.get(key) {
+        Some(old) if old == value => None,
+        Some(old) => Some(format!("{key} {old} → {value}")),
+        None => Some(format!("{key} {value}")),
+    });
+    changed.collect()
+}
+
+/// Collects the values in a table of tables by their dotted keys.
+fn flatten(key: &str, value: toml::Value, into: &mut BTreeMap<String, toml::Value>) {
+    match value {
+        toml::Value::Table(table) => {
+            for (name, value) in table {
+                let key = if key.is_empty() { name } else { format!("{key}.{name}") };
+                flatten(&key, value, into);
+            }
+        }
+        value => {
+            into.insert(key.to_string(), value);
+        }
+    }
 }
 
 /// Sets `section.key` of `section.key=value`.

@@ -69,13 +69,20 @@ impl Train {
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
+        let bad_data = trainer.bad_data();
+        if outcome.skipped > 0 {
+            eprintln!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
+        }
+        if bad_data.total() > 0 {
+            eprintln!("{bad_data}");
+        }
         if !outcome.complete {
             anyhow::bail!(
                 "stopped; {} holds all of it, and the same command goes on",
                 outcome.checkpoint.display()
             );
         }
-        self.report(&outcome, seconds, held_out.scores(), &trainer.bad_data());
+        self.report(&outcome, seconds, held_out.scores(), &bad_data);
         Ok(())
     }
 
@@ -154,12 +161,6 @@ impl Train {
             return;
         }
         println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
-        if outcome.skipped > 0 {
-            println!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
-        }
-        if bad_data.total() > 0 {
-            println!("{bad_data}");
-        }
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
             for v in validation {

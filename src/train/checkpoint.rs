@@ -1,9 +1,9 @@
 //! Checkpoints: a folder per step, whole or not there.
 //!
 //! `RUN/checkpoints/step-00001000/`: `model.safetensors` (weights, with the configuration), `optimizer.safetensors`, and
-//! `state.json`, which holds the step and the others' checksums. `RUN/best/` is the one that validation found best, with its
-//! score. Random numbers and data need no state: those of a step depend
-//! on the seed and the step alone.
+//! `state.json`, which holds the step, the position in the data, and the others' checksums. `RUN/best/` is the one that
+//! validation found best, with its score. Random numbers need no state: those of a sample depend on the seed, which is part
+//! of the configuration, and on its position in the data alone.
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
@@ -23,10 +23,12 @@ pub(crate) const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
 
-#[derive(Serialize, Deserialize)]
-struct State {
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct State {
     /// Steps done.
     step: u64,
+    /// Samples drawn: the position in the data.
+    samples: u64,
     /// Sizes in bytes and CRC-32 of the other files, by their names.
     files: BTreeMap<String, (u64, u32)>,
     /// Of the best checkpoint: what validation found, in dB.
@@ -126,7 +128,8 @@ impl Trainer {
             let files =
                 [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;
-            write_state(folder, &State { step: self.step, files, validation_psnr: None })
+            let (step, samples) = (self.step, self.samples);
+            write_state(folder, &State { step, samples, files, validation_psnr: None })
         })?;
         let all = list_checkpoints(run)?;
         let surplus = all.len().saturating_sub(self.config.train.keep_checkpoints);
@@ -141,20 +144,20 @@ impl Trainer {
     /// # Errors
     /// Files that can't be read, were damaged, or were written for another model.
     pub fn load(&mut self, checkpoint: &Path) -> Result<()> {
-        let step = check(checkpoint)?;
+        let State { step, samples, .. } = check(checkpoint)?;
         let file = checkpoint.join(MODEL_FILE);
         read_weights(&file)?.load_into(&self.vs, &file)?;
         self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
-        self.step = step;
+        (self.step, self.samples) = (step, samples);
         Ok(())
     }
 }
 
-/// Whether a checkpoint is whole: its files are as they were written. Returns its step.
+/// Whether a checkpoint is whole: its files are as they were written.
 ///
 /// # Errors
 /// What is missing or damaged.
-pub(super) fn check(checkpoint: &Path) -> Result<u64> {
+pub(super) fn check(checkpoint: &Path) -> Result<State> {
     let state = read_state(checkpoint)?;
     for (name, (bytes, crc)) in &state.files {
         let file = checkpoint.join(name);
@@ -164,7 +167,7 @@ pub(super) fn check(checkpoint: &Path) -> Result<u64> {
             return Err(Error::input(&file, "the file", found, format!("{bytes} bytes, checksum {crc:08x}")));
         }
     }
-    Ok(state.step)
+    Ok(state)
 }
 
 fn read_state(checkpoint: &Path) -> Result<State> {

@@ -7,7 +7,7 @@ use super::lock::RunLock;
 use super::metrics::Metrics;
 use super::trainer::{StepReport, Trainer};
 use super::validator::{Score, Validator};
-use crate::config::TrainConfig;
+use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
 use std::path::{Path, PathBuf};
@@ -70,6 +70,13 @@ pub fn run(
     begin(trainer, out, resume, &mut observe)?;
     let config = out.join("config.toml");
     let toml = trainer.config.to_toml();
+    let changes = match std::fs::read_to_string(&config) {
+        Ok(before) if trainer.step > 0 => changed_keys(&before, &toml),
+        _ => vec![],
+    };
+    if !changes.is_empty() {
+        observe(Event::Notice(format!("the run goes on with another configuration: {}", changes.join(", "))));
+    }
     write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
     let metrics = Metrics::open(&out.join("metrics.jsonl"), trainer.step)?;
     let mut board = Board::create(out, trainer.config.train.log_every)?;
@@ -140,7 +147,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         }
         let complete = self.trainer.step >= steps;
         // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
-        self.trainer.step -= trouble;
+        self.trainer.take_back(trouble);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
         if complete && go_on {
             self.validate(&checkpoint)?;

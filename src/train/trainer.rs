@@ -24,6 +24,8 @@ pub struct Trainer {
     perceptual: Option<PerceptualLoss>,
     /// Steps done.
     pub(super) step: u64,
+    /// Samples drawn: the position in the data.
+    pub(super) samples: u64,
     scenes: Arc<dyn SceneGroups>,
     /// Begins with the first step that is done, wherever that is.
     loader: Option<Loader>,
@@ -74,7 +76,7 @@ impl Trainer {
         model.set_precision(config.train.precision);
         let optimizer = AdamW::new(&vs, config.train.weight_decay);
         let config = config.clone();
-        Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, scenes, loader: None })
+        Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
     }
 
     /// Draws a sample and follows its gradient.
@@ -84,6 +86,7 @@ impl Trainer {
     pub fn step(&mut self) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
+        self.samples += batch as u64;
         let stage = stage_at(&self.config.curriculum, self.step);
         let picture = is_due(self.config.train.pictures_every, self.step)
             .then(|| glance(&self.model, &sample, stage))
@@ -166,12 +169,18 @@ impl Trainer {
 
     /// Where the next step's samples come from.
     fn loader(&mut self) -> Result<&mut Loader> {
-        let first = self.step * self.config.train.batch as u64;
+        let first = self.samples;
         let loader = match self.loader.take() {
             Some(loader) if loader.position() == first => loader,
             _ => Loader::start(&self.config.data, self.config.train.seed, self.scenes.clone(), first)?,
         };
         Ok(self.loader.insert(loader))
+    }
+
+    /// Takes back the last `steps` steps, which were all skipped and so changed nothing but where the run stands.
+    pub(super) fn take_back(&mut self, steps: u64) {
+        self.step -= steps;
+        self.samples -= steps * self.config.train.batch as u64;
     }
 
     /// Scenes that were skipped since the run was begun or resumed.
