@@ -287,6 +287,8 @@ fn precisions_that_are_unknown() {
     let files = ["--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)];
     let error = refuse(&[&["reconstruct", "--precision", "f16"], &files[..]].concat());
     assert_says(&error, &["--precision: f16", "f32 or bf16"]);
+    let error = refuse(&[&["eval", "--precision", "f16"], &files[..4]].concat());
+    assert_says(&error, &["--precision: f16", "f32 or bf16"]);
     let (config, run) = (folder.path().join("tiny.toml"), folder.path().join("run"));
     let config = ["--config", arg(&config), "--out", arg(&run)];
     let error = refuse(&[&["train", "--set", "train.precision=f16"], &config[..]].concat());

@@ -112,6 +112,20 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
     let splats = set.path("splats");
     let error = refuse(&strs(&set.arguments(&["--splat", arg(&splats)], "chunks")));
     assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
+    // Nor do those of the same weights in another precision.
+    let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
+    assert!(refuse(&strs(&half)).contains("evaluation.json: the evaluation is of tiny.safetensors"));
+    let elsewhere = set.path("half");
+    let half: Vec<String> = half
+        .into_iter()
+        .map(|a| if a == arg(&set.path("out")) { arg(&elsewhere).into() } else { a })
+        .collect();
+    assert_eq!(run(&half, set.folder.path()).0, Some(0));
+    let half = read_evaluation(&elsewhere).unwrap();
+    assert_eq!(half.method, "tiny bf16");
+    assert_ne!(half.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+    assert!((half.scenes[1].scores.psnr - first.scenes[1].scores.psnr).abs() < 0.2);
+
     let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
     set.write_index(&index);
     let error = refuse(&strs(&arguments));

@@ -1,4 +1,4 @@
-use super::{device, print_json, progress, stop_flag};
+use super::{device, model, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Dataset, Holdout, Split, View, open_capture};
@@ -7,7 +7,7 @@ use globalsplat::eval::{
     CaptureScores, Evaluation, EvaluationIndex, Perceptual, Rendered, Subject, Sweep, contact_sheet, machine,
     peak_memory_bytes, score_model, score_renders, score_splat, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_file, load_model, read_ply, write_png};
+use globalsplat::io::{check_writable_dir, check_writable_file, read_ply, write_png};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -62,6 +62,9 @@ pub struct Eval {
     /// Also write a picture: photo, render and depth side by side, a row per view
     #[arg(long, value_name = "FILE.png", conflicts_with = "renders", requires = "scene")]
     sheet: Option<PathBuf>,
+    /// f32, or bf16 for the model's matrix products
+    #[arg(long, default_value = "f32", requires = "weights")]
+    precision: String,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -87,7 +90,7 @@ impl Eval {
         let (mut scores, views, pictures, rendered) = if let Some(path) = &self.splat {
             with_pictures(score_splat(&read_ply(path)?.gaussians, &capture)?)
         } else if let Some(path) = &self.weights {
-            let loaded = load_model(path, device)?;
+            let loaded = model::load(path, &self.precision, device)?;
             let holdout = match &self.holdout {
                 Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
                 None => loaded.config.data.holdout,
@@ -131,7 +134,8 @@ impl Eval {
         }
         let dataset = Dataset::open(data, Split::Test)?;
         check_writable_dir(out)?;
-        let loaded = self.weights.as_ref().map(|path| load_model(path, device)).transpose()?;
+        let load = |path: &PathBuf| model::load(path, &self.precision, device);
+        let loaded = self.weights.as_ref().map(load).transpose()?;
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
@@ -143,10 +147,14 @@ impl Eval {
                 _ => unreachable!("clap asks for one of the three"),
             };
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let precision = match self.precision.as_str() {
+                "f32" => String::new(),
+                other => format!(" {other}"),
+            };
             let sweep = Sweep {
                 subject,
-                method: self.name.clone().unwrap_or(stem),
-                fingerprint: fingerprint(path)?,
+                method: self.name.clone().unwrap_or(stem + &precision),
+                fingerprint: fingerprint(path)? + &precision,
                 dataset: &dataset,
                 index,
                 image_size: loaded

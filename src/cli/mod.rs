@@ -10,6 +10,7 @@ mod doctor;
 mod eval;
 mod export;
 mod inspect;
+mod model;
 mod pack;
 mod parity;
 mod progress;

@@ -1,10 +1,10 @@
-use super::{device, print_json};
+use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Holdout, open_capture, spread_over_path};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, reconstruct};
-use globalsplat::io::{check_writable_file, load_model, write_ply};
+use globalsplat::io::{check_writable_file, write_ply};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -31,7 +31,7 @@ pub struct Reconstruct {
     /// Views not to use: every:N, every:N+K or none
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
-    /// f32, or bf16 for the encoder's matrix products: faster on machines with instructions for it
+    /// f32, or bf16 for matrix products: faster on machines with instructions for it
     #[arg(long, default_value = "f32")]
     precision: String,
     /// cpu, cuda or cuda:N
@@ -45,12 +45,10 @@ pub struct Reconstruct {
 impl Reconstruct {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
-        let precision = self.precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_file(&self.out)?;
+        let loaded = model::load(&self.weights, &self.precision, device)?;
         let capture = open_capture(&self.scene)?;
-        let mut loaded = load_model(&self.weights, device)?;
-        loaded.model.set_precision(precision);
         let (shown, _) = holdout.split(capture.len());
         let chosen = spread_over_path(&capture.cameras(), &shown, self.views);
         let views = capture.load(&chosen, Some(loaded.config.data.image_size))?;
