@@ -281,6 +281,28 @@ fn weights_that_are_something_else() {
 }
 
 #[test]
+fn options_that_would_be_ignored() {
+    let data = ["eval", "--weights", "w", "--data", "d", "--index", "i.json", "--out", "o"];
+    let of_models = [["--holdout", "every:3"], ["--views", "3"], ["--precision", "bf16"]];
+    let of_data_sets = [["--index", "i.json"], ["--out", "o"], ["--name", "n"]];
+    let of_scenes = [["--holdout", "every:3"], ["--views", "3"], ["--sheet", "s.png"]];
+    let commands: [(&[&str], [[&str; 2]; 3]); 4] = [
+        (&["eval", "--splat", "s.ply", "--scene", "c"], of_models),
+        (&["eval", "--renders", "r", "--scene", "c"], of_models),
+        (&["eval", "--weights", "w", "--scene", "c"], of_data_sets),
+        (&data, of_scenes),
+    ];
+    for (command_line, options) in commands {
+        for option in options {
+            let output = command(&[command_line, &option].concat()).output().unwrap();
+            let error = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{error}");
+            assert!(error.contains("cannot be used with") && error.contains(option[0]), "{error}");
+        }
+    }
+}
+
+#[test]
 fn precisions_that_are_unknown() {
     let (folder, room) = room();
     let (weights, splat) = (tiny_weights(folder.path(), &room), folder.path().join("out.ply"));

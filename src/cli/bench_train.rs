@@ -3,6 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{Spread, TrainReport, bench_train};
 use globalsplat::config::Config;
+use serde_json::json;
 use std::path::PathBuf;
 
 /// A training step, part by part, on made-up scenes: pictures of noise, all Gaussians shown.
@@ -55,8 +56,14 @@ impl Train {
 fn print_report(r: &TrainReport) {
     let [height, width] = r.size;
     println!(
-        "{} scenes of {} context and {} target views of {width}x{height}, {} Gaussians, {} threads, {} steps",
-        r.scenes, r.context_views, r.target_views, r.gaussians, r.threads, r.steps
+        "{} scenes of {} context and {} target views of {width}x{height}, {} Gaussians, loss.perceptual={}, {} threads, {} steps",
+        r.scenes,
+        r.context_views,
+        r.target_views,
+        r.gaussians,
+        json!(r.perceptual),
+        r.threads,
+        r.steps
     );
     println!("{:<18} {:>10} {:>10} {:>10} {:>7}", "ms per step", "median", "least", "3 of 4", "share");
     let row = |name: &str, s: &Spread| {

@@ -45,25 +45,25 @@ pub struct Eval {
     #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
     data: Option<PathBuf>,
     /// Which frames of its scenes are shown and asked for; may be given more than once
-    #[arg(long, value_name = "FILE.json", requires = "data")]
+    #[arg(long, value_name = "FILE.json", requires = "data", conflicts_with = "scene")]
     index: Vec<PathBuf>,
     /// Folder for the report and the scores
-    #[arg(long, value_name = "DIR", requires = "data")]
+    #[arg(long, value_name = "DIR", requires = "data", conflicts_with = "scene")]
     out: Option<PathBuf>,
     /// How the report calls what is scored; by default as its file or folder
-    #[arg(long, requires = "data")]
+    #[arg(long, requires = "data", conflicts_with = "scene")]
     name: Option<String>,
     /// Views the model is asked for: every:N or every:N+K; by default as it was trained
-    #[arg(long, value_name = "WHICH", requires_all = ["weights", "scene"])]
+    #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
     /// Views the model sees, spread over the path of the camera; by default all that are not held out
-    #[arg(long, value_name = "N", requires_all = ["weights", "scene"])]
+    #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
     /// Also write a picture: photo, render and depth side by side, a row per view
-    #[arg(long, value_name = "FILE.png", conflicts_with = "renders", requires = "scene")]
+    #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
     /// f32, or bf16 for the model's matrix products
-    #[arg(long, default_value = "f32", requires = "weights")]
+    #[arg(long, default_value = "f32", conflicts_with_all = ["splat", "renders"])]
     precision: String,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]

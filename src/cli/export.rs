@@ -20,7 +20,7 @@ pub struct Export {
     #[arg(long, value_name = "RUN", group = "source")]
     run: Option<PathBuf>,
     /// Of the run, the weights that validation found best, instead of the newest
-    #[arg(long, requires = "run")]
+    #[arg(long, conflicts_with = "config")]
     best: bool,
     /// Fresh weights of a configuration instead, as training would begin with
     #[arg(long, value_name = "FILE", group = "source")]
