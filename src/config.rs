@@ -37,8 +37,8 @@ pub struct DataConfig {
     pub context_views: usize,
     /// Views it is asked for of a scene in a training step.
     pub target_views: usize,
-    /// [shortest, longest] part of a video, in frames, that the views of a training step are from. A video that is shorter
-    /// than the longest one counts as a whole; one that is shorter than the shortest is skipped.
+    /// [shortest, longest] part of a video, in frames, that the views of a training step are from, at most the whole of it. A
+    /// video that is shorter than the shortest is skipped.
     pub window: [usize; 2],
     /// How context views are chosen: `uniform` or `farthest`.
     pub sampling: Sampling,
@@ -278,7 +278,7 @@ impl Config {
             })?;
         }
         let config: Config = table.try_into().map_err(described)?;
-        config.check()?;
+        config.check().map_err(|e| Error::Request(format!("{}: {e}", origin.display())))?;
         Ok(config)
     }
 
@@ -326,6 +326,22 @@ impl Config {
                 return refuse(field, value.to_string(), "a number above 0".into());
             }
         }
+        let LossConfig {
+            mse, perceptual_factor, consistency_alpha, consistency_depth, frustum, decoder, ..
+        } = self.loss;
+        for (field, value) in [
+            ("train.weight_decay", self.train.weight_decay),
+            ("loss.mse", mse),
+            ("loss.perceptual_factor", perceptual_factor),
+            ("loss.consistency_alpha", consistency_alpha),
+            ("loss.consistency_depth", consistency_depth),
+            ("loss.frustum", frustum),
+            ("loss.decoder", decoder),
+        ] {
+            if !(value >= 0. && value.is_finite()) {
+                return refuse(field, value.to_string(), "0 or more".into());
+            }
+        }
         let DataConfig { window: [shortest, longest], jitter, .. } = self.data;
         if shortest > longest {
             return refuse("data.window", format!("[{shortest}, {longest}]"), "[shortest, longest]".into());
@@ -366,6 +382,13 @@ impl DataConfig {
     /// A variable that isn't set and has no default.
     pub fn capture_paths(&self) -> Result<Vec<PathBuf>> {
         expand_paths(&self.captures)
+    }
+
+    /// Everything that validation's scores depend on.
+    pub(crate) fn validation_settings(&self) -> String {
+        let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
+        let views = (self.image_size, self.context_views, self.target_views, self.window);
+        serde_json::to_string(&(scenes, views)).expect("numbers and strings")
     }
 
     /// `validation` with environment variables filled in.

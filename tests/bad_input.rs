@@ -318,6 +318,24 @@ fn precisions_that_are_unknown() {
 }
 
 #[test]
+fn numbers_that_make_no_sense() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let told =
+        |setting: &str| refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", setting]);
+    for (setting, field) in [
+        ("train.weight_decay=nan", "train.weight_decay is NaN"),
+        ("loss.frustum=-1", "loss.frustum is -1"),
+        ("loss.consistency_depth=inf", "loss.consistency_depth is inf"),
+        ("train.batch=0", "train.batch is 0"),
+    ] {
+        assert_says(&told(setting), &["tiny.toml", field]);
+    }
+    let error = refuse(&["bench", "train", "--set", "train.batch=4"]);
+    assert_says(&error, &["--set train.batch=4", "--batch N"]);
+}
+
+#[test]
 fn configurations_with_unknown_or_ill_typed_keys() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
@@ -410,7 +428,7 @@ fn a_view_too_many_for_the_split() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let error = refuse(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--holdout", "none"]);
-    assert_says(&error, &["0 to ask for", "--holdout every:N"]);
+    assert_says(&error, &["0 to ask for", "--holdout or data.holdout, every:N"]);
 }
 
 #[test]

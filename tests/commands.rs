@@ -440,6 +440,22 @@ fn a_data_set_of_chunks_is_learned_from_and_told_of() {
     let told: Value = serde_json::from_slice(&train("part", "0.5").stdout).unwrap();
     assert_eq!(told["skipped_scenes"]["in_broken_files"].as_u64(), Some(1));
     assert!(told["skipped_scenes"]["first"].as_str().unwrap().contains("000001.torch"));
+    // Views that are held out of scenes in chunks are asked for as well, of those that can be read.
+    let (run, holdout) = (folder.path().join("held_out"), "data.holdout=\"every:3+1\"");
+    let settings = ["--set", holdout, "--set", "data.max_bad_share=0.5"];
+    let output = globalsplat(
+        &[&["train", "--config", arg(&config), "--out", arg(&run), "--json"], &settings[..]].concat(),
+    );
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let held_out = told["held_out"]["scenes"].as_array().unwrap();
+    let of = |i: usize| {
+        (held_out[i]["ours"]["scene"].as_str(), held_out[i]["ours"]["views"].as_array().map(Vec::len))
+    };
+    assert_eq!((held_out.len(), of(0), of(1)), (2, (Some("room_000"), Some(2)), (Some("room_001"), Some(2))));
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(err.matches("a held-out scene is left out: ").count(), 1, "{err}");
+    assert!(err.contains("000001.torch"), "{err}");
+
     let refused = train("none", "0.1");
     let err = String::from_utf8_lossy(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{err}");

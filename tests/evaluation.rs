@@ -133,6 +133,31 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
 }
 
 #[test]
+fn what_changed_since_is_scored_again() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let first = read_evaluation(&set.path("out")).unwrap();
+    // Another scene's splat in its place.
+    std::fs::copy(splats.join("room_001.ply"), splats.join("room_000.ply")).unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert!(second.scenes[0].scores.psnr < first.scenes[0].scores.psnr - 10.);
+    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+
+    // LPIPS, once its weights are there.
+    if globalsplat::io::find_pretrained("lpips_alex.safetensors").is_none() {
+        println!("skipped: the weights of LPIPS are not there; run make weights");
+        return;
+    }
+    assert!(second.scenes.iter().all(|scene| scene.scores.lpips_alex.is_none()));
+    succeed(&strs(&arguments));
+    let third = read_evaluation(&set.path("out")).unwrap();
+    assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
+}
+
+#[test]
 fn anybodys_pictures_are_scored_by_an_index() {
     let set = Set::new();
     for (room, folder) in [("room_000", "renders/room_000"), ("room_002", "renders/room_002/color")] {

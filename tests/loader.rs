@@ -202,6 +202,31 @@ fn bad_data_are_counted_and_skipped() {
     assert_same(&load(3, 7, 17).0, &all[7..]);
 }
 
+/// Groups that break the program's own rules.
+#[derive(Debug)]
+struct Panics;
+
+impl SceneGroups for Panics {
+    fn sizes(&self) -> Vec<usize> {
+        vec![1]
+    }
+
+    fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
+        panic!("group {group} must not be opened")
+    }
+
+    fn decoded_bytes(&self) -> Option<u64> {
+        None
+    }
+}
+
+#[test]
+fn what_goes_wrong_inside_is_told() {
+    let mut loader = Loader::start(&config(), 0, Arc::new(Panics), 0).unwrap();
+    let error = loader.next_scene().unwrap_err().to_string();
+    assert_eq!(error, "loading sample 0 failed inside: group 0 must not be opened");
+}
+
 #[test]
 fn too_much_bad_data_is_an_error() {
     let folder = tempfile::tempdir().unwrap();

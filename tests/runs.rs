@@ -4,13 +4,19 @@
 mod common;
 
 use common::program::{arg, command, fail, room, succeed, tiny_config};
+use globalsplat::config::Config;
+use globalsplat::data::TrainingScenes;
+use globalsplat::error::Error;
+use globalsplat::train::{Resume, Score, Trainer, Validator};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::time::Duration;
+use tch::Device;
 
 /// The last checkpoint's tensors, by file and name.
 fn tensors(run: &Path) -> Vec<(String, tch::Tensor)> {
@@ -304,7 +310,8 @@ fn the_best_checkpoint_is_kept_and_exported() {
     let best = validations.iter().fold(validations[0], |a, b| if b.1 > a.1 { *b } else { a });
     assert!(best.0 < 29, "{validations:?}");
     let state: Value = serde_json::from_slice(&std::fs::read(run.join("best/state.json")).unwrap()).unwrap();
-    assert_eq!((state["step"].as_u64(), state["validation_psnr"].as_f64()), (Some(best.0 + 1), Some(best.1)));
+    let told = (state["step"].as_u64(), state["validation"]["psnr"].as_f64());
+    assert_eq!(told, (Some(best.0 + 1), Some(best.1)));
     assert_eq!(checkpoints(&run), ["step-00000030"], "the best one is kept beside them");
 
     let weights = folder.path().join("best.safetensors");
@@ -319,6 +326,111 @@ fn the_best_checkpoint_is_kept_and_exported() {
     succeed(&text(&train(&config, &bare, &["data.holdout=none"])));
     let error = fail(&["export", "--run", arg(&bare), "--best", "--out", arg(&weights)], 2);
     assert!(error.contains("without a best checkpoint") && error.contains("data.validation"), "{error}");
+}
+
+#[test]
+fn the_best_checkpoint_is_looked_for_anew_where_validation_asks_for_something_else() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&text(&train(&config, &run, &["train.steps=4", "train.validate_every=2"])));
+    let state = run.join("best/state.json");
+    let mut best: Value = serde_json::from_slice(&std::fs::read(&state).unwrap()).unwrap();
+    let beaten = |best: &Value| best["validation"]["psnr"].as_f64() != Some(99.);
+    best["validation"]["psnr"] = 99.into();
+    std::fs::write(&state, best.to_string()).unwrap();
+    let again = |settings: &[&str]| {
+        let output = command(&text(&train(&config, &run, settings))).output().unwrap();
+        assert!(output.status.success());
+        let best: Value = serde_json::from_slice(&std::fs::read(&state).unwrap()).unwrap();
+        (String::from_utf8(output.stderr).unwrap(), beaten(&best))
+    };
+    assert!(!again(&["train.steps=5"]).1, "nothing is as good");
+    let (said, is_beaten) = again(&["train.steps=6", "data.holdout=every:4"]);
+    assert!(said.contains("best: the validation is of") && said.contains("looked for anew"), "{said}");
+    assert!(is_beaten);
+    std::fs::write(&state, "{").unwrap();
+    let (said, is_beaten) = again(&["train.steps=7", "data.holdout=every:4"]);
+    assert!(said.contains("state.json: the file is broken") && is_beaten, "{said}");
+}
+
+#[test]
+fn a_run_goes_on_from_a_checkpoint_that_is_named_unless_it_has_later_ones() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&text(&train(&config, &run, &["train.checkpoint_every=2"])));
+    assert_eq!(checkpoints(&run), ["step-00000004", "step-00000006"]);
+    let from = run.join("checkpoints/step-00000004");
+    let resume = |out: &Path| [train(&config, out, &[]), vec!["--resume".into(), arg(&from).into()]].concat();
+    let error = fail(&text(&resume(&run)), 2);
+    assert!(error.contains("step-00000006") && error.contains("none after step 4"), "{error}");
+    let branch = folder.path().join("branch");
+    succeed(&text(&resume(&branch)));
+    assert_same_bits(&run, &branch);
+    assert_eq!(steps(&branch).0, [4, 5]);
+}
+
+#[test]
+fn what_kills_left_is_put_right() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&text(&train(&config, &run, &["train.steps=3"])));
+    // Between the two renames of a save, and within an earlier one.
+    let folder = run.join("checkpoints");
+    for (from, to) in [("step-00000003", ".step-00000003.old"), ("step-00000002", ".step-00000001.partial")] {
+        std::fs::rename(folder.join(from), folder.join(to)).unwrap();
+    }
+    std::fs::rename(run.join("best"), run.join(".best.old")).unwrap();
+    succeed(&text(&train(&config, &run, &["train.steps=4"])));
+    assert_eq!(steps(&run).0, [0, 1, 2, 3], "it went on from step 3");
+    let mut left: Vec<_> =
+        std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["step-00000003", "step-00000004"]);
+    assert!(run.join("best").is_dir() && !run.join(".best.old").exists());
+}
+
+#[test]
+fn a_damaged_checkpoint_is_not_exported() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    succeed(&text(&train(&config, &run, &[])));
+    let weights = folder.path().join("weights.safetensors");
+    for (checkpoint, best) in [("checkpoints/step-00000006", None), ("best", Some("--best"))] {
+        let file = run.join(checkpoint).join("model.safetensors");
+        let mut bytes = std::fs::read(&file).unwrap();
+        let last = bytes.len() - 5;
+        bytes[last] ^= 1;
+        // Both may be one file.
+        std::fs::remove_file(&file).unwrap();
+        std::fs::write(&file, &bytes).unwrap();
+        let mut arguments = vec!["export", "--run", arg(&run), "--out", arg(&weights)];
+        arguments.extend(best);
+        let error = fail(&arguments, 2);
+        assert!(error.contains("model.safetensors: the file is damaged"), "{error}");
+    }
+    assert!(!weights.exists());
+}
+
+/// Is stopped before it knows anything.
+struct Stopped;
+
+impl Validator for Stopped {
+    fn validate(&mut self, _: &Trainer, _: &mut dyn FnMut() -> bool) -> Result<Option<Score>, Error> {
+        Ok(None)
+    }
+}
+
+#[test]
+fn a_run_is_not_complete_without_its_last_validation() {
+    let (folder, room) = room();
+    let config = Config::read(&tiny_config(folder.path(), &room), &["train.steps=1".into()]).unwrap();
+    let run = |validator: Option<&mut dyn Validator>| {
+        let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths().unwrap()).unwrap());
+        let mut trainer = Trainer::new(&config, scenes, Device::Cpu).unwrap();
+        globalsplat::train::run(&mut trainer, folder.path(), &Resume::Auto, validator, |_| true).unwrap()
+    };
+    assert!(!run(Some(&mut Stopped)).complete);
+    assert!(run(None).complete);
 }
 
 #[test]

@@ -3,6 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{Spread, TrainReport, bench_train};
 use globalsplat::config::Config;
+use globalsplat::error::Error;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -21,7 +22,7 @@ pub struct Train {
     /// Override a key of it, as in train.checkpoint_rounds=true
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Scenes in a step, in place of train.batch
+    /// Scenes in a step, whatever train.batch says
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     batch: u16,
     /// Steps that are measured
@@ -42,6 +43,9 @@ impl Train {
             Some(file) => Config::read(file, &self.set)?,
             None => Config::parse("", &self.set, "the defaults".as_ref())?,
         };
+        if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
+            return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
+        }
         config.train.batch = self.batch.into();
         let report = bench_train(&config, self.steps as usize, device)?;
         if self.json {

@@ -4,7 +4,7 @@ use clap::{ArgGroup, Args, ValueEnum};
 use globalsplat::config::Config;
 use globalsplat::io::{ModelDtype, check_writable_file, load_model, save_model};
 use globalsplat::model::GlobalSplat;
-use globalsplat::train::{best_checkpoint, latest_checkpoint};
+use globalsplat::train::{MODEL_FILE, best_checkpoint, latest_checkpoint};
 use serde_json::json;
 use std::path::PathBuf;
 use tch::{Device, nn};
@@ -48,7 +48,7 @@ impl Export {
         let (vs, config) = match (&self.run, &self.config) {
             (Some(run), _) => {
                 let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };
-                let loaded = load_model(&checkpoint.join("model.safetensors"), Device::Cpu)?;
+                let loaded = load_model(&checkpoint.join(MODEL_FILE), Device::Cpu)?;
                 (loaded.vs, loaded.config)
             }
             (None, config) => {

@@ -63,7 +63,7 @@ impl Train {
             .into());
         }
         check_writable_dir(&self.out)?;
-        let mut held_out = HeldOut::find(&config.data, scenes.captures())?;
+        let mut held_out = HeldOut::find(&config.data, &scenes)?;
         let mut trainer = Trainer::new(&config, scenes, device)?;
 
         let start = Instant::now();
@@ -77,10 +77,12 @@ impl Train {
             eprintln!("{bad_data}");
         }
         if !outcome.complete {
-            anyhow::bail!(
-                "stopped; {} holds all of it, and the same command goes on",
-                outcome.checkpoint.display()
-            );
+            let checkpoint = outcome.checkpoint.display();
+            let command = match resume {
+                Resume::From(_) => "the same command with --resume auto",
+                _ => "the same command",
+            };
+            anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
         }
         self.report(&outcome, seconds, held_out.scores(), &bad_data);
         Ok(())

@@ -22,6 +22,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::HashMap;
 use std::ops::AddAssign;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -118,7 +119,9 @@ impl Loader {
         if sizes.iter().all(|&size| size == 0) {
             return Err(Error::Request("there are no scenes to train on".into()));
         }
-        let fits = scenes.decoded_bytes().is_some_and(|bytes| bytes <= config.photo_megabytes * 1_000_000);
+        let fits = scenes
+            .decoded_bytes()
+            .is_some_and(|bytes| bytes <= config.photo_megabytes.saturating_mul(1_000_000));
         let order = Order::new(sizes, seed);
         let shared = Arc::new(Shared {
             config: config.clone(),
@@ -144,9 +147,16 @@ impl Loader {
                 let mut tools = Tools::default();
                 for sample in turns {
                     // Nobody listens any more when the loader is gone.
-                    if shared.stopped.load(Ordering::Relaxed)
-                        || sender.send(shared.load(sample, &mut tools)).is_err()
-                    {
+                    if shared.stopped.load(Ordering::Relaxed) {
+                        return;
+                    }
+                    let load = AssertUnwindSafe(|| shared.load(sample, &mut tools));
+                    let scene = catch_unwind(load).unwrap_or_else(|panic| {
+                        let why = panic.downcast_ref::<String>().map(String::as_str);
+                        let why = why.or(panic.downcast_ref().copied()).unwrap_or("for no known reason");
+                        Err(Error::Failed(format!("loading sample {sample} failed inside: {why}")))
+                    });
+                    if sender.send(scene).is_err() {
                         return;
                     }
                 }
@@ -204,7 +214,7 @@ impl Drop for Loader {
         self.shared.stopped.store(true, Ordering::Relaxed);
         self.receivers.clear();
         for thread in self.threads.drain(..) {
-            // One that panicked has said so already.
+            // What it panicked with was sent already.
             let _ = thread.join();
         }
     }

@@ -69,6 +69,11 @@ impl TrainingScenes {
     pub fn captures(&self) -> &[Capture] {
         &self.captures
     }
+
+    /// Chunks with the others.
+    pub fn chunks(&self) -> &[SceneGroup] {
+        &self.chunks
+    }
 }
 
 impl SceneGroups for TrainingScenes {

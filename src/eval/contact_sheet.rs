@@ -8,7 +8,7 @@ use tch::Tensor;
 /// Small pictures are enlarged to about this many pixels.
 const HEIGHT: i64 = 256;
 
-/// A row per view: photo, render, depth. [3, H', W'] in [0, 1]. The views have one size.
+/// A row per view: photo, render, depth. [3, H', W'] in [0, 1].
 pub fn contact_sheet(truth: &[View], rendered: &[Rendered]) -> Tensor {
     let row = |(view, r): (&View, &Rendered)| {
         let pictures = [view.image.shallow_clone(), r.rgb.clamp(0., 1.), colourize_depth(&r.depth, &r.alpha)];

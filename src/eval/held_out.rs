@@ -1,19 +1,28 @@
 //! Validation: what training never shows is asked for while it goes on.
 
-use super::protocol::{CaptureScores, ask, colours, load_split, nearest_context_baseline, score};
+use super::protocol::{CaptureScores, ask, colours, nearest_context_baseline, score, split_views};
 use crate::config::DataConfig;
-use crate::data::{Capture, Dataset, Holdout, SceneGroup, Split, View, spread_over_path};
+use crate::data::{Capture, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, spread_over_path};
 use crate::error::{Error, Result};
 use crate::train::{Score, Trainer, Validator};
 
-/// Views held out of the training captures, and scenes that are held out as a whole.
+/// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
 pub struct HeldOut {
     config: DataConfig,
-    captures: Vec<Capture>,
-    /// Groups, and which of their scenes. They are opened when they are needed: a chunk is large.
-    scenes: Vec<(SceneGroup, String)>,
+    scenes: Vec<HeldOutScene>,
     scores: Vec<HeldOutScores>,
+}
+
+/// What is asked for.
+#[derive(Debug)]
+enum HeldOutScene {
+    /// The views that are held out of a capture.
+    Views(Capture),
+    /// The views that are held out of a scene in a chunk. It is opened when it is needed: a chunk is large.
+    ViewsInChunk(SceneGroup, String),
+    /// A scene that is held out as a whole.
+    Whole(SceneGroup, String),
 }
 
 /// A scene's scores.
@@ -26,59 +35,84 @@ pub struct HeldOutScores {
 }
 
 impl HeldOut {
-    /// What `config` holds out: of `training`, which it is trained on, and of `config.validation`.
+    /// What `config` holds out: of `training`, which it is trained on (all captures, and at most `config.validation_scenes`
+    /// scenes in chunks), and of `config.validation`.
     ///
     /// # Errors
-    /// Nothing known at one of the paths, or a scene that is broken or has too few views.
-    pub fn find(config: &DataConfig, training: &[Capture]) -> Result<Self> {
+    /// Nothing known at one of the paths, a capture that `config.holdout` leaves too few views, or a held-out scene that is
+    /// broken or has too few.
+    pub fn find(config: &DataConfig, training: &TrainingScenes) -> Result<Self> {
         let mut scenes = vec![];
-        for path in config.validation_paths()? {
-            for group in Dataset::open(&path, Split::Test)?.groups() {
-                scenes.extend(group.keys.iter().map(|key| (group.clone(), key.clone())));
+        if config.holdout != Holdout::None {
+            for capture in training.captures() {
+                split_views(capture, config.holdout)?;
+                scenes.push(HeldOutScene::Views(capture.clone()));
             }
+            let in_chunks = spread(training.chunks(), config.validation_scenes);
+            scenes.extend(in_chunks.into_iter().map(|(group, key)| HeldOutScene::ViewsInChunk(group, key)));
         }
-        let count = config.validation_scenes.min(scenes.len());
-        let scenes: Vec<_> = (0..count).map(|i| scenes[i * scenes.len() / count].clone()).collect();
-        for (group, key) in &scenes {
-            split_scene(&group.open()?.capture(key)?, config)?;
+        let mut groups = vec![];
+        for path in config.validation_paths()? {
+            groups.extend_from_slice(Dataset::open(&path, Split::Test)?.groups());
         }
-        let captures = if config.holdout == Holdout::None { vec![] } else { training.to_vec() };
-        Ok(HeldOut { config: config.clone(), captures, scenes, scores: vec![] })
+        for (group, key) in spread(&groups, config.validation_scenes) {
+            split_scene(&group.open()?.capture(&key)?, config)?;
+            scenes.push(HeldOutScene::Whole(group, key));
+        }
+        Ok(HeldOut { config: config.clone(), scenes, scores: vec![] })
     }
 
     /// Whether nothing is held out.
     pub fn is_empty(&self) -> bool {
-        self.captures.is_empty() && self.scenes.is_empty()
+        self.scenes.is_empty()
     }
 
     /// What the last validation found.
     pub fn scores(&self) -> &[HeldOutScores] {
         &self.scores
     }
+}
 
-    /// The views to show and those to ask for, of scene number `i`, and its name.
-    fn load(&self, i: usize) -> Result<(String, Vec<View>, Vec<View>)> {
-        let size = self.config.image_size;
-        if let Some(capture) = self.captures.get(i) {
-            let (context, target) = load_split(capture, self.config.holdout, None, size)?;
-            return Ok((capture.name.clone(), context, target));
-        }
-        let (group, key) = &self.scenes[i - self.captures.len()];
-        let capture = group.open()?.capture(key)?;
-        let (context, target) = split_scene(&capture, &self.config)?;
-        Ok((capture.name.clone(), capture.load(&context, Some(size))?, capture.load(&target, Some(size))?))
+impl HeldOutScene {
+    /// Its name, the views to show and those to ask for.
+    fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
+        let size = Some(config.image_size);
+        let (capture, (context, target)) = match self {
+            HeldOutScene::Views(capture) => (capture.clone(), split_views(capture, config.holdout)?),
+            HeldOutScene::ViewsInChunk(group, key) => {
+                let capture = group.open()?.capture(key)?;
+                let (shown, held_out) = split_views(&capture, config.holdout)?;
+                let cameras = capture.cameras();
+                let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
+                let target = spread_over_path(&cameras, &held_out, config.target_views);
+                (capture, (context, target))
+            }
+            HeldOutScene::Whole(group, key) => {
+                let capture = group.open()?.capture(key)?;
+                let split = split_scene(&capture, config)?;
+                (capture, split)
+            }
+        };
+        Ok((capture.name.clone(), capture.load(&context, size)?, capture.load(&target, size)?))
     }
 }
 
 impl Validator for HeldOut {
     fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
         self.scores.clear();
-        let mut scores = vec![];
-        for i in 0..self.captures.len() + self.scenes.len() {
+        let (mut scores, mut left_out, mut unusable) = (vec![], vec![], vec![]);
+        for (i, scene) in self.scenes.iter().enumerate() {
             if !go_on() {
                 return Ok(None);
             }
-            let (name, context, target) = self.load(i)?;
+            let (name, context, target) = match scene.load(&self.config) {
+                Ok(views) => views,
+                Err(e) => {
+                    left_out.push(e.to_string());
+                    unusable.push(i);
+                    continue;
+                }
+            };
             let (reconstruction, rendered) = ask(trainer, &context, &target)?;
             let count = reconstruction.gaussians.count();
             scores.push(HeldOutScores {
@@ -86,13 +120,29 @@ impl Validator for HeldOut {
                 nearest: nearest_context_baseline(&name, &context, &target)?,
             });
         }
-        self.scores = scores;
-        let mean = |value: fn(&HeldOutScores) -> f64| {
-            self.scores.iter().map(value).sum::<f64>() / self.scores.len() as f64
-        };
+        for i in unusable.into_iter().rev() {
+            self.scenes.remove(i);
+        }
+        if scores.is_empty() {
+            let why = left_out.first().map(|why| format!(": {why}")).unwrap_or_default();
+            return Err(Error::Failed(format!("no held-out scene can be used{why}")));
+        }
+        let mean =
+            |value: fn(&HeldOutScores) -> f64| scores.iter().map(value).sum::<f64>() / scores.len() as f64;
         let (psnr, ssim) = (mean(|s| s.ours.psnr), mean(|s| s.ours.ssim));
-        Ok(Some(Score { psnr, ssim, scenes: self.scores.len() }))
+        let score = Score { psnr, ssim, scenes: scores.len(), left_out };
+        self.scores = scores;
+        Ok(Some(score))
     }
+}
+
+/// At most so many scenes of `groups`, spread evenly over all of them.
+fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
+    let scenes: Vec<_> =
+        groups.iter().flat_map(|group| group.keys.iter().map(move |key| (group, key))).collect();
+    let count = most.min(scenes.len());
+    let chosen = (0..count).map(|i| scenes[i * scenes.len() / count]);
+    chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
 /// The views of a held-out scene that a model is shown and those that it is asked for, always the same: as many as in

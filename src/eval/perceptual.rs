@@ -1,7 +1,7 @@
 //! LPIPS in evaluation: wherever its weights are found.
 
 use super::protocol::{CaptureScores, ViewScore};
-use crate::data::View;
+use crate::data::{ImageSize, View};
 use crate::error::Result;
 use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
 use crate::loss::{Lpips, LpipsNetwork};
@@ -38,6 +38,17 @@ impl Perceptual {
             values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
         };
         (scores.lpips_vgg, scores.lpips_alex) = (mean(|view| view.lpips_vgg), mean(|view| view.lpips_alex));
+    }
+
+    /// Whether `scores` of views of one size lack a distance that the weights that are there could tell.
+    pub fn could_add_to(scores: &CaptureScores, size: ImageSize) -> bool {
+        let side = i64::from(size.height.min(size.width));
+        let networks = [(LpipsNetwork::Vgg16, scores.lpips_vgg), (LpipsNetwork::AlexNet, scores.lpips_alex)];
+        networks.into_iter().any(|(network, score)| {
+            score.is_none()
+                && side >= network.smallest_side()
+                && find_pretrained(network.file_name()).is_some()
+        })
     }
 
     /// Why `scores`, which have been added to, lack a distance; `None` where they don't.

@@ -213,18 +213,20 @@ pub(super) fn load_split(
     views: Option<usize>,
     size: ImageSize,
 ) -> Result<(Vec<View>, Vec<View>)> {
-    let (mut context, held_out) = holdout.split(capture.len());
+    let (mut context, held_out) = split_views(capture, holdout)?;
     if let Some(views) = views {
         context = spread_over_path(&capture.cameras(), &context, views);
     }
+    Ok((capture.load(&context, Some(size))?, capture.load(&held_out, Some(size))?))
+}
+
+/// Positions of the views that `holdout` leaves, and of those that it holds out.
+pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
+    let (context, held_out) = holdout.split(capture.len());
     if held_out.is_empty() || context.len() < 2 {
         let split = format!("{} to show and {} to ask for", context.len(), held_out.len());
-        return Err(Error::input(
-            capture.file(),
-            format!("the split by {holdout}"),
-            split,
-            "2 and 1 at least (--holdout every:N)",
-        ));
+        let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";
+        return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
     }
-    Ok((capture.load(&context, Some(size))?, capture.load(&held_out, Some(size))?))
+    Ok((context, held_out))
 }

@@ -14,6 +14,7 @@ use crate::io::{LoadedModel, ply_size, read_ply, write_atomically, write_jpeg};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::UNIX_EPOCH;
 use tch::Tensor;
 
 /// Who is judged.
@@ -229,10 +230,33 @@ impl Sweep<'_> {
         self.out.join("scenes").join(format!("{}.json", scene_file_name(key)))
     }
 
-    /// Scores from before. What can't be read is scored again.
+    /// Scores from before. What can't be read, is of other files, or lacks a score that could be had now, is scored again.
     fn kept(&self, key: &str) -> Option<SceneScores> {
-        let scores: SceneScores = serde_json::from_slice(&std::fs::read(self.kept_file(key)).ok()?).ok()?;
-        (scores.scores.scene == key).then_some(scores)
+        let Kept { scores, files } =
+            serde_json::from_slice(&std::fs::read(self.kept_file(key)).ok()?).ok()?;
+        let is_whole = !Perceptual::could_add_to(&scores.scores, self.image_size);
+        (scores.scores.scene == key && files == self.files(key) && is_whole).then_some(scores)
+    }
+
+    /// What tells a scene's splat or pictures from others in their place: names, sizes, times. Of a model it is nothing, as
+    /// its fingerprint tells it from others.
+    fn files(&self, key: &str) -> Option<String> {
+        let files: Vec<PathBuf> = match &self.subject {
+            Subject::Model(_) => return None,
+            Subject::Splats(folder) => vec![splat_file(folder, key)],
+            Subject::Renders(folder) => {
+                let pictures = std::fs::read_dir(pictures_folder(folder, key)).ok()?;
+                pictures.filter_map(|entry| Some(entry.ok()?.path())).collect()
+            }
+        };
+        let describe = |file: &PathBuf| {
+            let metadata = file.metadata().ok()?;
+            let since = metadata.modified().ok()?.duration_since(UNIX_EPOCH).ok()?;
+            Some(format!("{} {} {}", file.file_name()?.display(), metadata.len(), since.as_nanos()))
+        };
+        let mut described: Vec<_> = files.iter().filter_map(describe).collect();
+        described.sort();
+        Some(format!("{:08x}", crc32fast::hash(described.join("\n").as_bytes())))
     }
 
     fn answer(&self, key: &str, scene: &LoadedScene) -> Result<Answer> {
@@ -249,7 +273,7 @@ impl Sweep<'_> {
                 })
             }
             Subject::Splats(folder) => {
-                let file = folder.join(format!("{key}.ply"));
+                let file = splat_file(folder, key);
                 let gaussians = read_ply(&file)?.gaussians;
                 let cameras: Vec<_> = scene.target.iter().map(|view| view.camera).collect();
                 let rendered = render_views(&gaussians, &cameras)?;
@@ -262,8 +286,7 @@ impl Sweep<'_> {
                 })
             }
             Subject::Renders(folder) => {
-                let plain = folder.join(key);
-                let folder = Some(plain.join("color")).filter(|color| color.is_dir()).unwrap_or(plain);
+                let folder = pictures_folder(folder, key);
                 let picture = |frame: &usize| read_picture(&folder, &frame_name(*frame));
                 let pictures = scene.frames.target.iter().map(picture).collect::<Result<_>>()?;
                 Ok(Answer {
@@ -316,9 +339,30 @@ impl Sweep<'_> {
             peak_memory_bytes: memory.map(|memory| memory.host),
             peak_device_memory_bytes: memory.and_then(|memory| memory.device),
         };
-        write_json(&self.kept_file(key), &scores)?;
-        Ok(scores)
+        let kept = Kept { scores, files: self.files(key) };
+        write_json(&self.kept_file(key), &kept)?;
+        Ok(kept.scores)
     }
+}
+
+/// Where a folder of splats has that of scene `key`.
+fn splat_file(folder: &Path, key: &str) -> PathBuf {
+    folder.join(format!("{key}.ply"))
+}
+
+/// Where a folder of pictures has those of scene `key`.
+fn pictures_folder(folder: &Path, key: &str) -> PathBuf {
+    let plain = folder.join(key);
+    Some(plain.join("color")).filter(|color| color.is_dir()).unwrap_or(plain)
+}
+
+/// A scene's scores on disk.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    #[serde(flatten)]
+    scores: SceneScores,
+    /// As [`Sweep::files`] says.
+    files: Option<String>,
 }
 
 /// What a model took, in bytes.

@@ -56,16 +56,30 @@ pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Resul
     Ok(())
 }
 
-/// Brings back the folder that [`replace_dir`] had moved away from `path` when its process was ended.
+/// Puts right what [`replace_dir`] left in `folder` when its process was ended: folders that it had moved away come back where
+/// nothing has taken their place, and those half filled go. Nothing is done where there is no such folder.
 ///
 /// # Errors
-/// The system's refusal to rename.
-pub fn recover_dir(path: &Path) -> Result<()> {
-    let retired = sibling(path, "old");
-    match !path.exists() && retired.exists() {
-        true => fs::rename(&retired, path).map_err(Error::write(path)),
-        false => Ok(()),
+/// The system's refusal to read, rename or remove.
+pub fn recover_dirs(folder: &Path) -> Result<()> {
+    if !folder.is_dir() {
+        return Ok(());
     }
+    for entry in fs::read_dir(folder).map_err(Error::read(folder))? {
+        let left = entry.map_err(Error::read(folder))?.path();
+        let name = left.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        if !left.is_dir() {
+            continue;
+        }
+        let of = |suffix: &str| name.strip_prefix('.')?.strip_suffix(suffix).map(|of| folder.join(of));
+        match of(".old") {
+            Some(path) if !path.exists() => fs::rename(&left, &path).map_err(Error::write(&path))?,
+            Some(_) => remove_dir_if_there(&left)?,
+            None if of(".partial").is_some() => remove_dir_if_there(&left)?,
+            None => {}
+        }
+    }
+    Ok(())
 }
 
 /// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.

@@ -1,6 +1,6 @@
 //! Moving pictures: GIF by ourselves, MP4 by the ffmpeg on the PATH.
 
-use super::images::rgb_from_tensor;
+use super::images::{padded, rgb_from_tensor};
 use super::write_atomically;
 use crate::error::{Error, Result};
 use image::codecs::gif::{GifEncoder, Repeat};
@@ -11,12 +11,12 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 use tch::Tensor;
 
-/// Writes frames [3, H, W], in [0, 1], as `path` says: `.gif` or `.mp4`.
+/// Writes frames [3, H, W], in [0, 1], as `path` says: `.gif` or `.mp4`. Frames that are smaller than others get a white margin.
 ///
 /// # Errors
 /// Another ending, no ffmpeg for `.mp4`, or the system's refusal to write.
 pub fn write_film(path: &Path, frames: &[Tensor], frames_per_second: u32) -> Result<()> {
-    let frames = frames.iter().map(rgb_from_tensor).collect::<Result<Vec<_>>>()?;
+    let frames = padded(frames, &[1, 2]).iter().map(rgb_from_tensor).collect::<Result<Vec<_>>>()?;
     match path.extension().and_then(|e| e.to_str()) {
         Some("gif") => write_gif(path, frames, frames_per_second),
         Some("mp4") => write_mp4(path, &frames, frames_per_second),

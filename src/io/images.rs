@@ -208,25 +208,58 @@ pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
 /// Pixels between pictures.
 const GAP: i64 = 4;
 
-/// Pictures [3, H, W] of one height side by side, with a white gap.
+/// Pictures [3, H, W] side by side, with a white gap, and white below those that are lower than others.
 pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 2)
 }
 
-/// Pictures [3, H, W] of one width one below the other, with a white gap.
+/// Pictures [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
 pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 1)
 }
 
 fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
     let mut parts = vec![];
-    for (i, picture) in pictures.iter().enumerate() {
+    for (i, picture) in padded(pictures, &[3 - dim]).into_iter().enumerate() {
         if i > 0 {
             let mut gap = picture.size();
             gap[dim as usize] = GAP;
             parts.push(Tensor::ones(gap, (picture.kind(), picture.device())));
         }
-        parts.push(picture.shallow_clone());
+        parts.push(picture);
     }
     Tensor::cat(&parts, dim)
+}
+
+/// Pictures [3, H, W], as large as the largest of them along `dims` by white below and to the right.
+pub(super) fn padded(pictures: &[Tensor], dims: &[i64]) -> Vec<Tensor> {
+    let largest = |dim: i64| pictures.iter().map(|picture| picture.size()[dim as usize]).max().unwrap_or(0);
+    let missing = |picture: &Tensor, dim: i64| match dims.contains(&dim) {
+        true => largest(dim) - picture.size()[dim as usize],
+        false => 0,
+    };
+    let pad = |picture: &Tensor| {
+        let sides = [0, missing(picture, 2), 0, missing(picture, 1)];
+        picture.pad(sides, "constant", 1.)
+    };
+    pictures.iter().map(pad).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::Device;
+
+    #[test]
+    fn pictures_of_different_sizes_are_tiled_with_white() {
+        let picture = |height, width| Tensor::zeros([3, height, width], (Kind::Float, Device::Cpu));
+        let row = tile_horizontally(&[picture(2, 3), picture(5, 1)]);
+        assert_eq!(row.size(), [3, 5, 3 + GAP + 1]);
+        let black = |t: &Tensor| t.eq(0.).sum(Kind::Int64).int64_value(&[]);
+        assert_eq!(black(&row), 3 * (2 * 3 + 5));
+        assert_eq!(black(&row.narrow(1, 0, 2).narrow(2, 0, 3)), 3 * 2 * 3);
+        assert_eq!(tile_vertically(&[picture(2, 3), picture(5, 1)]).size(), [3, 2 + GAP + 5, 3]);
+        let frames = padded(&[picture(2, 3), picture(5, 1)], &[1, 2]);
+        assert!(frames.iter().all(|frame| frame.size() == [3, 5, 3]));
+    }
 }

@@ -11,7 +11,7 @@ mod pretrained;
 mod weights;
 
 pub use append::AppendFile;
-pub use atomic::{check_writable_dir, check_writable_file, recover_dir, replace_dir, write_atomically};
+pub use atomic::{check_writable_dir, check_writable_file, recover_dirs, replace_dir, write_atomically};
 pub use event_file::EventFile;
 pub use film::write_film;
 pub use images::{

@@ -8,7 +8,7 @@
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    ModelDtype, read_weights, recover_dir, replace_dir, save_model, write_atomically, write_weights,
+    ModelDtype, read_weights, recover_dirs, replace_dir, save_model, write_atomically, write_weights,
 };
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -19,21 +19,31 @@ use std::path::{Path, PathBuf};
 const FOLDER: &str = "checkpoints";
 const BEST: &str = "best";
 const PREFIX: &str = "step-";
-pub(crate) const MODEL_FILE: &str = "model.safetensors";
+/// The weights of a checkpoint, in its folder.
+pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
 
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct State {
     /// Steps done.
-    step: u64,
+    pub step: u64,
     /// Samples drawn: the position in the data.
     samples: u64,
     /// Sizes in bytes and CRC-32 of the other files, by their names.
     files: BTreeMap<String, (u64, u32)>,
-    /// Of the best checkpoint: what validation found, in dB.
+    /// Of the best checkpoint: what validation found.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    validation_psnr: Option<f64>,
+    validation: Option<Validation>,
+}
+
+/// What makes a checkpoint the best one.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Validation {
+    /// In dB.
+    pub psnr: f64,
+    /// The settings that say what was asked for: scores by others can't be compared.
+    pub asked: String,
 }
 
 /// The run's checkpoints, oldest first.
@@ -60,22 +70,24 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
 /// The newest one.
 ///
 /// # Errors
-/// None there, or a folder that can't be read.
+/// None there, a folder that can't be read, or a checkpoint that was damaged.
 pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
     let none = || {
         Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made")
     };
-    list_checkpoints(run)?.pop().ok_or_else(none)
+    let latest = list_checkpoints(run)?.pop().ok_or_else(none)?;
+    check(&latest)?;
+    Ok(latest)
 }
 
 /// The one that validation found best.
 ///
 /// # Errors
-/// A run that has none.
+/// A run that has none, or whose best checkpoint was damaged.
 pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
     let best = run.join(BEST);
     match best.is_dir() {
-        true => Ok(best),
+        true => check(&best).map(|_| best),
         false => {
             let expected = "one with held-out views (data.holdout) or scenes (data.validation)";
             Err(Error::input(run, "the run", "without a best checkpoint", expected))
@@ -83,26 +95,39 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
     }
 }
 
-/// What validation found the run's best checkpoint to be worth, in dB.
+/// Puts right what a run that was killed within a save left.
 ///
 /// # Errors
-/// One that can't be read.
-pub(super) fn best_score(run: &Path) -> Result<Option<f64>> {
+/// The system's refusal.
+pub(super) fn recover(run: &Path) -> Result<()> {
+    recover_dirs(run)?;
+    recover_dirs(&run.join(FOLDER))
+}
+
+/// What validation, by the settings `asked`, found the run's best checkpoint to be worth, in dB.
+///
+/// # Errors
+/// One that can't be read, or was found by other settings.
+pub(super) fn best_score(run: &Path, asked: &str) -> Result<Option<f64>> {
     let best = run.join(BEST);
-    recover_dir(&best)?;
-    match best.is_dir() {
-        true => Ok(read_state(&best)?.validation_psnr),
-        false => Ok(None),
+    if !best.is_dir() {
+        return Ok(None);
+    }
+    match check(&best)?.validation {
+        Some(validation) if validation.asked == asked => Ok(Some(validation.psnr)),
+        found => {
+            let found = found.map_or("absent".into(), |validation| format!("of {}", validation.asked));
+            Err(Error::input(&best, "the validation", found, format!("one of {asked}")))
+        }
     }
 }
 
-/// Makes `checkpoint` the run's best one, which validation found to be worth so many dB. The files are shared where the file
-/// system can.
+/// Makes `checkpoint` the run's best one, for what validation found. The files are shared where the file system can.
 ///
 /// # Errors
 /// The system's refusal to write; the best one before is left whole.
-pub(super) fn keep_best(run: &Path, checkpoint: &Path, psnr: f64) -> Result<()> {
-    let state = State { validation_psnr: Some(psnr), ..read_state(checkpoint)? };
+pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -> Result<()> {
+    let state = State { validation: Some(validation), ..read_state(checkpoint)? };
     replace_dir(&run.join(BEST), |folder| {
         for name in state.files.keys() {
             let (from, to) = (checkpoint.join(name), folder.join(name));
@@ -129,7 +154,7 @@ impl Trainer {
                 [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;
             let (step, samples) = (self.step, self.samples);
-            write_state(folder, &State { step, samples, files, validation_psnr: None })
+            write_state(folder, &State { step, samples, files, validation: None })
         })?;
         let all = list_checkpoints(run)?;
         let surplus = all.len().saturating_sub(self.config.train.keep_checkpoints);

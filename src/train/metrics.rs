@@ -85,7 +85,7 @@ impl Metrics {
 
     /// Scores after step `step`.
     pub fn tell_validation(&mut self, step: u64, score: &Score) -> Result<()> {
-        let Score { psnr, ssim, scenes } = score;
+        let Score { psnr, ssim, scenes, .. } = score;
         self.append(
             &json!({ "step": step, "validation": { "psnr": psnr, "ssim": ssim, "scenes": scenes } }),
         )?;

@@ -17,7 +17,7 @@ mod subsets;
 mod trainer;
 mod validator;
 
-pub use checkpoint::{best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use curriculum::stage_at;
 pub use optimizer::AdamW;
 pub use pass::LossValues;

@@ -1,7 +1,9 @@
 //! A whole run: from where it stands to the last step, with checkpoints on the way.
 
 use super::board::Board;
-use super::checkpoint::{best_score, check, keep_best, latest_checkpoint, list_checkpoints};
+use super::checkpoint::{
+    Validation, best_score, check, keep_best, latest_checkpoint, list_checkpoints, recover,
+};
 use super::is_due;
 use super::lock::RunLock;
 use super::metrics::Metrics;
@@ -67,7 +69,8 @@ pub fn run(
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
     let _lock = RunLock::take(out)?;
-    begin(trainer, out, resume, &mut observe)?;
+    recover(out)?;
+    let begun = begin(trainer, out, resume, &mut observe)?;
     let config = out.join("config.toml");
     let toml = trainer.config.to_toml();
     let changes = match std::fs::read_to_string(&config) {
@@ -77,12 +80,18 @@ pub fn run(
     if !changes.is_empty() {
         observe(Event::Notice(format!("the run goes on with another configuration: {}", changes.join(", "))));
     }
-    write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
-    let metrics = Metrics::open(&out.join("metrics.jsonl"), trainer.step)?;
-    let mut board = Board::create(out, trainer.config.train.log_every)?;
+    patiently(&mut observe, || {
+        write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))
+    })?;
+    let metrics = patiently(&mut observe, || Metrics::open(&out.join("metrics.jsonl"), trainer.step))?;
+    let mut board = patiently(&mut observe, || Board::create(out, trainer.config.train.log_every))?;
     patiently(&mut observe, || board.start(trainer.step))?;
-    let best = best_score(out)?;
-    Run { trainer, out, validator, observe, metrics, board, best }.train()
+    let asked = trainer.config.data.validation_settings();
+    let best = best_score(out, &asked).unwrap_or_else(|e| {
+        observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
+        None
+    });
+    Run { trainer, out, validator, observe, metrics, board, best, asked }.train(begun)
 }
 
 /// A run that goes on.
@@ -95,17 +104,18 @@ struct Run<'a, 'v, O> {
     board: Board,
     /// Of the best checkpoint, in dB.
     best: Option<f64>,
+    /// Settings that scores depend on.
+    asked: String,
 }
 
 impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
-    fn train(mut self) -> Result<Outcome> {
+    /// `saved` is the run's own checkpoint of the state as it is, if there is one.
+    fn train(mut self, mut saved: Option<PathBuf>) -> Result<Outcome> {
         let TrainConfig { steps, batch, checkpoint_every, validate_every, max_skipped, .. } =
             self.trainer.config.train;
         let (mut skipped, mut go_on) = (0, true);
         // Steps that were skipped since the last one that wasn't.
         let mut trouble = 0;
-        // The checkpoint of the state as it is.
-        let mut saved = None;
         while self.trainer.step < steps {
             let step = self.trainer.step;
             let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
@@ -145,12 +155,18 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 break;
             }
         }
-        let complete = self.trainer.step >= steps;
+        let mut complete = self.trainer.step >= steps;
         // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
         self.trainer.take_back(trouble);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
-        if complete && go_on {
-            self.validate(&checkpoint)?;
+        if complete && self.validator.is_some() {
+            match self.validate(&checkpoint) {
+                Err(e) => {
+                    (self.observe)(Event::Notice(format!("the last validation is left out: {e}")));
+                }
+                // Stopped before the end, the same command does it again.
+                Ok(_) => complete = self.metrics.tells_validation(self.trainer.step.saturating_sub(1)),
+            }
         }
         Ok(Outcome { checkpoint, complete, skipped })
     }
@@ -167,8 +183,12 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         let Some(score) = validator.validate(self.trainer, &mut || observe(Event::Waiting))? else {
             return Ok(false);
         };
+        for why in &score.left_out {
+            observe(Event::Notice(format!("a held-out scene is left out: {why}")));
+        }
         if score.psnr > self.best.unwrap_or(f64::NEG_INFINITY) {
-            patiently(observe, || keep_best(self.out, checkpoint, score.psnr))?;
+            let found = || Validation { psnr: score.psnr, asked: self.asked.clone() };
+            patiently(observe, || keep_best(self.out, checkpoint, found()))?;
             self.best = Some(score.psnr);
         }
         let step = self.trainer.step.saturating_sub(1);
@@ -194,17 +214,30 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     }
 }
 
-/// Brings the trainer to where the run begins.
+/// Brings the trainer to where the run begins, and returns its own checkpoint of that.
 fn begin(
     trainer: &mut Trainer,
     out: &Path,
     resume: &Resume,
     observe: &mut impl FnMut(Event) -> bool,
-) -> Result<()> {
+) -> Result<Option<PathBuf>> {
     let checkpoints = list_checkpoints(out)?;
     match resume {
-        Resume::From(checkpoint) => trainer.load(checkpoint),
-        Resume::Never if checkpoints.is_empty() => Ok(()),
+        Resume::From(checkpoint) => {
+            let step = check(checkpoint)?.step;
+            // They would be taken for newer ones of what is trained now.
+            let later = |of: &&PathBuf| check(of).map_or(true, |state| state.step > step);
+            if let Some(later) = checkpoints.iter().rev().find(later) {
+                let expected = format!(
+                    "none after step {step} (choose another --out, or --resume auto to go on from the last one)"
+                );
+                let found = later.file_name().unwrap_or_default().display();
+                return Err(Error::input(out, "the run's checkpoints", found, expected));
+            }
+            trainer.load(checkpoint)?;
+            Ok(checkpoints.into_iter().find(|of| of == checkpoint))
+        }
+        Resume::Never if checkpoints.is_empty() => Ok(None),
         Resume::Never => {
             let expected = "none with --resume never (choose another --out)";
             Err(Error::input(out, "the run", "one with checkpoints", expected))
@@ -212,14 +245,17 @@ fn begin(
         Resume::Auto => {
             for checkpoint in checkpoints.iter().rev() {
                 match check(checkpoint) {
-                    Ok(_) => return trainer.load(checkpoint),
+                    Ok(_) => {
+                        trainer.load(checkpoint)?;
+                        return Ok(Some(checkpoint.clone()));
+                    }
                     Err(e) => {
                         observe(Event::Notice(format!("{e}; the checkpoint before it is taken")));
                     }
                 }
             }
             match checkpoints.len() {
-                0 => Ok(()),
+                0 => Ok(None),
                 count => {
                     let found = format!("broken, all {count} of them");
                     Err(Error::input(

@@ -5,7 +5,7 @@ use super::trainer::Trainer;
 use super::{Stopwatch, subsets};
 use crate::config::{Config, LossConfig, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
-use crate::loss::{PerceptualKind, Share, losses};
+use crate::loss::{PerceptualKind, PerceptualLoss, Share, Vgg19, losses};
 use crate::model::{ModelConfig, Stage, Streams};
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
@@ -14,7 +14,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Kind, Tensor, nn};
 
 const SIZE: u32 = 32;
 const STAGE: Stage = Stage { index: 2, mix: 0.4 };
@@ -95,6 +95,18 @@ fn of_model(config: &Config, pass: impl FnOnce(&mut Trainer) -> LossValues) -> S
     let _ = tch::no_grad(|| {
         variables["gaussian_decoder.geo_pos_readout.bias"].shallow_clone().g_mul_scalar_(20.)
     });
+    // The weights of a network that compares pictures are a file that tests may not have.
+    let perceptual = nn::VarStore::new(Device::Cpu);
+    trainer.perceptual = Some(PerceptualLoss::Vgg19(Vgg19::new(&perceptual.root())));
+    for (name, mut weight) in perceptual.variables().into_iter().collect::<BTreeMap<_, _>>() {
+        if name.ends_with(".weight") {
+            let inputs = weight.numel() as f64 / weight.size()[0] as f64;
+            let bound = (6. / inputs).sqrt() as f32;
+            let noise: Vec<f32> = (0..weight.numel()).map(|_| random.random_range(-bound..bound)).collect();
+            tch::no_grad(|| weight.copy_(&Tensor::from_slice(&noise).view(weight.size().as_slice())));
+        }
+        let _ = weight.set_requires_grad(false);
+    }
     let mut opacities = variables["gaussian_decoder.geo_param_readout.bias"].view([-1, 10]).select(1, 9);
     let _ = tch::no_grad(|| opacities.g_add_scalar_(4.));
     let values = pass(&mut trainer);
@@ -121,9 +133,10 @@ fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
 }
 
 type Term = fn(&LossValues) -> f64;
-const TERMS: [(&str, Term); 5] = [
+const TERMS: [(&str, Term); 6] = [
     ("total", |l| l.total),
     ("mse", |l| l.mse),
+    ("perceptual", |l| l.perceptual),
     ("consistency", |l| l.consistency),
     ("frustum", |l| l.frustum),
     ("decoder", |l| l.decoder),
@@ -165,7 +178,8 @@ fn a_pass_in_parts_is_the_plain_one() {
             let decoded = trainer.model.forward(images, c2w, intrinsics, STAGE);
             let pictures =
                 render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D).expect("pictures");
-            let losses = losses(&config.loss, None, &sample, &decoded, &pictures, &Share::WHOLE);
+            let perceptual = trainer.perceptual.as_ref();
+            let losses = losses(&config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE);
             losses.total.backward();
             LossValues::of(&losses)
         });

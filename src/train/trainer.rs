@@ -21,7 +21,7 @@ pub struct Trainer {
     pub(super) vs: nn::VarStore,
     pub(super) model: GlobalSplat,
     pub(super) optimizer: AdamW,
-    perceptual: Option<PerceptualLoss>,
+    pub(super) perceptual: Option<PerceptualLoss>,
     /// Steps done.
     pub(super) step: u64,
     /// Samples drawn: the position in the data.

@@ -4,7 +4,7 @@ use super::trainer::Trainer;
 use crate::error::Result;
 
 /// Means over everything that is held out.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Score {
     /// In dB, the mean over the scenes.
     pub psnr: f64,
@@ -12,6 +12,8 @@ pub struct Score {
     pub ssim: f64,
     /// How many there are.
     pub scenes: usize,
+    /// What is wrong with those that can't be used, each told once.
+    pub left_out: Vec<String>,
 }
 
 /// Judges a model by what training never shows.
@@ -19,6 +21,6 @@ pub trait Validator {
     /// The score of the model as it is now; none where `go_on`, which is asked now and then, says no.
     ///
     /// # Errors
-    /// Scenes that can't be read, or whatever the model fails with.
+    /// No scene that can be used, or whatever the model fails with.
     fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>>;
 }
