@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""The full model against its four ablations at small scale: same budget, three seeds each, mean and spread.
+"""The full model against its four ablations, and in bf16, at small scale: same budget, three seeds each, mean and spread.
 
     .venv/bin/python scripts/ablations.py [OUT]
 
-Makes rooms, trains configs/small.toml and each variant in OUT (runs/ablations by default), and prints a Markdown table. What is
-done stays done: the same command goes on where it was stopped.
+Makes rooms, trains configs/small.toml and each variant in OUT (runs/ablations by default), as many runs side by side as there
+are cores, and prints two Markdown tables: how good each became, and how it learned. What is done stays done: the same command
+goes on where it was stopped.
 """
 
 import json
@@ -12,6 +13,7 @@ import os
 import statistics
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -24,39 +26,90 @@ VARIANTS = {
     # As wide as makes it as large as the two streams.
     "single stream": ["model.streams=single", "model.width=144"],
     "full capacity": ["curriculum.full_capacity=true"],
+    "full model, bf16": ["train.precision=bf16"],
 }
+# Parts of a run over which its curve is averaged.
+PARTS = 6
+
+
+def run_folder(out, name, seed):
+    return out / f"{name.replace(' ', '_').replace(',', '')}_{seed}"
 
 
 def trained(out, name, seed, settings, rooms):
-    """What a run told at its end, which OUT keeps."""
-    run = out / f"{name.replace(' ', '_')}_{seed}"
+    """What a run on one core told at its end, which OUT keeps, and the seconds for which its process kept the core busy."""
+    run = run_folder(out, name, seed)
     result = run / "result.json"
     if not result.is_file():
         command = [PROGRAM, "train", "--config", REPOSITORY / "configs/small.toml", "--out", run, "--json"]
         for setting in [*settings, f"train.seed={seed}"]:
             command += ["--set", setting]
-        environment = dict(os.environ, GLOBALSPLAT_ROOMS=str(rooms))
-        told = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
-        result.write_text(told)
+        environment = dict(os.environ, GLOBALSPLAT_ROOMS=str(rooms), OMP_NUM_THREADS="1")
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        told = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        if status != 0 or "held_out" not in (told := json.loads(told)):
+            raise RuntimeError(f"{run}: training failed")
+        partial = result.with_suffix(".partial")
+        partial.write_text(json.dumps(told | {"core_seconds": usage.ru_utime + usage.ru_stime}))
+        partial.rename(result)
     return json.loads(result.read_text())
+
+
+def curve(out, name):
+    """PSNR in training over equal parts of the runs, each the mean over a part's steps and the seeds, in dB."""
+    parts = [[] for _ in range(PARTS)]
+    for seed in SEEDS:
+        lines = (run_folder(out, name, seed) / "metrics.jsonl").read_text().splitlines()
+        steps = [line for line in map(json.loads, lines) if "mse" in line and not line["skipped"]]
+        for line in steps:
+            parts[line["step"] * PARTS // (steps[-1]["step"] + 1)].append(line["psnr"])
+    return steps[-1]["step"] + 1, [statistics.mean(part) for part in parts]
+
+
+def row(*cells):
+    print("|", " | ".join(cells), "|", flush=True)
 
 
 def main():
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/ablations").absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    config = (REPOSITORY / "configs/small.toml").read_text()
+    kept = out / "small.toml"
+    if kept.exists() and kept.read_text() != config:
+        sys.exit(f"{kept} is not configs/small.toml as it is now: choose another OUT")
+    kept.write_text(config)
     rooms = out / "rooms"
     if not rooms.is_dir():
         command = [PROGRAM, "synth", "--out", rooms, "--scenes", "8", "--frames", "18", "--size", "64", "--seed", "5"]
         subprocess.run(command, check=True, stdout=sys.stderr)
-    print("| variant | held-out PSNR, dB | SSIM | seconds |")
-    print("|---|---|---|---|")
-    for name, settings in VARIANTS.items():
-        runs = [trained(out, name, seed, settings, rooms) for seed in SEEDS]
-        psnr, ssim = ([run["held_out"][key] for run in runs] for key in ("psnr", "ssim"))
-        seconds = statistics.mean(run["seconds"] for run in runs)
-        spread = f"{statistics.mean(psnr):.2f} ± {statistics.stdev(psnr):.2f}"
-        print(f"| {name} | {spread} | {statistics.mean(ssim):.4f} | {seconds:.0f} |", flush=True)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        results = {
+            name: [pool.submit(trained, out, name, seed, settings, rooms) for seed in SEEDS]
+            for name, settings in VARIANTS.items()
+        }
+        row("variant", "held-out PSNR, dB", "SSIM", "seconds of a core")
+        row(*["---"] * 4)
+        for name in VARIANTS:
+            try:
+                runs = [result.result() for result in results[name]]
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            psnr, ssim = ([run["held_out"][key] for run in runs] for key in ("psnr", "ssim"))
+            seconds = statistics.mean(run["core_seconds"] for run in runs)
+            spread = f"{statistics.mean(psnr):.2f} ± {statistics.stdev(psnr):.2f}"
+            row(name, spread, f"{statistics.mean(ssim):.4f}", f"{seconds:.0f}")
     nearest = runs[0]["held_out"]
-    print(f"| the nearest photo shown | {nearest['nearest_photo_psnr']:.2f} | {nearest['nearest_photo_ssim']:.4f} | |")
+    row("the nearest photo shown", f"{nearest['nearest_photo_psnr']:.2f}", f"{nearest['nearest_photo_ssim']:.4f}", "")
+
+    print()
+    for position, name in enumerate(VARIANTS):
+        steps, psnr = curve(out, name)
+        if position == 0:
+            row("PSNR in training, to step", *(str(steps * (part + 1) // PARTS) for part in range(PARTS)))
+            row(*["---"] * (PARTS + 1))
+        row(name, *(f"{value:.2f}" for value in psnr))
 
 
 if __name__ == "__main__":
