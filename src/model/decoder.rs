@@ -178,3 +178,26 @@ impl Decoder {
         normalize(&vectors).flatten(-2, -1)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::{Device, Kind};
+
+    #[test]
+    fn bf16_is_for_appearance_alone() {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let config = ModelConfig { width: 32, latents: 8, candidates: 4, ..Default::default() };
+        let mut decoder = Decoder::new(&vs.root(), &config);
+        let tokens = || Tensor::linspace(-1., 1., 8 * 32, (Kind::Float, Device::Cpu)).sin().view([1, 8, 32]);
+        let encoded = Encoded { geometry: tokens(), appearance: tokens() };
+        let exact = decoder.heads(&encoded);
+        decoder.precision = Precision::Bf16;
+        let rounded = decoder.heads(&encoded);
+        assert!(rounded.positions.equal(&exact.positions) && rounded.gate.equal(&exact.gate));
+        assert!(rounded.rotations.equal(&exact.rotations) && rounded.log_scales.equal(&exact.log_scales));
+        assert!(rounded.opacity_logits.equal(&exact.opacity_logits));
+        let error = ((&rounded.sh - &exact.sh).norm() / exact.sh.norm()).double_value(&[]);
+        assert!(rounded.sh.kind() == Kind::Float && (1e-4..1e-2).contains(&error), "{error:.1e}");
+    }
+}
