@@ -258,6 +258,8 @@ fn a_run_that_ends_in_trouble_is_saved_as_it_was_before() {
     assert!(output.status.success() && err.contains("5 steps were skipped"), "{err}");
     // Five of six steps changed nothing.
     assert_eq!(checkpoints(&run), ["step-00000001"]);
+    let is_finite = |t: &tch::Tensor| t.isfinite().all().int64_value(&[]) == 1;
+    assert!(tensors(&run).iter().all(|(_, t)| is_finite(t)));
 }
 
 #[test]

@@ -161,6 +161,8 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
+                // What can't be written is no matter of what is held out.
+                Err(e @ Error::Write { .. }) => return Err(e),
                 Err(e) => {
                     (self.observe)(Event::Notice(format!("the last validation is left out: {e}")));
                 }
@@ -232,7 +234,7 @@ fn begin(
                     "none after step {step} (choose another --out, or --resume auto to go on from the last one)"
                 );
                 let found = later.file_name().unwrap_or_default().display();
-                return Err(Error::input(out, "the run's checkpoints", found, expected));
+                return Err(Error::input(out, "the last checkpoint", found, expected));
             }
             trainer.load(checkpoint)?;
             Ok(checkpoints.into_iter().find(|of| of == checkpoint))
