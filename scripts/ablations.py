@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """The full model against its four ablations, and in bf16, at small scale: same budget, three seeds each, mean and spread.
 
-    .venv/bin/python scripts/ablations.py [OUT]
+    .venv/bin/python scripts/ablations.py [--out OUT] [--seeds 3] [--only VARIANT ...]
 
 Makes rooms, trains configs/small.toml and each variant in OUT (runs/ablations by default), as many runs side by side as there
 are cores, and prints two Markdown tables: how good each became, and how it learned. What is done stays done: the same command
 goes on where it was stopped.
 """
 
+import argparse
 import json
 import os
 import statistics
@@ -18,7 +19,6 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROGRAM = REPOSITORY / "target/release/globalsplat"
-SEEDS = (0, 1, 2)
 VARIANTS = {
     "full model": [],
     "Plücker only": ["model.camera_code=false"],
@@ -56,10 +56,10 @@ def trained(out, name, seed, settings, rooms):
     return json.loads(result.read_text())
 
 
-def curve(out, name):
+def curve(out, name, seeds):
     """PSNR in training over equal parts of the runs, each the mean over a part's steps and the seeds, in dB."""
     parts = [[] for _ in range(PARTS)]
-    for seed in SEEDS:
+    for seed in range(seeds):
         lines = (run_folder(out, name, seed) / "metrics.jsonl").read_text().splitlines()
         steps = [line for line in map(json.loads, lines) if "mse" in line and not line["skipped"]]
         for line in steps:
@@ -72,7 +72,12 @@ def row(*cells):
 
 
 def main():
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/ablations").absolute()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/ablations"))
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each variant")
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
+    arguments = parser.parse_args()
+    out, seeds = arguments.out.absolute(), arguments.seeds
     out.mkdir(parents=True, exist_ok=True)
     config = (REPOSITORY / "configs/small.toml").read_text()
     kept = out / "small.toml"
@@ -85,12 +90,12 @@ def main():
         subprocess.run(command, check=True, stdout=sys.stderr)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = {
-            name: [pool.submit(trained, out, name, seed, settings, rooms) for seed in SEEDS]
-            for name, settings in VARIANTS.items()
+            name: [pool.submit(trained, out, name, seed, VARIANTS[name], rooms) for seed in range(seeds)]
+            for name in arguments.only
         }
         row("variant", "held-out PSNR, dB", "SSIM", "seconds of a core")
         row(*["---"] * 4)
-        for name in VARIANTS:
+        for name in arguments.only:
             try:
                 runs = [result.result() for result in results[name]]
             except BaseException:
@@ -104,8 +109,8 @@ def main():
     row("the nearest photo shown", f"{nearest['nearest_photo_psnr']:.2f}", f"{nearest['nearest_photo_ssim']:.4f}", "")
 
     print()
-    for position, name in enumerate(VARIANTS):
-        steps, psnr = curve(out, name)
+    for position, name in enumerate(arguments.only):
+        steps, psnr = curve(out, name, seeds)
         if position == 0:
             row("PSNR in training, to step", *(str(steps * (part + 1) // PARTS) for part in range(PARTS)))
             row(*["---"] * (PARTS + 1))
