@@ -1,9 +1,17 @@
 //! What can go wrong, told in one sentence.
 
+use std::any::Any;
 use std::path::{Path, PathBuf};
 
 /// The library's result.
 pub type Result<T> = std::result::Result<T, Error>;
+
+/// What a panic says of itself, on one line: libtorch appends stack traces to its messages.
+pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("an unknown reason");
+    text.lines().next().unwrap_or(text)
+}
 
 /// Every failure of the library. [`Error::is_request`] tells a wrong request from work that failed.
 #[derive(Debug, thiserror::Error)]

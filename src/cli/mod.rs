@@ -23,6 +23,7 @@ mod train;
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
 use globalsplat::data::ImageSize;
+use globalsplat::error::panic_message;
 use std::panic;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -91,17 +92,10 @@ pub fn main() -> ExitCode {
             ExitCode::from(if request { WRONG_REQUEST } else { FAILED })
         }
         Err(panic) => {
-            let text = panic.downcast_ref::<String>().map(String::as_str);
-            let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("an unknown reason");
-            eprintln!("globalsplat: the work failed inside: {}", first_sentence(text));
+            eprintln!("globalsplat: the work failed inside: {}", panic_message(&*panic));
             ExitCode::from(FAILED)
         }
     }
-}
-
-/// libtorch appends stack traces to its messages.
-fn first_sentence(text: &str) -> &str {
-    text.lines().next().unwrap_or(text)
 }
 
 /// A picture size as `--size` takes it.

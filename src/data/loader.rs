@@ -13,7 +13,7 @@ use super::sample::Sample;
 use super::sampler::choose_views;
 use super::scenes::SceneGroups;
 use crate::config::DataConfig;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, panic_message};
 use crate::scene::{Camera, normalize};
 use glam::DVec3;
 use image::RgbImage;
@@ -152,8 +152,7 @@ impl Loader {
                     }
                     let load = AssertUnwindSafe(|| shared.load(sample, &mut tools));
                     let scene = catch_unwind(load).unwrap_or_else(|panic| {
-                        let why = panic.downcast_ref::<String>().map(String::as_str);
-                        let why = why.or(panic.downcast_ref().copied()).unwrap_or("for no known reason");
+                        let why = panic_message(&*panic);
                         Err(Error::Failed(format!("loading sample {sample} failed inside: {why}")))
                     });
                     if sender.send(scene).is_err() {
