@@ -6,6 +6,7 @@ use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores};
 use globalsplat::io::check_writable_dir;
+use globalsplat::loss::psnr_of_mse;
 use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
 use std::path::PathBuf;
@@ -128,7 +129,7 @@ impl Train {
             bar.set_message(format!(
                 "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e} {samples_per_second:.1} samples/s{validation}",
                 report.losses.total,
-                -10. * mse.log10(),
+                psnr_of_mse(mse),
                 report.stage.index,
                 report.stage.mix,
                 report.learning_rate

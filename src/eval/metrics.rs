@@ -1,5 +1,6 @@
 //! Picture metrics (SPEC section 9), in float64 on values clamped to [0, 1].
 
+use crate::loss::psnr_of_mse;
 use tch::{Kind, Tensor};
 
 /// SSIM's Gaussian window: 11×11, σ = 1.5.
@@ -13,15 +14,10 @@ fn prepare(picture: &Tensor) -> Tensor {
     picture.detach().to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
 }
 
-/// Errors below it count as it, so that equal pictures have a PSNR: 100 dB.
-const MIN_MSE: f64 = 1e-10;
-
 /// Peak signal-to-noise ratio in dB of two pictures of one shape.
 pub fn psnr(picture: &Tensor, truth: &Tensor) -> f64 {
     let mse = (prepare(picture) - prepare(truth)).square().mean(Kind::Double).double_value(&[]);
-    // f64::max would take NaN for the smallest error of all.
-    let mse = if mse < MIN_MSE { MIN_MSE } else { mse };
-    -10. * mse.log10()
+    psnr_of_mse(mse)
 }
 
 /// Structural similarity of two pictures [3, H, W], H and W at least 11: the mean over channels and over the pixels whose

@@ -12,7 +12,7 @@ pub use consistency::{consistency, depth_pixels};
 pub use decoder_regularization::{DecoderRegularization, decoder_regularization, sh_soft_cap};
 pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
-pub use mse::mse;
+pub use mse::{mse, psnr_of_mse};
 pub use perceptual::{PerceptualKind, PerceptualLoss};
 pub use vgg19::Vgg19;
 

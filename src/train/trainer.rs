@@ -9,7 +9,7 @@ use super::{is_due, stage_at, subsets};
 use crate::config::Config;
 use crate::data::{BadData, Loader, Sample, SceneGroups};
 use crate::error::Result;
-use crate::loss::{PerceptualLoss, Share};
+use crate::loss::{PerceptualLoss, Share, psnr_of_mse};
 use crate::model::{GlobalSplat, Stage};
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
@@ -52,14 +52,10 @@ pub struct StepReport {
     pub picture: Option<Tensor>,
 }
 
-/// Mean squared errors below it count as it, so that there is a PSNR.
-const MIN_MSE: f64 = 1e-10;
-
 impl StepReport {
     /// Of all pictures together, in dB.
     pub fn psnr(&self) -> f64 {
-        let mse = self.losses.mse;
-        -10. * if mse < MIN_MSE { MIN_MSE.log10() } else { mse.log10() }
+        psnr_of_mse(self.losses.mse)
     }
 }
 
