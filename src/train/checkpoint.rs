@@ -164,16 +164,16 @@ impl Trainer {
         Ok(path)
     }
 
-    /// Goes on from a checkpoint. Weights that don't fit it leave the trainer unusable, all else as it was.
+    /// Goes on from a checkpoint, which [`check`] found whole and of `state`. Weights that don't fit it leave the trainer
+    /// unusable, all else as it was.
     ///
     /// # Errors
-    /// Files that can't be read, were damaged, or were written for another model.
-    pub fn load(&mut self, checkpoint: &Path) -> Result<()> {
-        let State { step, samples, .. } = check(checkpoint)?;
+    /// Files that can't be read, or were written for another model.
+    pub(super) fn load(&mut self, checkpoint: &Path, state: &State) -> Result<()> {
         let file = checkpoint.join(MODEL_FILE);
         read_weights(&file)?.load_into(&self.vs, &file)?;
         self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
-        (self.step, self.samples) = (step, samples);
+        (self.step, self.samples) = (state.step, state.samples);
         Ok(())
     }
 }

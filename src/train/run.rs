@@ -59,8 +59,8 @@ pub struct Outcome {
 /// go on: a stopped run is saved first. `validator` is asked now and then, and at the end.
 ///
 /// # Errors
-/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, or whatever a step, a
-/// save or the last validation fails with. A full disk is waited for.
+/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, or whatever a step or a
+/// save fails with. A full disk is waited for, and a validation that fails is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -226,9 +226,10 @@ fn begin(
     let checkpoints = list_checkpoints(out)?;
     match resume {
         Resume::From(checkpoint) => {
-            let step = check(checkpoint)?.step;
+            let state = check(checkpoint)?;
+            let step = state.step;
             // They would be taken for newer ones of what is trained now.
-            let later = |of: &&PathBuf| check(of).map_or(true, |state| state.step > step);
+            let later = |of: &&PathBuf| check(of).map_or(true, |other| other.step > step);
             if let Some(later) = checkpoints.iter().rev().find(later) {
                 let expected = format!(
                     "none after step {step} (choose another --out, or --resume auto to go on from the last one)"
@@ -236,7 +237,7 @@ fn begin(
                 let found = later.file_name().unwrap_or_default().display();
                 return Err(Error::input(out, "the last checkpoint", found, expected));
             }
-            trainer.load(checkpoint)?;
+            trainer.load(checkpoint, &state)?;
             Ok(checkpoints.into_iter().find(|of| of == checkpoint))
         }
         Resume::Never if checkpoints.is_empty() => Ok(None),
@@ -247,8 +248,8 @@ fn begin(
         Resume::Auto => {
             for checkpoint in checkpoints.iter().rev() {
                 match check(checkpoint) {
-                    Ok(_) => {
-                        trainer.load(checkpoint)?;
+                    Ok(state) => {
+                        trainer.load(checkpoint, &state)?;
                         return Ok(Some(checkpoint.clone()));
                     }
                     Err(e) => {
