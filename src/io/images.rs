@@ -233,16 +233,14 @@ fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
 
 /// Pictures [3, H, W], as large as the largest of them along `dims` by white below and to the right.
 pub(super) fn padded(pictures: &[Tensor], dims: &[i64]) -> Vec<Tensor> {
-    let largest = |dim: i64| pictures.iter().map(|picture| picture.size()[dim as usize]).max().unwrap_or(0);
-    let missing = |picture: &Tensor, dim: i64| match dims.contains(&dim) {
-        true => largest(dim) - picture.size()[dim as usize],
-        false => 0,
-    };
-    let pad = |picture: &Tensor| {
-        let sides = [0, missing(picture, 2), 0, missing(picture, 1)];
-        picture.pad(sides, "constant", 1.)
-    };
-    pictures.iter().map(pad).collect()
+    let sides = |dim: i64| pictures.iter().map(move |picture| picture.size()[dim as usize]);
+    let [heights, widths] = [1, 2].map(|dim| {
+        let largest = sides(dim).max().filter(|_| dims.contains(&dim));
+        sides(dim).map(move |side| largest.map_or(0, |largest| largest - side))
+    });
+    let missing = heights.zip(widths);
+    let padded = pictures.iter().zip(missing);
+    padded.map(|(picture, (below, right))| picture.pad([0, right, 0, below], "constant", 1.)).collect()
 }
 
 #[cfg(test)]
