@@ -13,7 +13,7 @@ import time
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from harness.cases import CASES
+from harness.areas import CASES
 from harness.exchange import ProgramError, program
 from harness.hold import hold
 from harness.table import as_json, markdown, self_test_report, table

@@ -189,7 +189,7 @@ def vgg19_parameters(rng):
     return drawn
 
 
-# ---- cameras ---------------------------------------------------------------------------------------------------------
+# ---- cameras and pictures --------------------------------------------------------------------------------------------
 
 
 def poses(rng, *batch, turn=0.15, move=0.4):
@@ -223,3 +223,14 @@ def views(rng, batch, count, height, width):
         "c2w": poses(rng, batch, count).astype(np.float32),
         "intrinsics": intrinsics(rng, batch, count, height=height, width=width).astype(np.float32),
     }
+
+
+def pictures(rng, config, batch, count):
+    """(image height, width) in whole patches, and images with cameras."""
+    patch = config["patch_size"]
+    rows = whole(rng, 1, 4)
+    height, width = patch * rows, patch * (rows + whole(rng, 1, 3))
+    if rng.random() < 0.5:
+        height, width = width, height
+    images = uniform(rng, 0.0, 1.0, batch, count, 3, height, width)
+    return (height, width), {"images": images} | views(rng, batch, count, height, width)

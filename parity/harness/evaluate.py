@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from .areas import TWINS
 from .exchange import read_request, write_answer
-from .twins import TWINS
 
 
 class Evaluation:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from .cases import CASES, Draw
-from .compare import Tolerance, compare
+from .areas import CASES
+from .compare import compare
 from .disturb import undetected
 from .evaluate import Evaluation
 from .exchange import Request, ask
+from .registry import Draw
+from .tolerance import Tolerance
 
 THREADS = 2  # for large cases; handing out small ones to threads costs more than it gains
 

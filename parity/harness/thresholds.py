@@ -9,6 +9,8 @@ import torch
 from reference import splat
 from reference.loss import lpips, vgg19
 
+MOST_TRIES = 100  # to draw one without a doubt
+
 
 def doubtful_pixels(config, inputs, margin):
     """inputs: arrays of a rasterizer request -> bool [B, C, H, W]."""

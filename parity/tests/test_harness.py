@@ -14,13 +14,14 @@ sys.path.insert(0, str(REPOSITORY / "parity"))
 
 import run  # noqa: E402
 from harness import coverage, draw, exchange, scenes  # noqa: E402
-from harness.cases import CASES  # noqa: E402
-from harness.compare import FLOAT32, FLOAT64, Tolerance, compare, judge  # noqa: E402
+from harness.areas import CASES  # noqa: E402
+from harness.compare import compare, judge  # noqa: E402
 from harness.disturb import undetected  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.hold import hold, questions  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
 from harness.thresholds import closest_call, doubtful_pixels  # noqa: E402
+from harness.tolerance import FLOAT32, FLOAT64, Tolerance  # noqa: E402
 
 from reference.loss.lpips import convolutions  # noqa: E402
 

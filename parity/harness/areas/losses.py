@@ -1,0 +1,125 @@
+"""The terms of the training objective that need no trained network."""
+
+import numpy as np
+import reference.loss.consistency
+import reference.loss.decoder_regularization
+import reference.loss.frustum
+import reference.loss.mse
+
+from .. import draw
+from ..draw import normal, uniform, whole
+from ..registry import Draw, by, case, twin
+
+
+@case
+def mse(rng):
+    """Down to one pixel."""
+    for shape in [(1, 1, 3, 1, 1), (2, 3, 3, 7, 12)]:
+        images = {"rendered": uniform(rng, 0.0, 1.0, *shape), "truth": uniform(rng, 0.0, 1.0, *shape)}
+        yield Draw(by(*shape), images, differentiate=("rendered",))
+
+
+@twin("mse")
+def mse_twin(config, params, inputs):
+    return {"loss": reference.loss.mse.mse(inputs["rendered"], inputs["truth"])}
+
+
+@case
+def frustum(rng):
+    """Points around the cameras, none within 0.05 of a camera's plane, where pixel coordinates have no digits."""
+    for batch, count, points, image in [(1, 1, 40, (16, 16)), (2, 3, 60, (24, 40)), (3, 4, 25, (31, 17))]:
+        w2c = draw.inverse(draw.poses(rng, batch, count))
+        means = rng.uniform(-4.0, 4.0, (batch, points, 3)) + np.array([0.0, 0.0, 2.0])
+        depth = np.einsum("bvc,bnc->bvn", w2c[..., 2, :3], means) + w2c[..., 2, 3, None]
+        means[np.abs(depth).min(1) < 0.05] = (0.1, -0.1, 2.5)
+        inputs = {
+            "means": means,
+            "w2c": w2c,
+            "intrinsics": draw.intrinsics(rng, batch, count, height=image[0], width=image[1]),
+            "far": rng.uniform(2.0, 5.0, batch),
+        }
+        inputs = {name: value.astype(np.float32) for name, value in inputs.items()}
+        label = f"{by(batch, count)}, {points} points, image {by(*image)}"
+        yield Draw(label, inputs, {"image": image}, differentiate=("means",))
+
+
+@twin("frustum")
+def frustum_twin(config, params, inputs):
+    loss = reference.loss.frustum.frustum(
+        inputs["means"], inputs["w2c"], inputs["intrinsics"], *config["image"], inputs["far"]
+    )
+    return {"loss": loss}
+
+
+@case
+def sh_soft_cap(rng):
+    """Coefficients on both sides of the cap, which is 5."""
+    for shape in [(1, 1, 1, 3), (2, 5, 4, 27)]:
+        yield Draw(by(*shape), {"sh": normal(rng, *shape, scale=5.0)}, differentiate=("sh",))
+
+
+@twin("sh_soft_cap")
+def sh_soft_cap_twin(config, params, inputs):
+    return {"loss": reference.loss.decoder_regularization.sh_soft_cap(inputs["sh"])}
+
+
+@case
+def decoder_regularization(rng):
+    """Scales, coefficients and opacities on both sides of what is allowed."""
+    for opacity in (True, False):
+        shape = whole(rng, 1, 3), whole(rng, 2, 9), whole(rng, 1, 16)
+        inputs = {
+            "log_scales": normal(rng, *shape, 3, scale=3.0, mean=-3.0),
+            "rotations": normal(rng, *shape, 6),
+            "sh": normal(rng, *shape, 27, scale=5.0),
+            "opacity_logits": uniform(rng, -13.0, 6.0, *shape, 1),
+        }
+        label = f"{by(*shape)}, {'with' if opacity else 'without'} opacity"
+        yield Draw(label, inputs, {"opacity": opacity}, differentiate=tuple(inputs))
+
+
+@twin("decoder_regularization")
+def decoder_regularization_twin(config, params, inputs):
+    raw = {
+        "log_scale": inputs["log_scales"],
+        "rotation": inputs["rotations"],
+        "sh": inputs["sh"],
+        "opacity_logit": inputs["opacity_logits"],
+    }
+    return {"loss": reference.loss.decoder_regularization.decoder_regularization(raw, config["opacity"])}
+
+
+@case
+def consistency(rng):
+    """A fifth of the pixels below the opacity at which depth counts; once all of them."""
+    for shape, empty, factors in [
+        ((1, 1, 4, 4), 0.2, (1e-3, 1e-2)),
+        ((2, 3, 7, 12), 0.2, (1.0, 0.5)),
+        ((1, 2, 3, 5), 1.0, (1.0, 1.0)),
+    ]:
+
+        def alpha():
+            return uniform(rng, 0.02, 1.0, *shape) * np.where(rng.random(shape) < empty, 0.005, 1.0).astype(np.float32)
+
+        inputs = {
+            "alpha_a": alpha(),
+            "alpha_b": alpha(),
+            "depth_a": uniform(rng, 0.5, 5.0, *shape),
+            "depth_b": uniform(rng, 0.5, 5.0, *shape),
+        }
+        config = {"alpha_factor": factors[0], "depth_factor": factors[1]}
+        label = f"{by(*shape)}, factors {factors[0]:g} and {factors[1]:g}"
+        yield Draw(label, inputs, config, differentiate=tuple(inputs))
+
+
+@twin("consistency")
+def consistency_twin(config, params, inputs):
+    loss = reference.loss.consistency.consistency(
+        inputs["alpha_a"],
+        inputs["alpha_b"],
+        inputs["depth_a"],
+        inputs["depth_b"],
+        config["alpha_factor"],
+        config["depth_factor"],
+    )
+    return {"loss": loss}

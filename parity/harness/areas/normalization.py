@@ -1,0 +1,25 @@
+"""The scene's own frame, from its cameras."""
+
+import reference.normalize
+
+from .. import draw
+from ..draw import whole
+from ..registry import Draw, case, twin
+from ..tolerance import FLOAT64
+
+
+@case
+def scene_normalization(rng):
+    """One camera, and cameras all in one place, have no extent to divide by."""
+    for count in (1, 2, 7, 36):
+        c2w = draw.poses(rng, count, turn=0.4, move=whole(rng, 1, 20))
+        yield Draw(f"{count} cameras", {"c2w": c2w}, tolerance=FLOAT64)
+    together = draw.poses(rng, 3)
+    together[:, :3, 3] = together[0, :3, 3]
+    yield Draw("3 cameras in one place", {"c2w": together}, tolerance=FLOAT64)
+
+
+@twin("scene_normalization")
+def scene_normalization_twin(config, params, inputs):
+    c2w, _, scale = reference.normalize.normalize_scene(inputs["c2w"])
+    return {"c2w": c2w, "scale": scale}

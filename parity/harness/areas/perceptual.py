@@ -1,0 +1,103 @@
+"""The losses that compare the features of trained networks."""
+
+import numpy as np
+import reference.loss.lpips
+import reference.loss.vgg19
+
+from .. import draw
+from ..draw import uniform
+from ..registry import Draw, by, case, twin
+from ..thresholds import MOST_TRIES, closest_call, closest_call_of_vgg19
+
+# Of a layer's standard deviation, within which a ReLU or a max pooling may decide otherwise: twice what rounding moves
+# numbers by.
+CLOSE_CALL = 5e-6
+
+
+def sure_pictures(rng, closest, *shapes):
+    """Random pictures of these shapes, drawn until no threshold is a close call."""
+    for _ in range(MOST_TRIES):
+        pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
+        if closest(*pictures) > CLOSE_CALL:
+            return pictures
+    raise RuntimeError(f"every one of {MOST_TRIES} sets of pictures has a close call")
+
+
+def lpips_draws(rng, network, shapes, dead=()):
+    """Pictures are drawn again until no ReLU and no pooling is a close call. The layers in `dead` put out nothing."""
+    params = draw.lpips_parameters(rng, network)
+    for name in dead:
+        params[f"{name}.bias"] -= np.float32(100.0)
+    for shape in shapes:
+        picture, truth = sure_pictures(
+            rng, lambda *pair: closest_call(network, params, np.concatenate(pair)), shape, shape
+        )
+        inputs = {"picture": picture, "truth": truth}
+        label = by(*shape) + "".join(f", {name} dead" for name in dead)
+        yield Draw(label, inputs, {"network": network}, params, tuple(inputs), module="lpips")
+
+
+@case
+def lpips_vgg(rng):
+    """The smallest height that its poolings leave anything of."""
+    yield from lpips_draws(rng, "lpips_vgg", [(2, 3, 16, 19)])
+
+
+@case
+def lpips_alex(rng):
+    """Its smallest picture, odd sides, and features that are all zero, whose length has no derivative."""
+    yield from lpips_draws(rng, "lpips_alex", [(1, 3, 31, 31), (2, 3, 49, 36)])
+    yield from lpips_draws(rng, "lpips_alex", [(1, 3, 47, 63)], dead=("conv5",))
+
+
+@twin("lpips")
+def lpips_twin(config, params, inputs):
+    distance = reference.loss.lpips.lpips(config["network"], params, inputs["picture"], inputs["truth"])
+    return {"distance": distance}
+
+
+@case
+def vgg19(rng):
+    """The smallest picture that its poolings leave anything of, and odd sides."""
+    params = draw.vgg19_parameters(rng)
+    for shape in [(1, 3, 16, 16), (1, 3, 19, 17)]:
+        picture, truth = sure_pictures(rng, lambda *pair: closest_call_of_vgg19(params, *pair), shape, shape)
+        yield Draw(by(*shape), {"picture": picture, "truth": truth}, {}, params, ("picture",))
+
+
+@twin("vgg19")
+def vgg19_twin(config, params, inputs):
+    return {"loss": reference.loss.vgg19.vgg19(params, inputs["picture"], inputs["truth"])}
+
+
+@case
+def perceptual(rng):
+    """Two renderings of the same targets. The network's weights are inputs that take no gradient."""
+    params = draw.vgg19_parameters(rng)
+
+    def closest_to_vgg19(rendered, truth):
+        return min(closest_call_of_vgg19(params, half, truth[0]) for half in rendered)
+
+    rendered, truth = sure_pictures(rng, closest_to_vgg19, (2, 1, 3, 16, 16), (1, 1, 3, 16, 16))
+    inputs = {"rendered": rendered, "truth": truth, **params}
+    yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",))
+    params = draw.lpips_parameters(rng, "lpips_alex")
+    rendered, truth = sure_pictures(
+        rng,
+        lambda *both: closest_call("lpips_alex", params, np.concatenate(both).reshape(-1, 3, 31, 31)),
+        (2, 1, 3, 31, 31),
+        (1, 1, 3, 31, 31),
+    )
+    inputs = {"rendered": rendered, "truth": truth, **params}
+    yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",))
+
+
+@twin("perceptual")
+def perceptual_twin(config, params, inputs):
+    halves = inputs["rendered"].chunk(2)
+    if config["kind"] == "vgg19":
+        losses = [reference.loss.vgg19.vgg19(inputs, half, inputs["truth"]) for half in halves]
+    else:
+        *halves, truth = (t.flatten(0, 1) for t in (*halves, inputs["truth"]))
+        losses = [reference.loss.lpips.lpips(config["kind"], inputs, half, truth).mean() for half in halves]
+    return {"loss": sum(losses) / 2.0}

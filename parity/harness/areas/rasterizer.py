@@ -1,0 +1,130 @@
+"""Both steps from Gaussians to pictures, projection and rasterizer, in either precision."""
+
+import numpy as np
+import reference.splat
+import torch
+
+from .. import scenes
+from ..registry import Draw, case, twin
+from ..thresholds import MOST_TRIES, doubtful_pixels
+from ..tolerance import FLOAT32, FLOAT64, Tolerance
+
+PROJECTION_THIN_FLOAT32 = Tolerance(
+    1e-5,
+    2e-3,
+    why="the gradients of a Gaussian hundreds of times longer than wide are small differences of large terms; "
+    "7e-4 measured, about as much as by the reference in float32",
+)
+RASTERIZER_FLOAT32 = Tolerance(
+    1e-5,
+    3e-4,
+    pictures=1e-4,
+    why="a gradient sums terms of both signs over all pixels of a Gaussian, and 1 - T has few digits where little is "
+    "covered; 2.4e-4 is the largest over 8 seeds",
+)
+# Relative distance from a threshold within which rounding may decide.
+DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
+
+
+def splat_draws(rng, module, dtype, family, tolerance):
+    """Float64 scenes are drawn again until none of their pixels is doubtful. Float32 ones say which pixels are, and
+    these have no gradient."""
+    differentiate = ("means", "scales", "quaternions", "sh")
+    if module == "rasterizer":
+        differentiate += ("opacities",)
+    for label, (size, make) in family.items():
+        config = scenes.settings(size)
+        for _ in range(MOST_TRIES):
+            inputs = {name: value.astype(dtype) for name, value in make(rng, size).items()}
+            doubtful = doubtful_pixels(config, inputs, DOUBT[dtype]) if module == "rasterizer" else None
+            if doubtful is None or dtype == np.float32 or not doubtful.any():
+                break
+        else:
+            raise RuntimeError(f"{label}: every one of {MOST_TRIES} scenes has a pixel on a threshold")
+        yield Draw(
+            label, inputs, config, differentiate=differentiate, module=module, tolerance=tolerance, doubtful=doubtful
+        )
+
+
+def of_every_camera(inputs, function):
+    """function(Gaussians of a scene, w2c, intrinsics) -> dict; the dicts' values stacked to [B, C, ...]."""
+    rows = []
+    for b in range(inputs["w2c"].shape[0]):
+        scene = [inputs[name][b] for name in ("means", "scales", "quaternions", "opacities", "sh")]
+        cameras = zip(inputs["w2c"][b], inputs["intrinsics"][b])
+        rows.append([function(*scene, w2c, intrinsics) for w2c, intrinsics in cameras])
+    return {key: torch.stack([torch.stack([seen[key] for seen in row]) for row in rows]) for key in rows[0][0]}
+
+
+@case
+def projection(rng):
+    """Every scene: float64 has digits for thin Gaussians, too."""
+    family = scenes.RANDOM | scenes.ADVERSARIAL | scenes.THIN
+    yield from splat_draws(rng, "projection", np.float64, family, FLOAT64)
+
+
+@case
+def projection_float32(rng):
+    """What float32 has digits for."""
+    yield from splat_draws(rng, "projection", np.float32, scenes.RANDOM | scenes.ADVERSARIAL, FLOAT32)
+
+
+@case
+def projection_thin_float32(rng):
+    yield from splat_draws(rng, "projection", np.float32, scenes.THIN, PROJECTION_THIN_FLOAT32)
+
+
+@twin("projection")
+def projection_twin(config, params, inputs):
+    size = config["width"], config["height"], config["eps2d"]
+
+    def project(means, scales, quaternions, opacities, sh, w2c, intrinsics):
+        seen = reference.splat.project(means, scales, quaternions, w2c, intrinsics, *size)
+        visible = seen["visible"] & (opacities >= reference.splat.SMALLEST_ALPHA)
+        colour = reference.splat.sh_colour(means, sh, w2c)
+        return {
+            "visible": visible.long(),
+            "mean2d": torch.where(visible[:, None], seen["mean2d"], 0.0),
+            "conic": torch.where(visible[:, None], seen["conic"], 0.0),
+            "depth": torch.where(visible, seen["depth"], 0.0),
+            "colour": torch.where(visible[:, None], colour, 0.0),
+        }
+
+    return of_every_camera(inputs, project)
+
+
+@case
+def rasterizer(rng):
+    """Ordinary scenes of several sizes; those that break rasterizers have a line of their own."""
+    yield from splat_draws(rng, "rasterizer", np.float64, scenes.RANDOM, FLOAT64)
+
+
+@case
+def rasterizer_adversarial(rng):
+    yield from splat_draws(rng, "rasterizer", np.float64, scenes.ADVERSARIAL | scenes.THIN, FLOAT64)
+
+
+@case
+def rasterizer_float32(rng):
+    yield from splat_draws(rng, "rasterizer", np.float32, scenes.RANDOM, RASTERIZER_FLOAT32)
+
+
+@case
+def rasterizer_adversarial_float32(rng):
+    yield from splat_draws(rng, "rasterizer", np.float32, scenes.ADVERSARIAL, RASTERIZER_FLOAT32)
+
+
+@case
+def rasterizer_thin_float32(rng):
+    yield from splat_draws(rng, "rasterizer", np.float32, scenes.THIN, RASTERIZER_FLOAT32)
+
+
+@twin("rasterizer")
+def rasterizer_twin(config, params, inputs):
+    def render(*scene_and_camera):
+        rgb, alpha, depth = reference.splat.render(
+            *scene_and_camera, config["width"], config["height"], config["eps2d"]
+        )
+        return {"rgb": rgb.movedim(-1, 0), "alpha": alpha, "depth": depth}
+
+    return of_every_camera(inputs, render)

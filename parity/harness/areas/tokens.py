@@ -1,0 +1,110 @@
+"""From pictures and cameras to the tokens that the encoder reads."""
+
+import reference.rays
+import reference.tokens
+
+from .. import draw
+from ..draw import normal, whole
+from ..names import reference_config, under
+from ..registry import Draw, by, case, twin
+
+
+@case
+def patchify(rng):
+    """Any number of channels, which the program has last; down to patches of one pixel."""
+    for shape, patch in [((1, 1, 4, 4, 3), 2), ((2, 3, 6, 15, 6), 3), ((1, 2, 5, 3, 2), 1)]:
+        label = f"{by(*shape)}, patch {patch}"
+        yield Draw(label, {"xs": normal(rng, *shape)}, {"patch_size": patch}, differentiate=("xs",))
+
+
+@twin("patchify")
+def patchify_twin(config, params, inputs):
+    return {"tokens": reference.tokens.patchify(inputs["xs"].movedim(-1, 2), config["patch_size"])}
+
+
+@case
+def rgb_tokens(rng):
+    """The half of a token that comes of colours."""
+    for _ in range(3):
+        config = draw.model_config(rng)
+        image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
+        images = {"images": inputs["images"]}
+        params = {"rgb_patch_embeds.1.weight": draw.parameters(rng, config)["rgb_patch_embeds.1.weight"]}
+        label = f"{by(*images['images'].shape)}, patch {config['patch_size']}"
+        yield Draw(label, images, config, params, ("images",))
+
+
+@twin("rgb_tokens")
+def rgb_tokens_twin(config, params, inputs):
+    return {"tokens": reference.tokens.rgb_tokens(params, inputs["images"], config["patch_size"])}
+
+
+@case
+def ray_tokens(rng):
+    """The half of a token that comes of cameras, with the camera code and without."""
+    for code in (True, True, False):
+        config = draw.model_config(rng, camera_code=code)
+        image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
+        inputs.pop("images")
+        params = draw.parameters(rng, config)
+        params = {name: value for name, value in params.items() if name.startswith(("ray_patch_embeds", "view_pe"))}
+        label = f"{by(*inputs['c2w'].shape[:2], *image)}, {'camera code' if code else 'no camera code'}"
+        yield Draw(label, inputs, config | {"image": image}, params)
+
+
+@twin("ray_tokens")
+def ray_tokens_twin(config, params, inputs):
+    tokens = reference.tokens.ray_tokens(
+        params, inputs["c2w"], inputs["intrinsics"], *config["image"], config["patch_size"], config["camera_code"]
+    )
+    return {"tokens": tokens}
+
+
+@case
+def rays(rng):
+    """Plücker coordinates of every pixel, down to an image of one."""
+    for batch, count, image in [(1, 1, (1, 1)), (2, 3, (7, 12)), (1, 4, (33, 17))]:
+        yield Draw(by(batch, count, *image), draw.views(rng, batch, count, *image), {"image": image})
+
+
+@twin("rays")
+def rays_twin(config, params, inputs):
+    rays = reference.rays.plucker_rays(inputs["c2w"], inputs["intrinsics"], *config["image"])
+    return {"rays": rays.movedim(2, -1)}
+
+
+@case
+def camera_code(rng):
+    """One code for each view. Intrinsics enter as shares of the image, so that its size counts."""
+    for batch, count, image in [(1, 1, (8, 8)), (2, 5, (24, 40)), (3, 2, (256, 256))]:
+        config = draw.model_config(rng)
+        params = draw.parameters(rng, config, "view_pe.")
+        inputs = draw.views(rng, batch, count, *image)
+        yield Draw(f"{by(batch, count)}, image {by(*image)}", inputs, config | {"image": image}, params)
+
+
+@twin("camera_code")
+def camera_code_twin(config, params, inputs):
+    params = under("view_pe", params)
+    return {"code": reference.rays.camera_code(params, inputs["c2w"], inputs["intrinsics"], *config["image"])}
+
+
+@case
+def tokens(rng):
+    """Both halves side by side, with the camera code and without."""
+    for code in (True, True, False):
+        config = draw.model_config(rng, camera_code=code)
+        image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
+        params = draw.parameters(rng, config)
+        tokenizer = ("rgb_patch_embeds", "ray_patch_embeds", "view_pe")
+        params = {name: value for name, value in params.items() if name.startswith(tokenizer)}
+        label = f"{by(*inputs['images'].shape)}, {'camera code' if code else 'no camera code'}"
+        yield Draw(label, inputs, config, params, ("images",))
+
+
+@twin("tokens")
+def tokens_twin(config, params, inputs):
+    tokens = reference.tokens.view_tokens(
+        reference_config(config), params, inputs["images"], inputs["c2w"], inputs["intrinsics"]
+    )
+    return {"tokens": tokens}
