@@ -3,10 +3,12 @@
     python parity/run.py                         everything, about a minute
     python parity/run.py --only 'rasterizer*'    the cases of that name
     python parity/run.py --self-test             are wrong answers noticed?
+    python parity/run.py --self-test --markdown docs/parity.md    the same, written down
 """
 
 import argparse
 import json
+import shlex
 import shutil
 import sys
 import time
@@ -14,9 +16,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from harness.areas import CASES
+from harness.document import document
 from harness.exchange import ProgramError, program
 from harness.hold import hold
-from harness.table import as_json, markdown, self_test_report, table
+from harness.table import as_json, self_test_report, table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 WRONG_REQUEST = 2
@@ -29,7 +32,7 @@ def arguments(argv):
     parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
     parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
     parser.add_argument("--self-test", action="store_true", help="disturb right answers and expect each to be noticed")
-    parser.add_argument("--markdown", metavar="FILE", type=Path, help="write a line per case to FILE")
+    parser.add_argument("--markdown", metavar="FILE", type=Path, help="write docs/parity.md, a line per case, to FILE")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write every number to FILE")
     parser.add_argument(
         "--binary",
@@ -39,6 +42,18 @@ def arguments(argv):
         help="the program (default: target/release/globalsplat)",
     )
     return parser.parse_args(argv)
+
+
+def command(options):
+    """What was asked for, but for where things are on this machine."""
+    words = ["python", "parity/run.py"]
+    for name, default in (("only", "*"), ("seed", 0), ("repeat", 1), ("device", "cpu")):
+        value = getattr(options, name)
+        words += [] if value == default else [f"--{name}", str(value)]
+    words += ["--self-test"] if options.self_test else []
+    path = options.markdown.resolve()
+    words += ["--markdown", str(path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path.name)]
+    return shlex.join(words)
 
 
 def progress(text):
@@ -77,7 +92,7 @@ def main(argv=None):
         undetected = sum(len(result.blind) for result in results)
         print(self_test_report(results))
     if options.markdown:
-        options.markdown.write_text(markdown(results) + "\n")
+        options.markdown.write_text(document(results, command(options), options.device), encoding="utf-8")
     if options.json:
         about = {"seed": options.seed, "repeat": options.repeat, "device": options.device}
         options.json.write_text(json.dumps(as_json(results, **about), indent=1) + "\n")

@@ -29,6 +29,7 @@ class Result:
     findings: list
     doubtful: int  # pixels left out
     seconds: float  # of the reference
+    large: bool = False  # the reference computed in float32, too
     tried: int = 0  # disturbed answers
     blind: list = field(default_factory=list)  # those that pass
 
@@ -102,7 +103,9 @@ def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None):
         on_progress(f"comparison, {done} of {len(asked)} draws: {question.case}, {drawn.label}")
         findings = compare(answer, question.expected, drawn.tolerance, drawn.doubtful)
         doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
-        result = Result(question.case, drawn.label, seed, drawn.tolerance, findings, doubtful, question.seconds)
+        result = Result(
+            question.case, drawn.label, seed, drawn.tolerance, findings, doubtful, question.seconds, drawn.large
+        )
         if self_test and result.passed:
             result.tried, result.blind = undetected(answer, question.expected, drawn.tolerance, drawn.doubtful)
         yield result

@@ -1,4 +1,4 @@
-"""What a person reads, and the same as JSON."""
+"""What a person reads on the terminal, and the same as JSON."""
 
 MOST_FAILURES = 5  # shown of one draw
 
@@ -24,25 +24,6 @@ def table(results):
     lines = layout(rows)
     lines += [f"[{number}] {why}" for number, why in enumerate(whys, start=1)]
     return "\n".join([*lines, *doubtful(results), *failures(results)])
-
-
-def markdown(results):
-    """A line per case for the README: the worst error of its outputs and of its gradients, with what is allowed."""
-    lines = ["| case | draws | outputs | gradients |", "|---|---|---|---|"]
-    for case, found in by_case(results).items():
-        cells = []
-        for is_kind in (is_output, is_gradient):
-            findings = [finding for result in found for finding in result.findings if is_kind(finding)]
-            worst_one = max(findings, key=lambda finding: finding.share, default=None)
-            if worst_one is None:
-                cells.append("")
-            elif worst_one.measure == "exact":
-                cells.append("exact" if worst_one.passed else "**wrong**")
-            else:
-                unit = "" if worst_one.measure == "relative" else f" {worst_one.measure}"
-                cells.append(f"{worst_one.error:.0e} of {worst_one.tolerance:.0e}{unit}")
-        lines.append(f"| {case} | {len(found)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
 
 
 def by_case(results):
@@ -108,9 +89,14 @@ def failures(results):
     return lines
 
 
+def undetected(results):
+    """The disturbed answers that pass all the same."""
+    return [f"{result.case}, {result.label}: {what}" for result in results for what in result.blind]
+
+
 def self_test_report(results):
     tried = sum(result.tried for result in results)
-    blind = [f"{result.case}, {result.label}: {what}" for result in results for what in result.blind]
+    blind = undetected(results)
     untested = [f"{result.case}, {result.label}" for result in results if not result.passed]
     lines = [f"self-test: {tried} disturbed answers, {tried - len(blind)} judged failures"]
     lines += [f"not detected: {what}" for what in blind]

@@ -1,6 +1,8 @@
 """The harness itself, without the program: the reference stands in for it, or answers are made by hand."""
 
+import dataclasses
 import json
+import re
 import stat
 import sys
 from pathlib import Path
@@ -17,6 +19,7 @@ from harness import coverage, draw, exchange, scenes  # noqa: E402
 from harness.areas import CASES  # noqa: E402
 from harness.compare import compare, judge  # noqa: E402
 from harness.disturb import undetected  # noqa: E402
+from harness.document import document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.hold import hold, questions  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
@@ -282,6 +285,43 @@ def test_exit_status(tmp_path, capsys, then, status, said):
     assert said in captured.out + captured.err
     if then != "sys.exit('broken')":
         assert json.loads(report.read_text())["passed"] == (status == 0)
+
+
+def test_a_document_holds_the_figures_and_nothing_of_the_machine_s_files(tmp_path, capsys):
+    program, written = stand_in(tmp_path, ""), []
+    for name in ("first", "second"):
+        path = tmp_path / name / "parity.md"
+        path.parent.mkdir()
+        asked = ["--only", "ms?", "--seed", "1", "--self-test", "--markdown", str(path), "--binary", str(program)]
+        assert run.main(asked) == 0
+        written.append(path.read_text())
+    assert written[0] == written[1] and str(tmp_path) not in written[0]
+    said = capsys.readouterr().out
+    tried = re.search(r"(\d+) disturbed", said)[1]
+    words = " ".join(written[0].split())
+    assert "2 draws of 1 case, none failed" in words and "mistakes are 2 times it." in words
+    assert f"Of {tried} wrong answers every one was noticed." in words
+    assert "\n\n    python parity/run.py --only 'ms?' --seed 1 --self-test --markdown parity.md\n\n" in written[0]
+    assert "| mse | 2 | " in written[0] and "## Tolerances" not in written[0] and "## Failures" not in written[0]
+
+
+def test_a_document_tells_what_is_wrong():
+    def spoiled(asked, answered, on_progress):
+        answer_files(asked, answered)
+        for path in answered.iterdir():
+            if "mse" in path.name:
+                answer = dict(np.load(path))
+                exchange.write_answer(path, answer | {"out.loss": answer["out.loss"] * np.float32(1.01)})
+
+    results = list(hold(["mse", "resample", "subsets"], 0, spoiled, self_test=True))
+    text = document(results, "the command", "cpu")
+    assert re.search(r"\| mse \| 2 \| \*\*1e-02 of 1e-05\*\* \|", text) and "\n- FAIL mse (seed 0), " in text
+    assert "| subsets | 8 | exact |  |" in text and "- exact: " in text
+    assert "\n- `resample`: rounded to levels" in text
+    blind = [dataclasses.replace(result, blind=["out.image: times 1.001"]) for result in results[-1:]]
+    assert "1 were not noticed:" in " ".join(document(blind, "the command", "cpu").split())
+    unheld = [dataclasses.replace(result, tried=0) for result in results]
+    assert "wrong answers" not in document(unheld, "the command", "cpu")
 
 
 def test_wrong_requests(tmp_path, capsys):
