@@ -1,9 +1,10 @@
 #include "chunk.h"
 
+#include <ATen/ops/empty.h>
+#include <ATen/ops/from_blob.h>
 #include <caffe2/serialize/inline_container.h>
 #include <torch/csrc/jit/serialization/pickler.h>
 #include <torch/csrc/jit/serialization/unpickler.h>
-#include <torch/torch.h>
 
 #include <algorithm>
 #include <string>
@@ -11,13 +12,13 @@
 #include <unordered_map>
 #include <vector>
 
-#include "globalsplat/src/data/chunk/bridge.rs.h"
+#include "globalsplat-csrc/src/chunk.rs.h"
 
 namespace globalsplat {
 namespace {
 
 using c10::IValue;
-using torch::Tensor;
+using at::Tensor;
 
 constexpr int64_t kCameraNumbers = 18;
 
@@ -36,7 +37,7 @@ class Storages {
     TORCH_CHECK(found != by_key_.end(), "the archive has no data/", key, ", which a tensor asks for");
     // Nobody writes into these tensors, nor keeps them.
     void* const data = const_cast<uint8_t*>(file_.data()) + found->second->start;
-    return {data, data, [](void*) {}, torch::kCPU};
+    return {data, data, [](void*) {}, at::kCPU};
   }
 
   // Where `tensor` lies in the file. Throws unless it is in one piece, inside its record.
@@ -67,7 +68,7 @@ class Storages {
     rust::Vec<T> out;
     out.reserve(size_t(tensor.numel()));
     // Archives align their records; a file that doesn't is still no reason to read across an alignment.
-    Tensor aligned = torch::empty(tensor.sizes(), tensor.options());
+    Tensor aligned = at::empty(tensor.sizes(), tensor.options());
     if (range.length > 0) std::memcpy(aligned.data_ptr(), file_.data() + range.start, range.length);
     const Tensor converted = aligned.to(c10::CppTypeToScalarType<T>::value).contiguous();
     std::copy_n(converted.data_ptr<T>(), converted.numel(), std::back_inserter(out));
@@ -151,7 +152,7 @@ ChunkScene scene(const Fields& fields, const Storages& storages) {
   out.cameras = storages.numbers<float>(cameras, fields.name("cameras"));
   out.timestamps = storages.numbers<int64_t>(timestamps, fields.name("timestamps"));
   for (const Tensor& image : images) {
-    TORCH_CHECK(image.dim() == 1 && image.scalar_type() == torch::kByte, "an image of ", fields.name("images"), " is ",
+    TORCH_CHECK(image.dim() == 1 && image.scalar_type() == at::kByte, "an image of ", fields.name("images"), " is ",
                 image.scalar_type(), " ", image.sizes(), ", expected the bytes of a JPEG");
     out.images.push_back(storages.extent(image, fields.name("images")));
   }
@@ -160,9 +161,9 @@ ChunkScene scene(const Fields& fields, const Storages& storages) {
 
 // `numbers` as a tensor, not copied.
 template <class Numbers>
-Tensor tensor(const Numbers& numbers, torch::ScalarType type) {
+Tensor tensor(const Numbers& numbers, at::ScalarType type) {
   const auto count = int64_t(numbers.size());
-  return torch::from_blob(const_cast<void*>(static_cast<const void*>(numbers.data())), {count}, type);
+  return at::from_blob(const_cast<void*>(static_cast<const void*>(numbers.data())), {count}, type);
 }
 
 }  // namespace
@@ -184,11 +185,11 @@ std::unique_ptr<std::vector<uint8_t>> pickle_scenes(const rust::Vec<SceneToPickl
   for (const SceneToPickle& scene : scenes) {
     // A list of anything: a list of tensors would be a type of its own in the pickle.
     c10::impl::GenericList images(any);
-    for (const EncodedImage& image : scene.images) images.push_back(tensor(image.bytes, torch::kByte));
+    for (const EncodedImage& image : scene.images) images.push_back(tensor(image.bytes, at::kByte));
     c10::impl::GenericDict dict(c10::StringType::get(), any);
     dict.insert("url", std::string(scene.url));
-    dict.insert("timestamps", tensor(scene.timestamps, torch::kLong));
-    dict.insert("cameras", tensor(scene.cameras, torch::kFloat).view({-1, kCameraNumbers}));
+    dict.insert("timestamps", tensor(scene.timestamps, at::kLong));
+    dict.insert("cameras", tensor(scene.cameras, at::kFloat).view({-1, kCameraNumbers}));
     dict.insert("images", images);
     dict.insert("key", std::string(scene.key));
     list.push_back(dict);

@@ -10,13 +10,13 @@
 
 namespace globalsplat {
 
-// Shared with Rust, see src/data/chunk/bridge.rs.
+// Shared with Rust, see src/chunk.rs.
 struct ChunkRecord;
 struct ChunkScene;
 struct SceneToPickle;
 
 // The scenes of a chunk, whose images stay where they are in `file`, the bytes of an uncompressed torch.save archive.
-// `pickle` is its data.pkl, which src/data/chunk/pickle.rs has to have passed; `records` are its tensors' bytes in the order of
+// `pickle` is its data.pkl, which the reader of chunks has to have checked; `records` are its tensors' bytes in the order of
 // `start`. Throws (a Rust error) on a pickle that isn't such a list.
 rust::Vec<ChunkScene> unpickle_scenes(rust::Slice<const uint8_t> file, rust::Slice<const uint8_t> pickle,
                                       const rust::Vec<ChunkRecord>& records);

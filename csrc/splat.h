@@ -1,4 +1,4 @@
-// The differentiable splat op on torch tensors, and what Rust calls through cxx.
+// The differentiable splat ops on torch tensors, as Rust calls them through cxx.
 #pragma once
 
 #include <array>
@@ -8,34 +8,24 @@
 
 namespace globalsplat {
 
-// Shared with Rust, see src/render/bridge.rs.
-struct SplatArguments;
-struct StageTimes;
-struct PairCounts;
+struct SplatArguments;  // shared with Rust, see src/render.rs
 
-// Tensors of float32 or float64 (all alike), on any device. `out` receives three new tensors that the caller owns, on the device
-// of the means: rgb [B, C, 3, H, W], accumulated opacity [B, C, H, W], expected depth [B, C, H, W].
-// Differentiable with respect to the five Gaussian tensors; cameras get no gradient.
+// Tensors of any device and floating type. `out` receives three new tensors that the caller owns, on the device of the means,
+// float64 where the means are and float32 else: rgb [B, C, 3, H, W], accumulated opacity [B, C, H, W], expected depth
+// [B, C, H, W]. Differentiable with respect to the five Gaussian tensors; cameras get no gradient.
 // Throws (a Rust error) on shapes that don't fit.
 void splat(const SplatArguments& of, rust::Slice<size_t> out);
 
-
-// Wall-clock seconds that the stages of this thread's last call of splat(), and of its backward pass, took.
-StageTimes stage_times();
-
-// What a call of splat() with float32 Gaussians has to blend. Same arguments.
-PairCounts count_pairs(const SplatArguments& of);
-
-// Floating-point operations per second that multiply-adds alone reach on libtorch's number of threads, in `seconds`.
-double multiply_add_peak(double seconds);
+// The rasterizer's first step as an op of its own, so that it can be checked by itself. `out` receives five new tensors:
+// visible [B, C, N] (int64, 1 where a Gaussian isn't dropped), mean2d [B, C, N, 2], conic [B, C, N, 3] (xx, xy, yy of the
+// inverse 2D covariance), depth [B, C, N] and colour [B, C, N, 3]; zeros where not visible. Differentiable with respect to
+// means, scales, quaternions and sh.
+void project(const SplatArguments& of, rust::Slice<size_t> out);
 
 // The first out.size() (1, 4, 9 or 16) spherical harmonics of a unit vector, as the rasterizer evaluates them.
 void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out);
 
 // Of the libtorch whose headers this was compiled with.
 rust::String libtorch_version();
-
-// The instruction set of the kernels in use. Throws when GLOBALSPLAT_SIMD names an unknown one.
-rust::String simd_level();
 
 }  // namespace globalsplat

@@ -74,6 +74,15 @@ impl Error {
         }
     }
 
+    /// The setting `field` is `found`, expected `expected`.
+    pub fn setting(
+        field: impl std::fmt::Display,
+        found: impl std::fmt::Display,
+        expected: impl std::fmt::Display,
+    ) -> Self {
+        Error::Request(format!("{field} is {found}, expected {expected}"))
+    }
+
     /// For `map_err` on reading.
     pub fn read(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_owned();

@@ -1,8 +1,29 @@
 //! GlobalSplat: posed photos to a compact 3D Gaussian splat in one forward pass.
 //!
-//! Data flows down this list; an arrow never points up.
-//! [`data`] → [`scene`] → [`model`] → [`render`] → [`loss`] → [`train`] → [`eval`] → [`bench`], with [`io`] for files.
+//! ```no_run
+//! use globalsplat::data::{Holdout, open_capture};
+//! use globalsplat::io::{Splat, write_splat};
+//! use globalsplat::reconstruct::{load_context, load_model, reconstruct};
+//!
+//! # fn main() -> globalsplat::Result<()> {
+//! let model = load_model("model.safetensors".as_ref(), tch::Device::Cpu)?;
+//! let capture = open_capture("captures/room".as_ref())?;
+//! // 24 photos, spread over the path of the camera and fitted to the model.
+//! let views = load_context(&capture, Holdout::None, Some(24), model.config.data.image_size)?;
+//! let reconstruction = reconstruct(&model, &views, &[])?;
+//! write_splat("room.ply".as_ref(), &Splat::of(&reconstruction.in_world())?)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! `examples/` has this as a program, and one that optimizes Gaussians on a photo with the differentiable splat op alone.
+//!
+//! Modules, from what a person touches down to the ground; each uses those below it and [`scene`]:
+//! [`eval`] judges, [`train`] trains, [`reconstruct`] makes splats of photos, [`config`] has what a run depends on, [`optim`] and
+//! [`loss`] are what learning needs, [`data`] reads captures, [`synth`] makes them up, [`io`] has files, [`render`] is the
+//! differentiable splat op, [`model`] the network, [`scene`] camera maths.
 
+#[doc(hidden)]
 pub mod bench;
 pub mod config;
 pub mod data;
@@ -11,7 +32,10 @@ pub mod eval;
 pub mod io;
 pub mod loss;
 pub mod model;
+pub mod optim;
+#[doc(hidden)]
 pub mod parity;
+pub mod reconstruct;
 pub mod render;
 pub mod scene;
 pub mod synth;

@@ -208,8 +208,8 @@ fn a_splat_that_is_something_else() {
 
 #[test]
 fn splats_of_every_degree_load() {
-    use globalsplat::io::{read_ply, write_ply};
-    use globalsplat::model::Gaussians;
+    use globalsplat::io::{Splat, read_splat, write_splat};
+    use globalsplat::scene::Gaussians;
     let folder = tempfile::tempdir().unwrap();
     for degree in 0..4 {
         let mut random = common::Random::new(degree as u64);
@@ -222,9 +222,9 @@ fn splats_of_every_degree_load() {
             sh: random.symmetric(&[1, 5, bases, 3]),
         };
         let file = folder.path().join("splat.ply");
-        write_ply(&file, &gaussians).unwrap();
-        let again = read_ply(&file).unwrap();
-        assert_eq!(again.sh_degree, degree);
+        write_splat(&file, &Splat::of(&gaussians).unwrap()).unwrap();
+        let again = read_splat(&file).unwrap();
+        assert_eq!(again.sh_degree(), degree);
         assert!(common::largest_error(&again.gaussians.sh, &gaussians.sh) < 1e-6);
     }
 }
@@ -428,7 +428,7 @@ fn a_view_too_many_for_the_split() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let error = refuse(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--holdout", "none"]);
-    assert_says(&error, &["0 to ask for", "--holdout or data.holdout, every:N"]);
+    assert_says(&error, &["0 target views", "--holdout or data.holdout, every:N"]);
 }
 
 #[test]

@@ -4,16 +4,24 @@ mod common;
 
 use common::captures;
 use glam::{DMat3, DVec3};
-use globalsplat::data::{find_captures, open_capture};
-use globalsplat::eval::{Perceptual, score_splat};
-use globalsplat::io::{find_pretrained, read_ply, write_ply};
+use globalsplat::data::{Capture, find_captures, open_capture};
+use globalsplat::eval::{EvalScene, Method, Perceptual, Synthesis, judge, score};
+use globalsplat::io::{Splat, find_pretrained, read_splat, write_splat};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::render::transform;
 use globalsplat::scene::Similarity;
+use std::path::Path;
 
 /// Mean PSNR and SSIM over a capture's views that the published splat is known to reach.
 const PUBLISHED: [(&str, f64, f64); 2] =
     [("322261824c4a3003", 29.089, 0.9160), ("5aca87f95a9412c6", 27.222, 0.9175)];
+
+/// The splat that was published for the capture in `folder`, at all of its cameras.
+fn published_splat(folder: &Path, capture: &Capture) -> (EvalScene, Synthesis) {
+    let scene = EvalScene::all_views(capture).expect("photos");
+    let made = Method::Splat(folder.join("reference.ply")).synthesize(&scene).expect("pictures");
+    (scene, made)
+}
 
 #[test]
 fn published_splats_reach_their_scores() {
@@ -22,8 +30,8 @@ fn published_splats_reach_their_scores() {
         let Some((_, psnr, ssim)) = PUBLISHED.iter().find(|(name, ..)| *name == capture.name) else {
             continue;
         };
-        let splat = read_ply(&path.join("reference.ply")).expect("a splat");
-        let (scores, ..) = score_splat(&splat.gaussians, &capture).expect("scores");
+        let (scene, made) = published_splat(&path, &capture);
+        let scores = score(&scene.name, &made.pictures, &scene.target, made.gaussians).expect("scores");
         assert!((scores.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.psnr);
         assert!((scores.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.ssim);
     }
@@ -45,10 +53,8 @@ fn published_splats_look_as_they_are_known_to() {
         let Some((_, vgg, alex)) = PUBLISHED_LPIPS.iter().find(|(name, ..)| *name == capture.name) else {
             continue;
         };
-        let splat = read_ply(&path.join("reference.ply")).expect("a splat");
-        let (mut scores, views, rendered) = score_splat(&splat.gaussians, &capture).expect("scores");
-        let pictures: Vec<_> = rendered.into_iter().map(|r| r.rgb).collect();
-        perceptual.add_to(&mut scores, &pictures, &views);
+        let (scene, made) = published_splat(&path, &capture);
+        let scores = judge(&scene, &made, &perceptual).expect("scores");
         assert!(perceptual.why_absent(&scores).is_none());
         let (found_vgg, found_alex) =
             (scores.lpips_vgg.expect("LPIPS-VGG"), scores.lpips_alex.expect("LPIPS-Alex"));
@@ -61,14 +67,14 @@ fn published_splats_look_as_they_are_known_to() {
 fn a_splat_survives_being_written() {
     for path in captures().unwrap_or_default() {
         let file = path.join("reference.ply");
-        let splat = read_ply(&file).expect("a splat").gaussians;
+        let splat = read_splat(&file).expect("a splat").gaussians;
         let folder = tempfile::tempdir().expect("a folder");
         let copy = folder.path().join("copy.ply");
-        write_ply(&copy, &splat).expect("a written splat");
+        write_splat(&copy, &Splat::of(&splat).expect("one scene")).expect("a written splat");
         if splat.count() == 16_384 && splat.sh.size()[2] == 16 {
             assert_eq!(std::fs::metadata(&copy).expect("a file").len(), 4_064_762);
         }
-        let again = read_ply(&copy).expect("a splat").gaussians;
+        let again = read_splat(&copy).expect("a splat").gaussians;
         assert!(again.means.equal(&splat.means) && again.sh.equal(&splat.sh));
         assert!(common::largest_error(&again.scales, &splat.scales) < 1e-6);
         assert!(common::largest_error(&again.opacities, &splat.opacities) < 1e-5);
@@ -79,7 +85,7 @@ fn a_splat_survives_being_written() {
 fn a_moved_splat_looks_the_same_to_moved_cameras() {
     for path in captures().unwrap_or_default() {
         let capture = open_capture(&path).expect("a capture");
-        let splat = read_ply(&path.join("reference.ply")).expect("a splat").gaussians;
+        let splat = read_splat(&path.join("reference.ply")).expect("a splat").gaussians;
         let to = Similarity {
             rotation: DMat3::from_euler(glam::EulerRot::XYZ, 0.7, -1.1, 2.3),
             translation: DVec3::new(3., -2., 5.),
@@ -96,8 +102,8 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
                 globalsplat::scene::Camera { c2w, ..*camera }
             })
             .collect();
-        let before = globalsplat::eval::render_views(&splat, &cameras[..2]).expect("pictures");
-        let after = globalsplat::eval::render_views(&moved, &moved_cameras).expect("pictures");
+        let before = globalsplat::render::render_views(&splat, &cameras[..2]).expect("pictures");
+        let after = globalsplat::render::render_views(&moved, &moved_cameras).expect("pictures");
         for (a, b) in before.iter().zip(&after) {
             // Not to the last bit: positions of size 10 instead of 1 keep fewer digits in float32.
             assert!(globalsplat::eval::psnr(&b.rgb, &a.rgb) > 60.);

@@ -4,8 +4,8 @@ mod common;
 
 use common::formats::assert_same_cameras;
 use common::program::{arg, refuse, succeed};
+use globalsplat::data::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
-use globalsplat::synth::write_room;
 use serde_json::Value;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};

@@ -2,8 +2,9 @@
 
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
+use globalsplat::data::write_room;
+use globalsplat::loss::Term;
 use globalsplat::model::{GlobalSplat, Streams};
-use globalsplat::synth::write_room;
 use globalsplat::train::Trainer;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -72,7 +73,7 @@ fn every_configuration_trains() {
         let (first, last) = (reports[0].stage, reports[2].stage);
         assert_eq!(last.index, config.curriculum.final_stage, "{name}");
         assert!(config.curriculum.full_capacity || first.index == 0, "{name}");
-        let consistent = reports.iter().any(|r| r.losses.consistency > 0.);
+        let consistent = reports.iter().any(|r| r.losses[Term::Consistency] > 0.);
         assert_eq!(consistent, config.loss.has_consistency(), "{name}: {reports:?}");
     }
 }

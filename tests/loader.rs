@@ -1,7 +1,7 @@
 //! What training is fed with: the same samples whatever the number of threads, from anywhere, past everything broken.
 
 use glam::{DMat4, DVec3};
-use globalsplat::config::DataConfig;
+use globalsplat::data::DataConfig;
 use globalsplat::data::{
     Capture, JitterConfig, LoadedScene, Loader, SceneGroups, open_capture, write_cameras_json,
 };

@@ -5,8 +5,8 @@ mod common;
 use common::browser::Browser;
 use common::program::{arg, refuse, succeed};
 use globalsplat::eval::{
-    CaptureScores, Efficiency, Evaluation, Failure, SceneScores, Summary, ViewScore, read_evaluation,
-    strip_path, write_csv, write_evaluation, write_report,
+    CaptureScores, Efficiency, Evaluation, Failure, SceneScores, Summary, ViewScore, comparison_path,
+    read_evaluation, write_csv, write_evaluation, write_report,
 };
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -85,7 +85,7 @@ fn made_up(folder: &Path) -> Vec<(PathBuf, Evaluation)> {
         for scene in evaluation.scenes.iter().filter(|scene| scene.scores.scene != "b") {
             let colour = image::Rgb([90, 120, (scene.scores.psnr * 5.) as u8]);
             image::RgbImage::from_pixel(1036, 256, colour)
-                .save(strip_path(folder, &scene.scores.scene))
+                .save(comparison_path(folder, &scene.scores.scene))
                 .unwrap();
         }
         write_evaluation(folder, evaluation).unwrap();
@@ -180,7 +180,7 @@ fn the_command_writes_the_page_and_refuses_in_a_sentence() {
     assert!(error.contains("whole/scores.json") && error.contains("missing field `index`"), "{error}");
     std::fs::write(&scores, &text[..text.len() / 2]).unwrap();
     assert!(refuse(&["report", whole, "--out", arg(&page)]).contains("EOF while parsing"));
-    let picture = strip_path(&evaluations[1].0, "../up");
+    let picture = comparison_path(&evaluations[1].0, "../up");
     std::fs::write(&picture, "no picture").unwrap();
     let error = refuse(&["report", part, "--out", arg(&page)]);
     assert!(error.contains(arg(&picture)) && error.contains("undecodable"), "{error}");

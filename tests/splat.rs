@@ -3,9 +3,8 @@
 mod common;
 
 use common::{Random, largest_error};
-use globalsplat::data::ImageSize;
-use globalsplat::model::Gaussians;
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
+use globalsplat::scene::{Gaussians, ImageSize};
 use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
 use tch::{Device, Kind, Tensor};
@@ -123,7 +122,7 @@ fn gradients_are_those_of_finite_differences() {
     }
 }
 
-/// SPEC section 6, pixel by pixel over every Gaussian, in float64 and without any culling.
+/// Spec 6.2 to 6.4, pixel by pixel over every Gaussian, in float64 and without any culling.
 fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
     let values = |t: &Tensor| Vec::<f64>::try_from(t.to_kind(Kind::Double).flatten(0, -1)).expect("numbers");
     let [means, scales, quaternions, opacities, sh] = fields(g).map(|(_, t)| values(t));
@@ -299,7 +298,7 @@ fn instruction_sets_agree() {
     const OUT: &str = "GLOBALSPLAT_TEST_OUT";
     const UNSUPPORTED: i32 = 77;
     if let Some(out) = std::env::var_os(OUT) {
-        if globalsplat::render::simd_level().is_err() {
+        if globalsplat::render::cpu::simd_level().is_err() {
             std::process::exit(UNSUPPORTED);
         }
         let (g, c) = globalsplat::bench::made_up_scene(16384, 12, ImageSize { width: 256, height: 256 });

@@ -1,4 +1,4 @@
-// Alpha blending of one 16×16 tile, forward and backward.
+// Alpha blending of one 16×16 tile, forward and backward (spec 6.4 and 6.5).
 //
 // For a pixel and the splats in front-to-back order i = 1, 2, …
 //     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre

@@ -1,4 +1,4 @@
-// Gaussians seen by cameras, forward and backward, a vector of Gaussians at a time.
+// Gaussians seen by cameras, forward and backward, a vector of Gaussians at a time (spec 6.2).
 //
 //     t = W μ + p                          camera space; z ≤ 0.01 is dropped
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)

@@ -1,5 +1,5 @@
 // Real spherical harmonics up to degree 3, with the constants and signs of the original 3DGS release
-// (Kerbl et al. 2023): Y_0 = 0.28209479, Y_1 = 0.48860251·(−y, z, −x), …
+// (Kerbl et al. 2023; spec 6.3): Y_0 = 0.28209479, Y_1 = 0.48860251·(−y, z, −x), …
 //
 // T is a number, V what is computed with: T itself or a vector of them.
 #pragma once

@@ -12,14 +12,15 @@ CASES_OF = {
     "src/model/rotation.rs": ["rotation_matrix", "quaternion"],
     "src/model/stream.rs": ["stream_round", "self_attention_block"],
     "src/model/tokens.rs": ["patchify", "rgb_tokens", "ray_tokens", "tokens"],
-    "src/data/jitter.rs": ["jitter"],
-    "src/data/resample.rs": ["resample"],
+    "src/data/pixels/jitter.rs": ["jitter"],
+    "src/data/pixels/resample.rs": ["resample"],
     "src/loss/consistency.rs": ["consistency"],
     "src/loss/decoder_regularization.rs": ["decoder_regularization", "sh_soft_cap"],
     "src/loss/frustum.rs": ["frustum"],
     "src/loss/lpips.rs": ["lpips_vgg", "lpips_alex"],
     "src/loss/mse.rs": ["mse"],
     "src/loss/perceptual.rs": ["perceptual"],
+    "src/loss/ssim.rs": ["ssim"],
     "src/loss/vgg19.rs": ["vgg19"],
     "src/scene/normalize.rs": ["scene_normalization"],
     "src/scene/rays.rs": ["rays"],
@@ -34,19 +35,20 @@ CASES_OF = {
         "rasterizer_thin_float32",
     ],
     "src/train/curriculum.rs": ["stages"],
-    "src/train/optimizer.rs": ["adamw"],
+    "src/optim/adamw.rs": ["adamw"],
     "src/train/schedule.rs": ["learning_rate"],
     "src/train/subsets.rs": ["subsets"],
 }
 
 EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
-    "src/model/gaussians.rs": "names for five tensors",
     "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
     "src/model/precision.rs": "every case of the encoder runs in float32; tests/model.rs holds bf16 against it",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
-    "src/loss/mod.rs": "the weighted sum of terms that are held one by one",
+    "src/loss/config.rs": "factors",
+    "src/loss/terms.rs": "names of the terms, and their weighted sum, which its own test holds",
+    "src/loss/mod.rs": "what the terms look at; they are held one by one",
 }
 
 

@@ -46,9 +46,9 @@ class Evaluation:
         }
 
 
-def answer_files(asked, answered, on_progress=lambda done: None):
+def answer_files(requests, answers, on_progress=lambda done: None):
     """The reference in the program's place: answers a folder of requests, in the precision they are written in."""
-    for done, path in enumerate(sorted(asked.glob("*.npz")), start=1):
+    for done, path in enumerate(sorted(requests.glob("*.npz")), start=1):
         request = read_request(path)
         kinds = {array.dtype for array in [*request.params.values(), *request.inputs.values()]}
         double = np.dtype(np.float64) in kinds
@@ -56,5 +56,5 @@ def answer_files(asked, answered, on_progress=lambda done: None):
         answer = evaluation.output_arrays()
         if request.cotangents:
             answer |= evaluation.gradient_arrays(request.cotangents)
-        write_answer(answered / path.name, answer)
+        write_answer(answers / path.name, answer)
         on_progress(done)

@@ -89,15 +89,15 @@ def program(binary, device="cpu"):
     return answer
 
 
-def ask(requests, answerer, on_progress=lambda done: None):
+def exchange(requests, answerer, on_progress=lambda done: None):
     """Yields the answers to `requests`, in their order, after all of them are there."""
     with tempfile.TemporaryDirectory(prefix="globalsplat-parity-") as folder:
-        asked, answered = Path(folder, "requests"), Path(folder, "answers")
-        asked.mkdir()
-        answered.mkdir()
+        requests_folder, answers_folder = Path(folder, "requests"), Path(folder, "answers")
+        requests_folder.mkdir()
+        answers_folder.mkdir()
         names = [f"{number:04}_{request.module}.npz" for number, request in enumerate(requests)]
         for name, request in zip(names, requests):
-            write_request(asked / name, request)
-        answerer(asked, answered, on_progress)
+            write_request(requests_folder / name, request)
+        answerer(requests_folder, answers_folder, on_progress)
         for name in names:
-            yield read_answer(answered / name)
+            yield read_answer(answers_folder / name)

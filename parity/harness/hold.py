@@ -11,7 +11,7 @@ from .areas import CASES
 from .compare import compare
 from .disturb import undetected
 from .evaluate import Evaluation
-from .exchange import Request, ask
+from .exchange import Request, exchange
 from .registry import Draw
 from .tolerance import Tolerance
 
@@ -88,19 +88,19 @@ def cotangents(rng, request, outputs, doubtful):
 
 def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None):
     """Yields a Result for every draw of the named cases."""
-    asked = []
+    drawn_questions = []
     for question in questions(names, seed):
-        asked.append(question)
-        on_progress(f"reference, {len(asked)} draws: {question.case}, {question.drawn.label}")
+        drawn_questions.append(question)
+        on_progress(f"reference, {len(drawn_questions)} draws: {question.case}, {question.drawn.label}")
 
     def on_answers(done):
-        at = asked[min(done, len(asked) - 1)]
-        on_progress(f"program, {done} of {len(asked)} draws: {at.case}, {at.drawn.label}")
+        at = drawn_questions[min(done, len(drawn_questions) - 1)]
+        on_progress(f"program, {done} of {len(drawn_questions)} draws: {at.case}, {at.drawn.label}")
 
-    answers = ask([question.request for question in asked], answerer, on_answers)
-    for done, (question, answer) in enumerate(zip(asked, answers), start=1):
+    answers = exchange([question.request for question in drawn_questions], answerer, on_answers)
+    for done, (question, answer) in enumerate(zip(drawn_questions, answers), start=1):
         drawn = question.drawn
-        on_progress(f"comparison, {done} of {len(asked)} draws: {question.case}, {drawn.label}")
+        on_progress(f"comparison, {done} of {len(drawn_questions)} draws: {question.case}, {drawn.label}")
         findings = compare(answer, question.expected, drawn.tolerance, drawn.doubtful)
         doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
         result = Result(

@@ -162,7 +162,7 @@ def test_an_answer_is_arrays_or_an_error(tmp_path):
 
 
 def test_the_reference_in_float32_passes_every_case_and_every_disturbance_is_noticed():
-    """So that a failing program is wrong, not asked for more digits than there are."""
+    """So that a failing program is wrong, not requests for more digits than there are."""
     results = list(hold([name for name in CASES if name not in LEFT_OUT], 0, answer_files, self_test=True))
     assert {result.case for result in results} == CASES.keys() - LEFT_OUT
     assert [table([result]) for result in results if not result.passed] == []
@@ -253,8 +253,8 @@ import numpy as np
 from harness.evaluate import answer_files
 from harness.exchange import write_answer
 options = dict(zip(sys.argv[2::2], sys.argv[3::2]))
-asked, answered = Path(options["--requests"]), Path(options["--responses"])
-answer_files(asked, answered)
+requests, answers = Path(options["--requests"]), Path(options["--responses"])
+answer_files(requests, answers)
 {then}
 """
 
@@ -267,7 +267,7 @@ def stand_in(tmp_path, then):
 
 
 SPOIL = """
-for path in answered.iterdir():
+for path in answers.iterdir():
     answer = dict(np.load(path))
     answer["out.loss"] = answer["out.loss"] * 1.01
     write_answer(path, answer)
@@ -292,8 +292,8 @@ def test_a_document_holds_the_figures_and_nothing_of_the_machine_s_files(tmp_pat
     for name in ("first", "second"):
         path = tmp_path / name / "parity.md"
         path.parent.mkdir()
-        asked = ["--only", "ms?", "--seed", "1", "--self-test", "--markdown", str(path), "--binary", str(program)]
-        assert run.main(asked) == 0
+        requests = ["--only", "ms?", "--seed", "1", "--self-test", "--markdown", str(path), "--binary", str(program)]
+        assert run.main(requests) == 0
         written.append(path.read_text())
     assert written[0] == written[1] and str(tmp_path) not in written[0]
     said = capsys.readouterr().out
@@ -306,9 +306,9 @@ def test_a_document_holds_the_figures_and_nothing_of_the_machine_s_files(tmp_pat
 
 
 def test_a_document_tells_what_is_wrong():
-    def spoiled(asked, answered, on_progress):
-        answer_files(asked, answered)
-        for path in answered.iterdir():
+    def spoiled(requests, answers, on_progress):
+        answer_files(requests, answers)
+        for path in answers.iterdir():
             if "mse" in path.name:
                 answer = dict(np.load(path))
                 exchange.write_answer(path, answer | {"out.loss": answer["out.loss"] * np.float32(1.01)})

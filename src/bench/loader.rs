@@ -1,8 +1,7 @@
 //! The loader: how many views a second reach training as tensors, and where the time goes.
 
 use super::video::write_videos;
-use crate::config::DataConfig;
-use crate::data::{LoadTimes, Loader, Sample, SceneGroups};
+use crate::data::{DataConfig, LoadTimes, Loader, Sample, SceneGroups};
 use crate::error::Result;
 use crate::eval::{peak_memory_bytes, resident_memory_bytes};
 use serde::Serialize;

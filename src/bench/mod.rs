@@ -6,7 +6,7 @@ mod train;
 mod video;
 
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
-pub use raster::{RasterReport, Stage, bench_raster, made_up_scene};
+pub use raster::{RasterReport, bench_raster, made_up_scene};
 pub use train::{TrainReport, bench_train};
 
 use serde::Serialize;
@@ -20,6 +20,15 @@ pub struct Spread {
     pub least: f64,
     /// Three of four are below: what a busy machine makes of it.
     pub upper_quartile: f64,
+}
+
+/// A part of some work.
+#[derive(Debug, Serialize)]
+pub struct Section {
+    /// What the part is called.
+    pub name: &'static str,
+    /// Of a view, or of a step.
+    pub milliseconds: Spread,
 }
 
 impl Spread {

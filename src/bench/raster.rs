@@ -1,28 +1,17 @@
 //! The splat op: from Gaussians in tensors to pictures, and back to gradients in tensors.
 
-use super::Spread;
-use crate::data::ImageSize;
+use super::{Section, Spread};
 use crate::error::Result;
 use crate::eval::{peak_memory_bytes, resident_memory_bytes};
-use crate::model::Gaussians;
-use crate::render::{
-    Cameras, DEFAULT_EPS2D, StageTimes, count_pairs, multiply_add_peak, render, simd_level, stage_times,
-};
+use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
+use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use std::time::Instant;
 use tch::{Kind, Tensor, no_grad};
-
-/// A part of the work.
-#[derive(Debug, Serialize)]
-pub struct Stage {
-    /// What the part is called.
-    pub name: &'static str,
-    /// Milliseconds per view.
-    pub milliseconds: Spread,
-}
 
 /// What [`bench_raster`] measured. All times are milliseconds per view.
 #[derive(Debug, Serialize)]
@@ -44,7 +33,7 @@ pub struct RasterReport {
     /// A call that records gradients, and its backward pass.
     pub forward_backward: Spread,
     /// In the order of the work.
-    pub stages: Vec<Stage>,
+    pub stages: Vec<Section>,
     /// What there is to blend, per view.
     pub pairs: Pairs,
     /// What the threads together reach with multiply-adds alone, in 10⁹ floating-point operations per second.
@@ -120,7 +109,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
             stages.push(stage_times());
         }
     }
-    let stage = |name, seconds: fn(&StageTimes) -> f64| Stage {
+    let stage = |name, seconds: fn(&StageTimes) -> f64| Section {
         name,
         milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
     };
@@ -132,7 +121,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         contributing: counts.contributing as f64 / views as f64,
     };
     let peak = multiply_add_peak(PEAK_SECONDS);
-    let rate = |stage: &Stage, operations: f64| {
+    let rate = |stage: &Section, operations: f64| {
         let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
         Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
     };

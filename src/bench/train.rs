@@ -1,12 +1,12 @@
 //! A training step: how long its parts take, and how much memory it needs.
 
-use super::Spread;
+use super::{Section, Spread};
 use crate::config::Config;
-use crate::data::{Capture, ImageSize, LoadTimes, LoadedScene, Sample};
+use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
 use crate::error::Result;
 use crate::eval::peak_memory_bytes;
-use crate::loss::PerceptualKind;
-use crate::scene::{Camera, Intrinsics};
+use crate::loss::{PerceptualKind, PerceptualLoss};
+use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::{Stopwatch, Trainer};
 use glam::{DMat4, DVec3};
 use rand::{RngCore, SeedableRng};
@@ -25,7 +25,7 @@ pub struct TrainReport {
     pub scenes: usize,
     /// Photos that the model sees of a scene.
     pub context_views: usize,
-    /// Pictures that it is asked for.
+    /// Pictures of a scene that are compared.
     pub target_views: usize,
     /// [height, width] of both.
     pub size: [u32; 2],
@@ -45,15 +45,6 @@ pub struct TrainReport {
     pub resident_peak: u64,
 }
 
-/// A part of a step.
-#[derive(Debug, Serialize)]
-pub struct Section {
-    /// What the part is called.
-    pub name: &'static str,
-    /// Of a step.
-    pub milliseconds: Spread,
-}
-
 /// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
 /// of noise, cameras on a short path. L_perc is left out where its weights aren't there.
 ///
@@ -62,7 +53,7 @@ pub struct Section {
 pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<TrainReport> {
     let mut config = config.clone();
     config.curriculum.full_capacity = true;
-    if !config.loss.perceptual_weights()?.is_file() {
+    if !PerceptualLoss::weights_file(&config.loss)?.is_file() {
         config.loss.perceptual = PerceptualKind::None;
     }
     let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;

@@ -3,11 +3,10 @@ use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{RasterReport, Spread, bench_loader, bench_raster, made_up_scene, made_up_videos};
-use globalsplat::config::DataConfig;
-use globalsplat::data::{ImageSize, TrainingScenes, open_capture, view_batch};
+use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
 use globalsplat::error::Error;
-use globalsplat::io::{check_writable_dir, read_ply};
-use globalsplat::render::Cameras;
+use globalsplat::io::{check_writable_dir, read_splat};
+use globalsplat::scene::ImageSize;
 use std::path::PathBuf;
 use std::sync::Arc;
 use tch::Device;
@@ -90,10 +89,10 @@ impl Raster {
         }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
-                let gaussians = read_ply(splat)?.gaussians;
+                let gaussians = read_splat(splat)?.gaussians;
                 let views = open_capture(scene)?.load_all(None)?;
                 let poses: Vec<_> = views.iter().map(|view| view.camera.c2w).collect();
-                (gaussians, Cameras::of(&view_batch(&views, &poses, Device::Cpu)))
+                (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };

@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
-use globalsplat::render::simd_level;
+use globalsplat::render::cpu::simd_level;
 use serde_json::json;
 
 /// Tell what this machine offers: libtorch, devices, SIMD level, threads, and the weights found.

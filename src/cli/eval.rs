@@ -1,25 +1,26 @@
 use super::{device, model, print_json, progress, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Dataset, Holdout, Split, View, open_capture};
+use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    CaptureScores, Evaluation, EvaluationIndex, Perceptual, Rendered, Subject, Sweep, contact_sheet, machine,
-    peak_memory_bytes, score_model, score_renders, score_splat, write_csv, write_evaluation, write_report,
+    CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep, contact_sheet, judge,
+    machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_file, read_ply, write_png};
+use globalsplat::io::{check_writable_dir, check_writable_file, write_png};
+use globalsplat::reconstruct::LoadedModel;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
-use tch::{Device, Tensor};
+use tch::Device;
 
 /// Score a model, splats or pictures against photos: PSNR, SSIM, and LPIPS where `make weights` was run.
 ///
-/// Of one capture (--scene): with --weights the model sees the views that are not held out and is asked for the others; with
-/// --splat or --renders all views are asked for.
+/// Of one capture (--scene): with --weights the model sees the views that are not held out, and the others are its targets; with
+/// --splat or --renders all views are targets.
 ///
 /// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
-/// asked for. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
+/// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
 /// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, anybody's pictures
 /// DIR/SCENE/000012.png, named by the frame.
 #[derive(Args)]
@@ -44,7 +45,7 @@ pub struct Eval {
     /// The data set: a folder of chunks with an index.json, one with such a folder named test, or one of captures
     #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
     data: Option<PathBuf>,
-    /// Which frames of its scenes are shown and asked for; may be given more than once
+    /// Context and target frames of its scenes; may be given more than once
     #[arg(long, value_name = "FILE.json", requires = "data", conflicts_with = "scene")]
     index: Vec<PathBuf>,
     /// Folder for the report and the scores
@@ -53,7 +54,7 @@ pub struct Eval {
     /// How the report calls what is scored; by default as its file or folder
     #[arg(long, requires = "data", conflicts_with = "scene")]
     name: Option<String>,
-    /// Views the model is asked for: every:N or every:N+K; by default as it was trained
+    /// Target views: every:N or every:N+K; by default as the model was trained
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
     /// Views the model sees, spread over the path of the camera; by default all that are not held out
@@ -87,25 +88,14 @@ impl Eval {
             check_writable_file(sheet)?;
         }
         let capture = open_capture(scene)?;
-        let (mut scores, views, pictures, rendered) = if let Some(path) = &self.splat {
-            with_pictures(score_splat(&read_ply(path)?.gaussians, &capture)?)
-        } else if let Some(path) = &self.weights {
-            let loaded = model::load(path, &self.precision, device)?;
-            let holdout = match &self.holdout {
-                Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
-                None => loaded.config.data.holdout,
-            };
-            with_pictures(score_model(&loaded, &capture, holdout, self.views)?)
-        } else {
-            let folder = self.renders.as_ref().expect("clap asks for one of the three");
-            let (scores, views, pictures) = score_renders(folder, &capture)?;
-            (scores, views, pictures, vec![])
-        };
-        let peak_memory = peak_memory_bytes(); // of the subject, not of the networks that judge it
+        let loaded = self.load_model(device)?;
+        let scene = self.one_scene(&capture, loaded.as_ref())?;
+        let made = self.method(loaded.as_ref()).synthesize(&scene)?;
+        let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
-        perceptual.add_to(&mut scores, &pictures, &views);
+        let scores = judge(&scene, &made, &perceptual)?;
         if let Some(sheet) = &self.sheet {
-            write_png(sheet, &contact_sheet(&views, &rendered))?;
+            write_png(sheet, &contact_sheet(&scene.target, &made.rendered))?;
         }
         if let Some(line) = perceptual.why_absent(&scores) {
             eprintln!("{line}");
@@ -118,6 +108,36 @@ impl Eval {
             print_table(&scores);
         }
         Ok(())
+    }
+
+    /// What a model is shown and has to match; of splats and pictures all photos.
+    fn one_scene(&self, capture: &Capture, loaded: Option<&LoadedModel>) -> Result<EvalScene> {
+        let Some(loaded) = loaded else { return Ok(EvalScene::all_views(capture)?) };
+        let data = &loaded.config.data;
+        let holdout = match &self.holdout {
+            Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
+            None => data.holdout,
+        };
+        Ok(EvalScene::held_out(capture, holdout, self.views, data.image_size)?)
+    }
+
+    fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
+        let load = |path: &PathBuf| model::load(path, &self.precision, device);
+        Ok(self.weights.as_ref().map(load).transpose()?)
+    }
+
+    /// The file or folder that is judged.
+    fn path(&self) -> &Path {
+        let paths = [&self.weights, &self.splat, &self.renders];
+        paths.into_iter().flatten().next().expect("clap asks for one of the three")
+    }
+
+    fn method<'a>(&self, loaded: Option<&'a LoadedModel>) -> Method<'a> {
+        match (loaded, &self.splat) {
+            (Some(loaded), _) => Method::Model(loaded),
+            (None, Some(_)) => Method::Splat(self.path().to_owned()),
+            (None, None) => Method::Renders(self.path().to_owned()),
+        }
     }
 }
 
@@ -134,26 +154,19 @@ impl Eval {
         }
         let dataset = Dataset::open(data, Split::Test)?;
         check_writable_dir(out)?;
-        let load = |path: &PathBuf| model::load(path, &self.precision, device);
-        let loaded = self.weights.as_ref().map(load).transpose()?;
+        let (loaded, path) = (self.load_model(device)?, self.path());
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
         for (index, folder) in indices.iter().zip(folders) {
-            let (subject, path) = match (&loaded, &self.weights, &self.splat, &self.renders) {
-                (Some(loaded), Some(path), ..) => (Subject::Model(loaded), path),
-                (.., Some(path), _) => (Subject::Splats(path.clone()), path),
-                (.., Some(path)) => (Subject::Renders(path.clone()), path),
-                _ => unreachable!("clap asks for one of the three"),
-            };
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             let precision = match self.precision.as_str() {
                 "f32" => String::new(),
                 other => format!(" {other}"),
             };
             let sweep = Sweep {
-                subject,
-                method: self.name.clone().unwrap_or(stem + &precision),
+                method: self.method(loaded.as_ref()),
+                name: self.name.clone().unwrap_or(stem + &precision),
                 fingerprint: fingerprint(path)? + &precision,
                 dataset: &dataset,
                 index,
@@ -230,7 +243,7 @@ impl Eval {
     }
 }
 
-/// [height, width] of the protocol's pictures (SPEC section 9).
+/// [height, width] of the protocol's pictures (spec 9.1).
 const PROTOCOL_SIZE: [u32; 2] = [256, 256];
 
 /// Where each index's scores go: into `out` itself where there is one alone.
@@ -257,15 +270,6 @@ fn fingerprint(path: &Path) -> Result<String> {
     }
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     Ok(format!("{} {:08x}", path.file_name().unwrap_or_default().display(), crc32fast::hash(&bytes)))
-}
-
-type Scored = (CaptureScores, Vec<View>, Vec<Rendered>);
-
-fn with_pictures(
-    (scores, views, rendered): Scored,
-) -> (CaptureScores, Vec<View>, Vec<Tensor>, Vec<Rendered>) {
-    let pictures = rendered.iter().map(|r| r.rgb.shallow_clone()).collect();
-    (scores, views, pictures, rendered)
 }
 
 fn print_table(scores: &CaptureScores) {

@@ -3,7 +3,8 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
-use globalsplat::io::{CONFIG_KEY, read_ply, read_weights};
+use globalsplat::io::{read_splat, read_weights};
+use globalsplat::reconstruct::CONFIG_KEY;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -60,13 +61,13 @@ fn range(t: &Tensor) -> Value {
 }
 
 fn splat(path: &Path) -> Result<Value> {
-    let ply = read_ply(path)?;
-    let g = &ply.gaussians;
+    let splat = read_splat(path)?;
+    let g = &splat.gaussians;
     let axis = |i: i64| range(&g.means.select(-1, i));
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
-        "sh_degree": ply.sh_degree,
+        "sh_degree": splat.sh_degree(),
         "bytes": std::fs::metadata(path)?.len(),
         "x": axis(0),
         "y": axis(1),

@@ -22,8 +22,8 @@ mod train;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
-use globalsplat::data::ImageSize;
 use globalsplat::error::panic_message;
+use globalsplat::scene::ImageSize;
 use std::panic;
 use std::process::ExitCode;
 use std::sync::Arc;

@@ -1,6 +1,6 @@
 //! `--weights` and `--precision f32|bf16`.
 
-use globalsplat::io::{LoadedModel, load_model};
+use globalsplat::reconstruct::{LoadedModel, load_model};
 use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;

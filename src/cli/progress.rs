@@ -1,11 +1,94 @@
-//! Progress bars on standard error, quiet where that is no terminal.
+//! Progress on standard error: a bar where that is a terminal, else a line every half minute.
 
 use indicatif::{ProgressBar, ProgressStyle};
+use std::io::{IsTerminal, stderr};
+use std::ops::Deref;
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::time::Duration;
 
-/// A bar of `length` items with rate and time left.
-pub fn bar(length: u64, unit: &str) -> ProgressBar {
+/// Between lines.
+const PAUSE: Duration = Duration::from_secs(30);
+
+/// A bar, and a thread that writes lines where nobody sees it.
+pub struct Progress {
+    bar: ProgressBar,
+    /// Ends the thread by being dropped.
+    _lines: Option<Sender<()>>,
+}
+
+/// Progress over `length` items with rate and time left.
+pub fn bar(length: u64, unit: &'static str) -> Progress {
     let template = format!("{{bar:30}} {{pos}}/{{len}} {unit} {{per_sec}} {{elapsed}} <{{eta}} {{msg}}");
     let style =
         ProgressStyle::with_template(&template).expect("a template that is right").progress_chars("━╸─");
-    ProgressBar::new(length).with_style(style)
+    let bar = ProgressBar::new(length).with_style(style);
+    let lines = (!stderr().is_terminal()).then(|| write_lines(bar.clone(), unit));
+    Progress { bar, _lines: lines }
+}
+
+impl Deref for Progress {
+    type Target = ProgressBar;
+
+    fn deref(&self) -> &ProgressBar {
+        &self.bar
+    }
+}
+
+fn write_lines(bar: ProgressBar, unit: &'static str) -> Sender<()> {
+    let (sender, receiver) = channel();
+    std::thread::spawn(move || {
+        while receiver.recv_timeout(PAUSE) == Err(RecvTimeoutError::Timeout) && !bar.is_finished() {
+            eprintln!("globalsplat: {}", line(&bar, unit));
+        }
+    });
+    sender
+}
+
+/// Where the work stands, as `600 of 3000 steps, 8.1 a second, 5 minutes left, loss 0.02`.
+fn line(bar: &ProgressBar, unit: &str) -> String {
+    let (done, of) = (bar.position(), bar.length().unwrap_or(0));
+    let mut line = format!("{done} of {of} {unit}");
+    if done > 0 {
+        line += &format!(", {:.1} a second, {} left", bar.per_sec(), duration(bar.eta()));
+    }
+    if !bar.message().is_empty() {
+        line += &format!(", {}", bar.message());
+    }
+    line
+}
+
+/// In words, to the precision that anybody needs.
+fn duration(time: Duration) -> String {
+    let (minutes, hours) = (time.as_secs().div_ceil(60), time.as_secs() / 3600);
+    match time.as_secs() {
+        ..90 => format!("{} seconds", time.as_secs()),
+        90..7200 => format!("{minutes} minutes"),
+        _ => format!("{hours} hours"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_tell_where_the_work_stands() {
+        let bar = ProgressBar::hidden();
+        bar.set_length(10);
+        assert_eq!(line(&bar, "scenes"), "0 of 10 scenes");
+        bar.set_position(4);
+        bar.set_message("loss 0.5");
+        let line = line(&bar, "scenes");
+        assert!(line.starts_with("4 of 10 scenes, ") && line.ends_with(" left, loss 0.5"), "{line}");
+    }
+
+    #[test]
+    fn durations_are_in_words() {
+        let of = |seconds| duration(Duration::from_secs(seconds));
+        assert_eq!((of(5), of(89), of(100)), ("5 seconds".into(), "89 seconds".into(), "2 minutes".into()));
+        assert_eq!(
+            (of(7199), of(7200), of(90_000)),
+            ("120 minutes".into(), "2 hours".into(), "25 hours".into())
+        );
+    }
 }

@@ -1,10 +1,11 @@
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Holdout, open_capture, spread_over_path};
+use globalsplat::data::{Holdout, open_capture};
 use globalsplat::error::Error;
-use globalsplat::eval::{peak_memory_bytes, reconstruct};
-use globalsplat::io::{check_writable_file, write_ply};
+use globalsplat::eval::peak_memory_bytes;
+use globalsplat::io::{Splat, check_writable_file, write_splat};
+use globalsplat::reconstruct::{load_context, reconstruct};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -49,11 +50,9 @@ impl Reconstruct {
         check_writable_file(&self.out)?;
         let loaded = model::load(&self.weights, &self.precision, device)?;
         let capture = open_capture(&self.scene)?;
-        let (shown, _) = holdout.split(capture.len());
-        let chosen = spread_over_path(&capture.cameras(), &shown, self.views);
-        let views = capture.load(&chosen, Some(loaded.config.data.image_size))?;
+        let views = load_context(&capture, holdout, Some(self.views), loaded.config.data.image_size)?;
         let reconstruction = reconstruct(&loaded, &views, &[])?;
-        write_ply(&self.out, &reconstruction.in_world())?;
+        write_splat(&self.out, &Splat::of(&reconstruction.in_world())?)?;
 
         let bytes = std::fs::metadata(&self.out)?.len();
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());

@@ -2,14 +2,14 @@ use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::{DMat4, DVec3};
-use globalsplat::data::{ImageSize, open_capture, read_camera_path};
+use globalsplat::data::{open_capture, read_camera_path};
 use globalsplat::error::Error;
-use globalsplat::eval::{Rendered, render_views};
 use globalsplat::io::{
-    Ply, check_writable_dir, check_writable_file, colourize_depth, read_ply, tile_horizontally, write_film,
-    write_png,
+    Splat, check_writable_dir, check_writable_file, colourize_depth, read_splat, tile_horizontally,
+    write_film, write_png,
 };
-use globalsplat::scene::{Camera, Intrinsics, orbit_around_cameras, orbit_around_point};
+use globalsplat::render::{Rendered, render_views};
+use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_cameras, orbit_around_point};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -69,7 +69,7 @@ impl Render {
         } else {
             check_writable_dir(&self.out)?
         }
-        let splat = read_ply(&self.splat)?;
+        let splat = read_splat(&self.splat)?;
         let (names, cameras) = self.cameras(&splat)?;
 
         let bar = progress::bar(cameras.len() as u64, "views");
@@ -120,7 +120,7 @@ impl Render {
         parts
     }
 
-    fn cameras(&self, splat: &Ply) -> Result<(Vec<String>, Vec<Camera>)> {
+    fn cameras(&self, splat: &Splat) -> Result<(Vec<String>, Vec<Camera>)> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let resized = |cameras: Vec<Camera>| -> Vec<Camera> {
             match size {
@@ -164,14 +164,14 @@ fn with_size(camera: &Camera, ImageSize { width, height }: ImageSize) -> Camera 
 }
 
 /// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer.
-fn median_depth(splat: &Ply, cameras: &[Camera]) -> Result<f64> {
+fn median_depth(splat: &Splat, cameras: &[Camera]) -> Result<f64> {
     let rendered = render_views(&splat.gaussians, &cameras[cameras.len() / 2..][..1])?.remove(0);
     let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
     Ok(if seen.numel() == 0 { 1. } else { seen.median().double_value(&[]) })
 }
 
 /// Around the middle of the splat's opaque part, far enough to see most of it.
-fn orbit_around_splat(splat: &Ply, ImageSize { width, height }: ImageSize, frames: usize) -> Vec<Camera> {
+fn orbit_around_splat(splat: &Splat, ImageSize { width, height }: ImageSize, frames: usize) -> Vec<Camera> {
     let g = &splat.gaussians;
     let means = g.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);

@@ -1,10 +1,10 @@
 use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::ImageSize;
+use globalsplat::data::write_room;
 use globalsplat::error::Error;
 use globalsplat::io::check_writable_dir;
-use globalsplat::synth::write_room;
+use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::path::PathBuf;
 

@@ -6,7 +6,7 @@ use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores};
 use globalsplat::io::check_writable_dir;
-use globalsplat::loss::psnr_of_mse;
+use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
 use std::path::PathBuf;
@@ -122,7 +122,7 @@ impl Train {
                 first = false;
             }
             bar.set_position(report.step + 1);
-            let mse = report.losses.mse;
+            let mse = report.losses[Term::Mse];
             let mse = smooth_mse.map_or(mse, |old: f64| 0.98 * old + 0.02 * mse);
             // What a skipped step was off by is no number.
             smooth_mse = Some(mse).filter(|mse| mse.is_finite()).or(smooth_mse);

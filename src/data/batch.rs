@@ -1,6 +1,7 @@
 //! Views as the tensors that model and renderer take.
 
 use super::capture::View;
+use crate::render::Cameras;
 use crate::scene::{Camera, pose_to_rows};
 use glam::DMat4;
 use std::borrow::Borrow;
@@ -46,6 +47,17 @@ impl ViewBatch {
         let cat =
             |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
         ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
+    }
+
+    /// The cameras that took the views.
+    pub fn cameras(&self) -> Cameras {
+        let size = self.images.size();
+        Cameras {
+            w2c: self.w2c.shallow_clone(),
+            intrinsics: self.intrinsics.shallow_clone(),
+            width: size[4],
+            height: size[3],
+        }
     }
 
     /// The views at `positions`, of every scene.

@@ -1,7 +1,7 @@
-//! Data sets: many captures under one name.
+//! Data sets: many captures under one name (spec 10.8).
 
-use super::capture::{Capture, capture_folders, folder_name, open_capture};
-use super::chunk::{Chunk, INDEX_FILE};
+use super::capture::Capture;
+use super::formats::{Chunk, INDEX_FILE, capture_folders, folder_name, open_capture};
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

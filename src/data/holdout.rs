@@ -1,4 +1,4 @@
-//! Which views are shown to the model and which are kept to ask about.
+//! Which views a model is shown, and which are held out to score it by.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;

@@ -1,43 +1,26 @@
 //! Captures: posed photos on disk, read, checked, resized, and put into tensors.
 
-mod augment;
-mod bad_data;
 mod batch;
-mod cameras_json;
 mod capture;
-mod chunk;
-mod colmap;
+mod config;
 mod dataset;
-mod distortion;
+mod formats;
 mod holdout;
-mod jitter;
-mod loader;
-mod open_groups;
-mod order;
-mod planes;
-mod preprocess;
-mod resample;
-mod sample;
-mod sampler;
-mod scenes;
-mod spread;
-mod transforms_json;
+mod loading;
+mod pixels;
+mod room;
 
-pub use augment::Augmentation;
-pub use bad_data::BadData;
 pub use batch::{ViewBatch, view_batch};
-pub use cameras_json::write_cameras_json;
-pub use capture::{Capture, View, find_captures, open_capture, read_camera_path};
-pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
+pub use capture::{Capture, View};
+pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
+pub use formats::{
+    Chunk, ChunkWriter, INDEX_FILE, find_captures, open_capture, read_camera_path, write_cameras_json,
+};
 pub use holdout::Holdout;
-pub use jitter::{Adjustment, Jitter, JitterConfig};
-pub use loader::{LoadTimes, LoadedScene, Loader};
-pub use order::{Order, Place};
-pub use planes::Planes;
-pub use preprocess::{ImageSize, fit};
-pub use resample::{Region, Resampler};
-pub use sample::Sample;
-pub use sampler::{ChosenViews, Sampling, choose_views};
-pub use scenes::{SceneGroups, TrainingScenes};
-pub use spread::spread_over_path;
+pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Sample, SceneGroups, TrainingScenes};
+pub use pixels::{Planes, fit};
+pub use room::write_room;
+
+// For the parity checks, which run every part by itself.
+pub(crate) use pixels::{Jitter, Region, Resampler};

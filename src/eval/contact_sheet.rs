@@ -1,8 +1,8 @@
 //! Truth, render and depth side by side: what a person looks at first.
 
-use super::protocol::Rendered;
 use crate::data::View;
 use crate::io::{colourize_depth, enlarge, tile_horizontally, tile_vertically};
+use crate::render::Rendered;
 use tch::Tensor;
 
 /// Small pictures are enlarged to about this many pixels.

@@ -1,9 +1,9 @@
 //! What an evaluation over a data set found: the contents of `scores.json`, which the report shows.
 
-use super::protocol::CaptureScores;
+use super::scores::CaptureScores;
 use serde::{Deserialize, Serialize};
 
-/// One subject (a model, somebody's splats, somebody's pictures) scored by one index.
+/// One method (a model, somebody's splats, somebody's pictures) scored by one index.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Evaluation {
     /// How its row is called in tables.
@@ -74,7 +74,7 @@ pub struct SceneScores {
     pub scores: CaptureScores,
     /// Frames that were shown.
     pub context: Vec<usize>,
-    /// Frames that were asked for.
+    /// Frames that had to be matched.
     pub target: Vec<usize>,
     /// Size of the splat as a PLY, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -116,6 +116,26 @@ impl Summary {
             lpips_alex: mean(&|s| s.lpips_alex),
             gaussians: mean(&|s| s.gaussians.map(|n| n as f64)),
         }
+    }
+}
+
+impl Efficiency {
+    /// Of scenes that a model was run on; none where it wasn't.
+    pub(super) fn of(scenes: &[SceneScores]) -> Option<Self> {
+        let time = |scene: &SceneScores| scene.forward_seconds;
+        let mut times: Vec<f64> = scenes.iter().filter(|scene| !scene.warm_up).filter_map(time).collect();
+        if times.is_empty() {
+            times = scenes.iter().filter_map(time).collect();
+        }
+        let bytes: Vec<f64> = scenes.iter().filter_map(|scene| Some(scene.splat_bytes? as f64)).collect();
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        (!times.is_empty()).then(|| Efficiency {
+            forward_seconds: mean(&times),
+            timed_scenes: times.len(),
+            peak_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_memory_bytes).max().unwrap_or(0),
+            peak_device_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_device_memory_bytes).max(),
+            splat_bytes: mean(&bytes),
+        })
     }
 }
 

@@ -1,9 +1,11 @@
-//! Validation: what training never shows is asked for while it goes on.
+//! Validation: what training never shows is rendered and scored while it goes on (spec 8.8).
 
-use super::protocol::{CaptureScores, ask, colours, nearest_context_baseline, score, split_views};
-use crate::config::DataConfig;
-use crate::data::{Capture, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, spread_over_path};
+use super::method::{colours, synthesize_views};
+use super::scene::split_views;
+use super::scores::{CaptureScores, nearest_context_baseline, score};
+use crate::data::{Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View};
 use crate::error::{Error, Result};
+use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
@@ -14,7 +16,7 @@ pub struct HeldOut {
     scores: Vec<HeldOutScores>,
 }
 
-/// What is asked for.
+/// Where target views come from.
 #[derive(Debug)]
 enum HeldOutScene {
     /// The views that are held out of a capture.
@@ -74,7 +76,7 @@ impl HeldOut {
 }
 
 impl HeldOutScene {
-    /// Its name, the views to show and those to ask for.
+    /// Its name, context and target views.
     fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
         let size = Some(config.image_size);
         let (capture, (context, target)) = match self {
@@ -113,7 +115,7 @@ impl Validator for HeldOut {
                     continue;
                 }
             };
-            let (reconstruction, rendered) = ask(trainer, &context, &target)?;
+            let (reconstruction, rendered) = synthesize_views(trainer.as_model(), &context, &target)?;
             let count = reconstruction.gaussians.count();
             scores.push(HeldOutScores {
                 ours: score(&name, &colours(&rendered), &target, Some(count))?,
@@ -145,7 +147,7 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
-/// The views of a held-out scene that a model is shown and those that it is asked for, always the same: as many as in
+/// The context and target views of a held-out scene, always the same: as many as in
 /// training, at even distances along the camera's path, from the middle of a video that is longer than training's.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();

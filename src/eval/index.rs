@@ -1,4 +1,4 @@
-//! Evaluation indices: which frames of which scenes are shown, and which are asked for.
+//! Evaluation indices: which frames of which scenes are context, and which are targets.
 
 use crate::error::{Error, Result};
 use serde::Deserialize;
@@ -10,11 +10,11 @@ use std::path::{Path, PathBuf};
 pub struct SceneFrames {
     /// Shown to the model.
     pub context: Vec<usize>,
-    /// Asked for.
+    /// What has to be matched.
     pub target: Vec<usize>,
 }
 
-/// The contents of an index file: {scene: {"context": [frames], "target": [frames]}}, where null stands for a scene that is
+/// The contents of an index file: `{scene: {"context": [frames], "target": [frames]}}`, where null stands for a scene that is
 /// left out.
 #[derive(Debug, Clone)]
 pub struct EvaluationIndex {

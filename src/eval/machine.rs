@@ -1,7 +1,7 @@
 //! What the figures were measured on.
 
 use crate::error::Result;
-use crate::render::simd_level;
+use crate::render::cpu::simd_level;
 use tch::Device;
 
 /// Processor, cores and device, as `Intel(R) Xeon(R), 2 cores, avx512`.

@@ -1,10 +1,11 @@
 //! LPIPS in evaluation: wherever its weights are found.
 
-use super::protocol::{CaptureScores, ViewScore};
-use crate::data::{ImageSize, View};
+use super::scores::{CaptureScores, ViewScore};
+use crate::data::View;
 use crate::error::Result;
 use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
 use crate::loss::{Lpips, LpipsNetwork};
+use crate::scene::ImageSize;
 use tch::{Device, Tensor};
 
 /// The networks whose weights were found.
@@ -15,7 +16,7 @@ pub struct Perceptual {
 }
 
 impl Perceptual {
-    /// Loads what is in [`pretrained_folders`]. Weights that are absent are no error.
+    /// Loads what is in the folders of pretrained weights. Weights that are absent are no error.
     ///
     /// # Errors
     /// A file that holds something else.

@@ -1,4 +1,4 @@
-//! What the paper's tables say, method by method, exactly as printed there.
+//! What the paper's tables say, method by method, exactly as printed there (spec 9.6).
 
 use serde::Deserialize;
 use std::collections::BTreeMap;

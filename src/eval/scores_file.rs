@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 const SCORES: &str = "scores.json";
 
 /// The picture of a scene's worst view in the folder of its evaluation: truth, render, error and depth side by side.
-pub fn strip_path(folder: &Path, scene: &str) -> PathBuf {
+pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
     folder.join("scenes").join(format!("{}.jpg", scene_file_name(scene)))
 }
 

@@ -2,23 +2,28 @@
 
 mod append;
 mod atomic;
+mod environment;
 mod event_file;
 mod film;
 mod images;
-mod model_file;
-mod ply;
 mod pretrained;
+mod splat;
 mod weights;
 
-pub use append::AppendFile;
-pub use atomic::{check_writable_dir, check_writable_file, recover_dirs, replace_dir, write_atomically};
-pub use event_file::EventFile;
+pub use atomic::{check_writable_dir, check_writable_file};
 pub use film::write_film;
 pub use images::{
-    Photo, colourize_depth, decode_photo, encode_photo, encoded_image_size, enlarge, read_image,
-    read_image_size, tensor_from_rgb, tile_horizontally, tile_vertically, write_jpeg, write_png,
+    Photo, colourize_depth, decode_photo, read_image, tensor_from_rgb, tile_horizontally, write_png,
 };
-pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, load_model, save_model};
-pub use ply::{Ply, ply_size, read_ply, write_ply};
-pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
+pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
+pub use splat::{Splat, read_splat, write_splat};
 pub use weights::{Weights, read_weights, write_weights};
+
+pub(crate) use append::AppendFile;
+pub(crate) use atomic::{recover_dirs, replace_dir, write_atomically};
+pub(crate) use environment::expand_path;
+pub(crate) use event_file::EventFile;
+pub(crate) use images::{
+    encode_photo, encoded_image_size, enlarge, read_image_size, tile_vertically, write_jpeg,
+};
+pub(crate) use pretrained::pretrained_folders;

@@ -5,8 +5,7 @@ use std::path::PathBuf;
 /// Names the folder of pretrained weights; no other is looked at where it is set.
 pub const WEIGHTS_VARIABLE: &str = "GLOBALSPLAT_WEIGHTS";
 
-/// Folders in which pretrained weights may be, the first choice first: the one that [`WEIGHTS_VARIABLE`] names, else
-/// `weights` here, else where `make weights` put them when this program was built.
+/// Folders in which pretrained weights may be, the first choice first.
 pub fn pretrained_folders() -> Vec<PathBuf> {
     match std::env::var_os(WEIGHTS_VARIABLE) {
         Some(folder) => vec![folder.into()],
@@ -14,7 +13,8 @@ pub fn pretrained_folders() -> Vec<PathBuf> {
     }
 }
 
-/// The file of that name in the first of [`pretrained_folders`] that has it.
+/// The file of that name in the first folder of pretrained weights that has it: the one that [`WEIGHTS_VARIABLE`] names, else
+/// `weights` here, else where `make weights` put them when this program was built.
 pub fn find_pretrained(name: &str) -> Option<PathBuf> {
     pretrained_folders().into_iter().map(|folder| folder.join(name)).find(|path| path.is_file())
 }

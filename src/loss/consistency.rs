@@ -1,7 +1,20 @@
-//! L_con: two subsets of the photos have to tell the same geometry (SPEC section 7).
+//! L_con: two subsets of the photos have to tell the same geometry (spec 7.7).
 
-use super::Share;
 use tch::{Kind, Tensor};
+
+/// What a forward pass is of a training step, which may go through the model in slices.
+#[derive(Debug)]
+pub struct Share {
+    /// Of the step's scenes.
+    pub scenes: f64,
+    /// Pixels of the whole step whose depth L_con compares, a scalar; none where this pass is the whole step.
+    pub depth_pixels: Option<Tensor>,
+}
+
+impl Share {
+    /// All of it.
+    pub const WHOLE: Share = Share { scenes: 1., depth_pixels: None };
+}
 
 /// Depth is compared where both splats are at least this opaque.
 const MIN_ALPHA: f64 = 0.01;

@@ -1,7 +1,6 @@
-//! L_dec: keeps the decoder's raw numbers in a range where they can be learned (SPEC section 7).
+//! L_dec: keeps the decoder's raw numbers in a range where they can be learned (spec 7.6).
 
 use crate::model::RawOutputs;
-use std::ops::Mul;
 use tch::{Kind, Tensor};
 
 /// The term's own factor.
@@ -41,20 +40,6 @@ pub fn decoder_regularization(raw: &RawOutputs, opacity: bool) -> DecoderRegular
     };
     let total = (&scale + &rotation + &sh + &opacity) * FACTOR;
     DecoderRegularization { total, opacity, scale, rotation, sh }
-}
-
-impl Mul<f64> for DecoderRegularization {
-    type Output = Self;
-
-    fn mul(self, factor: f64) -> Self {
-        DecoderRegularization {
-            total: self.total * factor,
-            opacity: self.opacity * factor,
-            scale: self.scale * factor,
-            rotation: self.rotation * factor,
-            sh: self.sh * factor,
-        }
-    }
 }
 
 /// mean softplus(|c| − 5)².

@@ -1,4 +1,4 @@
-//! L_fru: pulls Gaussians that no input view can see back into some view's frustum (SPEC section 7).
+//! L_fru: pulls Gaussians that no input view can see back into some view's frustum (spec 7.5).
 
 use crate::data::ViewBatch;
 use tch::{Kind, Tensor};
@@ -13,7 +13,7 @@ const SOFTNESS: f64 = 10.;
 /// Mean over Gaussians and scenes of log(1 + v/10), v the smallest violation over the views: how far the projection lies
 /// outside of the image, in pixels, plus how far the depth lies outside of [0.01, far].
 ///
-/// `means` [B, N, 3], `far` [B]. A scalar.
+/// `means` [B, N, 3], `far` `[B]`. A scalar.
 pub fn frustum(means: &Tensor, views: &ViewBatch, far: &Tensor) -> Tensor {
     let (height, width) = (views.images.size()[3], views.images.size()[4]);
     let rotation = views.w2c.narrow(-2, 0, 3).narrow(-1, 0, 3);

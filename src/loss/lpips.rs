@@ -207,7 +207,7 @@ impl Lpips {
         })
     }
 
-    /// Σ over layers of the mean over pixels of Σ over channels of w (â − b̂)²: [B] of two times B pictures.
+    /// Σ over layers of the mean over pixels of Σ over channels of w (â − b̂)²: `[B]` of two times B pictures.
     pub fn compare(&self, a: impl Iterator<Item = Tensor>, b: impl Iterator<Item = Tensor>) -> Tensor {
         let linear = self.steps.iter().filter_map(|step| step.linear.as_ref());
         linear

@@ -1,4 +1,4 @@
-//! The rendering loss's first half: ‖I − Î‖² per element.
+//! The rendering loss's first half: ‖I − Î‖² per element (spec 7.2).
 
 use tch::{Kind, Tensor};
 

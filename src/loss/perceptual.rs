@@ -1,26 +1,13 @@
-//! L_perc (SPEC section 7): pictures look as their truth, to a network that was trained on photos.
+//! L_perc (spec 7.3 and 7.4): pictures look as their truth, to a network that was trained on photos.
 
-use super::{Lpips, LpipsNetwork, Vgg19};
-use crate::config::LossConfig;
-use crate::data::ImageSize;
+use super::config::{LossConfig, PerceptualKind};
+use super::lpips::{Lpips, LpipsNetwork};
+use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
-use serde::{Deserialize, Serialize};
-use std::path::Path;
+use crate::io::{expand_path, find_pretrained, pretrained_folders};
+use crate::scene::ImageSize;
+use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
-
-/// Which network compares.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PerceptualKind {
-    /// None: L_perc is left out.
-    None,
-    /// Features of VGG-19.
-    Vgg19,
-    /// LPIPS with VGG-16.
-    LpipsVgg,
-    /// LPIPS with AlexNet.
-    LpipsAlex,
-}
 
 /// A network that compares, with its weights.
 #[derive(Debug)]
@@ -37,8 +24,7 @@ impl PerceptualLoss {
     /// # Errors
     /// A file that isn't there, and how to get it; one that holds another network; pictures too small for the network.
     pub fn load(config: &LossConfig, size: ImageSize, device: Device) -> Result<Option<Self>> {
-        let file = config.perceptual_weights()?;
-        let file = Path::new(&file);
+        let file = &Self::weights_file(config)?;
         let (expected, how) = match config.perceptual {
             PerceptualKind::None => return Ok(None),
             PerceptualKind::Vgg19 => (
@@ -70,6 +56,23 @@ impl PerceptualLoss {
             )));
         }
         Ok(Some(loss))
+    }
+
+    /// The file that `config` names, environment variables filled in; where it names none, the file that `make weights` makes, or
+    /// would be called.
+    ///
+    /// # Errors
+    /// A variable that isn't set and has no default.
+    pub fn weights_file(config: &LossConfig) -> Result<PathBuf> {
+        if !config.perceptual_weights.is_empty() {
+            return expand_path(&config.perceptual_weights);
+        }
+        let name = match config.perceptual {
+            PerceptualKind::LpipsVgg => LpipsNetwork::Vgg16.file_name(),
+            PerceptualKind::LpipsAlex => LpipsNetwork::AlexNet.file_name(),
+            PerceptualKind::Vgg19 | PerceptualKind::None => "vgg19.safetensors",
+        };
+        Ok(find_pretrained(name).unwrap_or_else(|| pretrained_folders()[0].join(name)))
     }
 
     fn smallest_side(&self) -> i64 {

@@ -1,4 +1,4 @@
-//! L_perc of kind `vgg19` (SPEC section 7): how far apart a picture's and its truth's features are in VGG-19 (Simonyan &
+//! L_perc of kind `vgg19` (spec 7.3): how far apart a picture's and its truth's features are in VGG-19 (Simonyan &
 //! Zisserman 2015) with average pooling.
 
 use crate::error::Result;

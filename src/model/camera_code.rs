@@ -1,4 +1,4 @@
-//! The camera code: one vector per view that tells a Plücker ray's view from another's (SPEC section 3).
+//! The camera code: one vector per view that tells a Plücker ray's view from another's (spec 3.3).
 
 use super::layers::default_linear;
 use std::f64::consts::PI;

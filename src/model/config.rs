@@ -13,7 +13,7 @@ pub enum Streams {
     Single,
 }
 
-/// The numbers of SPEC sections 3 to 5. The default is the main 16K model.
+/// The numbers of spec 3 to 5. The default is the main 16K model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelConfig {

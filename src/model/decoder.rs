@@ -1,12 +1,12 @@
-//! Two linear heads, and what makes Gaussians of their numbers (SPEC section 5).
+//! Two linear heads, and what makes Gaussians of their numbers (spec 5.1, 5.2 and 5.5).
 
 use super::config::ModelConfig;
 use super::encoder::Encoded;
-use super::gaussians::Gaussians;
 use super::layers::linear;
 use super::merge::{Candidates, Stage};
 use super::precision::Precision;
 use super::rotation::{normalize, quaternion_from_6d};
+use crate::scene::Gaussians;
 use std::f64::consts::LN_2;
 use tch::{Tensor, nn, nn::Module};
 

@@ -1,16 +1,14 @@
-//! The encoder: a fixed set of scene tokens reads every view, in two streams (SPEC section 4).
+//! The encoder: a fixed set of scene tokens reads every view, in two streams (spec 4.1).
 
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, randn};
 use super::mixer::Mixer;
 use super::precision::Precision;
-use super::stream::StreamRound;
+use super::stream::{REGISTERS, StreamRound};
 use tch::{Tensor, nn, nn::Module};
 
 /// Query tokens before the scene tokens; not decoded.
 const AUXILIARIES: i64 = 4;
-/// Tokens after the global token that only take part in self-attention.
-pub(super) const REGISTERS: i64 = 4;
 /// Learned tokens at the head of the memory.
 const MEMORY_REGISTERS: i64 = 4;
 

@@ -1,4 +1,4 @@
-//! The pieces that streams and mixer are made of, with the initializations of SPEC section 4.
+//! The pieces that streams and mixer are made of, with the initializations of spec 4.4.
 
 use super::precision::Precision;
 use tch::{Tensor, nn};
@@ -6,7 +6,7 @@ use tch::{Tensor, nn};
 /// Of encoder linears and learnable tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
 
-/// Normal with mean 0. Where SPEC says truncated normal the cut is at ±2, as in torch's `trunc_normal_`: a hundred
+/// Normal with mean 0. Where spec 4.4 truncates normals the cut is at ±2, as in torch's `trunc_normal_`: a hundred
 /// standard deviations away, so it is the plain normal.
 pub(super) fn randn(stdev: f64) -> nn::Init {
     nn::Init::Randn { mean: 0., stdev }

@@ -1,4 +1,5 @@
-//! From K candidates per scene token to the G = 2^s Gaussians of a stage, and from one stage to the next (SPEC section 5).
+//! From K candidates per scene token to the G = 2^s Gaussians of a stage, and from one stage to the next
+//! (spec 5.3 and 5.4).
 
 use serde::{Deserialize, Serialize};
 use std::f64::consts::LN_2;

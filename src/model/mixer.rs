@@ -1,4 +1,4 @@
-//! Where the two streams meet, once per round (SPEC section 4).
+//! Where the two streams meet, once per round (spec 4.3).
 
 use super::layers::{LayerScale, Mlp, layer_norm};
 use super::precision::Precision;

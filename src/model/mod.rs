@@ -1,4 +1,4 @@
-//! The network: posed images to Gaussians (SPEC sections 3 to 5, the paper's figure 2), in the order data flows.
+//! The network: posed images to Gaussians (spec 3 to 5, the paper's figure 2), in the order data flows.
 //!
 //! Parameters carry the names of the published weights, so that a model trained here and one published by the authors
 //! are the same file after a change of container.
@@ -7,7 +7,6 @@ mod camera_code;
 mod config;
 mod decoder;
 mod encoder;
-mod gaussians;
 mod layers;
 mod leaves;
 mod merge;
@@ -19,13 +18,10 @@ mod stream;
 mod tokens;
 
 pub use config::{ModelConfig, Streams};
-pub use decoder::{Decoded, Decoder, RawOutputs};
-pub use encoder::{Encoded, Encoder};
-pub use gaussians::Gaussians;
+pub use decoder::{Decoded, RawOutputs};
+pub use encoder::Encoded;
 pub use merge::Stage;
 pub use precision::Precision;
-pub use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
-pub use tokens::{Tokenizer, patchify};
 
 // For training, which goes through the model in parts.
 pub(crate) use leaves::{leaf, pull_back};
@@ -33,11 +29,13 @@ pub(crate) use recompute::KeptRounds;
 
 // For the parity checks, which run every module by itself.
 pub(crate) use camera_code::CameraCode;
-pub(crate) use decoder::MAX_SCALE;
+pub(crate) use decoder::{Decoder, MAX_SCALE};
+pub(crate) use encoder::Encoder;
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
+pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub(crate) use stream::{SelfAttentionBlock, StreamRound};
-pub(crate) use tokens::{RayTokens, RgbTokens};
+pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, randn};

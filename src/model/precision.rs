@@ -1,4 +1,4 @@
-//! What matrix products are computed in.
+//! What matrix products are computed in (spec 1.3).
 
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;

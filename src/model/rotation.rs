@@ -1,4 +1,4 @@
-//! Rotations from six numbers (Zhou et al. 2019), differentiable.
+//! Rotations from six numbers (Zhou et al. 2019), differentiable (spec 5.6).
 
 use tch::{Kind, Tensor};
 

@@ -1,11 +1,12 @@
-//! One stream's part of an encoder round: look at the images, think, then talk among the scene tokens (SPEC section 4).
+//! One stream's part of an encoder round: look at the images, think, then talk among the scene tokens (spec 4.2).
 
 use super::config::ModelConfig;
-use super::encoder::REGISTERS;
 use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear};
 use super::precision::Precision;
 use tch::{Tensor, nn, nn::Module};
 
+/// The last of the slots, which neither look at the images nor pass the first MLP.
+pub(super) const REGISTERS: i64 = 4;
 const MLP_RATIO: i64 = 4;
 const CROSS_LAYER_SCALE: f64 = 1e-3;
 const SELF_LAYER_SCALE: f64 = 1e-2;
@@ -50,7 +51,7 @@ impl StreamRound {
 
     /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width]; result [B, S, d].
     pub fn forward(&self, slots: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
-        // Registers neither look at the images nor pass the MLP: they only change in self-attention.
+        // Registers change in self-attention, and where streams are mixed.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);

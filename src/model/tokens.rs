@@ -1,4 +1,4 @@
-//! Image tokens: what a patch looks like, and along which rays (SPEC section 3).
+//! Image tokens: what a patch looks like, and along which rays (spec 3.1 and 3.2).
 
 use super::camera_code::CameraCode;
 use super::config::ModelConfig;

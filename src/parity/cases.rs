@@ -6,10 +6,10 @@ use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
-use crate::model::Gaussians;
 use crate::model::{self, Encoded, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
+use crate::optim::AdamW;
 use crate::render::{self, Cameras};
-use crate::scene;
+use crate::scene::{self, Gaussians};
 use crate::train;
 use glam::DMat4;
 use image::RgbImage;
@@ -40,6 +40,9 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "rasterizer" => rasterizer(request),
         "mse" => loss_of(loss::mse(request.input("rendered")?, request.input("truth")?)),
         "frustum" => frustum(request),
+        "ssim" => {
+            outputs([("ssim", loss::ssim(request.input("picture")?, request.input("truth")?).view([1]))])
+        }
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
@@ -374,7 +377,7 @@ fn resample(request: &Request) -> Result<Answer> {
     let image = RgbImage::from_raw(width, height, bytes).expect("three bytes a pixel");
     let [left, top, region_width, region_height] = request.number("region")?;
     let region = data::Region { left, top, width: region_width, height: region_height };
-    let size: data::ImageSize = request.number("size")?;
+    let size: scene::ImageSize = request.number("size")?;
     let mut planes = vec![0u8; 3 * size.height as usize * size.width as usize];
     data::Resampler::default().resample(&image, region, size, &mut planes);
     let shape = [3, i64::from(size.height), i64::from(size.width)];
@@ -428,8 +431,12 @@ fn adamw(request: &Request) -> Result<Answer> {
         let _variable = path.var_copy(last, value);
     }
     vs.unfreeze();
-    let mut optimizer = train::AdamW::new(&vs, request.number("weight_decay")?);
-    let learning_rate = request.number("learning_rate")?;
+    let config = TrainConfig {
+        learning_rate: request.number("learning_rate")?,
+        weight_decay: request.number("weight_decay")?,
+        ..Default::default()
+    };
+    let mut optimizer = AdamW::new(train::parameter_groups(&vs, &config));
     let variables: Tensors = vs.variables().into_iter().collect();
     let gradients = |name: &str| request.input(&format!("grad.{name}"));
     let count = variables.keys().next().map_or(Ok(0), |name| gradients(name).map(|g| g.size()[0]))?;
@@ -440,7 +447,7 @@ fn adamw(request: &Request) -> Result<Answer> {
             objective = &objective + (variable * gradients(name)?.get(step)).sum(Kind::Float);
         }
         objective.backward();
-        optimizer.step(learning_rate);
+        optimizer.step();
     }
     let outputs = variables.into_iter().map(|(name, value)| (name, value.detach())).collect();
     Ok(Answer { outputs, params: Tensors::new() })

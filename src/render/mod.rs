@@ -1,16 +1,15 @@
-//! The differentiable splat op (SPEC section 6), safe and typed.
+//! The differentiable splat op (spec 6), safe and typed.
 
-mod bridge;
+pub mod cpu;
 mod transform;
+mod views;
 
-pub use bridge::ffi::{PairCounts, StageTimes};
 pub use transform::transform;
+pub use views::{Rendered, render_views};
 
-use crate::data::ViewBatch;
 use crate::error::Result;
-use crate::model::Gaussians;
-use crate::scene::{Camera, pose_to_rows};
-use bridge::ffi::{self, SplatArguments};
+use crate::scene::{Camera, Gaussians, pose_to_rows};
+use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Kind, Tensor};
 
 /// Pixels² added to the diagonal of every projected covariance.
@@ -30,17 +29,6 @@ pub struct Cameras {
 }
 
 impl Cameras {
-    /// Those that took the views of `batch`.
-    pub fn of(batch: &ViewBatch) -> Self {
-        let size = batch.images.size();
-        Cameras {
-            w2c: batch.w2c.shallow_clone(),
-            intrinsics: batch.intrinsics.shallow_clone(),
-            width: size[4],
-            height: size[3],
-        }
-    }
-
     /// One camera of one scene, B = C = 1.
     pub fn single(camera: &Camera) -> Self {
         let matrix = |rows: &[f64], n: i64| Tensor::from_slice(rows).view([1, 1, n, n]).to_kind(Kind::Float);
@@ -65,7 +53,7 @@ pub struct Pictures {
 }
 
 /// Renders every scene from its cameras. Differentiable with respect to the Gaussians; float64 tensors are rendered in
-/// float64, all others in float32. Tensors on a GPU are moved to the host and the pictures back.
+/// float64, all others in float32. Tensors on a device that can't render are moved to the host and the pictures back.
 ///
 /// # Errors
 /// Shapes that don't fit together, and a `GLOBALSPLAT_SIMD` that this machine doesn't have.
@@ -100,11 +88,12 @@ pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<P
 }
 
 /// The C++ side's ops take a place for new tensors, as addresses.
-type Op = fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
+type Op = unsafe fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
 
 fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
     let mut out = [0usize; N];
-    op(&arguments(gaussians, cameras, eps2d), &mut out)?;
+    // SAFETY: the tensors outlive the call.
+    unsafe { op(&arguments(gaussians, cameras, eps2d), &mut out) }?;
     // SAFETY: on success the C++ side has put new tensors there and left them to us.
     Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
 }
@@ -124,32 +113,6 @@ fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArgum
         height: cameras.height as i32,
         eps2d,
     }
-}
-
-/// The instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
-///
-/// # Errors
-/// A `GLOBALSPLAT_SIMD` that names one which this machine doesn't have.
-pub fn simd_level() -> Result<String> {
-    Ok(ffi::simd_level()?)
-}
-
-/// How long the stages of this thread's last [`render()`] and of its backward pass took.
-pub fn stage_times() -> StageTimes {
-    ffi::stage_times()
-}
-
-/// How much a call of [`render()`] with float32 Gaussians has to blend.
-///
-/// # Errors
-/// As [`render()`].
-pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
-    Ok(ffi::count_pairs(&arguments(gaussians, cameras, eps2d))?)
-}
-
-/// Floating-point operations per second that multiply-adds alone reach here, measured for so many seconds on every thread.
-pub fn multiply_add_peak(seconds: f64) -> f64 {
-    ffi::multiply_add_peak(seconds)
 }
 
 /// The version of the libtorch that this program was built with.

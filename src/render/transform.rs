@@ -1,9 +1,8 @@
-//! Moving a splat from one world to another, colours included.
+//! Moving a splat from one world to another, colours included (spec 2.4).
 
-use super::bridge::ffi;
-use crate::model::Gaussians;
-use crate::scene::Similarity;
+use crate::scene::{Gaussians, Similarity};
 use glam::{DMat3, DQuat, DVec3};
+use globalsplat_csrc::render::sh_basis;
 use tch::Tensor;
 
 /// The same splat after every point x has gone to `to(x)`: pictures from cameras that moved along are the same, and depth
@@ -42,7 +41,7 @@ fn rotate_sh(sh: &Tensor, rotation: &DMat3) -> Tensor {
     let evaluate = |rotation: &DMat3| {
         let mut values = vec![0.; DIRECTIONS * bases];
         for (i, row) in values.chunks_exact_mut(bases).enumerate() {
-            ffi::sh_basis(&(*rotation * fibonacci_direction(i, DIRECTIONS)).to_array(), row);
+            sh_basis(&(*rotation * fibonacci_direction(i, DIRECTIONS)).to_array(), row);
         }
         Tensor::from_slice(&values).view([DIRECTIONS as i64, bases as i64])
     };

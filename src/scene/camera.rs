@@ -1,6 +1,7 @@
 //! Intrinsics and poses.
 
 use glam::{DMat3, DMat4, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// How far RᵀR may be from the identity, per entry: captures store poses with 3 to 7 digits.
 const RIGID_TOLERANCE: f64 = 5e-3;
@@ -55,6 +56,28 @@ impl Intrinsics {
             }
         }
         Ok(())
+    }
+}
+
+/// Height and width in pixels, written [H, W].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "[u32; 2]", into = "[u32; 2]")]
+pub struct ImageSize {
+    /// Rows.
+    pub height: u32,
+    /// Columns.
+    pub width: u32,
+}
+
+impl From<[u32; 2]> for ImageSize {
+    fn from([height, width]: [u32; 2]) -> Self {
+        ImageSize { height, width }
+    }
+}
+
+impl From<ImageSize> for [u32; 2] {
+    fn from(size: ImageSize) -> Self {
+        [size.height, size.width]
     }
 }
 

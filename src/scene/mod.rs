@@ -1,13 +1,16 @@
-//! Camera maths: intrinsics and poses, scene normalization, rays, trajectories.
+//! What a scene is made of, cameras and Gaussians, and camera maths: intrinsics and poses, normalization, rays, trajectories.
 //!
 //! OpenCV axes everywhere: x right, y down, z forward. Poses are camera-to-world.
 
 mod camera;
+mod gaussians;
 mod normalize;
 mod rays;
 mod trajectory;
 
-pub use camera::{Camera, Intrinsics, check_pose, nearest_rigid, pose_to_rows};
+pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
+pub(crate) use camera::{check_pose, nearest_rigid};
+pub use gaussians::{Gaussians, RawGaussians};
 pub use normalize::{Normalization, Similarity, normalize};
-pub use rays::plucker_rays;
+pub(crate) use rays::plucker_rays;
 pub use trajectory::{orbit_around_cameras, orbit_around_point};

@@ -1,4 +1,4 @@
-//! Scene normalization (SPEC section 2): one similarity per scene gives all scenes the same place, direction and size.
+//! Scene normalization (spec 2.1 and 2.2): one similarity per scene gives all scenes the same place, direction and size.
 
 use crate::error::{Error, Result};
 use glam::{DMat3, DMat4, DVec3};

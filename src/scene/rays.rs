@@ -1,4 +1,4 @@
-//! Plücker rays (SPEC section 3).
+//! Plücker rays (spec 3.2).
 
 use tch::{Kind, Tensor};
 

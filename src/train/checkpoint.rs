@@ -7,9 +7,8 @@
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
-use crate::io::{
-    ModelDtype, read_weights, recover_dirs, replace_dir, save_model, write_atomically, write_weights,
-};
+use crate::io::{read_weights, recover_dirs, replace_dir, write_atomically, write_weights};
+use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
@@ -42,8 +41,9 @@ pub(super) struct State {
 pub(super) struct Validation {
     /// In dB.
     pub psnr: f64,
-    /// The settings that say what was asked for: scores by others can't be compared.
-    pub asked: String,
+    /// What the score depends on: scores by other settings can't be compared.
+    #[serde(rename = "asked")]
+    pub settings: String,
 }
 
 /// The run's checkpoints, oldest first.
@@ -104,20 +104,20 @@ pub(super) fn recover(run: &Path) -> Result<()> {
     recover_dirs(&run.join(FOLDER))
 }
 
-/// What validation, by the settings `asked`, found the run's best checkpoint to be worth, in dB.
+/// What validation, by `settings`, found the run's best checkpoint to be worth, in dB.
 ///
 /// # Errors
 /// One that can't be read, or was found by other settings.
-pub(super) fn best_score(run: &Path, asked: &str) -> Result<Option<f64>> {
+pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
     let best = run.join(BEST);
     if !best.is_dir() {
         return Ok(None);
     }
     match check(&best)?.validation {
-        Some(validation) if validation.asked == asked => Ok(Some(validation.psnr)),
+        Some(validation) if validation.settings == settings => Ok(Some(validation.psnr)),
         found => {
-            let found = found.map_or("absent".into(), |validation| format!("of {}", validation.asked));
-            Err(Error::input(&best, "the validation", found, format!("one of {asked}")))
+            let found = found.map_or("absent".into(), |validation| format!("of {}", validation.settings));
+            Err(Error::input(&best, "the validation", found, format!("one of {settings}")))
         }
     }
 }

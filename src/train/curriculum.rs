@@ -1,4 +1,4 @@
-//! When a scene token shows how many Gaussians (SPEC section 8).
+//! When a scene token shows how many Gaussians (spec 8.7).
 
 use crate::config::CurriculumConfig;
 use crate::model::Stage;

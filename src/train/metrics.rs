@@ -1,9 +1,10 @@
 //! What a run writes down: `metrics.jsonl`, a line for every step and for every validation.
 
-use super::trainer::StepReport;
+use super::step_report::StepReport;
 use super::validator::Score;
 use crate::error::{Error, Result};
 use crate::io::{AppendFile, write_atomically};
+use crate::loss::Term;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -22,26 +23,15 @@ pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'stat
 }
 
 /// The terms of a step's loss, by name.
-pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); 9] {
-    let losses = &report.losses;
-    [
-        ("mse", losses.mse),
-        ("perceptual", losses.perceptual),
-        ("consistency", losses.consistency),
-        ("frustum", losses.frustum),
-        ("decoder", losses.decoder),
-        ("decoder_opacity", losses.decoder_opacity),
-        ("decoder_scale", losses.decoder_scale),
-        ("decoder_rotation", losses.decoder_rotation),
-        ("decoder_sh", losses.decoder_sh),
-    ]
+pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL.len()] {
+    Term::ALL.map(|term| (term.name(), report.losses[term]))
 }
 
 /// `metrics.jsonl`, which steps and validations are added to.
 #[derive(Debug)]
 pub(super) struct Metrics {
     file: AppendFile,
-    /// The last steps before the validations that it tells of.
+    /// The last steps before the validations that it has.
     validated: BTreeSet<u64>,
 }
 
@@ -71,7 +61,7 @@ impl Metrics {
         Ok(Metrics { file: AppendFile::open(path)?, validated })
     }
 
-    pub fn tell_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
         let mut line = json!({ "step": report.step, "skipped": report.skipped });
         for (name, value) in progress(report, samples_per_second).into_iter().chain(loss_terms(report)) {
             line[name] = value.into();
@@ -84,7 +74,7 @@ impl Metrics {
     }
 
     /// Scores after step `step`.
-    pub fn tell_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let Score { psnr, ssim, scenes, .. } = score;
         self.append(
             &json!({ "step": step, "validation": { "psnr": psnr, "ssim": ssim, "scenes": scenes } }),
@@ -93,8 +83,8 @@ impl Metrics {
         Ok(())
     }
 
-    /// Whether it tells of a validation after step `step`.
-    pub fn tells_validation(&self, step: u64) -> bool {
+    /// Whether it has a validation after step `step`.
+    pub fn has_validation(&self, step: u64) -> bool {
         self.validated.contains(&step)
     }
 

@@ -1,32 +1,37 @@
 //! Training: what a step does, how the run goes on, and how it survives being stopped.
 
-mod board;
 mod checkpoint;
 mod curriculum;
-mod glance;
+mod forward_backward;
 mod lock;
 mod metrics;
-mod optimizer;
-mod pass;
+mod parameter_groups;
+mod preview;
 mod run;
 mod schedule;
+mod step_report;
 #[cfg(test)]
 mod step_tests;
 mod stopwatch;
 mod subsets;
+mod tensorboard;
 mod trainer;
 mod validator;
 
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
-pub use curriculum::stage_at;
-pub use optimizer::AdamW;
-pub use pass::LossValues;
 pub use run::{Event, Outcome, Resume, run};
-pub use schedule::learning_rate;
-pub use stopwatch::Stopwatch;
-pub use subsets::subsets;
-pub use trainer::{StepReport, Trainer};
+pub use step_report::StepReport;
+pub use trainer::Trainer;
 pub use validator::{Score, Validator};
+
+// For benchmarks.
+pub(crate) use stopwatch::Stopwatch;
+
+// For the parity checks, which run every part by itself.
+pub(crate) use curriculum::stage_at;
+pub(crate) use parameter_groups::parameter_groups;
+pub(crate) use schedule::learning_rate;
+pub(crate) use subsets::subsets;
 
 /// Whether something that is done every so many steps, or never (0), is done at `step`.
 fn is_due(every: u64, step: u64) -> bool {

@@ -1,13 +1,14 @@
 //! A whole run: from where it stands to the last step, with checkpoints on the way.
 
-use super::board::Board;
 use super::checkpoint::{
     Validation, best_score, check, keep_best, latest_checkpoint, list_checkpoints, recover,
 };
 use super::is_due;
 use super::lock::RunLock;
 use super::metrics::Metrics;
-use super::trainer::{StepReport, Trainer};
+use super::step_report::StepReport;
+use super::tensorboard::TensorBoard;
+use super::trainer::Trainer;
 use super::validator::{Score, Validator};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
@@ -36,7 +37,7 @@ pub enum Event<'a> {
         /// How fast.
         samples_per_second: f64,
     },
-    /// What is held out was asked for.
+    /// The model was validated.
     Validation(&'a Score),
     /// Something a person should know, in one sentence.
     Notice(String),
@@ -56,7 +57,7 @@ pub struct Outcome {
 }
 
 /// Trains into the folder `out`, which nobody else may train into meanwhile. `observe` hears what happens and says whether to
-/// go on: a stopped run is saved first. `validator` is asked now and then, and at the end.
+/// go on: a stopped run is saved first. `validator` scores the model now and then, and at the end.
 ///
 /// # Errors
 /// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, or whatever a step or a
@@ -84,14 +85,15 @@ pub fn run(
         write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))
     })?;
     let metrics = patiently(&mut observe, || Metrics::open(&out.join("metrics.jsonl"), trainer.step))?;
-    let mut board = patiently(&mut observe, || Board::create(out, trainer.config.train.log_every))?;
-    patiently(&mut observe, || board.start(trainer.step))?;
-    let asked = trainer.config.data.validation_settings();
-    let best = best_score(out, &asked).unwrap_or_else(|e| {
+    let mut tensorboard =
+        patiently(&mut observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
+    patiently(&mut observe, || tensorboard.start(trainer.step))?;
+    let settings = trainer.config.data.validation_settings();
+    let best = best_score(out, &settings).unwrap_or_else(|e| {
         observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
         None
     });
-    Run { trainer, out, validator, observe, metrics, board, best, asked }.train(begun)
+    Run { trainer, out, validator, observe, metrics, tensorboard, best, settings }.train(begun)
 }
 
 /// A run that goes on.
@@ -101,11 +103,11 @@ struct Run<'a, 'v, O> {
     validator: Option<&'v mut dyn Validator>,
     observe: O,
     metrics: Metrics,
-    board: Board,
+    tensorboard: TensorBoard,
     /// Of the best checkpoint, in dB.
     best: Option<f64>,
-    /// Settings that scores depend on.
-    asked: String,
+    /// What scores depend on.
+    settings: String,
 }
 
 impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
@@ -115,11 +117,11 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             self.trainer.config.train;
         let (mut skipped, mut go_on) = (0, true);
         // Steps that were skipped since the last one that wasn't.
-        let mut trouble = 0;
+        let mut skipped_in_a_row = 0;
         while self.trainer.step < steps {
             let step = self.trainer.step;
             let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
-            if validates && trouble == 0 && !self.metrics.tells_validation(step - 1) {
+            if validates && skipped_in_a_row == 0 && !self.metrics.has_validation(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 go_on = match self.validate(&checkpoint) {
                     Err(e) => (self.observe)(Event::Notice(format!("a validation is left out: {e}"))),
@@ -135,18 +137,18 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let report = self.trainer.step()?;
             let samples_per_second = batch as f64 / start.elapsed().as_secs_f64();
             saved = None;
-            patiently(&mut self.observe, || self.metrics.tell_step(&report, samples_per_second))?;
-            patiently(&mut self.observe, || self.board.tell_step(&report, samples_per_second))?;
-            patiently(&mut self.observe, || self.board.tell_picture(&report))?;
+            patiently(&mut self.observe, || self.metrics.log_step(&report, samples_per_second))?;
+            patiently(&mut self.observe, || self.tensorboard.log_step(&report, samples_per_second))?;
+            patiently(&mut self.observe, || self.tensorboard.log_picture(&report))?;
             go_on = (self.observe)(Event::Step { report: &report, samples_per_second });
             if report.skipped {
                 skipped += 1;
-                trouble += 1;
-                if trouble == max_skipped {
-                    return Err(self.hopeless(trouble, &report));
+                skipped_in_a_row += 1;
+                if skipped_in_a_row == max_skipped {
+                    return Err(self.not_finite(skipped_in_a_row, &report));
                 }
             } else {
-                trouble = 0;
+                skipped_in_a_row = 0;
                 if self.trainer.step.is_multiple_of(checkpoint_every) {
                     saved = Some(self.save()?);
                 }
@@ -157,7 +159,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         }
         let mut complete = self.trainer.step >= steps;
         // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
-        self.trainer.take_back(trouble);
+        self.trainer.take_back(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
@@ -167,7 +169,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                     (self.observe)(Event::Notice(format!("the last validation is left out: {e}")));
                 }
                 // Stopped before the end, the same command does it again.
-                Ok(_) => complete = self.metrics.tells_validation(self.trainer.step.saturating_sub(1)),
+                Ok(_) => complete = self.metrics.has_validation(self.trainer.step.saturating_sub(1)),
             }
         }
         Ok(Outcome { checkpoint, complete, skipped })
@@ -189,20 +191,20 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             observe(Event::Notice(format!("a held-out scene is left out: {why}")));
         }
         if score.psnr > self.best.unwrap_or(f64::NEG_INFINITY) {
-            let found = || Validation { psnr: score.psnr, asked: self.asked.clone() };
+            let found = || Validation { psnr: score.psnr, settings: self.settings.clone() };
             patiently(observe, || keep_best(self.out, checkpoint, found()))?;
             self.best = Some(score.psnr);
         }
         let step = self.trainer.step.saturating_sub(1);
-        if !self.metrics.tells_validation(step) {
-            patiently(observe, || self.board.tell_validation(step, &score))?;
-            patiently(observe, || self.metrics.tell_validation(step, &score))?;
+        if !self.metrics.has_validation(step) {
+            patiently(observe, || self.tensorboard.log_validation(step, &score))?;
+            patiently(observe, || self.metrics.log_validation(step, &score))?;
         }
         Ok(observe(Event::Validation(&score)))
     }
 
     /// Why nothing is learned any more.
-    fn hopeless(&self, steps: u64, last: &StepReport) -> Error {
+    fn not_finite(&self, steps: u64, last: &StepReport) -> Error {
         let before = match latest_checkpoint(self.out) {
             Ok(checkpoint) => format!("{} is from before", checkpoint.display()),
             Err(_) => "no checkpoint was saved before".into(),

@@ -1,4 +1,4 @@
-//! The learning rate (SPEC section 8).
+//! The learning rate (spec 8.6).
 
 use crate::config::TrainConfig;
 use std::f64::consts::PI;

@@ -1,13 +1,11 @@
 //! A step's gradient, however it is computed.
 
-use super::pass::LossValues;
-use super::trainer::Trainer;
-use super::{Stopwatch, subsets};
-use crate::config::{Config, LossConfig, TrainConfig};
+use super::{Stopwatch, Trainer, subsets};
+use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
-use crate::loss::{PerceptualKind, PerceptualLoss, Share, Vgg19, losses};
+use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Stage, Streams};
-use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
 use rand::{Rng, SeedableRng};
@@ -69,15 +67,15 @@ fn small() -> ModelConfig {
 }
 
 /// Loss and gradients.
-type Step = (LossValues, BTreeMap<String, Tensor>);
+type Step = (Losses<f64>, BTreeMap<String, Tensor>);
 
 /// By the trainer.
 fn gradients(config: &Config, sample: &Sample) -> Step {
     of_model(config, |trainer| trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
 }
 
-/// What `pass` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.
-fn of_model(config: &Config, pass: impl FnOnce(&mut Trainer) -> LossValues) -> Step {
+/// What `compute` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.
+fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) -> Step {
     let scenes = Arc::new(Vec::<Capture>::new());
     let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
     let mut random = ChaCha8Rng::seed_from_u64(2);
@@ -109,7 +107,7 @@ fn of_model(config: &Config, pass: impl FnOnce(&mut Trainer) -> LossValues) -> S
     }
     let mut opacities = variables["gaussian_decoder.geo_param_readout.bias"].view([-1, 10]).select(1, 9);
     let _ = tch::no_grad(|| opacities.g_add_scalar_(4.));
-    let values = pass(&mut trainer);
+    let values = compute(&mut trainer);
     (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
 }
 
@@ -117,8 +115,8 @@ fn of_model(config: &Config, pass: impl FnOnce(&mut Trainer) -> LossValues) -> S
 /// arithmetic, as a share of the largest.
 fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
     let ((loss, found), (expected_loss, expected)) = (found, expected);
-    for (name, term) in TERMS {
-        let (found, expected) = (term(loss), term(expected_loss));
+    let terms = Term::ALL.map(|term| (term.name(), loss[term], expected_loss[term]));
+    for (name, found, expected) in terms.into_iter().chain([("total", loss.total, expected_loss.total)]) {
         assert!(expected > 0., "{name} counts");
         assert!((found / expected - 1.).abs() <= tolerance, "{name}: {found}, expected {expected}");
     }
@@ -131,16 +129,6 @@ fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
         assert!(error <= tolerance, "{name}: relative error {error:.1e}");
     }
 }
-
-type Term = fn(&LossValues) -> f64;
-const TERMS: [(&str, Term); 6] = [
-    ("total", |l| l.total),
-    ("mse", |l| l.mse),
-    ("perceptual", |l| l.perceptual),
-    ("consistency", |l| l.consistency),
-    ("frustum", |l| l.frustum),
-    ("decoder", |l| l.decoder),
-];
 
 #[test]
 fn slices_of_a_step_add_up_to_it() {
@@ -168,7 +156,7 @@ fn rounds_that_are_computed_again_give_the_same_gradients() {
 }
 
 #[test]
-fn a_pass_in_parts_is_the_plain_one() {
+fn a_step_in_parts_is_the_plain_one() {
     let sample = sample();
     for streams in [Streams::Dual, Streams::Single] {
         let config = config(ModelConfig { streams, ..small() }, TrainConfig::default());
@@ -177,11 +165,11 @@ fn a_pass_in_parts_is_the_plain_one() {
             let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
             let decoded = trainer.model.forward(images, c2w, intrinsics, STAGE);
             let pictures =
-                render(&decoded.gaussians, &Cameras::of(&sample.target), DEFAULT_EPS2D).expect("pictures");
+                render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D).expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
             let losses = losses(&config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE);
             losses.total.backward();
-            LossValues::of(&losses)
+            losses.map(|t| t.double_value(&[]))
         });
         assert_same(&gradients(&config, &sample), &plain, 1e-6);
     }

@@ -1,4 +1,4 @@
-//! Two halves of the context that overlap in its ends (SPEC section 7).
+//! Two halves of the context that overlap in its ends (spec 7.8).
 
 /// Positions of the two subsets of `views` ordered context views at `step`: the first and the last go to both; of those
 /// between, odd positions go to the first subset and even ones to the second, the other way round on odd steps; the

@@ -1,16 +1,21 @@
 //! One training step, and the state that steps change.
 
-use super::glance::glance;
-use super::optimizer::AdamW;
-use super::pass::{LossValues, Pass};
+use super::curriculum::stage_at;
+use super::forward_backward::ForwardBackward;
+use super::is_due;
+use super::parameter_groups::parameter_groups;
+use super::preview::preview;
 use super::schedule::learning_rate;
+use super::step_report::StepReport;
 use super::stopwatch::Stopwatch;
-use super::{is_due, stage_at, subsets};
+use super::subsets::subsets;
 use crate::config::Config;
 use crate::data::{BadData, Loader, Sample, SceneGroups};
 use crate::error::Result;
-use crate::loss::{PerceptualLoss, Share, psnr_of_mse};
+use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
+use crate::optim::AdamW;
+use crate::reconstruct::Model;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -31,34 +36,6 @@ pub struct Trainer {
     loader: Option<Loader>,
 }
 
-/// What a step did.
-#[derive(Debug)]
-pub struct StepReport {
-    /// Counted from 0.
-    pub step: u64,
-    /// Where the curriculum stood.
-    pub stage: Stage,
-    /// The learning rate used.
-    pub learning_rate: f64,
-    /// The loss and its terms.
-    pub losses: LossValues,
-    /// Of the gradient, before clipping.
-    pub gradient_norm: f64,
-    /// Loss or gradient wasn't finite, so nothing was changed.
-    pub skipped: bool,
-    /// Names of the scenes it looked at.
-    pub scenes: Vec<String>,
-    /// What the first of them looked like before the step, at the steps that `train.pictures_every` chooses, [3, H, W].
-    pub picture: Option<Tensor>,
-}
-
-impl StepReport {
-    /// Of all pictures together, in dB.
-    pub fn psnr(&self) -> f64 {
-        psnr_of_mse(self.losses.mse)
-    }
-}
-
 impl Trainer {
     /// Fresh weights by the configuration's seed. `scenes` are what is learned; views held out aren't shown.
     ///
@@ -70,7 +47,7 @@ impl Trainer {
         let vs = nn::VarStore::new(device);
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
         model.set_precision(config.train.precision);
-        let optimizer = AdamW::new(&vs, config.train.weight_decay);
+        let optimizer = AdamW::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
     }
@@ -85,7 +62,7 @@ impl Trainer {
         self.samples += batch as u64;
         let stage = stage_at(&self.config.curriculum, self.step);
         let picture = is_due(self.config.train.pictures_every, self.step)
-            .then(|| glance(&self.model, &sample, stage))
+            .then(|| preview(&self.model, &sample, stage))
             .transpose()?;
         Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default())? })
     }
@@ -95,7 +72,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A picture that can't be made.
-    pub fn learn(&mut self, sample: &Sample, watch: &mut Stopwatch) -> Result<StepReport> {
+    pub(crate) fn learn(&mut self, sample: &Sample, watch: &mut Stopwatch) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
@@ -103,7 +80,8 @@ impl Trainer {
             let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
             let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());
             if !skipped {
-                self.optimizer.step(learning_rate);
+                self.optimizer.set_learning_rate(learning_rate);
+                self.optimizer.step();
             }
             (gradient_norm, skipped)
         });
@@ -127,9 +105,9 @@ impl Trainer {
         sample: &Sample,
         stage: Stage,
         watch: &mut Stopwatch,
-    ) -> Result<LossValues> {
-        let pass =
-            Pass { config: &self.config, model: &self.model, perceptual: self.perceptual.as_ref(), stage };
+    ) -> Result<Losses<f64>> {
+        let perceptual = self.perceptual.as_ref();
+        let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage };
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
         let halves = pair.then(|| subsets(sample.context_views(), self.step));
         let scenes = sample.scenes();
@@ -148,17 +126,17 @@ impl Trainer {
         if pair && self.config.loss.consistency_depth > 0. && count < scenes {
             let pixels = (0..scenes).step_by(count).map(|first| {
                 let slice = watch.time("data", || slice(first));
-                watch.time("depth pixels", || pass.depth_pixels(&slice))
+                watch.time("depth pixels", || part.depth_pixels(&slice))
             });
             share.depth_pixels =
                 Some(Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>));
         }
         watch.time("zero gradients", || self.optimizer.zero_grad());
-        let mut values = LossValues::default();
+        let mut values = Losses::default();
         for first in (0..scenes).step_by(count) {
             share.scenes = count.min(scenes - first) as f64 / scenes as f64;
             let slice = watch.time("data", || slice(first));
-            values += pass.gradients(&slice, &share, watch)?;
+            values += part.gradients(&slice, &share, watch)?;
         }
         Ok(values)
     }
@@ -197,5 +175,10 @@ impl Trainer {
     /// Where the weights are.
     pub fn device(&self) -> Device {
         self.vs.device()
+    }
+
+    /// The model as it is now, to reconstruct with.
+    pub fn as_model(&self) -> Model<'_> {
+        Model { network: &self.model, config: &self.config, device: self.vs.device() }
     }
 }

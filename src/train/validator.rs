@@ -1,4 +1,4 @@
-//! Whom a run asks how good the model has become.
+//! How good the model has become: what a run validates it with.
 
 use super::trainer::Trainer;
 use crate::error::Result;
@@ -18,7 +18,7 @@ pub struct Score {
 
 /// Judges a model by what training never shows.
 pub trait Validator {
-    /// The score of the model as it is now; none where `go_on`, which is asked now and then, says no.
+    /// The score of the model as it is now; none where `go_on`, which is called now and then, says no.
     ///
     /// # Errors
     /// No scene that can be used, or whatever the model fails with.

@@ -5,7 +5,7 @@
 use globalsplat::config::Config;
 use globalsplat::data::{Capture, Chunk, Dataset, Split, open_capture, read_camera_path};
 use globalsplat::eval::EvaluationIndex;
-use globalsplat::io::{decode_photo, read_ply, read_weights};
+use globalsplat::io::{decode_photo, read_splat, read_weights};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -116,7 +116,7 @@ pub fn photo(bytes: &[u8]) {
 }
 
 pub fn ply(bytes: &[u8]) {
-    let _ = read_ply(&file("ply", "splat.ply", bytes));
+    let _ = read_splat(&file("ply", "splat.ply", bytes));
 }
 
 pub fn weights(bytes: &[u8]) {

@@ -5,6 +5,7 @@ import reference.loss.consistency
 import reference.loss.decoder_regularization
 import reference.loss.frustum
 import reference.loss.mse
+import reference.loss.ssim
 
 from .. import draw
 from ..draw import normal, uniform, whole
@@ -123,3 +124,29 @@ def consistency_twin(config, params, inputs):
         config["depth_factor"],
     )
     return {"loss": loss}
+
+
+@case
+def ssim(rng):
+    """Pictures that have half of their values in common: the mean of unrelated ones is nearly nothing, and has no
+    digits. C1 counts in dark pictures alone. An identical pair has no gradient, and is held beside another one."""
+
+    def half_alike(*shape):
+        truth = uniform(rng, 0.0, 1.0, *shape)
+        return 0.5 * truth + uniform(rng, 0.0, 0.5, *shape), truth
+
+    pairs = {by(*shape): half_alike(*shape) for shape in [(1, 3, 11, 11), (1, 3, 13, 20), (3, 3, 25, 17)]}
+    pairs["1×3×14×13, dark"] = [np.float32(0.05) * pictures for pictures in half_alike(1, 3, 14, 13)]
+    truth = uniform(rng, 0.2, 0.8, 1, 3, 15, 18)
+    pairs["1×3×15×18, nearly equal"] = truth + uniform(rng, -0.02, 0.02, *truth.shape), truth
+    picture, truth = half_alike(2, 3, 12, 16)
+    picture[1] = truth[1]
+    pairs["2×3×12×16, one pair identical"] = picture, truth
+    for label, (picture, truth) in pairs.items():
+        yield Draw(label, {"picture": picture, "truth": truth}, differentiate=("picture", "truth"))
+    yield Draw("2×3×12×16, identical", {"picture": truth, "truth": truth})
+
+
+@twin("ssim")
+def ssim_twin(config, params, inputs):
+    return {"ssim": reference.loss.ssim.ssim(inputs["picture"], inputs["truth"])}

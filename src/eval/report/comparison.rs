@@ -1,8 +1,8 @@
 //! Measured rows among the published ones: a table for each data set and number of context views.
 
+use super::entry::{Entry, dataset_name};
 use super::numbers::{self, count, decimal, short};
 use super::plot;
-use super::subject::{Subject, dataset_name};
 use super::table::{Head, cell, measured_badges, published_badge, swatch, table};
 use crate::eval::published::published;
 use maud::{Markup, html};
@@ -21,7 +21,7 @@ const HEAD: [Head; 6] = [
 pub struct Row<'a> {
     pub name: &'a str,
     /// `None` where the paper has it.
-    pub measured: Option<&'a Subject<'a>>,
+    pub measured: Option<&'a Entry<'a>>,
     pub psnr: Option<f64>,
     pub ssim: Option<f64>,
     pub lpips: Option<f64>,
@@ -36,7 +36,7 @@ impl Row<'_> {
 }
 
 /// Everything known of one data set and number of context views, best PSNR first.
-pub fn rows<'a>(subjects: &'a [Subject<'a>], dataset: &str, views: usize) -> Vec<Row<'a>> {
+pub fn rows<'a>(entries: &'a [Entry<'a>], dataset: &str, views: usize) -> Vec<Row<'a>> {
     let methods = published().novel_views.iter().filter(|method| method.dataset == dataset);
     let theirs = methods.filter_map(|method| {
         let scores = method.scores.get(&views)?;
@@ -49,12 +49,12 @@ pub fn rows<'a>(subjects: &'a [Subject<'a>], dataset: &str, views: usize) -> Vec
             kilo_gaussians: scores.kilo_gaussians,
         })
     });
-    let measured = subjects.iter().filter(|s| s.dataset == dataset && s.evaluation.context_views == views);
-    let ours = measured.map(|subject| {
-        let mean = subject.evaluation.summary;
+    let measured = entries.iter().filter(|s| s.dataset == dataset && s.evaluation.context_views == views);
+    let ours = measured.map(|entry| {
+        let mean = entry.evaluation.summary;
         Row {
-            name: &subject.name,
-            measured: Some(subject),
+            name: &entry.name,
+            measured: Some(entry),
             psnr: numbers::mean(mean.psnr),
             ssim: numbers::mean(mean.ssim),
             lpips: mean.lpips_vgg.and_then(numbers::mean),
@@ -68,14 +68,14 @@ pub fn rows<'a>(subjects: &'a [Subject<'a>], dataset: &str, views: usize) -> Vec
 }
 
 /// A section for each data set, those with something measured first.
-pub fn comparisons(subjects: &[Subject]) -> Markup {
+pub fn comparisons(entries: &[Entry]) -> Markup {
     let mut datasets: Vec<&str> = vec!["re10k", "acid"];
-    for subject in subjects {
-        if !datasets.contains(&subject.dataset.as_str()) {
-            datasets.push(&subject.dataset);
+    for entry in entries {
+        if !datasets.contains(&entry.dataset.as_str()) {
+            datasets.push(&entry.dataset);
         }
     }
-    let measured = |dataset: &str| subjects.iter().any(|subject| subject.dataset == dataset);
+    let measured = |dataset: &str| entries.iter().any(|entry| entry.dataset == dataset);
     datasets.sort_by_key(|dataset| !measured(dataset));
     html! {
         @for dataset in datasets {
@@ -87,26 +87,26 @@ pub fn comparisons(subjects: &[Subject]) -> Markup {
                         "compare to the published ones."
                     }
                     div.plots {
-                        (plot::quality_by_views(subjects, dataset))
-                        (plot::distributions(subjects, dataset))
+                        (plot::quality_by_views(entries, dataset))
+                        (plot::distributions(entries, dataset))
                     }
                 }
-                @for views in view_counts(subjects, dataset) { (comparison(subjects, dataset, views)) }
+                @for views in view_counts(entries, dataset) { (comparison(entries, dataset, views)) }
             }
         }
     }
 }
 
 /// Numbers of context views that were published or measured.
-pub fn view_counts(subjects: &[Subject], dataset: &str) -> BTreeSet<usize> {
+pub fn view_counts(entries: &[Entry], dataset: &str) -> BTreeSet<usize> {
     let methods = published().novel_views.iter().filter(|method| method.dataset == dataset);
     let theirs = methods.flat_map(|method| method.scores.keys().copied());
-    let ours = subjects.iter().filter(|s| s.dataset == dataset).map(|s| s.evaluation.context_views);
+    let ours = entries.iter().filter(|s| s.dataset == dataset).map(|s| s.evaluation.context_views);
     theirs.chain(ours).collect()
 }
 
-fn comparison(subjects: &[Subject], dataset: &str, views: usize) -> Markup {
-    let rows = rows(subjects, dataset, views);
+fn comparison(entries: &[Entry], dataset: &str, views: usize) -> Markup {
+    let rows = rows(entries, dataset, views);
     let measured = rows.iter().filter(|row| row.measured.is_some()).count();
     let caption = format!("{}, {}", dataset_name(dataset), count(views, "context view"));
     let body = html! { @for row in &rows { (table_row(row)) } };
@@ -131,10 +131,10 @@ fn table_row(row: &Row) -> Markup {
     html! {
         tr.measured[row.measured.is_some()] {
             th scope="row" {
-                @if let Some(subject) = row.measured { (swatch(subject)) }
+                @if let Some(entry) = row.measured { (swatch(entry)) }
                 @if row.is_published_globalsplat() { strong { (row.name) } } @else { (row.name) }
             }
-            td { @match row.measured { Some(subject) => (measured_badges(subject)), None => (published_badge()) } }
+            td { @match row.measured { Some(entry) => (measured_badges(entry)), None => (published_badge()) } }
             (cell(row.psnr.map(|v| decimal(v, 2))))
             (cell(row.ssim.map(|v| decimal(v, 3))))
             (cell(row.lpips.map(|v| decimal(v, 3))))

@@ -1,7 +1,7 @@
 //! What a reconstruction costs, and what the paper says of the model's size and parts.
 
+use super::entry::Entry;
 use super::numbers::{self, decimal, short, thousands};
-use super::subject::Subject;
 use super::table::{Head, cell, measured_badges, published_badge, swatch, table};
 use crate::eval::published::published;
 use maud::{Markup, html};
@@ -10,7 +10,7 @@ const GIGA: f64 = 1e-9;
 const MEGA: f64 = 1e-6;
 
 /// Time, memory and size: the paper's table and what was measured, fastest first.
-pub fn efficiency(subjects: &[Subject]) -> Markup {
+pub fn efficiency(entries: &[Entry]) -> Markup {
     let head = [
         Head::Text("Method"),
         Head::Text("Source"),
@@ -40,13 +40,13 @@ pub fn efficiency(subjects: &[Subject]) -> Markup {
         };
         (row.milliseconds, markup)
     });
-    let ours = subjects.iter().filter_map(|subject| {
-        let (evaluation, cost) = (subject.evaluation, subject.evaluation.efficiency?);
+    let ours = entries.iter().filter_map(|entry| {
+        let (evaluation, cost) = (entry.evaluation, entry.evaluation.efficiency?);
         let milliseconds = cost.forward_seconds * 1e3;
         let markup = html! {
             tr.measured {
-                th scope="row" { (swatch(subject)) (subject.name) }
-                td { (measured_badges(subject)) }
+                th scope="row" { (swatch(entry)) (entry.name) }
+                td { (measured_badges(entry)) }
                 td.machine { (evaluation.machine) }
                 td.number { (evaluation.context_views) }
                 td.number title={ "mean of " (numbers::count(cost.timed_scenes, "scene")) } {

@@ -1,7 +1,7 @@
 //! What the page is about, the means at a glance, and what failed.
 
+use super::entry::{Entry, dataset_name};
 use super::numbers::{self, count, decimal, thousands};
-use super::subject::{Subject, dataset_name};
 use super::table::{partial_badge, share, swatch};
 use maud::{Markup, html};
 
@@ -9,37 +9,37 @@ use maud::{Markup, html};
 const OPEN_FAILURES: usize = 20;
 
 /// Of the page.
-pub fn title(subjects: &[Subject]) -> String {
-    match subjects {
+pub fn title(entries: &[Entry]) -> String {
+    match entries {
         [one] => format!("{} on {}", one.name, dataset_name(&one.dataset)),
         [first, rest @ ..] if rest.iter().all(|s| s.dataset == first.dataset) => {
-            format!("{} evaluations on {}", subjects.len(), dataset_name(&first.dataset))
+            format!("{} evaluations on {}", entries.len(), dataset_name(&first.dataset))
         }
-        _ => format!("{} evaluations", subjects.len()),
+        _ => format!("{} evaluations", entries.len()),
     }
 }
 
 /// Title, and a card for each evaluation.
-pub fn heading(title: &str, subjects: &[Subject]) -> Markup {
+pub fn heading(title: &str, entries: &[Entry]) -> Markup {
     html! {
         header {
             p.kicker { "Evaluation of novel views" }
             h1 { (title) }
         }
-        section.cards aria-label="Means" { @for subject in subjects { (card(subject)) } }
+        section.cards aria-label="Means" { @for entry in entries { (card(entry)) } }
     }
 }
 
-fn card(subject: &Subject) -> Markup {
-    let evaluation = subject.evaluation;
+fn card(entry: &Entry) -> Markup {
+    let evaluation = entry.evaluation;
     let mean = evaluation.summary;
     let [height, width] = evaluation.image_size;
     html! {
         article.card {
-            h2 { (swatch(subject)) (subject.name) }
+            h2 { (swatch(entry)) (entry.name) }
             p.setting {
-                (subject.setting()) ", " (width) "×" (height) " pixels"
-                @if !subject.is_whole() { " " (partial_badge(subject)) }
+                (entry.setting()) ", " (width) "×" (height) " pixels"
+                @if !entry.is_whole() { " " (partial_badge(entry)) }
             }
             dl.tiles {
                 (tile("PSNR", numbers::mean(mean.psnr).map(|v| decimal(v, 2)), "dB"))
@@ -51,10 +51,10 @@ fn card(subject: &Subject) -> Markup {
                 (tile("Gaussians", mean.gaussians.and_then(numbers::mean).map(|n| thousands(n.round() as u64)), ""))
             }
             p.fine {
-                @if subject.is_whole() {
-                    "Means over all " (count(subject.scored(), "scene")) " that " (evaluation.index) " names."
+                @if entry.is_whole() {
+                    "Means over all " (count(entry.scored(), "scene")) " that " (evaluation.index) " names."
                 } @else {
-                    "Means over " (share(subject)) " that " (evaluation.index) " names, so not comparable to means "
+                    "Means over " (share(entry)) " that " (evaluation.index) " names, so not comparable to means "
                     "over all of them."
                 }
                 @if !evaluation.failures.is_empty() {
@@ -81,16 +81,16 @@ fn tile(name: &str, value: Option<String>, unit: &str) -> Markup {
 }
 
 /// Scenes that couldn't be scored, and why; nothing where all could.
-pub fn failures(subjects: &[Subject]) -> Markup {
-    let failed: Vec<_> = subjects.iter().filter(|s| !s.evaluation.failures.is_empty()).collect();
+pub fn failures(entries: &[Entry]) -> Markup {
+    let failed: Vec<_> = entries.iter().filter(|s| !s.evaluation.failures.is_empty()).collect();
     html! {
         @if !failed.is_empty() {
             section.failures id="failures" {
                 h2 { "Scenes that failed" }
-                @for subject in failed {
-                    @let failures = &subject.evaluation.failures;
+                @for entry in failed {
+                    @let failures = &entry.evaluation.failures;
                     details open[failures.len() <= OPEN_FAILURES] {
-                        summary { (subject.name) ", " (subject.setting()) ": " (count(failures.len(), "scene")) }
+                        summary { (entry.name) ", " (entry.setting()) ": " (count(failures.len(), "scene")) }
                         ul {
                             @for failure in failures { li { code { (failure.scene) } " " (failure.error) } }
                         }

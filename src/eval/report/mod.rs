@@ -2,19 +2,19 @@
 
 mod comparison;
 mod cost;
+mod entry;
 mod heading;
 mod numbers;
 mod plot;
 mod scenes;
-mod subject;
 mod table;
 
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
+use entry::Entry;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::{Path, PathBuf};
-use subject::Subject;
 
 const STYLE: &str = include_str!("style.css");
 /// Sorts tables by a click on a heading; the page is whole without it.
@@ -29,12 +29,12 @@ pub fn write_report(path: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Resul
     if evaluations.is_empty() {
         return Err(Error::Request("a report shows one evaluation or more, found none".into()));
     }
-    let page = page(&subject::subjects(evaluations))?.into_string();
+    let page = page(&entry::entries(evaluations))?.into_string();
     write_atomically(path, |writer| writer.write_all(page.as_bytes()).map_err(Error::write(path)))
 }
 
-fn page(subjects: &[Subject]) -> Result<Markup> {
-    let title = heading::title(subjects);
+fn page(entries: &[Entry]) -> Result<Markup> {
+    let title = heading::title(entries);
     Ok(html! {
         (DOCTYPE)
         html lang="en" {
@@ -49,12 +49,12 @@ fn page(subjects: &[Subject]) -> Result<Markup> {
             }
             body {
                 main {
-                    (heading::heading(&title, subjects))
-                    (heading::failures(subjects))
-                    (comparison::comparisons(subjects))
-                    (cost::efficiency(subjects))
+                    (heading::heading(&title, entries))
+                    (heading::failures(entries))
+                    (comparison::comparisons(entries))
+                    (cost::efficiency(entries))
                     div.halves { (cost::compactness()) (cost::ablations()) }
-                    (scenes::scenes(subjects)?)
+                    (scenes::scenes(entries)?)
                     footer {
                         p { "Published rows are those of the GlobalSplat paper (Itkin et al.), as printed there. Its "
                             "numbers for NoPoSplat and AnySplat were first published by C3G, those for EcoSplat by "

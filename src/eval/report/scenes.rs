@@ -1,12 +1,12 @@
 //! Scene by scene, the worst first: pictures of the worst, numbers of all.
 
+use super::entry::{Entry, dataset_name};
 use super::numbers::{absent, count, decimal, thousands};
-use super::subject::{Subject, dataset_name};
 use super::table::{Head, cell, swatch, table};
 use crate::error::{Error, Result};
 use crate::eval::evaluation::SceneScores;
-use crate::eval::protocol::{CaptureScores, ViewScore};
-use crate::eval::scores_file::strip_path;
+use crate::eval::scores::{CaptureScores, ViewScore};
+use crate::eval::scores_file::comparison_path;
 use crate::io::read_image_size;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
@@ -23,7 +23,7 @@ const PARTS: [&str; 4] = ["Photo", "Render", "Error", "Depth"];
 struct Scene<'a> {
     name: &'a str,
     dataset: &'a str,
-    scored: Vec<(&'a Subject<'a>, &'a SceneScores)>,
+    scored: Vec<(&'a Entry<'a>, &'a SceneScores)>,
 }
 
 impl Scene<'_> {
@@ -33,12 +33,12 @@ impl Scene<'_> {
 }
 
 /// Evaluations of one data set share their scenes, so that pictures of one scene stand together.
-fn worst_first<'a>(subjects: &'a [Subject<'a>]) -> Vec<Scene<'a>> {
+fn worst_first<'a>(entries: &'a [Entry<'a>]) -> Vec<Scene<'a>> {
     let mut scenes: BTreeMap<(&str, &str), Vec<_>> = BTreeMap::new();
-    for subject in subjects {
-        for scene in &subject.evaluation.scenes {
-            let key = (subject.dataset.as_str(), scene.scores.scene.as_str());
-            scenes.entry(key).or_default().push((subject, scene));
+    for entry in entries {
+        for scene in &entry.evaluation.scenes {
+            let key = (entry.dataset.as_str(), scene.scores.scene.as_str());
+            scenes.entry(key).or_default().push((entry, scene));
         }
     }
     let mut scenes: Vec<Scene> =
@@ -48,8 +48,8 @@ fn worst_first<'a>(subjects: &'a [Subject<'a>]) -> Vec<Scene<'a>> {
 }
 
 /// Cards with pictures for the worst scenes, a table for the others.
-pub fn scenes(subjects: &[Subject]) -> Result<Markup> {
-    let scenes = worst_first(subjects);
+pub fn scenes(entries: &[Entry]) -> Result<Markup> {
+    let scenes = worst_first(entries);
     let mut pictures = 0;
     let shown = scenes
         .iter()
@@ -59,11 +59,11 @@ pub fn scenes(subjects: &[Subject]) -> Result<Markup> {
         })
         .count();
     let (shown, others) = scenes.split_at(shown);
-    let cards = shown.iter().map(|scene| card(scene, subjects.len() > 1)).collect::<Result<Vec<_>>>()?;
+    let cards = shown.iter().map(|scene| card(scene, entries.len() > 1)).collect::<Result<Vec<_>>>()?;
     Ok(html! {
         section.scenes {
             h2 { "Scenes, worst first" }
-            p { "Each strip shows the view with the lowest PSNR: photo, render, error and depth." }
+            p { "Each picture shows the view with the lowest PSNR: photo, render, error and depth." }
             @for card in &cards { (card) }
             @if !others.is_empty() { (rest(others)) }
         }
@@ -71,7 +71,7 @@ pub fn scenes(subjects: &[Subject]) -> Result<Markup> {
 }
 
 fn card(scene: &Scene, compares: bool) -> Result<Markup> {
-    let parts = scene.scored.iter().map(|&(subject, scores)| scored(subject, scores, compares));
+    let parts = scene.scored.iter().map(|&(entry, scores)| scored(entry, scores, compares));
     let parts = parts.collect::<Result<Vec<_>>>()?;
     Ok(html! {
         article.scene {
@@ -82,17 +82,17 @@ fn card(scene: &Scene, compares: bool) -> Result<Markup> {
 }
 
 /// One scene of one evaluation.
-fn scored(subject: &Subject, scene: &SceneScores, compares: bool) -> Result<Markup> {
+fn scored(entry: &Entry, scene: &SceneScores, compares: bool) -> Result<Markup> {
     Ok(html! {
         div.scored {
             p.scores {
                 @if compares {
-                    span.who { (swatch(subject)) (subject.name) ", " (count(scene.context.len(), "context view")) }
+                    span.who { (swatch(entry)) (entry.name) ", " (count(scene.context.len(), "context view")) }
                 }
                 (measures(&scene.scores))
                 @if let Some(seconds) = scene.forward_seconds { span { "time " b { (decimal(seconds, 2)) } " s" } }
             }
-            (strip(subject, &scene.scores)?)
+            (comparison(entry, &scene.scores)?)
             dl.frames {
                 dt { "Views" }
                 dd { (views(&scene.scores.views)) }
@@ -116,8 +116,8 @@ fn measures(scores: &CaptureScores) -> Markup {
 }
 
 /// The picture, in the page itself.
-fn strip(subject: &Subject, scores: &CaptureScores) -> Result<Markup> {
-    let path = strip_path(subject.folder, &scores.scene);
+fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
+    let path = comparison_path(entry.folder, &scores.scene);
     if !path.is_file() {
         return Ok(html! { p.missing { "No picture: the evaluation's folder has none of this scene." } });
     }
@@ -127,9 +127,9 @@ fn strip(subject: &Subject, scores: &CaptureScores) -> Result<Markup> {
     let worst = scores.views.iter().min_by(|a, b| a.psnr.total_cmp(&b.psnr));
     let view = worst.map_or(String::new(), |view| format!(", view {}", view.image));
     let alt =
-        format!("{}{view}, by {}: photo, render, error and depth side by side", scores.scene, subject.name);
+        format!("{}{view}, by {}: photo, render, error and depth side by side", scores.scene, entry.name);
     Ok(html! {
-        div.scroll.strip tabindex="0" role="region" aria-label={ "Pictures of " (scores.scene) } {
+        div.scroll.comparison-image tabindex="0" role="region" aria-label={ "Pictures of " (scores.scene) } {
             figure {
                 div.parts aria-hidden="true" { @for part in PARTS { span { (part) } } }
                 img src=(source) width=(width) height=(height) alt=(alt) decoding="async";
@@ -138,7 +138,7 @@ fn strip(subject: &Subject, scores: &CaptureScores) -> Result<Markup> {
     })
 }
 
-/// Scores of the views, the worst first: the one that the strip shows.
+/// Scores of the views, the worst first: the one that the picture shows.
 fn views(views: &[ViewScore]) -> Markup {
     let mut views: Vec<&ViewScore> = views.iter().collect();
     views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
@@ -169,12 +169,12 @@ fn rest(scenes: &[Scene]) -> Markup {
     ];
     let body = html! {
         @for scene in scenes {
-            @for (subject, scored) in &scene.scored {
+            @for (entry, scored) in &scene.scored {
                 @let scores = &scored.scores;
                 tr {
                     th scope="row" { (scene.name) }
-                    td { (swatch(subject)) (subject.name) }
-                    td { (subject.setting()) }
+                    td { (swatch(entry)) (entry.name) }
+                    td { (entry.setting()) }
                     (cell(Some(decimal(scores.psnr, 2))))
                     (cell(Some(decimal(scores.ssim, 4))))
                     (cell(scores.lpips_vgg.map(|v| decimal(v, 4))))

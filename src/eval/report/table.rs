@@ -1,7 +1,7 @@
 //! Parts that tables share.
 
+use super::entry::Entry;
 use super::numbers::absent;
-use super::subject::Subject;
 use maud::{Markup, html};
 
 /// What heads a column, which is aligned as its cells are.
@@ -43,11 +43,11 @@ pub fn published_badge() -> Markup {
 }
 
 /// Marks a row that was measured, with what keeps its numbers from being compared to published ones.
-pub fn measured_badges(subject: &Subject) -> Markup {
-    let [height, width] = subject.evaluation.image_size;
+pub fn measured_badges(entry: &Entry) -> Markup {
+    let [height, width] = entry.evaluation.image_size;
     html! {
         span.badge.measured { "measured here" }
-        @if !subject.is_whole() { " " (partial_badge(subject)) }
+        @if !entry.is_whole() { " " (partial_badge(entry)) }
         @if [height, width] != super::super::published::IMAGE_SIZE {
             " " span.badge.partial { (width) "×" (height) " pixels" }
         }
@@ -55,17 +55,17 @@ pub fn measured_badges(subject: &Subject) -> Markup {
 }
 
 /// How many scenes a mean is of, where it isn't of all.
-pub fn partial_badge(subject: &Subject) -> Markup {
-    html! { span.badge.partial { (share(subject)) } }
+pub fn partial_badge(entry: &Entry) -> Markup {
+    html! { span.badge.partial { (share(entry)) } }
 }
 
 /// `2 of 5,601 scenes`.
-pub fn share(subject: &Subject) -> String {
-    let of = super::numbers::count(subject.evaluation.indexed_scenes, "scene");
-    format!("{} of {of}", super::numbers::thousands(subject.scored() as u64))
+pub fn share(entry: &Entry) -> String {
+    let of = super::numbers::count(entry.evaluation.indexed_scenes, "scene");
+    format!("{} of {of}", super::numbers::thousands(entry.scored() as u64))
 }
 
 /// A name with the colour that plots show it in.
-pub fn swatch(subject: &Subject) -> Markup {
-    html! { span.swatch.(subject.colour) aria-hidden="true" {} }
+pub fn swatch(entry: &Entry) -> Markup {
+    html! { span.swatch.(entry.colour) aria-hidden="true" {} }
 }

@@ -1,7 +1,7 @@
 //! How the scenes' PSNR is distributed: one histogram for each evaluation, all over the same values.
 
+use super::super::entry::Entry;
 use super::super::numbers::{count, decimal, short};
-use super::super::subject::Subject;
 use super::super::table::swatch;
 use super::axes::{Axis, Margins, frame};
 use super::{HEIGHT, WIDTH, figure, px};
@@ -13,23 +13,23 @@ const BIN_WIDTHS: [f64; 5] = [0.2, 0.5, 1., 2., 5.];
 const MOST_BINS: f64 = 28.;
 
 /// One histogram for each evaluation on `dataset`.
-pub fn distributions(subjects: &[Subject], dataset: &str) -> Markup {
-    let subjects = subjects.iter().filter(|subject| subject.dataset == dataset && subject.scored() > 0);
-    let values = subjects.clone().flat_map(|s| s.evaluation.scenes.iter().map(|scene| scene.scores.psnr));
+pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
+    let entries = entries.iter().filter(|entry| entry.dataset == dataset && entry.scored() > 0);
+    let values = entries.clone().flat_map(|s| s.evaluation.scenes.iter().map(|scene| scene.scores.psnr));
     let (worst, best) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
     let width = BIN_WIDTHS.into_iter().find(|width| (best - worst) / width <= MOST_BINS).unwrap_or(10.);
     let first = (worst / width).floor();
     html! {
-        @for subject in subjects {
+        @for entry in entries {
             @let bins = ((best / width).floor() - first) as usize + 1;
-            (histogram(subject, first, bins, width))
+            (histogram(entry, first, bins, width))
         }
     }
 }
 
-fn histogram(subject: &Subject, first: f64, bins: usize, width: f64) -> Markup {
+fn histogram(entry: &Entry, first: f64, bins: usize, width: f64) -> Markup {
     let mut counts = vec![0; bins];
-    for scene in &subject.evaluation.scenes {
+    for scene in &entry.evaluation.scenes {
         let bin = (scene.scores.psnr / width).floor() - first;
         counts[(bin as usize).min(bins - 1)] += 1;
     }
@@ -37,14 +37,14 @@ fn histogram(subject: &Subject, first: f64, bins: usize, width: f64) -> Markup {
     let edge = |bin: usize| (first + bin as f64) * width;
     let x = Axis::linear(edge(0), edge(bins), MARGINS.left, WIDTH - MARGINS.right);
     let y = Axis::linear(0., f64::from(highest).max(5.), HEIGHT - MARGINS.bottom, MARGINS.top);
-    let mean = subject.evaluation.summary.psnr;
+    let mean = entry.evaluation.summary.psnr;
     let at = x.pixel(mean);
     let drawing = html! {
         (frame(&x, &y, "PSNR of a scene (dB)", "Scenes", |v| decimal(v, if v.fract() == 0. { 0 } else { 1 })))
         @for (bin, &number) in counts.iter().enumerate() {
             @if number > 0 {
                 @let (left, right, top) = (x.pixel(edge(bin)), x.pixel(edge(bin + 1)), y.pixel(f64::from(number)));
-                rect.bar.(subject.colour) x=(px(left + 0.5)) y=(px(top)) width=(px(right - left - 1.))
+                rect.bar.(entry.colour) x=(px(left + 0.5)) y=(px(top)) width=(px(right - left - 1.))
                     height=(px(y.pixel(0.) - top)) {
                     title { (decimal(edge(bin), 2)) " to " (decimal(edge(bin + 1), 2)) " dB: " (count(number as usize, "scene")) }
                 }
@@ -56,17 +56,17 @@ fn histogram(subject: &Subject, first: f64, bins: usize, width: f64) -> Markup {
     };
     let step = short(width);
     let legend = html! {
-        li { (swatch(subject)) (count(subject.scored(), "scene")) " in steps of " (step) " dB" }
+        li { (swatch(entry)) (count(entry.scored(), "scene")) " in steps of " (step) " dB" }
     };
     let title = format!(
         "From scene to scene: {}, {}",
-        subject.name,
-        count(subject.evaluation.context_views, "context view")
+        entry.name,
+        count(entry.evaluation.context_views, "context view")
     );
     let about = format!(
         "Histogram of PSNR. {title}: mean {} dB over {}.",
         decimal(mean, 2),
-        count(subject.scored(), "scene")
+        count(entry.scored(), "scene")
     );
     figure(&title, &about, drawing, legend)
 }

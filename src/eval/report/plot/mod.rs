@@ -10,7 +10,7 @@ pub use distribution::distributions;
 pub use quality_by_size::quality_by_size;
 pub use quality_by_views::quality_by_views;
 
-use super::subject::Subject;
+use super::entry::Entry;
 use super::table::swatch;
 use maud::{Markup, html};
 
@@ -32,11 +32,11 @@ fn figure(title: &str, about: &str, drawing: Markup, legend: Markup) -> Markup {
 }
 
 /// What the colours stand for, of what is drawn.
-fn legend<'a>(published: bool, globalsplat: bool, measured: impl Iterator<Item = &'a Subject<'a>>) -> Markup {
+fn legend<'a>(published: bool, globalsplat: bool, measured: impl Iterator<Item = &'a Entry<'a>>) -> Markup {
     html! {
         @if published { li { span.swatch.published aria-hidden="true" {} "published" } }
         @if globalsplat { li { span.swatch.paper aria-hidden="true" {} "published GlobalSplat" } }
-        @for subject in measured { li { (swatch(subject)) (subject.name) ", measured here" } }
+        @for entry in measured { li { (swatch(entry)) (entry.name) ", measured here" } }
     }
 }
 

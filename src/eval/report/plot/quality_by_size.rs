@@ -61,7 +61,7 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
 fn mark(row: &Row, cx: f64, cy: f64, told: &str) -> Markup {
     html! {
         @match row.measured {
-            Some(subject) => circle.point.(subject.colour) cx=(px(cx)) cy=(px(cy)) r="6.5" { title { (told) } },
+            Some(entry) => circle.point.(entry.colour) cx=(px(cx)) cy=(px(cy)) r="6.5" { title { (told) } },
             None if row.is_published_globalsplat() => circle.point.paper cx=(px(cx)) cy=(px(cy)) r="5" { title { (told) } },
             None => circle.point.published cx=(px(cx)) cy=(px(cy)) r="4.5" { title { (told) } },
         }

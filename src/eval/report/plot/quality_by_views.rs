@@ -1,8 +1,8 @@
 //! PSNR against the number of context views: what more photos bring.
 
 use super::super::comparison::{rows, view_counts};
+use super::super::entry::{Entry, dataset_name};
 use super::super::numbers::decimal;
-use super::super::subject::{Subject, dataset_name};
 use super::axes::{Axis, Margins, frame};
 use super::labels::{shortened, spread};
 use super::{HEIGHT, WIDTH, figure, legend, px};
@@ -16,18 +16,18 @@ const LONGEST_NAME: usize = 14;
 /// One method over numbers of context views.
 struct Line<'a> {
     name: &'a str,
-    measured: Option<&'a Subject<'a>>,
+    measured: Option<&'a Entry<'a>>,
     class: String,
     points: Vec<(usize, f64)>,
 }
 
 /// A line for each method, published and measured; nothing where there is one number of views only.
-pub fn quality_by_views(subjects: &[Subject], dataset: &str) -> Markup {
-    let counts = view_counts(subjects, dataset);
+pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
+    let counts = view_counts(entries, dataset);
     if counts.len() < 2 {
         return html! {};
     }
-    let by_views: Vec<_> = counts.iter().map(|&views| (views, rows(subjects, dataset, views))).collect();
+    let by_views: Vec<_> = counts.iter().map(|&views| (views, rows(entries, dataset, views))).collect();
     let mut lines: Vec<Line> = vec![];
     for (views, row) in by_views.iter().flat_map(|(views, rows)| rows.iter().map(move |row| (*views, row))) {
         let Some(psnr) = row.psnr else { continue };
@@ -39,7 +39,7 @@ pub fn quality_by_views(subjects: &[Subject], dataset: &str) -> Markup {
                 name: row.name,
                 measured: row.measured,
                 class: match row.measured {
-                    Some(subject) => subject.colour.clone(),
+                    Some(entry) => entry.colour.clone(),
                     None if row.is_published_globalsplat() => "paper".into(),
                     None => "published".into(),
                 },

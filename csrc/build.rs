@@ -1,0 +1,85 @@
+//! Compiles the C++ beside it against the libtorch that `LIBTORCH` names, and links that.
+
+use std::{env, fs, path::PathBuf};
+
+/// What every C++ file is compiled with.
+fn cpp() -> cc::Build {
+    let mut build = cc::Build::new();
+    build
+        .cpp(true)
+        .std("c++17")
+        .opt_level(3)
+        .warnings(true)
+        .flag_if_supported("-fno-math-errno")
+        .include(".");
+    build
+}
+
+/// The rasterizer's kernels, once per instruction set; `flags` are all supported by any compiler for that target.
+fn kernels(isa: &str, flags: &[&str]) {
+    let mut build = cpp();
+    // GCC 12 takes the undefined values in its own AVX-512 headers for mistakes.
+    build.flag_if_supported("-Wno-maybe-uninitialized");
+    build.define("GS_ISA", isa).flag("-ffp-contract=off").file("raster/kernels_isa.cpp");
+    for flag in flags {
+        build.flag(flag);
+    }
+    build.compile(&format!("globalsplat_kernels_{isa}"));
+}
+
+/// The folder of libtorch.
+fn libtorch() -> PathBuf {
+    println!("cargo::rerun-if-env-changed=LIBTORCH");
+    let folder = PathBuf::from(env::var_os("LIBTORCH").unwrap_or_default());
+    if !folder.join("include/ATen").is_dir() {
+        let folder = folder.display();
+        println!(
+            "cargo::error=there is no libtorch in LIBTORCH={folder}; `make setup` puts one in .venv/libtorch"
+        );
+        std::process::exit(1);
+    }
+    folder.canonicalize().expect("it was there a moment ago")
+}
+
+fn main() {
+    let libtorch = libtorch();
+    let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
+    cxx_build::bridges(["src/chunk.rs", "src/render.rs"])
+        .std("c++17")
+        // The work is done in raster/ and in libtorch.
+        .opt_level(1)
+        .flag("-isystem")
+        .flag(&include)
+        .flag("-isystem")
+        .flag(format!("{include}/torch/csrc/api/include"))
+        .include(".")
+        .file("torch.cpp")
+        .compile("globalsplat_torch");
+
+    cpp()
+        .files(["raster/raster.cpp", "raster/parallel.cpp", "raster/kernels.cpp"])
+        .compile("globalsplat_raster");
+    match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
+        Ok("x86_64") => {
+            kernels("avx512", &["-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw", "-mfma"]);
+            kernels("avx2", &["-mavx2", "-mfma"]);
+            kernels("portable", &[]);
+        }
+        Ok("aarch64") => kernels("neon", &[]),
+        _ => kernels("portable", &[]),
+    }
+
+    // After our own libraries, which need these: linkers drop what nothing has asked for yet.
+    let lib = libtorch.join("lib");
+    println!("cargo::rustc-link-search=native={}", lib.display());
+    for library in ["torch_cpu", "c10", "torch"] {
+        println!("cargo::rustc-link-lib={library}");
+    }
+    println!("cargo::metadata=libtorch_lib={}", lib.display());
+    for entry in fs::read_dir(".").expect("this folder is there") {
+        let path = entry.expect("it can be listed").path();
+        if path.extension().is_none_or(|ending| ending != "md") {
+            println!("cargo::rerun-if-changed={}", path.display());
+        }
+    }
+}

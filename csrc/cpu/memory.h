@@ -1,0 +1,66 @@
+// Tensors on the CPU as the rasterizer takes them: plain memory.
+#pragma once
+
+#include <ATen/ops/empty_like.h>
+
+#include <vector>
+
+#include "../backend.h"
+#include "../raster/raster.h"
+
+namespace globalsplat::cpu {
+
+// Calls body(0.) or body(0.f), as the type of the inputs is.
+template <class Body>
+auto by_type(const Inputs& in, Body body) {
+  return in.gaussians.means.scalar_type() == at::kDouble ? body(0.) : body(0.f);
+}
+
+// One item per scene.
+template <class T>
+std::vector<raster::Gaussians<T>> scenes_of(const Inputs& in) {
+  std::vector<raster::Gaussians<T>> scenes;
+  const Gaussians& g = in.gaussians;
+  const int64_t count = in.count(), bases = g.sh.size(2);
+  for (int64_t b = 0; b < in.scenes(); ++b)
+    scenes.push_back({g.means.data_ptr<T>() + b * count * 3, g.scales.data_ptr<T>() + b * count * 3,
+                      g.quaternions.data_ptr<T>() + b * count * 4, g.opacities.data_ptr<T>() + b * count,
+                      g.sh.data_ptr<T>() + b * count * bases * 3, count, int(bases)});
+  return scenes;
+}
+
+// The same for gradients.
+template <class T>
+std::vector<raster::GaussianGradients<T>> gradients_of(const Gaussians& g) {
+  std::vector<raster::GaussianGradients<T>> scenes;
+  const int64_t count = g.means.size(1), bases = g.sh.size(2);
+  for (int64_t b = 0; b < g.means.size(0); ++b)
+    scenes.push_back({g.means.data_ptr<T>() + b * count * 3, g.scales.data_ptr<T>() + b * count * 3,
+                      g.quaternions.data_ptr<T>() + b * count * 4, g.opacities.data_ptr<T>() + b * count,
+                      g.sh.data_ptr<T>() + b * count * bases * 3});
+  return scenes;
+}
+
+// One item per camera of each scene.
+template <class T>
+std::vector<raster::View<T>> views_of(const Inputs& in) {
+  std::vector<raster::View<T>> views;
+  for (int64_t b = 0; b < in.scenes(); ++b)
+    for (int64_t c = 0; c < in.cameras(); ++c) {
+      const T* m = in.w2c.data_ptr<T>() + (b * in.cameras() + c) * 16;
+      const T* k = in.intrinsics.data_ptr<T>() + (b * in.cameras() + c) * 9;
+      views.push_back({{{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]},
+                        {m[3], m[7], m[11]},
+                        k[0], k[4], k[2], k[5]},
+                       int(b)});
+    }
+  return views;
+}
+
+// Not yet written.
+inline Gaussians empty_like(const Gaussians& g) {
+  const auto empty = [](const Tensor& t) { return at::empty_like(t); };
+  return {empty(g.means), empty(g.scales), empty(g.quaternions), empty(g.opacities), empty(g.sh)};
+}
+
+}  // namespace globalsplat::cpu

@@ -1,0 +1,119 @@
+#include <ATen/ops/zeros.h>
+
+#include <algorithm>
+#include <vector>
+
+#include "../raster/kernels.h"
+#include "backend.h"
+#include "memory.h"
+
+namespace globalsplat::cpu {
+namespace {
+
+// Each scene's cameras, and every Gaussian's splat as each sees it.
+template <class T>
+struct Seen {
+  std::vector<raster::Gaussians<T>> scenes;
+  int64_t cameras;
+  std::vector<raster::Lens<T>> lenses;             // [scenes · cameras]
+  std::vector<std::vector<raster::Splat<T>>> splats;  // [scenes · cameras][N]
+
+  explicit Seen(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
+    std::vector<raster::Splat<T>*> places;
+    for (const auto& view : views_of<T>(in)) {
+      lenses.push_back(raster::lens_of(view.camera, int(in.width), int(in.height), in.eps2d));
+      splats.emplace_back(size_t(in.count()));
+      places.push_back(splats.back().data());
+    }
+    for (size_t b = 0; b < scenes.size(); ++b)
+      raster::kernels().of<T>().project(scenes[b], 0, scenes[b].count, lenses.data() + int64_t(b) * cameras, cameras,
+                                        places.data() + int64_t(b) * cameras);
+  }
+
+  // Calls visit(view, place in [B, C, N], splat) for every visible pair.
+  template <class Visit>
+  void for_each_visible(Visit visit) const {
+    int64_t place = 0;
+    for (size_t view = 0; view < splats.size(); ++view)
+      for (const raster::Splat<T>& splat : splats[view]) {
+        if (splat.z > 0) visit(view, place, splat);
+        ++place;
+      }
+  }
+};
+
+template <class T>
+Projected project_as(const Inputs& in) {
+  const auto zeros = [&](std::vector<int64_t> tail, at::TensorOptions options) {
+    tail.insert(tail.begin(), {in.scenes(), in.cameras(), in.count()});
+    return at::zeros(tail, options);
+  };
+  const auto options = in.gaussians.means.options();
+  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options)};
+  const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
+    std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
+  };
+  Seen<T>(in).for_each_visible([&](size_t, int64_t at, const raster::Splat<T>& s) {
+    // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
+    const T two_ln2 = T(2 / raster::kLog2E);
+    out.visible.data_ptr<int64_t>()[at] = 1;
+    put(out.mean2d, at, {s.u, s.v});
+    put(out.conic, at, {two_ln2 * s.a * s.a, two_ln2 * s.a * s.b, two_ln2 * (s.b * s.b + s.c * s.c)});
+    put(out.depth, at, {s.z});
+    put(out.colour, at, {s.red, s.green, s.blue});
+  });
+  return out;
+}
+
+template <class T>
+Gaussians project_backward_as(const Inputs& in, const Projected& gradients) {
+  const Seen<T> seen(in);
+  // A record per visible Gaussian: the sums over pixels that project_backward() turns into just these gradients.
+  const size_t views = seen.splats.size(), count = size_t(in.count());
+  std::vector<std::vector<raster::SplatGradient<T>>> records(views);
+  std::vector<std::vector<uint32_t>> first(views, std::vector<uint32_t>(count + 1, 0));
+  seen.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
+    const T *d_mean = gradients.mean2d.data_ptr<T>() + 2 * at, *d_conic = gradients.conic.data_ptr<T>() + 3 * at;
+    const T* d_colour = gradients.colour.data_ptr<T>() + 3 * at;
+    // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the one number xy stands
+    // for two entries.
+    const T two_ln2 = T(2 / raster::kLog2E);
+    raster::SplatGradient<T> d{};
+    d.power_p = d_mean[0] / (two_ln2 * s.a);
+    d.power_r = (d_mean[1] - two_ln2 * s.b * d.power_p) / (two_ln2 * s.c);
+    d.power_pp = 2 * (s.a * s.a * d_conic[0] + s.a * s.b * d_conic[1] + s.b * s.b * d_conic[2]);
+    d.power_pr = s.a * s.c * d_conic[1] + 2 * s.b * s.c * d_conic[2];
+    d.power_rr = 2 * s.c * s.c * d_conic[2];
+    d.red = d_colour[0];
+    d.green = d_colour[1];
+    d.blue = d_colour[2];
+    d.z = gradients.depth.data_ptr<T>()[at];
+    records[view].push_back(d);
+    first[view][size_t(at) % count + 1] = 1;
+  });
+  std::vector<raster::SplatRecords<T>> of_views;
+  for (size_t view = 0; view < views; ++view) {
+    for (size_t i = 0; i < count; ++i) first[view][i + 1] += first[view][i];
+    of_views.push_back({records[view].data(), first[view].data()});
+  }
+  Gaussians out = empty_like(in.gaussians);
+  const auto places = gradients_of<T>(out);
+  for (size_t b = 0; b < seen.scenes.size(); ++b) {
+    const int64_t view = int64_t(b) * seen.cameras;
+    raster::kernels().of<T>().project_backward(seen.scenes[b], 0, int64_t(count), seen.lenses.data() + view,
+                                               seen.cameras, of_views.data() + view, places[b]);
+  }
+  return out;
+}
+
+}  // namespace
+
+Projected project(const Inputs& in) {
+  return by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
+}
+
+Gaussians project_backward(const Inputs& in, const Projected& gradients) {
+  return by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients); });
+}
+
+}  // namespace globalsplat::cpu

@@ -1,0 +1,95 @@
+#include <ATen/Parallel.h>
+#include <ATen/ops/empty.h>
+
+#include <memory>
+#include <type_traits>
+#include <vector>
+
+#include "../arguments.h"
+#include "../raster/kernels.h"
+#include "backend.h"
+#include "cpu.h"
+#include "globalsplat-csrc/src/render.rs.h"
+#include "memory.h"
+
+namespace globalsplat {
+namespace cpu {
+namespace {
+
+// Of this thread's last call and of its backward pass, which autograd runs on the thread that asked for it.
+thread_local raster::StageTimes last_times;
+
+template <class T>
+struct KeptFrame : Kept {
+  explicit KeptFrame(std::unique_ptr<raster::Frame<T>> f) : frame(std::move(f)) {}
+  std::unique_ptr<raster::Frame<T>> frame;
+};
+
+// One item per view. `Pixel` is T or const T.
+template <class Pixel>
+std::vector<raster::Pictures<Pixel>> pictures_of(const Pictures& p) {
+  using T = std::remove_const_t<Pixel>;
+  std::vector<raster::Pictures<Pixel>> pictures;
+  const int64_t views = p.rgb.size(0) * p.rgb.size(1), pixels = p.rgb.size(3) * p.rgb.size(4);
+  for (int64_t k = 0; k < views; ++k)
+    pictures.push_back({p.rgb.data_ptr<T>() + k * 3 * pixels, p.alpha.data_ptr<T>() + k * pixels,
+                        p.depth.data_ptr<T>() + k * pixels});
+  return pictures;
+}
+
+template <class T>
+std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, Pictures& out, raster::StageTimes& times) {
+  const auto options = in.gaussians.means.options();
+  out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
+  out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
+  out.depth = at::empty_like(out.alpha);
+  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, at::get_num_threads()};
+  return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
+}
+
+}  // namespace
+
+Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+  return by_type(in, [&](auto number) {
+    using T = decltype(number);
+    Pictures out;
+    kept = std::make_unique<KeptFrame<T>>(draw<T>(in, out, last_times));
+    return out;
+  });
+}
+
+Gaussians splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept) {
+  return by_type(in, [&](auto number) {
+    using T = decltype(number);
+    Gaussians out = empty_like(in.gaussians);
+    static_cast<const KeptFrame<T>&>(kept).frame->backward(scenes_of<T>(in), pictures_of<const T>(drawn),
+                                                           pictures_of<const T>(gradients), gradients_of<T>(out),
+                                                           last_times);
+    return out;
+  });
+}
+
+const Backend backend = {at::kCPU, splat, splat_backward, project, project_backward};
+
+}  // namespace cpu
+
+StageTimes stage_times() {
+  const raster::StageTimes& t = cpu::last_times;
+  return {t.project, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
+}
+
+PairCounts count_pairs(const SplatArguments& of) {
+  const Arguments a = borrowed(of);
+  a.check();
+  TORCH_CHECK(a.means.scalar_type() != at::kDouble, "pairs are counted as float32 sees them");
+  Pictures pictures;
+  raster::StageTimes times;
+  const raster::PairCounts counts = cpu::draw<float>(a.on(at::kCPU), pictures, times)->count();
+  return {counts.tile_entries, counts.evaluated, counts.contributing};
+}
+
+double multiply_add_peak(double seconds) { return raster::multiply_add_peak(at::get_num_threads(), seconds); }
+
+rust::String simd_level() { return raster::kernels().name; }
+
+}  // namespace globalsplat

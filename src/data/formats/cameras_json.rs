@@ -1,0 +1,136 @@
+//! `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}.
+//! (Spec 10.2.)
+
+use super::json::null_for_not_a_number;
+use super::{Found, file_in, folder_name};
+use crate::data::capture::{Capture, Frame, Photo, check_cameras};
+use crate::data::pixels::Distortion;
+use crate::error::{Error, Result};
+use crate::io::write_atomically;
+use crate::scene::{Camera, Intrinsics, pose_to_rows};
+use glam::DMat4;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// By which a capture of this format is recognized.
+const FILE_NAME: &str = "cameras.json";
+
+#[derive(Serialize, Deserialize)]
+struct File {
+    image_shape: [u32; 2],
+    views: Vec<ViewEntry>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct ViewEntry {
+    #[serde(default)]
+    image: String,
+    intrinsic: Vec<Vec<Number>>,
+    c2w: Vec<Vec<Number>>,
+}
+
+/// Python writes NaN and Infinity, which JSON doesn't know: they come as null and are found by the checks on cameras.
+type Number = Option<f64>;
+
+/// A folder with a `cameras.json`, or that file.
+pub(super) fn find(path: &Path) -> Option<Found> {
+    let itself = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
+    let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
+    Some(Box::new(move || read(&file)))
+}
+
+fn read(file: &Path) -> Result<Capture> {
+    let parsed = parse(file)?;
+    let root = file.parent().unwrap_or(Path::new("."));
+    let cameras = cameras(file, &parsed)?;
+    let mut frames = vec![];
+    for (i, (view, camera)) in parsed.views.into_iter().zip(cameras).enumerate() {
+        let image = root.join(&view.image);
+        if view.image.is_empty() || !image.is_file() {
+            let expected = "the path of an image beside it";
+            return Err(Error::input(
+                file,
+                format!("image of view {i}"),
+                format!("{:?}, which is not there", view.image),
+                expected,
+            ));
+        }
+        frames.push(Frame {
+            photo: Photo::File(image),
+            name: view.image,
+            camera,
+            distortion: Distortion::default(),
+        });
+    }
+    Capture::new(folder_name(root), file.to_owned(), frames)
+}
+
+/// Reads the cameras alone.
+pub(super) fn read_cameras(file: &Path) -> Result<Vec<Camera>> {
+    let cameras = cameras(file, &parse(file)?)?;
+    check_cameras(file, cameras.iter())?;
+    Ok(cameras)
+}
+
+/// Writes a `cameras.json` at `file`; `images` are paths relative to its folder. All cameras have one size.
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) -> Result<()> {
+    let views = images.iter().zip(cameras).map(|(image, camera)| ViewEntry {
+        image: image.clone(),
+        intrinsic: rows(&camera.intrinsics.to_rows(), 3),
+        c2w: rows(&pose_to_rows(&camera.c2w), 4),
+    });
+    let image_shape = cameras.first().map_or([0, 0], |camera| [camera.height, camera.width]);
+    let contents = File { image_shape, views: views.collect() };
+    let json = serde_json::to_vec_pretty(&contents).expect("numbers and strings");
+    write_atomically(file, |writer| writer.write_all(&json).map_err(Error::write(file)))
+}
+
+fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {
+    values.chunks(width).map(|row| row.iter().copied().map(Some).collect()).collect()
+}
+
+fn parse(file: &Path) -> Result<File> {
+    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    serde_json::from_str(&null_for_not_a_number(&text)).map_err(|e| {
+        let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
+        Error::input(file, "the file", format!("not a description of cameras ({e})"), expected)
+    })
+}
+
+fn cameras(file: &Path, parsed: &File) -> Result<Vec<Camera>> {
+    let [height, width] = parsed.image_shape;
+    if width == 0 || height == 0 {
+        return Err(Error::input(
+            file,
+            "image_shape",
+            format!("[{height}, {width}]"),
+            "a height and a width",
+        ));
+    }
+    let matrix = |rows: &[Vec<Number>], size: usize, field: String| -> Result<Vec<f64>> {
+        if rows.len() != size || rows.iter().any(|row| row.len() != size) {
+            let found =
+                format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
+            return Err(Error::input(file, field, found, format!("a {size}×{size} matrix")));
+        }
+        Ok(rows.iter().flatten().map(|v| v.unwrap_or(f64::NAN)).collect())
+    };
+    parsed
+        .views
+        .iter()
+        .enumerate()
+        .map(|(i, view)| {
+            let k = matrix(&view.intrinsic, 3, format!("intrinsic of view {i}"))?;
+            let c2w = matrix(&view.c2w, 4, format!("c2w of view {i}"))?;
+            Ok(Camera {
+                intrinsics: Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5] },
+                c2w: DMat4::from_cols_slice(&c2w).transpose(),
+                width,
+                height,
+            })
+        })
+        .collect()
+}

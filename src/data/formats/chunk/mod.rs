@@ -1,0 +1,176 @@
+//! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key",
+//! "url", "timestamps", "cameras" [n, 18], "images": n encoded images}, read and written by libtorch's own pickler
+//! (spec 10.7).
+
+mod archive;
+mod pickle;
+mod write;
+
+pub use write::{ChunkWriter, INDEX_FILE};
+
+use super::Found;
+use crate::data::capture::{Capture, Frame, Photo};
+use crate::data::pixels::Distortion;
+use crate::error::{Error, Result};
+use crate::io::encoded_image_size;
+use crate::scene::{Camera, Intrinsics};
+use archive::Archive;
+use glam::{DMat4, DVec4};
+use globalsplat_csrc::chunk::{ChunkScene, unpickle_scenes};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The ending of a chunk's name.
+const EXTENSION: &str = "torch";
+/// Numbers of a camera: f_x, f_y, c_x, c_y of the image's width and height, 0, 0, w2c's first three rows.
+const CAMERA_NUMBERS: usize = 18;
+
+/// A chunk in memory, images still encoded.
+#[derive(Debug, Clone)]
+pub struct Chunk {
+    file: PathBuf,
+    bytes: Arc<Vec<u8>>,
+    scenes: Vec<ChunkScene>,
+}
+
+/// `CHUNK.torch#KEY`, or `CHUNK.torch` with one scene alone.
+pub(super) fn find(path: &Path) -> Option<Found> {
+    let keyed =
+        path.to_str().and_then(|path| path.rsplit_once('#')).filter(|(file, _)| is_chunk(file.as_ref()));
+    if let Some((file, key)) = keyed {
+        let (file, key) = (PathBuf::from(file), key.to_string());
+        return Some(Box::new(move || Chunk::read(&file)?.capture(&key)));
+    }
+    let file = is_chunk(path).then(|| path.to_owned())?;
+    Some(Box::new(move || Chunk::read(&file)?.only_capture()))
+}
+
+/// Whether `path` is a file of scenes, by its name.
+fn is_chunk(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == EXTENSION) && path.is_file()
+}
+
+impl Chunk {
+    /// Reads a chunk, runs nothing that it holds, and believes nothing that it says about sizes.
+    ///
+    /// # Errors
+    /// A file that can't be read, is damaged, or holds anything but scenes.
+    pub fn read(file: &Path) -> Result<Self> {
+        Self::parse(file, std::fs::read(file).map_err(Error::read(file))?)
+    }
+
+    /// [`Chunk::read`] of the bytes that `file` holds.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
+        let archive = Archive::open(file, &bytes)?;
+        let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
+        let refuse = |found: String| Error::input(file, "data.pkl", found, expected);
+        let program = &bytes[archive.pickle];
+        pickle::check_pickle(program).map_err(refuse)?;
+        // libtorch appends where in its source it stood.
+        let first_line = |e: cxx::Exception| e.what().lines().next().unwrap_or_default().to_string();
+        let scenes = unpickle_scenes(&bytes, program, &archive.records);
+        let scenes = scenes.map_err(|e| refuse(format!("unusable ({})", first_line(e))))?;
+        Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
+    }
+
+    /// The scenes' names, in order.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.scenes.iter().map(|scene| scene.key.as_str())
+    }
+
+    /// The scene `key`.
+    ///
+    /// # Errors
+    /// No such scene, or one that breaks what every capture has to hold.
+    pub fn capture(&self, key: &str) -> Result<Capture> {
+        match self.scenes.iter().find(|scene| scene.key == key) {
+            Some(scene) => self.capture_of(scene),
+            None => Err(Error::input(
+                &self.file,
+                "the scene",
+                format!("{key:?}, which is not there"),
+                self.choice(),
+            )),
+        }
+    }
+
+    /// The scene of a chunk that has one alone.
+    ///
+    /// # Errors
+    /// More scenes, or none; otherwise as [`Chunk::capture`].
+    fn only_capture(&self) -> Result<Capture> {
+        match self.scenes.as_slice() {
+            [scene] => self.capture_of(scene),
+            scenes => {
+                let file = self.file.display();
+                Err(Error::Request(format!(
+                    "{file}: it holds {} scenes, expected {file}#KEY with {}",
+                    scenes.len(),
+                    self.choice()
+                )))
+            }
+        }
+    }
+
+    /// Which scenes there are, for an error.
+    fn choice(&self) -> String {
+        const SHOWN: usize = 8;
+        let keys: Vec<&str> = self.keys().take(SHOWN).collect();
+        let more = if self.scenes.len() > SHOWN { ", …" } else { "" };
+        format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
+    }
+
+    fn capture_of(&self, scene: &ChunkScene) -> Result<Capture> {
+        let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
+        let ranges: Vec<Range<usize>> = scene
+            .images
+            .iter()
+            .map(|image| image.start as usize..(image.start + image.length) as usize)
+            .collect();
+        // A frame that is damaged is found when it is loaded; until then it is as large as the others.
+        let sizes: Vec<_> =
+            ranges.iter().map(|range| encoded_image_size(&self.bytes[range.clone()])).collect();
+        let Some(usual) = sizes.iter().flatten().next() else {
+            return Err(Error::input(&named, "every image", "undecodable", "a JPEG or PNG"));
+        };
+        let cameras = scene.cameras.chunks_exact(CAMERA_NUMBERS);
+        let frames = ranges.into_iter().zip(cameras).zip(&sizes).enumerate().map(
+            |(index, ((bytes, numbers), size))| {
+                let name = format!("{index:06}");
+                let camera = camera(numbers, size.unwrap_or(*usual));
+                let photo = Photo::Part { file: self.bytes.clone(), bytes, name: named.join(&name) };
+                Frame { photo, name, camera, distortion: Distortion::default() }
+            },
+        );
+        Capture::new(scene.key.clone(), named.clone(), frames.collect())
+    }
+}
+
+/// From a chunk's numbers and (width, height).
+fn camera(numbers: &[f32], (width, height): (u32, u32)) -> Camera {
+    let at = |i: usize| f64::from(numbers[i]);
+    let (w, h) = (f64::from(width), f64::from(height));
+    let row = |i: usize| DVec4::new(at(i), at(i + 1), at(i + 2), at(i + 3));
+    let w2c = DMat4::from_cols(row(6), row(10), row(14), DVec4::W).transpose();
+    let intrinsics = Intrinsics { fx: at(0) * w, fy: at(1) * h, cx: at(2) * w, cy: at(3) * h };
+    Camera { intrinsics, c2w: w2c.inverse(), width, height }
+}
+
+/// What [`camera`] reads.
+fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
+    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+    let k = camera.intrinsics;
+    let mut numbers = [0f32; CAMERA_NUMBERS];
+    for (number, value) in numbers.iter_mut().zip([k.fx / w, k.fy / h, k.cx / w, k.cy / h]) {
+        *number = value as f32;
+    }
+    let rows = crate::scene::pose_to_rows(&camera.c2w.inverse());
+    for (number, value) in numbers[6..].iter_mut().zip(rows) {
+        *number = value as f32;
+    }
+    numbers
+}

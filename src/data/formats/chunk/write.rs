@@ -1,0 +1,107 @@
+//! Captures into chunks.
+
+use super::{EXTENSION, camera_numbers};
+use crate::data::capture::Capture;
+use crate::error::{Error, Result};
+use crate::io::write_atomically;
+use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// By which a folder of chunks is recognized: {key: chunk's file name}.
+pub const INDEX_FILE: &str = "index.json";
+
+/// Writes chunks and their index into a folder.
+#[derive(Debug)]
+pub struct ChunkWriter {
+    folder: PathBuf,
+    /// Bytes of images after which a chunk is written.
+    chunk_bytes: usize,
+    waiting: Vec<SceneToPickle>,
+    waiting_bytes: usize,
+    chunks: usize,
+    index: BTreeMap<String, String>,
+}
+
+impl ChunkWriter {
+    /// Chunks of about `chunk_bytes` in `folder`, which is there already.
+    ///
+    /// # Errors
+    /// A folder that holds chunks already.
+    pub fn new(folder: &Path, chunk_bytes: usize) -> Result<Self> {
+        let index = folder.join(INDEX_FILE);
+        if index.exists() {
+            return Err(Error::input(
+                folder,
+                "the output",
+                "a folder of chunks already",
+                "one without index.json",
+            ));
+        }
+        Ok(ChunkWriter {
+            folder: folder.to_owned(),
+            chunk_bytes,
+            waiting: vec![],
+            waiting_bytes: 0,
+            chunks: 0,
+            index: BTreeMap::new(),
+        })
+    }
+
+    /// Adds a capture, by its name. JPEG and PNG files are taken as they are, bit for bit, unless their lens distorts, they
+    /// lie on their side, or they have other than three channels of 8 bits; then they are encoded anew, a JPEG as a JPEG of
+    /// high quality, everything else as a PNG.
+    ///
+    /// # Errors
+    /// A name that is there already, photos that can't be read, the system's refusal to write.
+    pub fn add(&mut self, capture: &Capture) -> Result<()> {
+        if let Some(chunk) = self.index.get(&capture.name) {
+            let found = format!("{:?}, which {chunk} holds already", capture.name);
+            return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
+        }
+        let mut images = vec![];
+        for index in 0..capture.len() {
+            images.push(EncodedImage { bytes: capture.encoded(index)? });
+        }
+        let bytes: usize = images.iter().map(|image| image.bytes.len()).sum();
+        if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
+            self.write_chunk()?;
+        }
+        self.index.insert(capture.name.clone(), self.chunk_name());
+        self.waiting_bytes += bytes;
+        self.waiting.push(SceneToPickle {
+            key: capture.name.clone(),
+            url: String::new(),
+            timestamps: (0..capture.len() as i64).collect(),
+            cameras: capture.cameras().iter().flat_map(camera_numbers).collect(),
+            images,
+        });
+        Ok(())
+    }
+
+    /// Writes what is left, and the index, without which the chunks aren't found. Returns the number of chunks.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn finish(mut self) -> Result<usize> {
+        if !self.waiting.is_empty() {
+            self.write_chunk()?;
+        }
+        let file = self.folder.join(INDEX_FILE);
+        let json = serde_json::to_vec_pretty(&self.index).expect("strings");
+        write_atomically(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))?;
+        Ok(self.chunks)
+    }
+
+    fn chunk_name(&self) -> String {
+        format!("{:06}.{EXTENSION}", self.chunks)
+    }
+
+    fn write_chunk(&mut self) -> Result<()> {
+        let file = self.folder.join(self.chunk_name());
+        let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
+        write_atomically(&file, |writer| writer.write_all(bytes.as_slice()).map_err(Error::write(&file)))?;
+        (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
+        Ok(())
+    }
+}

@@ -1,0 +1,241 @@
+//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with
+//! OpenGL axes}]}, and of the lens, for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x`
+//! and `camera_angle_y` in radians, and the distortion `k1` to `k4`, `p1`, `p2` (spec 10.3).
+
+use super::json::null_for_not_a_number;
+use super::{Found, file_in, folder_name};
+use crate::data::capture::{Capture, Frame, Photo};
+use crate::data::pixels::Distortion;
+use crate::error::{Error, Result};
+use crate::io::read_image_size;
+use crate::scene::{Camera, Intrinsics, nearest_rigid};
+use glam::{DMat4, DVec4};
+use serde_json::Value;
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+
+/// By which a capture of this format is recognized.
+const FILE_NAME: &str = "transforms.json";
+
+/// What is tried behind a `file_path` that names no file.
+const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+
+/// Lenses that [`Distortion`] describes.
+const CAMERA_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
+
+/// A folder with a `transforms.json`, or a file `transforms….json`.
+pub(super) fn find(path: &Path) -> Option<Found> {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
+    let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
+    Some(Box::new(move || read(&file)))
+}
+
+/// Reads the capture that `file` describes. Frames come in the order of their names. Those whose image isn't there are left
+/// out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
+fn read(file: &Path) -> Result<Capture> {
+    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
+    let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
+        .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
+    let entries = match json.get("frames") {
+        Some(Value::Array(entries)) => entries,
+        other => return Err(Error::input(file, "frames", shown(other), "a list of frames")),
+    };
+    let root = file.parent().unwrap_or(Path::new("."));
+    let (mut frames, mut absent) = (vec![], None);
+    for (index, frame) in entries.iter().enumerate() {
+        let fields = Fields { file, index, frame, shared: &json };
+        let name = fields.file_path()?;
+        match image_at(root, name) {
+            Some(image) => frames.push(fields.frame(image, name)?),
+            None => absent = absent.or(Some(name)),
+        }
+    }
+    if let (Some(name), true) = (absent, frames.len() < 2) {
+        let found = format!("{} of {}, {name:?} is not there", frames.len(), entries.len());
+        return Err(Error::input(file, "the number of frames with an image", found, "two or more"));
+    }
+    frames.sort_by(|a, b| a.name.cmp(&b.name));
+    Capture::new(folder_name(root), file.to_owned(), frames)
+}
+
+fn image_at(root: &Path, name: &str) -> Option<PathBuf> {
+    let with_extension = EXTENSIONS.iter().map(|extension| root.join(format!("{name}.{extension}")));
+    std::iter::once(root.join(name)).chain(with_extension).find(|path| path.is_file())
+}
+
+/// What stands in the file, for an error.
+fn shown(value: Option<&Value>) -> String {
+    match value {
+        None => "absent".into(),
+        Some(Value::Null) => "null or NaN".into(),
+        Some(Value::Array(values)) => format!("a list of {}", values.len()),
+        Some(Value::Object(_)) => "an object".into(),
+        Some(value) => value.to_string(),
+    }
+}
+
+/// A frame's fields, each its own or else the one shared by all.
+struct Fields<'a> {
+    file: &'a Path,
+    index: usize,
+    frame: &'a Value,
+    shared: &'a Value,
+}
+
+impl<'a> Fields<'a> {
+    /// The value, and what to call it.
+    fn find(&self, key: &str) -> Option<(&'a Value, String)> {
+        let own = self.frame.get(key).map(|value| (value, self.name(key)));
+        own.or_else(|| self.shared.get(key).map(|value| (value, key.to_string())))
+    }
+
+    fn name(&self, key: &str) -> String {
+        format!("{key} of frame {}", self.index)
+    }
+
+    fn number(&self, key: &str) -> Result<Option<f64>> {
+        let Some((value, name)) = self.find(key) else { return Ok(None) };
+        match value.as_f64() {
+            Some(number) => Ok(Some(number)),
+            None => Err(Error::input(self.file, name, shown(Some(value)), "a number")),
+        }
+    }
+
+    /// A number of pixels.
+    fn size(&self, key: &str) -> Result<Option<u32>> {
+        match self.number(key)? {
+            None => Ok(None),
+            Some(size) if size >= 1. && size <= f64::from(u32::MAX) && size.fract() == 0. => {
+                Ok(Some(size as u32))
+            }
+            Some(size) => Err(self.refuse(key, size, "a number of pixels")),
+        }
+    }
+
+    /// The focal length in pixels that goes with an angle of view over `size` pixels: size / (2 tan(angle/2)).
+    fn focal_from_angle(&self, key: &str, size: u32) -> Result<Option<f64>> {
+        match self.number(key)? {
+            None => Ok(None),
+            Some(angle) if angle > 0. && angle < PI => Ok(Some(f64::from(size) / (2. * (angle / 2.).tan()))),
+            Some(angle) => Err(self.refuse(key, angle, "an angle between 0 and π")),
+        }
+    }
+
+    /// That the value of `key`, which is there, is `found`.
+    fn refuse(&self, key: &str, found: impl std::fmt::Display, expected: &str) -> Error {
+        let name = self.find(key).map_or(key.to_string(), |(_, name)| name);
+        Error::input(self.file, name, found, expected)
+    }
+
+    fn file_path(&self) -> Result<&'a str> {
+        match self.frame.get("file_path") {
+            Some(Value::String(path)) if !path.is_empty() => Ok(path),
+            other => {
+                Err(Error::input(self.file, self.name("file_path"), shown(other), "the path of an image"))
+            }
+        }
+    }
+
+    fn frame(&self, image: PathBuf, name: &str) -> Result<Frame> {
+        self.check_camera_model()?;
+        let (width, height) = match (self.size("w")?, self.size("h")?) {
+            (Some(width), Some(height)) => (width, height),
+            _ => read_image_size(&image)?,
+        };
+        let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w: self.c2w()?, width, height };
+        let distortion = self.distortion()?;
+        let refuse =
+            |name: &str, (found, expected)| Error::input(self.file, self.name(name), found, expected);
+        let intrinsics = camera.intrinsics.check(width, height);
+        intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
+        distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
+        Ok(Frame { photo: Photo::File(image), name: name.to_string(), camera, distortion })
+    }
+
+    /// A focal length that isn't given follows from the angle of view, and else equals that of the other axis; a principal
+    /// point that isn't given is the image's centre.
+    fn intrinsics(&self, width: u32, height: u32) -> Result<Intrinsics> {
+        let focal = |length: &str, angle: &str, size: u32| match self.number(length)? {
+            Some(focal) => Ok(Some(focal)),
+            None => self.focal_from_angle(angle, size),
+        };
+        let (fx, fy) = (focal("fl_x", "camera_angle_x", width)?, focal("fl_y", "camera_angle_y", height)?);
+        let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
+            let expected = "a focal length in pixels, or camera_angle_x";
+            return Err(Error::input(self.file, self.name("fl_x"), "absent", expected));
+        };
+        let cx = self.number("cx")?.unwrap_or(f64::from(width) / 2.);
+        let cy = self.number("cy")?.unwrap_or(f64::from(height) / 2.);
+        Ok(Intrinsics { fx, fy, cx, cy })
+    }
+
+    fn distortion(&self) -> Result<Distortion> {
+        if let Some((value, name)) = self.find("distortion_params") {
+            return Err(Error::input(
+                self.file,
+                name,
+                shown(Some(value)),
+                "the coefficients by name, as in k1",
+            ));
+        }
+        let number = |key: &str| Ok::<_, Error>(self.number(key)?.unwrap_or(0.));
+        Ok(Distortion {
+            radial: [number("k1")?, number("k2")?, number("k3")?, number("k4")?],
+            tangential: [number("p1")?, number("p2")?],
+        })
+    }
+
+    fn check_camera_model(&self) -> Result<()> {
+        if let Some((model, name)) = self.find("camera_model")
+            && !CAMERA_MODELS.iter().any(|known| model == known)
+        {
+            let expected = format!("one of {}", CAMERA_MODELS.join(", "));
+            return Err(Error::input(self.file, name, shown(Some(model)), expected));
+        }
+        if let Some((value, name)) = self.find("is_fisheye")
+            && value != &Value::Bool(false)
+        {
+            return Err(Error::input(
+                self.file,
+                name,
+                shown(Some(value)),
+                "false, as fisheye lenses aren't known",
+            ));
+        }
+        Ok(())
+    }
+
+    /// `transform_matrix` with OpenCV axes: OpenGL's y looks up and its z backward, so those two columns change sign.
+    fn c2w(&self) -> Result<DMat4> {
+        let name = self.name("transform_matrix");
+        let value = self.frame.get("transform_matrix");
+        let rows: Vec<&[Value]> = value
+            .and_then(Value::as_array)
+            .into_iter()
+            .flatten()
+            .filter_map(Value::as_array)
+            .map(Vec::as_slice)
+            .collect();
+        if value.and_then(Value::as_array).is_none_or(|all| all.len() != 4)
+            || rows.len() != 4
+            || rows.iter().any(|row| row.len() != 4)
+        {
+            return Err(Error::input(self.file, name, shown(value), "a 4×4 matrix"));
+        }
+        let mut entries = [0.; 16];
+        for (i, value) in rows.iter().copied().flatten().enumerate() {
+            entries[i] = match value {
+                Value::Null => f64::NAN,
+                value => value.as_f64().ok_or_else(|| {
+                    let field = format!("row {}, column {} of {name}", i / 4, i % 4);
+                    Error::input(self.file, field, shown(Some(value)), "a number")
+                })?,
+            };
+        }
+        let opengl = DMat4::from_cols_array(&entries).transpose();
+        let c2w = opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.));
+        nearest_rigid(&c2w).map_err(|(found, expected)| Error::input(self.file, name, found, expected))
+    }
+}

@@ -1,0 +1,299 @@
+//! Threads that read, decode, resize and augment ahead of training. Sample i depends on the seed and i alone: every thread
+//! makes each T-th sample, and they are taken from the threads by turns.
+
+use super::bad_data::{BadData, Fault, Ledger};
+use super::open_groups::{OpenGroups, Opened};
+use super::order::{Order, Place};
+use super::sample::Sample;
+use super::sampler::choose_views;
+use super::scene::{LoadTimes, LoadedScene};
+use super::scenes::SceneGroups;
+use crate::data::capture::Capture;
+use crate::data::config::DataConfig;
+use crate::data::pixels::{Augmentation, CHANNELS, Resampler};
+use crate::error::{Error, Result, panic_message};
+use crate::scene::{Camera, normalize};
+use glam::DVec3;
+use image::RgbImage;
+use rand::seq::SliceRandom;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Instant;
+use tch::Device;
+
+/// Far end of a frustum in units of the capture: these data sets have no metric scale (spec 2.3).
+const FAR: f64 = 4. * 10.;
+
+/// Delivers samples in order.
+#[derive(Debug)]
+pub struct Loader {
+    shared: Arc<Shared>,
+    receivers: Vec<Receiver<Result<LoadedScene>>>,
+    threads: Vec<JoinHandle<()>>,
+    next: u64,
+}
+
+/// Decoded photos by place and view.
+type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
+
+/// What all threads work with.
+#[derive(Debug)]
+struct Shared {
+    config: DataConfig,
+    seed: u64,
+    order: Order,
+    groups: OpenGroups,
+    ledger: Ledger,
+    /// Where there is memory for all of them.
+    photos: Option<Mutex<DecodedPhotos>>,
+    stopped: AtomicBool,
+}
+
+/// What a thread keeps from photo to photo.
+#[derive(Debug, Default)]
+struct Tools {
+    resampler: Resampler,
+    scratch: Vec<f32>,
+    times: LoadTimes,
+}
+
+impl Loader {
+    /// Begins to load `scenes`, sample `first` before all others.
+    ///
+    /// # Errors
+    /// No scenes, or threads that can't be had.
+    pub fn start(config: &DataConfig, seed: u64, scenes: Arc<dyn SceneGroups>, first: u64) -> Result<Self> {
+        let sizes = scenes.sizes();
+        if sizes.iter().all(|&size| size == 0) {
+            return Err(Error::Request("there are no scenes to train on".into()));
+        }
+        let fits = scenes
+            .decoded_bytes()
+            .is_some_and(|bytes| bytes <= config.photo_megabytes.saturating_mul(1_000_000));
+        let order = Order::new(sizes, seed);
+        let shared = Arc::new(Shared {
+            config: config.clone(),
+            seed,
+            ledger: Ledger::new(order.scenes(), config.max_bad_share),
+            order,
+            groups: OpenGroups::new(scenes),
+            photos: fits.then(Default::default),
+            stopped: AtomicBool::new(false),
+        });
+        let threads = match config.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        };
+        let mut loader = Loader { shared, receivers: vec![], threads: vec![], next: first };
+        // A thread holds a sample in its hands while its queue is full.
+        let queue = config.ahead.div_ceil(threads).saturating_sub(1).max(1);
+        for thread in 0..threads as u64 {
+            let (sender, receiver) = sync_channel(queue);
+            let shared = loader.shared.clone();
+            let turns = (first + thread..).step_by(threads);
+            let work = move || {
+                let mut tools = Tools::default();
+                for sample in turns {
+                    // Nobody listens any more when the loader is gone.
+                    if shared.stopped.load(Ordering::Relaxed) {
+                        return;
+                    }
+                    let load = AssertUnwindSafe(|| shared.load(sample, &mut tools));
+                    let scene = catch_unwind(load).unwrap_or_else(|panic| {
+                        let why = panic_message(&*panic);
+                        Err(Error::Failed(format!("loading sample {sample} failed inside: {why}")))
+                    });
+                    if sender.send(scene).is_err() {
+                        return;
+                    }
+                }
+            };
+            let spawned = std::thread::Builder::new().name(format!("loader-{thread}")).spawn(work);
+            let spawned =
+                spawned.map_err(|e| Error::Failed(format!("a loading thread can't be started: {e}")))?;
+            loader.receivers.push(receiver);
+            loader.threads.push(spawned);
+        }
+        Ok(loader)
+    }
+
+    /// Threads that load.
+    pub fn threads(&self) -> usize {
+        self.threads.len()
+    }
+
+    /// The number of the next sample.
+    pub fn position(&self) -> u64 {
+        self.next
+    }
+
+    /// The next sample.
+    ///
+    /// # Errors
+    /// More bad data than the configuration allows.
+    pub fn next_scene(&mut self) -> Result<LoadedScene> {
+        // Thread t made the t-th sample, whatever its number is.
+        let turn = self.receivers.len();
+        let receiver = &self.receivers[0];
+        let scene = receiver.recv().map_err(|_| Error::Failed("a loading thread has ended".into()))??;
+        self.receivers.rotate_left(1 % turn);
+        self.next += 1;
+        Ok(scene)
+    }
+
+    /// The next `batch` samples side by side.
+    ///
+    /// # Errors
+    /// As [`Loader::next_scene`].
+    pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
+        let scenes = (0..batch).map(|_| self.next_scene()).collect::<Result<Vec<_>>>()?;
+        Ok(Sample::of(&scenes, device))
+    }
+
+    /// What was skipped so far, with what is ready ahead.
+    pub fn bad_data(&self) -> BadData {
+        self.shared.ledger.counts()
+    }
+}
+
+impl Drop for Loader {
+    fn drop(&mut self) {
+        self.shared.stopped.store(true, Ordering::Relaxed);
+        self.receivers.clear();
+        for thread in self.threads.drain(..) {
+            // What it panicked with was sent already.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Shared {
+    /// Sample number `sample`: the scene whose turn it is. In place of one that is bad stands another of its group, or else
+    /// of the groups that come next.
+    fn load(&self, sample: u64, tools: &mut Tools) -> Result<LoadedScene> {
+        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
+        random.set_stream(sample);
+        tools.times = LoadTimes::default();
+        let (first, groups) = self.order.turn(sample);
+        for group in groups {
+            let start = Instant::now();
+            let opened = self.groups.open(group);
+            tools.times.read += start.elapsed().as_secs_f64();
+            let scenes: &[Result<Capture>] = match &*opened {
+                Opened::Scenes(scenes) => scenes,
+                Opened::Broken(why) => {
+                    let places = (0..self.order.size(group)).map(|scene| Place { group, scene });
+                    self.ledger.add(Fault::Group, places, why)?;
+                    continue;
+                }
+            };
+            let mut turns: Vec<usize> = (0..self.order.size(group)).collect();
+            if group == first.group {
+                turns.swap_remove(first.scene);
+                turns.insert(0, first.scene);
+            }
+            let mut shuffled = usize::from(group == first.group);
+            for turn in 0..turns.len() {
+                // Scenes are drawn only once they are needed: the first one is almost always good.
+                if turn == shuffled {
+                    turns[turn..].shuffle(&mut random);
+                    shuffled = usize::MAX;
+                }
+                let place = Place { group, scene: turns[turn] };
+                match self.load_scene(place, scenes.get(place.scene), &mut random, tools) {
+                    Ok(scene) => return Ok(scene),
+                    Err((fault, why)) => self.ledger.add(fault, std::iter::once(place), why)?,
+                }
+            }
+        }
+        Err(Error::Failed(format!("no scene can be trained on: {}", self.ledger.counts())))
+    }
+
+    fn load_scene(
+        &self,
+        place: Place,
+        capture: Option<&Result<Capture>>,
+        random: &mut impl Rng,
+        tools: &mut Tools,
+    ) -> std::result::Result<LoadedScene, (Fault, String)> {
+        let broken = |why: &Error| (Fault::Scene, why.to_string());
+        let capture = match capture {
+            Some(Ok(capture)) => capture,
+            Some(Err(why)) => return Err(broken(why)),
+            None => return Err((Fault::Scene, "its file holds fewer scenes than it should".into())),
+        };
+        let in_capture = |why: Error| (Fault::Scene, format!("{}: {why}", capture.file().display()));
+        let config = &self.config;
+        let cameras = capture.cameras();
+        let (shown, _) = config.holdout.split(cameras.len());
+        let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
+        let views = choose_views(config, &centres, random).ok_or_else(|| {
+            let why = format!("{} views to show, expected {} or more", shown.len(), config.window[0]);
+            (Fault::Short, format!("{}: {why} (data.window)", capture.file().display()))
+        })?;
+        let augmentation = Augmentation::draw(config, random);
+
+        let mut chosen = [&views.context[..], &views.target].concat();
+        chosen.sort_unstable();
+        chosen.dedup();
+        let framed = chosen.iter().map(|&view| augmentation.frame(&cameras[shown[view]], config.image_size));
+        let framed = framed.collect::<Result<Vec<_>>>().map_err(in_capture)?;
+        let (regions, cameras): (Vec<_>, Vec<_>) = framed.into_iter().unzip();
+        let among = |views: &[usize]| -> Vec<usize> {
+            views.iter().map(|view| chosen.binary_search(view).expect("one of those chosen")).collect()
+        };
+        let (context, target) = (among(&views.context), among(&views.target));
+        let (cameras, far) = normalized(cameras, &context, &target).map_err(in_capture)?;
+
+        let size = config.image_size;
+        let image_bytes = CHANNELS * size.height as usize * size.width as usize;
+        let mut images = vec![0; chosen.len() * image_bytes];
+        for ((planes, region), &view) in images.chunks_exact_mut(image_bytes).zip(regions).zip(&chosen) {
+            let start = Instant::now();
+            let photo =
+                self.photo(place, capture, shown[view]).map_err(|why| (Fault::Image, why.to_string()))?;
+            let decoded = Instant::now();
+            augmentation.show(&mut tools.resampler, &photo, region, size, planes);
+            let resized = Instant::now();
+            augmentation.jitter.apply_to_bytes(planes, &mut tools.scratch);
+            tools.times += LoadTimes {
+                decode: (decoded - start).as_secs_f64(),
+                resize: (resized - decoded).as_secs_f64(),
+                augment: resized.elapsed().as_secs_f64(),
+                ..Default::default()
+            };
+        }
+        let (name, times) = (capture.name.clone(), tools.times);
+        Ok(LoadedScene { name, images, size, cameras, context, target, far, times })
+    }
+
+    fn photo(&self, place: Place, capture: &Capture, view: usize) -> Result<Arc<RgbImage>> {
+        let Some(photos) = &self.photos else { return Ok(Arc::new(capture.photo(view)?)) };
+        let kept = photos.lock().expect("no thread panics here").get(&(place, view)).cloned();
+        if let Some(photo) = kept {
+            return Ok(photo);
+        }
+        let photo = Arc::new(capture.photo(view)?);
+        photos.lock().expect("no thread panics here").insert((place, view), photo.clone());
+        Ok(photo)
+    }
+}
+
+/// `cameras` in the world that context and target views give together, a view that is both counted twice, and how far their
+/// frusta reach.
+fn normalized(cameras: Vec<Camera>, context: &[usize], target: &[usize]) -> Result<(Vec<Camera>, f64)> {
+    let positions: Vec<usize> = context.iter().chain(target).copied().collect();
+    let poses: Vec<_> = positions.iter().map(|&position| cameras[position].c2w).collect();
+    let normalization = normalize(&poses)?;
+    let mut cameras = cameras;
+    for (&position, &c2w) in positions.iter().zip(&normalization.c2w) {
+        cameras[position].c2w = c2w;
+    }
+    Ok((cameras, FAR / normalization.world_from_normalized.scale))
+}

@@ -1,0 +1,127 @@
+//! Which views of a video a training sample looks at (spec 8.2).
+
+use crate::data::config::{DataConfig, Sampling};
+use glam::DVec3;
+use rand::Rng;
+use rand::seq::index;
+
+/// Positions in a video, ascending.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ChosenViews {
+    /// What the model sees.
+    pub context: Vec<usize>,
+    /// What its pictures are compared with; may be among the context.
+    pub target: Vec<usize>,
+}
+
+/// Views of a random window of a video whose cameras stand at `centres`; none where the video is shorter than the shortest
+/// window. The configuration's numbers of views are at most that window's length.
+pub fn choose_views(config: &DataConfig, centres: &[DVec3], random: &mut impl Rng) -> Option<ChosenViews> {
+    let [shortest, longest] = config.window;
+    if centres.len() < shortest {
+        return None;
+    }
+    let length = random.random_range(shortest..=longest).min(centres.len());
+    let start = random.random_range(0..=centres.len() - length);
+    let context = match config.sampling {
+        Sampling::Uniform => uniform(length, config.context_views, random),
+        Sampling::Farthest => farthest(&centres[start..][..length], config.context_views, random),
+    };
+    let target = uniform(length, config.target_views, random);
+    let in_video = |mut positions: Vec<usize>| {
+        positions.sort_unstable();
+        positions.iter_mut().for_each(|position| *position += start);
+        positions
+    };
+    Some(ChosenViews { context: in_video(context), target: in_video(target) })
+}
+
+fn uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usize> {
+    index::sample(random, length, count).into_vec()
+}
+
+fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
+    let mut chosen = vec![random.random_range(0..centres.len())];
+    // Of each frame to the nearest chosen one; below 0 for those that are chosen.
+    let mut distances = vec![f64::INFINITY; centres.len()];
+    while chosen.len() < count {
+        let last = chosen[chosen.len() - 1];
+        for (distance, centre) in distances.iter_mut().zip(centres) {
+            *distance = distance.min(centre.distance_squared(centres[last]));
+        }
+        distances[last] = -1.;
+        // The first of equally far ones, so that nothing is left to the machine.
+        let next = (0..centres.len()).rev().max_by(|&a, &b| distances[a].total_cmp(&distances[b]));
+        chosen.push(next.expect("more frames than views"));
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    fn config(sampling: Sampling) -> DataConfig {
+        DataConfig { window: [40, 220], context_views: 24, target_views: 12, sampling, ..Default::default() }
+    }
+
+    fn line(count: usize) -> Vec<DVec3> {
+        (0..count).map(|i| DVec3::new(i as f64, 0., 0.)).collect()
+    }
+
+    fn is_ascending(positions: &[usize]) -> bool {
+        positions.windows(2).all(|pair| pair[0] < pair[1])
+    }
+
+    #[test]
+    fn windows_are_as_long_as_they_may_be() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        for sampling in [Sampling::Uniform, Sampling::Farthest] {
+            let (mut shortest, mut longest, mut last) = (usize::MAX, 0, 0);
+            for _ in 0..2000 {
+                let views = choose_views(&config(sampling), &line(300), &mut random).unwrap();
+                assert_eq!((views.context.len(), views.target.len()), (24, 12));
+                assert!(is_ascending(&views.context) && is_ascending(&views.target));
+                let all = || views.context.iter().chain(&views.target);
+                let (first, end) = (*all().min().unwrap(), *all().max().unwrap());
+                shortest = shortest.min(end - first + 1);
+                longest = longest.max(end - first + 1);
+                last = last.max(end);
+            }
+            assert!((24..=40).contains(&shortest), "{shortest}");
+            assert!((200..=220).contains(&longest), "{longest}");
+            assert!(last > 290, "{last}");
+        }
+    }
+
+    #[test]
+    fn a_short_clip_is_its_own_window_and_a_shorter_one_is_skipped() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        assert_eq!(choose_views(&config(Sampling::Uniform), &line(39), &mut random), None);
+        let views = choose_views(&config(Sampling::Uniform), &line(40), &mut random).unwrap();
+        assert!(views.context.iter().all(|&view| view < 40));
+    }
+
+    #[test]
+    fn farthest_views_are_spread_over_the_window() {
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        let config = DataConfig {
+            window: [64, 64],
+            context_views: 9,
+            target_views: 1,
+            sampling: Sampling::Farthest,
+            ..Default::default()
+        };
+        for _ in 0..50 {
+            let context = choose_views(&config, &line(64), &mut random).unwrap().context;
+            assert!(context[0] <= 10 && context[8] >= 53, "{context:?}");
+            let widest = context.windows(2).map(|pair| pair[1] - pair[0]).max();
+            assert!(widest <= Some(16), "{context:?}");
+        }
+        // Cameras in one place are told apart all the same.
+        let still = choose_views(&config, &[DVec3::ONE; 64], &mut random).unwrap();
+        assert!(is_ascending(&still.context));
+    }
+}

@@ -1,0 +1,97 @@
+//! Where scenes come from: groups that are read together.
+
+use crate::data::capture::Capture;
+use crate::data::dataset::{Dataset, SceneGroup, Split};
+use crate::error::Result;
+use std::fmt;
+use std::path::PathBuf;
+
+/// Scenes in groups, each of which is opened as a whole, as a file that holds several of them.
+pub trait SceneGroups: Send + Sync + fmt::Debug {
+    /// Scenes in each group.
+    fn sizes(&self) -> Vec<usize>;
+
+    /// The scenes of `group`, in an order that is always the same, each of them or what is wrong with it.
+    ///
+    /// # Errors
+    /// A group that can't be read at all.
+    fn open(&self, group: usize) -> Result<Vec<Result<Capture>>>;
+
+    /// Bytes that all photos take up when they are decoded; none where nobody knows without reading them.
+    fn decoded_bytes(&self) -> Option<u64>;
+}
+
+/// Captures that are open already, a group each.
+impl SceneGroups for Vec<Capture> {
+    fn sizes(&self) -> Vec<usize> {
+        vec![1; self.len()]
+    }
+
+    fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
+        Ok(vec![Ok(self[group].clone())])
+    }
+
+    fn decoded_bytes(&self) -> Option<u64> {
+        Some(self.iter().map(decoded_bytes).sum())
+    }
+}
+
+fn decoded_bytes(capture: &Capture) -> u64 {
+    capture.cameras().iter().map(|camera| 3 * u64::from(camera.width) * u64::from(camera.height)).sum()
+}
+
+/// What a configuration names: captures, which are opened at once and kept, and chunks, which are read as they are needed.
+#[derive(Debug)]
+pub struct TrainingScenes {
+    captures: Vec<Capture>,
+    chunks: Vec<SceneGroup>,
+}
+
+impl TrainingScenes {
+    /// Finds them by [`Dataset::open`], where there are parts in the one that is to be learned from.
+    ///
+    /// # Errors
+    /// Nothing known at one of `paths`, or a capture that breaks its format's rules. Chunks aren't read yet.
+    pub fn find(paths: &[PathBuf]) -> Result<Self> {
+        let mut found = TrainingScenes { captures: vec![], chunks: vec![] };
+        for path in paths {
+            for group in Dataset::open(path, Split::Train)?.groups() {
+                match group.is_chunk() {
+                    true => found.chunks.push(group.clone()),
+                    false => found.captures.push(group.open()?.capture(&group.keys[0])?),
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Those that don't lie in chunks.
+    pub fn captures(&self) -> &[Capture] {
+        &self.captures
+    }
+
+    /// Chunks with the others.
+    pub fn chunks(&self) -> &[SceneGroup] {
+        &self.chunks
+    }
+}
+
+impl SceneGroups for TrainingScenes {
+    fn sizes(&self) -> Vec<usize> {
+        let chunks = self.chunks.iter().map(|chunk| chunk.keys.len());
+        self.captures.iter().map(|_| 1).chain(chunks).collect()
+    }
+
+    fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
+        if let Some(capture) = self.captures.get(group) {
+            return Ok(vec![Ok(capture.clone())]);
+        }
+        let chunk = &self.chunks[group - self.captures.len()];
+        let opened = chunk.open()?;
+        Ok(chunk.keys.iter().map(|key| opened.capture(key)).collect())
+    }
+
+    fn decoded_bytes(&self) -> Option<u64> {
+        self.chunks.is_empty().then(|| self.captures.iter().map(decoded_bytes).sum())
+    }
+}

@@ -1,0 +1,18 @@
+//! What happens to a photo between its file and the model: lens distortion removed, cut, resized, changed in colour.
+
+mod augment;
+mod distortion;
+mod fit;
+mod jitter;
+mod planes;
+mod resample;
+
+pub use fit::fit;
+pub use planes::Planes;
+
+pub(crate) use jitter::Jitter;
+pub(crate) use resample::{Region, Resampler};
+
+pub(in crate::data) use augment::Augmentation;
+pub(in crate::data) use distortion::Distortion;
+pub(in crate::data) use planes::CHANNELS;

@@ -1,0 +1,21 @@
+//! One view: truth, render, error and depth side by side.
+
+use crate::io::{colourize_depth, tile_horizontally};
+use crate::render::Rendered;
+use tch::{Kind, Tensor};
+
+/// Mean errors from here on are shown in the brightest colour.
+const FULL_ERROR: f64 = 0.25;
+
+/// [3, H, W'] in [0, 1]; without the depth where nothing is known but the picture.
+pub(super) fn comparison_image(truth: &Tensor, picture: &Tensor, rendered: Option<&Rendered>) -> Tensor {
+    let picture = picture.clamp(0., 1.);
+    let error = (&picture - truth).abs().mean_dim([0i64].as_slice(), false, Kind::Float) / FULL_ERROR;
+    // Black, red, yellow, white.
+    let heat = Tensor::stack(&[&error * 3., &error * 3. - 1., &error * 3. - 2.], 0).clamp(0., 1.);
+    let mut pictures = vec![truth.shallow_clone(), picture, heat];
+    if let Some(rendered) = rendered {
+        pictures.push(colourize_depth(&rendered.depth, &rendered.alpha));
+    }
+    tile_horizontally(&pictures)
+}

@@ -1,0 +1,89 @@
+//! What a sweep keeps on disk to go on from: whose scores they are, and every scene's as they come.
+
+use super::evaluation::{SceneScores, scene_file_name};
+use crate::error::{Error, Result};
+use crate::io::write_atomically;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// By which a sweep that goes on is recognized.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Identity {
+    #[serde(rename = "subject")]
+    pub method: String,
+    pub dataset: String,
+    pub index: String,
+    pub image_size: [u32; 2],
+}
+
+/// A scene's scores on disk.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    #[serde(flatten)]
+    scores: SceneScores,
+    /// What tells the files that were scored from others in their place.
+    files: Option<String>,
+}
+
+/// The folder `scenes` of an evaluation.
+pub(super) struct Journal {
+    scenes: PathBuf,
+}
+
+impl Journal {
+    /// Goes on in the folder `out`, or begins there.
+    ///
+    /// # Errors
+    /// Scores of something else in it, or the system's refusal to write.
+    pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
+        let file = out.join("evaluation.json");
+        let scenes = out.join("scenes");
+        std::fs::create_dir_all(&scenes).map_err(Error::write(&scenes))?;
+        let journal = Journal { scenes };
+        // Where nothing was scored yet, there is nothing to mix up.
+        let mut entries = std::fs::read_dir(&journal.scenes).map_err(Error::read(&journal.scenes))?;
+        if entries.next().is_some()
+            && let Ok(text) = std::fs::read(&file)
+        {
+            let wanted = |of: &Identity| format!("{} on {} by {}", of.method, of.dataset, of.index);
+            return match serde_json::from_slice::<Identity>(&text) {
+                Ok(found) if found == *identity => Ok(journal),
+                Ok(found) => {
+                    let expected = format!("{} (choose another --out)", wanted(identity));
+                    Err(Error::input(&file, "the evaluation", format!("of {}", wanted(&found)), expected))
+                }
+                Err(e) => Err(Error::input(
+                    &file,
+                    "the file",
+                    format!("broken ({e})"),
+                    "what globalsplat eval wrote",
+                )),
+            };
+        }
+        write_json(&file, identity)?;
+        Ok(journal)
+    }
+
+    /// Scores of scene `key` from before, of the same `files`. What can't be read is none.
+    pub fn kept(&self, key: &str, files: Option<String>) -> Option<SceneScores> {
+        let kept: Kept = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
+        (kept.scores.scores.scene == key && kept.files == files).then_some(kept.scores)
+    }
+
+    /// Keeps the scores of scene `key`, which are of `files`.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn keep(&self, key: &str, scores: &SceneScores, files: Option<String>) -> Result<()> {
+        write_json(&self.file(key), &Kept { scores: scores.clone(), files })
+    }
+
+    fn file(&self, key: &str) -> PathBuf {
+        self.scenes.join(format!("{}.json", scene_file_name(key)))
+    }
+}
+
+fn write_json(file: &Path, value: &impl Serialize) -> Result<()> {
+    let json = serde_json::to_vec_pretty(value).expect("numbers and strings");
+    write_atomically(file, |writer| writer.write_all(&json).map_err(Error::write(file)))
+}

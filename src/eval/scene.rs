@@ -1,0 +1,109 @@
+//! What a method is judged by: photos that it may see, and photos that it has to match.
+
+use super::index::{EvaluationIndex, SceneFrames};
+use crate::data::{Capture, Holdout, SceneGroup, View};
+use crate::error::{Error, Result};
+use crate::reconstruct::load_context;
+use crate::scene::ImageSize;
+use std::sync::mpsc::SyncSender;
+
+/// A scene, its photos in memory.
+#[derive(Debug)]
+pub struct EvalScene {
+    /// The capture's, or the key in an index.
+    pub name: String,
+    /// What a model sees; none where no model is judged.
+    pub context: Vec<View>,
+    /// What has to be matched.
+    pub target: Vec<View>,
+    /// Their positions in the capture, where an index tells them.
+    pub frames: Option<SceneFrames>,
+}
+
+impl EvalScene {
+    /// Every photo of `capture` as it is, for splats and pictures.
+    ///
+    /// # Errors
+    /// Photos that can't be read.
+    pub fn all_views(capture: &Capture) -> Result<Self> {
+        let target = capture.load_all(None)?;
+        Ok(EvalScene { name: capture.name.clone(), context: vec![], target, frames: None })
+    }
+
+    /// For a model that takes pictures of `size`: it sees the views that `holdout` leaves, or so many of them, spread over the
+    /// camera's path, and has to match the others.
+    ///
+    /// # Errors
+    /// Nothing held out, or photos that can't be read.
+    pub fn held_out(
+        capture: &Capture,
+        holdout: Holdout,
+        views: Option<usize>,
+        size: ImageSize,
+    ) -> Result<Self> {
+        let (_, held_out) = split_views(capture, holdout)?;
+        let context = load_context(capture, holdout, views, size)?;
+        let target = capture.load(&held_out, Some(size))?;
+        Ok(EvalScene { name: capture.name.clone(), context, target, frames: None })
+    }
+
+    /// The frames of scene `key` in `index`, named by their numbers.
+    fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
+        let frames = loader.index.frames(key, capture.len())?.clone();
+        let size = Some(loader.image_size);
+        let context = if loader.with_context { capture.load(&frames.context, size)? } else { vec![] };
+        let mut target = capture.load(&frames.target, size)?;
+        for (view, frame) in target.iter_mut().zip(&frames.target) {
+            view.name = frame_name(*frame);
+        }
+        Ok(EvalScene { name: key.into(), context, target, frames: Some(frames) })
+    }
+}
+
+/// Positions of the views that `holdout` leaves, and of those that it holds out.
+pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
+    let (context, held_out) = holdout.split(capture.len());
+    if held_out.is_empty() || context.len() < 2 {
+        let split = format!("{} context and {} target views", context.len(), held_out.len());
+        let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";
+        return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
+    }
+    Ok((context, held_out))
+}
+
+/// As chunks name a frame.
+fn frame_name(frame: usize) -> String {
+    format!("{frame:06}")
+}
+
+/// Reads the scenes of an index, beside the thread that judges them.
+pub(super) struct SceneLoader<'a> {
+    pub index: &'a EvaluationIndex,
+    pub image_size: ImageSize,
+    /// Only a model looks at it.
+    pub with_context: bool,
+}
+
+impl SceneLoader<'_> {
+    /// Sends the scenes of `groups` one by one, each chunk read once, until nobody listens.
+    pub fn send(
+        &self,
+        groups: Vec<(&SceneGroup, Vec<String>)>,
+        sender: &SyncSender<(String, Result<EvalScene>)>,
+    ) {
+        for (group, keys) in groups.into_iter().filter(|(_, keys)| !keys.is_empty()) {
+            let open = group.open().map_err(|e| e.to_string());
+            for key in keys {
+                let scene = match &open {
+                    Ok(open) => {
+                        open.capture(&key).and_then(|capture| EvalScene::indexed(&key, &capture, self))
+                    }
+                    Err(e) => Err(Error::Failed(e.clone())),
+                };
+                if sender.send((key, scene)).is_err() {
+                    return;
+                }
+            }
+        }
+    }
+}

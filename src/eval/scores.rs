@@ -1,0 +1,95 @@
+//! Pictures against photos, view by view.
+
+use super::metrics::{psnr, ssim};
+use crate::data::View;
+use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+use tch::Tensor;
+
+/// One view's scores.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ViewScore {
+    /// As the capture names it.
+    pub image: String,
+    /// In dB.
+    pub psnr: f64,
+    /// As scikit-image's.
+    pub ssim: f64,
+    /// The distance by VGG-16's features, where its weights are at hand.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
+    /// The distance by AlexNet's features, where its weights are at hand.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
+}
+
+/// A capture's scores: means over its views, and each of them.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct CaptureScores {
+    /// The capture's name.
+    pub scene: String,
+    /// In dB, mean over the views.
+    pub psnr: f64,
+    /// Mean over the views.
+    pub ssim: f64,
+    /// Mean over the views, where every one has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
+    /// Mean over the views, where every one has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
+    /// Number of Gaussians, where a splat was scored.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gaussians: Option<i64>,
+    /// One by one.
+    pub views: Vec<ViewScore>,
+}
+
+/// Scores pictures [3, H, W] against views of the same sizes, without LPIPS, which [`super::Perceptual`] adds.
+///
+/// # Errors
+/// A picture of another size than its view.
+pub fn score(
+    scene: &str,
+    pictures: &[Tensor],
+    truth: &[View],
+    gaussians: Option<i64>,
+) -> Result<CaptureScores> {
+    let mut views = vec![];
+    for (picture, view) in pictures.iter().zip(truth) {
+        if picture.size() != view.image.size() {
+            let (found, expected) = (picture.size(), view.image.size());
+            return Err(Error::Request(format!(
+                "the picture for {} has shape {found:?}, expected {expected:?}",
+                view.name
+            )));
+        }
+        let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
+        views.push(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None });
+    }
+    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
+    Ok(CaptureScores {
+        scene: scene.to_string(),
+        psnr: mean(|v| v.psnr),
+        ssim: mean(|v| v.ssim),
+        lpips_vgg: None,
+        lpips_alex: None,
+        gaussians,
+        views,
+    })
+}
+
+/// What answering with the context photo taken nearest (by camera centre) would score for the target views.
+pub(super) fn nearest_context_baseline(
+    scene: &str,
+    context: &[View],
+    target: &[View],
+) -> Result<CaptureScores> {
+    let centre = |view: &View| view.camera.c2w.w_axis.truncate();
+    let nearest = |target: &View| {
+        let distance = |view: &&View| centre(view).distance(centre(target));
+        let view = context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a context view");
+        view.image.shallow_clone()
+    };
+    score(scene, &target.iter().map(nearest).collect::<Vec<_>>(), target, None)
+}

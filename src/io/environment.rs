@@ -1,0 +1,28 @@
+//! Environment variables in what a configuration names.
+
+use crate::error::{Error, Result};
+use std::path::PathBuf;
+
+/// The path that `text` names, with `${NAME}` and `${NAME:-default}` filled in. An empty variable counts as none.
+///
+/// # Errors
+/// A variable that isn't set and has no default.
+pub fn expand_path(text: &str) -> Result<PathBuf> {
+    expand(text).map(PathBuf::from)
+}
+
+fn expand(text: &str) -> Result<String> {
+    let Some((before, rest)) = text.split_once("${") else { return Ok(text.to_string()) };
+    let Some((inside, after)) = rest.split_once('}') else { return Ok(text.to_string()) };
+    let (name, default) = match inside.split_once(":-") {
+        Some((name, default)) => (name, Some(default.to_string())),
+        None => (inside, None),
+    };
+    let value = std::env::var(name).ok().filter(|v| !v.is_empty()).or(default);
+    let value = value.ok_or_else(|| {
+        Error::Request(format!(
+            "{text}: the environment variable {name} is not set, expected it or a path in its place"
+        ))
+    })?;
+    Ok(format!("{before}{value}{}", expand(after)?))
+}

@@ -1,0 +1,207 @@
+//! AdamW (Loshchilov & Hutter 2019), with a state that can be saved (spec 8.5).
+
+use crate::error::{Error, Result};
+use std::collections::BTreeMap;
+use tch::Tensor;
+
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
+const EPS: f64 = 1e-8;
+/// Added to the norm that gradients are divided by, as in torch's `clip_grad_norm_`.
+const CLIP_EPS: f64 = 1e-6;
+
+/// Tensors that are updated alike.
+#[derive(Debug)]
+pub struct ParameterGroup {
+    /// Leaves that take gradients, by names that no other group uses.
+    pub parameters: Vec<(String, Tensor)>,
+    /// How far a step goes, about.
+    pub learning_rate: f64,
+    /// Decoupled: a share of every parameter that a step takes away, times the learning rate.
+    pub weight_decay: f64,
+}
+
+/// A tensor, its running moments and the group it is in.
+#[derive(Debug)]
+struct Parameter {
+    name: String,
+    value: Tensor,
+    first: Tensor,
+    second: Tensor,
+    group: usize,
+}
+
+/// What a group's parameters have in common.
+#[derive(Debug)]
+struct Settings {
+    learning_rate: f64,
+    weight_decay: f64,
+}
+
+/// The optimizer. Whatever the groups, parameters are gone through in the order of their names.
+#[derive(Debug)]
+pub struct AdamW {
+    parameters: Vec<Parameter>,
+    groups: Vec<Settings>,
+    steps: i64,
+}
+
+impl AdamW {
+    /// For the parameters of `groups`, moments at zero.
+    ///
+    /// # Panics
+    /// Two parameters of one name.
+    pub fn new(groups: Vec<ParameterGroup>) -> Self {
+        let (mut parameters, mut settings) = (BTreeMap::new(), vec![]);
+        for (group, of) in groups.into_iter().enumerate() {
+            for (name, value) in of.parameters {
+                let (first, second) = (value.zeros_like().detach(), value.zeros_like().detach());
+                let parameter = Parameter { name: name.clone(), value, first, second, group };
+                assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
+            }
+            settings.push(Settings { learning_rate: of.learning_rate, weight_decay: of.weight_decay });
+        }
+        AdamW { parameters: parameters.into_values().collect(), groups: settings, steps: 0 }
+    }
+
+    /// Of every group, from the next step on.
+    pub fn set_learning_rate(&mut self, learning_rate: f64) {
+        self.groups.iter_mut().for_each(|group| group.learning_rate = learning_rate);
+    }
+
+    /// The gradients that the last backward pass left, by the parameters' names and in their order. What is done to them in
+    /// place is done to what [`AdamW::clip_gradients`] and [`AdamW::step`] see.
+    pub fn gradients(&self) -> impl Iterator<Item = (&str, Tensor)> {
+        let gradients = self.parameters.iter().map(|p| (p.name.as_str(), p.value.grad()));
+        gradients.filter(|(_, gradient)| gradient.defined())
+    }
+
+    /// Forgets the gradients.
+    pub fn zero_grad(&mut self) {
+        self.parameters.iter_mut().for_each(|p| p.value.zero_grad());
+    }
+
+    /// Scales the gradients so that their common norm is at most `largest`, and returns what it was.
+    pub fn clip_gradients(&self, largest: f64) -> f64 {
+        let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
+        let norms: Vec<Tensor> = gradients.iter().map(Tensor::norm).collect();
+        let norm = Tensor::stack(&norms, 0).norm().double_value(&[]);
+        if norm > largest {
+            let factor = largest / (norm + CLIP_EPS);
+            gradients.into_iter().for_each(|mut g| {
+                let _ = g.g_mul_scalar_(factor);
+            });
+        }
+        norm
+    }
+
+    /// One update from the gradients that are there, by the groups' learning rates.
+    pub fn step(&mut self) {
+        self.steps += 1;
+        let correction1 = 1. - BETA1.powi(self.steps as i32);
+        let correction2 = 1. - BETA2.powi(self.steps as i32);
+        tch::no_grad(|| {
+            for p in &mut self.parameters {
+                let gradient = p.value.grad();
+                if !gradient.defined() {
+                    continue;
+                }
+                let Settings { learning_rate, weight_decay } = self.groups[p.group];
+                if weight_decay > 0. {
+                    let _ = p.value.g_mul_scalar_(1. - learning_rate * weight_decay);
+                }
+                let _ = p.first.lerp_(&gradient, 1. - BETA1);
+                let _ = p.second.g_mul_scalar_(BETA2).addcmul_(&(&gradient * (1. - BETA2)), &gradient);
+                let denominator = p.second.sqrt().divide_scalar(correction2.sqrt()) + EPS;
+                let _ = p.value.addcdiv_(&(&p.first * (-learning_rate / correction1)), &denominator);
+            }
+        });
+    }
+
+    /// Everything but the variables themselves.
+    pub fn state(&self) -> BTreeMap<String, Tensor> {
+        let mut state = BTreeMap::from([("steps".to_string(), Tensor::from_slice(&[self.steps]))]);
+        for p in &self.parameters {
+            state.insert(format!("first.{}", p.name), p.first.shallow_clone());
+            state.insert(format!("second.{}", p.name), p.second.shallow_clone());
+        }
+        state
+    }
+
+    /// Takes a state back that [`AdamW::state`] gave for the same model.
+    ///
+    /// # Errors
+    /// A moment that is missing or has another shape.
+    pub fn load_state(&mut self, state: &BTreeMap<String, Tensor>) -> Result<()> {
+        let find = |key: String, shape: Vec<i64>| match state.get(&key) {
+            Some(t) if t.size() == shape => Ok(t),
+            _ => Err(Error::Request(format!("the optimizer's state has no {key} of shape {shape:?}"))),
+        };
+        self.steps = find("steps".into(), vec![1])?.int64_value(&[0]);
+        for p in &mut self.parameters {
+            p.first.copy_(find(format!("first.{}", p.name), p.value.size())?);
+            p.second.copy_(find(format!("second.{}", p.name), p.value.size())?);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::Kind;
+
+    fn leaf(values: &[f32]) -> Tensor {
+        Tensor::from_slice(values).set_requires_grad(true)
+    }
+
+    fn group(parameters: &[(&str, &Tensor)], learning_rate: f64, weight_decay: f64) -> ParameterGroup {
+        let parameters = parameters.iter().map(|(name, t)| (name.to_string(), t.shallow_clone())).collect();
+        ParameterGroup { parameters, learning_rate, weight_decay }
+    }
+
+    #[test]
+    fn steps_are_those_of_the_equations() {
+        let (weight, bias) = (leaf(&[2.]), leaf(&[2.]));
+        let groups = vec![group(&[("weight", &weight)], 1e-2, 0.1), group(&[("bias", &bias)], 3e-2, 0.)];
+        let mut adamw = AdamW::new(groups);
+        let (mut m, mut v, mut expected) = (0f64, 0f64, [2f64, 2f64]);
+        for (i, gradient) in [0.5f64, -1.5, 0.25].into_iter().enumerate() {
+            adamw.zero_grad();
+            ((&weight + &bias).sum(Kind::Float) * gradient).backward();
+            adamw.step();
+            let t = i as i32 + 1;
+            (m, v) = (0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient * gradient);
+            let update = (m / (1. - 0.9f64.powi(t))) / ((v / (1. - 0.999f64.powi(t))).sqrt() + 1e-8);
+            expected = [expected[0] * (1. - 1e-2 * 0.1) - 1e-2 * update, expected[1] - 3e-2 * update];
+        }
+        assert!((weight.double_value(&[0]) - expected[0]).abs() < 1e-6);
+        assert!((bias.double_value(&[0]) - expected[1]).abs() < 1e-6);
+    }
+
+    #[test]
+    fn gradients_are_clipped_together() {
+        let (a, b) = (leaf(&[0.]), leaf(&[0.]));
+        let adamw = AdamW::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
+        (&a * 3. + &b * 4.).sum(Kind::Float).backward();
+        assert!((adamw.clip_gradients(10.) - 5.).abs() < 1e-6);
+        assert_eq!(a.grad().double_value(&[0]), 3.);
+        adamw.clip_gradients(1.);
+        assert!((a.grad().double_value(&[0]) - 0.6).abs() < 1e-5);
+    }
+
+    #[test]
+    fn gradients_can_be_changed_before_they_are_used() {
+        let (a, b) = (leaf(&[1.]), leaf(&[1.]));
+        let mut adamw = AdamW::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
+        (&a * 3. + &b * 0.).sum(Kind::Float).backward();
+        for (name, mut gradient) in adamw.gradients() {
+            // As an all-reduce would: in place.
+            let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
+        }
+        assert!((adamw.clip_gradients(10.) - 2.).abs() < 1e-6);
+        adamw.step();
+        assert_eq!(a.double_value(&[0]), 1.);
+        assert!((b.double_value(&[0]) - 0.9).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,24 @@
+//! Which of a capture's views a model sees.
+
+use super::spread::spread_over_path;
+use crate::data::{Capture, Holdout, View};
+use crate::error::Result;
+use crate::scene::ImageSize;
+
+/// The views that `holdout` leaves, or so many of them, spread over the camera's path, fitted to `size`.
+///
+/// # Errors
+/// Photos that can't be read.
+pub fn load_context(
+    capture: &Capture,
+    holdout: Holdout,
+    views: Option<usize>,
+    size: ImageSize,
+) -> Result<Vec<View>> {
+    let (shown, _) = holdout.split(capture.len());
+    let chosen = match views {
+        Some(views) => spread_over_path(&capture.cameras(), &shown, views),
+        None => shown,
+    };
+    capture.load(&chosen, Some(size))
+}

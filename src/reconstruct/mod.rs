@@ -1,0 +1,95 @@
+//! Posed photos to a splat: a model from its file, views that are chosen and fitted, one forward pass, and the way back to the
+//! capture's world.
+
+mod context;
+mod model_file;
+mod spread;
+
+pub use context::load_context;
+pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, load_model, save_model};
+
+pub(crate) use spread::spread_over_path;
+
+use crate::config::Config;
+use crate::data::{View, ViewBatch, view_batch};
+use crate::error::{Error, Result};
+use crate::model::GlobalSplat;
+use crate::render::transform;
+use crate::scene::{Gaussians, Similarity, normalize};
+use glam::DMat4;
+use std::time::{Duration, Instant};
+use tch::Device;
+
+/// A model to be used: one from a file, or one that is being trained.
+#[derive(Debug, Clone, Copy)]
+pub struct Model<'a> {
+    /// The network.
+    pub network: &'a GlobalSplat,
+    /// What it was built and trained from.
+    pub config: &'a Config,
+    /// Where the weights are.
+    pub device: Device,
+}
+
+impl<'a> From<&'a LoadedModel> for Model<'a> {
+    fn from(loaded: &'a LoadedModel) -> Self {
+        Model { network: &loaded.model, config: &loaded.config, device: loaded.vs.device() }
+    }
+}
+
+/// A splat in the normalized world, and the way to the capture's own.
+#[derive(Debug)]
+pub struct Reconstruction {
+    /// One scene, in the normalized world.
+    pub gaussians: Gaussians,
+    /// Normalized world to the capture's.
+    pub world_from_normalized: Similarity,
+    /// The other cameras that were normalized along, camera-to-world.
+    pub target_poses: Vec<DMat4>,
+    /// From views in memory to Gaussians.
+    pub forward_time: Duration,
+}
+
+impl Reconstruction {
+    /// The splat in the capture's own world.
+    pub fn in_world(&self) -> Gaussians {
+        transform(&self.gaussians, &self.world_from_normalized)
+    }
+}
+
+/// Runs the model over `context`. `targets` are poses (camera-to-world, in the capture's world) of target views:
+/// they take part in the normalization, as in the paper's protocol.
+///
+/// # Errors
+/// Fewer than two views, images that the model's patches don't divide, cameras without a mean direction.
+pub fn reconstruct<'a>(
+    model: impl Into<Model<'a>>,
+    context: &[View],
+    targets: &[DMat4],
+) -> Result<Reconstruction> {
+    let Model { network, config, device } = model.into();
+    if context.len() < 2 {
+        return Err(Error::Request(format!(
+            "a reconstruction needs two views or more, found {}",
+            context.len()
+        )));
+    }
+    let poses: Vec<DMat4> =
+        context.iter().map(|view| view.camera.c2w).chain(targets.iter().copied()).collect();
+    let normalization = normalize(&poses)?;
+    let (context_poses, target_poses) = normalization.c2w.split_at(context.len());
+    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(context, context_poses, device);
+    config.model.check_image(images.size()[3], images.size()[4])?;
+
+    let start = Instant::now();
+    let stage = config.curriculum.final_stage();
+    let decoded = tch::no_grad(|| network.forward(&images, &c2w, &intrinsics, stage));
+    // Bringing the Gaussians to the host also waits for a GPU.
+    let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);
+    Ok(Reconstruction {
+        gaussians,
+        world_from_normalized: normalization.world_from_normalized,
+        target_poses: target_poses.to_vec(),
+        forward_time: start.elapsed(),
+    })
+}

@@ -1,0 +1,68 @@
+//! A model as one safetensors file that rebuilds it: the weights, and the configuration in the metadata (spec 10.10).
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::io::{read_weights, write_weights};
+use crate::model::GlobalSplat;
+use std::collections::HashMap;
+use std::path::Path;
+use tch::{Device, Kind, Tensor, nn};
+
+/// The metadata's key for the configuration, as TOML.
+pub const CONFIG_KEY: &str = "globalsplat.config";
+
+/// How weights are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ModelDtype {
+    /// Exactly.
+    F32,
+    /// In half the bytes, with 8 bits of mantissa.
+    BF16,
+}
+
+/// A model from a file.
+#[derive(Debug)]
+pub struct LoadedModel {
+    /// Built as the file says.
+    pub model: GlobalSplat,
+    /// As the file says.
+    pub config: Config,
+    /// Holds the weights.
+    pub vs: nn::VarStore,
+}
+
+/// Writes the variables of `vs` and `config`, whole or not at all.
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn save_model(path: &Path, vs: &nn::VarStore, config: &Config, dtype: ModelDtype) -> Result<()> {
+    let stored = |t: Tensor| match dtype {
+        ModelDtype::F32 => t.to_kind(Kind::Float),
+        ModelDtype::BF16 => t.to_kind(Kind::BFloat16),
+    };
+    let tensors = vs.variables().into_iter().map(|(name, t)| (name, stored(t))).collect();
+    // A second key would stand before or after it by chance, and the same model wouldn't be the same bytes.
+    let metadata = HashMap::from([(CONFIG_KEY.to_string(), config.to_toml())]);
+    write_weights(path, &tensors, metadata)
+}
+
+/// Rebuilds the model that [`save_model`] wrote, in float32.
+///
+/// # Errors
+/// A file that can't be read, has no configuration, or whose weights don't fit it.
+pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
+    let weights = read_weights(path)?;
+    let config = weights.metadata.get(CONFIG_KEY).ok_or_else(|| {
+        Error::input(
+            path,
+            format!("metadata {CONFIG_KEY}"),
+            "absent",
+            "weights that `globalsplat export` wrote",
+        )
+    })?;
+    let config = Config::parse(config, &[], path)?;
+    let vs = nn::VarStore::new(device);
+    let model = GlobalSplat::new(&vs.root(), &config.model)?;
+    weights.load_into(&vs, path)?;
+    Ok(LoadedModel { model, config, vs })
+}

@@ -1,0 +1,143 @@
+//! 3D Gaussians: what the model makes and the rasterizer draws, and the same as numbers without bounds.
+
+use tch::{Device, Kind, Tensor};
+
+/// Opacities are kept this far from 0 and 1, whose logits are infinite.
+const OPACITY_MARGIN: f64 = 1e-6;
+/// Scales are at least this, whose logarithm is finite.
+const MIN_SCALE: f64 = 1e-30;
+
+/// 3D Gaussians of B scenes with N each.
+#[derive(Debug)]
+pub struct Gaussians {
+    /// Centres, [B, N, 3].
+    pub means: Tensor,
+    /// Standard deviations along the own axes, linear, [B, N, 3].
+    pub scales: Tensor,
+    /// (w, x, y, z), [B, N, 4].
+    pub quaternions: Tensor,
+    /// In [0, 1], [B, N].
+    pub opacities: Tensor,
+    /// Spherical harmonics, [B, N, (degree + 1)², 3].
+    pub sh: Tensor,
+}
+
+impl Gaussians {
+    /// N.
+    pub fn count(&self) -> i64 {
+        self.means.size()[1]
+    }
+
+    /// Applies `f` to every tensor.
+    pub fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
+        Gaussians {
+            means: f(&self.means),
+            scales: f(&self.scales),
+            quaternions: f(&self.quaternions),
+            opacities: f(&self.opacities),
+            sh: f(&self.sh),
+        }
+    }
+
+    /// A copy on `device`, or the same tensors where they are there already.
+    pub fn to_device(&self, device: Device) -> Self {
+        self.map(|t| t.to_device(device))
+    }
+}
+
+/// Gaussians before activation, as 3DGS stores and optimizes them: any number is a valid one.
+#[derive(Debug)]
+pub struct RawGaussians {
+    /// As [`Gaussians::means`].
+    pub means: Tensor,
+    /// Natural logarithms of the scales, [B, N, 3].
+    pub log_scales: Tensor,
+    /// As [`Gaussians::quaternions`], of any length.
+    pub quaternions: Tensor,
+    /// Logits of the opacities, [B, N].
+    pub opacity_logits: Tensor,
+    /// As [`Gaussians::sh`].
+    pub sh: Tensor,
+}
+
+impl RawGaussians {
+    /// What activates to `gaussians`: opacities up to 1e-6, all else up to rounding.
+    pub fn of(gaussians: &Gaussians) -> Self {
+        let Gaussians { means, scales, quaternions, opacities, sh } = gaussians;
+        RawGaussians {
+            means: means.shallow_clone(),
+            log_scales: scales.clamp_min(MIN_SCALE).log(),
+            quaternions: quaternions.shallow_clone(),
+            opacity_logits: opacities.to_kind(Kind::Double).logit(OPACITY_MARGIN).to_kind(opacities.kind()),
+            sh: sh.shallow_clone(),
+        }
+    }
+
+    /// The Gaussians; differentiable.
+    pub fn activate(&self) -> Gaussians {
+        Gaussians {
+            means: self.means.shallow_clone(),
+            scales: self.log_scales.exp(),
+            quaternions: self.quaternions.shallow_clone(),
+            opacities: self.opacity_logits.sigmoid(),
+            sh: self.sh.shallow_clone(),
+        }
+    }
+
+    /// Every tensor by its name, as an optimizer takes them.
+    pub fn named(&self) -> [(&'static str, &Tensor); 5] {
+        [
+            ("means", &self.means),
+            ("log_scales", &self.log_scales),
+            ("quaternions", &self.quaternions),
+            ("opacity_logits", &self.opacity_logits),
+            ("sh", &self.sh),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn raw_gaussians_activate_to_what_they_are_of() {
+        let gaussians = Gaussians {
+            means: Tensor::from_slice(&[1f32, -2., 3., 0., 0., 5.]).view([1, 2, 3]),
+            scales: Tensor::from_slice(&[1e-4f32, 0.5, 20., 1., 1., 0.]).view([1, 2, 3]),
+            quaternions: Tensor::from_slice(&[2f32, 0., 0., 0., 0., 0.6, 0.8, 0.]).view([1, 2, 4]),
+            opacities: Tensor::from_slice(&[0f32, 0.99]).view([1, 2]),
+            sh: Tensor::from_slice(&[0.5f32, -3., 0., 1., 2., 3.]).view([1, 2, 1, 3]),
+        };
+        let raw = RawGaussians::of(&gaussians);
+        assert!(raw.named().iter().all(|(_, t)| t.isfinite().all().int64_value(&[]) == 1));
+        let again = raw.activate();
+        let off = |a: &Tensor, b: &Tensor| (a - b).abs().max().double_value(&[]);
+        assert!(again.means.equal(&gaussians.means) && again.sh.equal(&gaussians.sh));
+        assert!(again.quaternions.equal(&gaussians.quaternions));
+        assert!(
+            off(&again.scales, &gaussians.scales) < 1e-5
+                && off(&again.opacities, &gaussians.opacities) < 2e-6
+        );
+    }
+
+    /// d exp(s) = exp(s) and d sigmoid(o) = α (1 − α), by which raw numbers learn.
+    #[test]
+    fn activation_has_its_gradients() {
+        let leaf =
+            |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).set_requires_grad(true);
+        let raw = RawGaussians {
+            means: leaf(&[0.; 3], &[1, 1, 3]),
+            log_scales: leaf(&[-3., 0., 1.5], &[1, 1, 3]),
+            quaternions: leaf(&[1., 0., 0., 0.], &[1, 1, 4]),
+            opacity_logits: leaf(&[-1.2], &[1, 1]),
+            sh: leaf(&[0.; 3], &[1, 1, 1, 3]),
+        };
+        let active = raw.activate();
+        (active.scales.sum(Kind::Double) + active.opacities.sum(Kind::Double)).backward();
+        assert!(raw.log_scales.grad().equal(&active.scales));
+        let expected = &active.opacities * (1. - &active.opacities);
+        let off: Tensor = raw.opacity_logits.grad() - expected;
+        assert!(off.abs().max().double_value(&[]) < 1e-15);
+    }
+}

@@ -1,0 +1,76 @@
+//! Forward and backward pass of a slice of a step, part by part.
+//!
+//! Every part begins with leaves that hold what the part before gave, and its backward pass with the gradients that these
+//! leaves got. So what one part kept is freed before the backward pass of the one before it begins, the encoder may choose
+//! to keep nothing and compute its rounds again, and one can tell how long each part takes.
+
+use super::stopwatch::Stopwatch;
+use crate::config::Config;
+use crate::data::Sample;
+use crate::error::Result;
+use crate::loss::{Losses, PerceptualLoss, Share, depth_pixels, losses};
+use crate::model::{GlobalSplat, Stage, leaf, pull_back};
+use crate::render::{DEFAULT_EPS2D, Pictures, render};
+use tch::{Tensor, no_grad};
+
+/// What all slices of a step have in common.
+#[derive(Debug)]
+pub(super) struct ForwardBackward<'a> {
+    pub config: &'a Config,
+    pub model: &'a GlobalSplat,
+    pub perceptual: Option<&'a PerceptualLoss>,
+    pub stage: Stage,
+}
+
+impl ForwardBackward<'_> {
+    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own.
+    pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<Losses<f64>> {
+        let context = &sample.context;
+        let model = self.model;
+        let tokens =
+            watch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
+        let tokens_leaf = leaf(&tokens);
+        let (encoded, kept) = watch.time("encoder", || match self.config.train.checkpoint_rounds {
+            true => {
+                let (encoded, kept) = model.encode_keeping_rounds(&tokens_leaf);
+                (encoded, Some(kept))
+            }
+            false => (model.encode(&tokens_leaf), None),
+        });
+        let encoded_leaves = encoded.map(leaf);
+        let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));
+        let decoded_leaves = decoded.map(leaf);
+        let cameras = sample.target.cameras();
+        let Pictures { rgb, alpha, depth } =
+            watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
+        let pictures = Pictures { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+        let losses = watch.time("losses", || {
+            losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, share)
+        });
+
+        watch.time("losses backward", || losses.total.backward());
+        watch.time("render backward", || {
+            pull_back(&[(&rgb, &pictures.rgb), (&alpha, &pictures.alpha), (&depth, &pictures.depth)]);
+        });
+        watch.time("decoder backward", || pull_back(&decoded.beside(&decoded_leaves)));
+        watch.time("encoder backward", || {
+            pull_back(&encoded.beside(&encoded_leaves));
+            if let Some(kept) = kept {
+                kept.backward();
+            }
+        });
+        watch.time("tokens backward", || pull_back(&[(&tokens, &tokens_leaf)]));
+        Ok(losses.map(|t| t.double_value(&[])))
+    }
+
+    /// Pixels of a paired sample whose depth L_con compares, a scalar.
+    pub fn depth_pixels(&self, sample: &Sample) -> Result<Tensor> {
+        let context = &sample.context;
+        no_grad(|| {
+            let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, self.stage);
+            let pictures = render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D)?;
+            let alpha = pictures.alpha.chunk(2, 0);
+            Ok(depth_pixels([&alpha[0], &alpha[1]]))
+        })
+    }
+}

@@ -1,0 +1,26 @@
+//! A picture of how training goes.
+
+use crate::data::Sample;
+use crate::error::Result;
+use crate::io::{colourize_depth, tile_horizontally};
+use crate::model::{GlobalSplat, Stage};
+use crate::render::{DEFAULT_EPS2D, render};
+use tch::{Device, Tensor};
+
+/// Of the first scene of `sample`, which isn't paired: a photo that the model sees, a target, what it makes of that,
+/// its depth and its accumulated opacity, side by side, [3, H, W'] in [0, 1] on the CPU.
+pub(super) fn preview(model: &GlobalSplat, sample: &Sample, stage: Stage) -> Result<Tensor> {
+    let Sample { context, target, .. } = sample.slice(0, 1);
+    let middle = |views: &Tensor| views.size()[1] as usize / 2;
+    let (shown, target) =
+        (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
+    let pictures = tch::no_grad(|| {
+        let decoded = model.forward(&context.images, &context.c2w, &context.intrinsics, stage);
+        render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
+    })?;
+    let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
+    let (photo, truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
+    let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
+    let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
+    Ok(tile_horizontally(&[photo, truth, rgb.clamp(0., 1.), colourize_depth(&depth, &alpha), grey]))
+}

@@ -1,0 +1,64 @@
+//! What TensorBoard shows of a run: `RUN/tensorboard`, a file for every time that the run was begun or resumed.
+
+use super::is_due;
+use super::metrics::{loss_terms, progress};
+use super::step_report::StepReport;
+use super::validator::Score;
+use crate::error::{Error, Result};
+use crate::io::EventFile;
+use std::path::Path;
+
+const FOLDER: &str = "tensorboard";
+/// TensorBoard reads a folder's files in the order of their names, so each has its number.
+const PREFIX: &str = "events.out.tfevents.";
+
+/// The file of this start.
+#[derive(Debug)]
+pub(super) struct TensorBoard {
+    file: EventFile,
+    /// Steps between numbers.
+    every: u64,
+}
+
+impl TensorBoard {
+    /// Makes a new file in the run's folder. [`TensorBoard::start`] comes next.
+    pub fn create(run: &Path, every: u64) -> Result<Self> {
+        let folder = run.join(FOLDER);
+        std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
+        let mut number = 0;
+        for entry in std::fs::read_dir(&folder).map_err(Error::read(&folder))? {
+            let name = entry.map_err(Error::read(&folder))?.file_name();
+            let of: Option<u64> = name.to_str().and_then(|name| name.strip_prefix(PREFIX)?.parse().ok());
+            number = number.max(of.map_or(0, |of| of + 1));
+        }
+        Ok(TensorBoard { file: EventFile::create(&folder.join(format!("{PREFIX}{number:010}")))?, every })
+    }
+
+    /// The run goes on with `step`: what was logged of it before, and of later ones, is void.
+    pub fn start(&mut self, step: u64) -> Result<()> {
+        self.file.start(step)
+    }
+
+    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+        if !is_due(self.every, report.step) {
+            return Ok(());
+        }
+        let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
+        let progress = progress(report, samples_per_second).map(tagged("train"));
+        let terms = loss_terms(report).map(tagged("loss"));
+        self.file.scalars(report.step, &[&progress[..], &terms].concat())
+    }
+
+    pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {
+        match &report.picture {
+            Some(picture) => self.file.picture(report.step, "train/views", picture),
+            None => Ok(()),
+        }
+    }
+
+    /// Scores after step `step`.
+    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+        let values = [("validation/psnr", score.psnr), ("validation/ssim", score.ssim)];
+        self.file.scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
+    }
+}
