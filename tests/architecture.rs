@@ -1,0 +1,294 @@
+//! The floor plan: which module may use which, held against every `use` in `src/`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// From what a person touches down to the ground: a module uses those after it, and those on the ground.
+const FLOORS: [&str; 14] = [
+    "parity",
+    "bench",
+    "eval",
+    "train",
+    "reconstruct",
+    "config",
+    "optim",
+    "loss",
+    "data",
+    "synth",
+    "io",
+    "render",
+    "model",
+    "scene",
+];
+const GROUND: [&str; 2] = ["scene", "error"];
+
+/// A module by its path, as ["data", "formats", "colmap"].
+type Module = Vec<String>;
+
+struct Source {
+    /// Without comments and tests.
+    text: String,
+    /// Whether it is a `mod.rs`, or `lib.rs`.
+    is_parent: bool,
+}
+
+#[test]
+fn arrows_go_down() {
+    let sources = sources();
+    for module in sources.keys().filter(|module| module.len() == 1 && module[0] != "error") {
+        assert!(FLOORS.contains(&module[0].as_str()), "{} has no floor", module[0]);
+    }
+    let floor = |module: &Module| FLOORS.iter().position(|name| *name == module[0]);
+    let mut arrows = 0;
+    for (from, to) in arrows_of(&sources) {
+        if from.is_empty() || from[0] == to[0] || GROUND.contains(&to[0].as_str()) {
+            continue;
+        }
+        assert!(floor(&from) < floor(&to), "{} uses {}, which is above it", from.join("::"), to.join("::"));
+        arrows += 1;
+    }
+    assert!(arrows > 100, "{arrows} arrows: are all of them found?");
+}
+
+/// Captures and splats can be read, written and drawn where nothing is known of a network.
+#[test]
+fn data_know_no_model() {
+    let arrows = arrows_of(&sources());
+    let mut reached: BTreeSet<&str> = BTreeSet::from(["data"]);
+    loop {
+        let more: BTreeSet<&str> = arrows
+            .iter()
+            .filter(|(from, _)| from.first().is_some_and(|from| reached.contains(from.as_str())))
+            .map(|(_, to)| to[0].as_str())
+            .collect();
+        if more.is_subset(&reached) {
+            break;
+        }
+        reached.extend(more);
+    }
+    assert!(reached.contains("scene") && !reached.contains("model"), "data reach {reached:?}");
+}
+
+#[test]
+fn files_use_each_other_in_one_direction() {
+    let mut graph: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
+    for (from, to) in arrows_of(&sources()) {
+        // A parent and its children need each other.
+        if !from.starts_with(&to) && !to.starts_with(&from) {
+            graph.entry(from).or_default().insert(to);
+        }
+    }
+    if let Some(circle) = circle(&graph) {
+        let names: Vec<String> = circle.iter().map(|module| module.join("::")).collect();
+        panic!("a circle: {}", names.join(" → "));
+    }
+}
+
+/// Every module has a room in the figure, and a line in CONTRIBUTING.md, where they come in the order of the floors.
+#[test]
+fn the_plan_is_drawn() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let [figure, page] = ["docs/floor_plan.svg", "CONTRIBUTING.md"]
+        .map(|file| std::fs::read_to_string(root.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")));
+    let mut below = page.as_str();
+    for module in ["cli"].into_iter().chain(FLOORS).chain(["error"]) {
+        assert!(figure.contains(&format!(">{module}</text>")), "docs/floor_plan.svg has no room {module}");
+        let line = below.find(&format!("\n    {module} "));
+        let line = line.unwrap_or_else(|| panic!("{module} is not in its place in CONTRIBUTING.md"));
+        below = &below[line + 1..];
+    }
+}
+
+#[test]
+fn circles_and_paths_are_found() {
+    let module = |path: &str| path.split("::").map(String::from).collect::<Module>();
+    let graph = |arrows: &[(&str, &str)]| {
+        let mut graph: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
+        for (a, b) in arrows {
+            graph.entry(module(a)).or_default().insert(module(b));
+        }
+        graph
+    };
+    assert!(circle(&graph(&[("a", "b"), ("b", "c"), ("a", "c")])).is_none());
+    assert_eq!(circle(&graph(&[("a", "b"), ("b", "c"), ("c", "b")])).map(|circle| circle.len()), Some(3));
+    let text = "use crate::{a::{B, c::D}, E as F};\nlet x = super::g::h();";
+    assert_eq!(paths(text), ["crate::a::B", "crate::a::c::D", "crate::E", "super::g::h"]);
+    assert_eq!(
+        code("a; // crate::b\n/// crate::c\nd(\"//\");\n#[cfg(test)]\nmod tests { crate::e }"),
+        "a; \n\nd(\"//\");\n"
+    );
+}
+
+/// (user, used), by the file in which what is used is defined.
+fn arrows_of(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
+    let mut arrows = BTreeSet::new();
+    for (module, source) in sources {
+        for path in paths(&source.text) {
+            let path: Vec<&str> = path.split("::").collect();
+            if let Some(used) =
+                resolve(sources, module, &path).filter(|used| used != module && !used.is_empty())
+            {
+                arrows.insert((module.clone(), used));
+            }
+        }
+    }
+    arrows
+}
+
+/// The file that defines what `path` names when it stands in `module`; re-exports are followed.
+fn resolve(sources: &BTreeMap<Module, Source>, module: &Module, path: &[&str]) -> Option<Module> {
+    let mut at = match path[0] {
+        "crate" => vec![],
+        "super" | "self" => module.clone(),
+        child => [module.clone(), vec![child.to_string()]].concat(),
+    };
+    let mut rest = &path[1..];
+    if path[0] == "super" {
+        at.pop();
+    }
+    while let Some((&first, others)) = rest.split_first() {
+        let below = [at.clone(), vec![first.to_string()]].concat();
+        match first {
+            "super" => drop(at.pop()),
+            _ if sources.contains_key(&below) => at = below,
+            item => return re_exported(sources, &at, item).or(Some(at)),
+        }
+        rest = others;
+    }
+    sources.contains_key(&at).then_some(at)
+}
+
+/// Where `item` comes from, if `module` is a parent that only re-exports it.
+fn re_exported(sources: &BTreeMap<Module, Source>, module: &Module, item: &str) -> Option<Module> {
+    let source = sources.get(module).filter(|source| source.is_parent)?;
+    let exports = paths(&source.text).into_iter().filter(|path| path.ends_with(&format!("::{item}")));
+    exports.into_iter().find_map(|path| {
+        let path: Vec<&str> = path.split("::").collect();
+        let own_child = [module.clone(), vec![path[0].to_string()]].concat();
+        sources.contains_key(&own_child).then(|| resolve(sources, module, &path)).flatten()
+    })
+}
+
+/// Some modules each of which uses the next, and the last the first.
+fn circle(graph: &BTreeMap<Module, BTreeSet<Module>>) -> Option<Vec<Module>> {
+    fn visit(
+        graph: &BTreeMap<Module, BTreeSet<Module>>,
+        at: &Module,
+        path: &mut Vec<Module>,
+        done: &mut BTreeSet<Module>,
+    ) -> Option<Vec<Module>> {
+        if let Some(start) = path.iter().position(|module| module == at) {
+            return Some([&path[start..], std::slice::from_ref(at)].concat());
+        }
+        if done.contains(at) {
+            return None;
+        }
+        path.push(at.clone());
+        let found = graph.get(at).into_iter().flatten().find_map(|next| visit(graph, next, path, done));
+        path.pop();
+        done.insert(at.clone());
+        found
+    }
+    let mut done = BTreeSet::new();
+    graph.keys().find_map(|start| visit(graph, start, &mut vec![], &mut done))
+}
+
+/// All `use`d paths, braces multiplied out, and those that stand in the code and begin with `crate` or `super`.
+fn paths(text: &str) -> Vec<String> {
+    let mut found = vec![];
+    let mut rest = text;
+    while let Some((start, is_use)) = next_path(rest) {
+        rest = &rest[start..];
+        let is_end = |c: char| match is_use {
+            true => c == ';',
+            false => !(c.is_alphanumeric() || c == '_' || c == ':'),
+        };
+        let end = rest.find(is_end).unwrap_or(rest.len());
+        expand("", rest[..end].trim(), &mut found);
+        rest = &rest[end..];
+    }
+    found
+}
+
+/// Where the next path begins, and whether it is a `use`.
+fn next_path(text: &str) -> Option<(usize, bool)> {
+    let inline = ["crate::", "super::"].iter().filter_map(|start| text.find(start)).min();
+    let used = text.find("use ").map(|at| at + "use ".len());
+    match (used, inline) {
+        (Some(used), Some(inline)) if inline < used => Some((inline, false)),
+        (Some(used), _) => Some((used, true)),
+        (None, inline) => inline.map(|at| (at, false)),
+    }
+}
+
+/// `a::{b, c::{d, e}}` as `a::b`, `a::c::d`, `a::c::e`, each behind `prefix`.
+fn expand(prefix: &str, tree: &str, into: &mut Vec<String>) {
+    let tree = tree.trim();
+    match tree.split_once('{') {
+        None => {
+            let name = tree.split(" as ").next().unwrap_or_default().trim_end_matches(':').trim();
+            if !name.is_empty() {
+                into.push(format!("{prefix}{name}"));
+            }
+        }
+        Some((head, inside)) => {
+            let inside = inside.trim_end().strip_suffix('}').unwrap_or(inside);
+            let (mut depth, mut start) = (0, 0);
+            for (i, c) in inside.char_indices().chain([(inside.len(), ',')]) {
+                match c {
+                    '{' => depth += 1,
+                    '}' => depth -= 1,
+                    ',' if depth == 0 => {
+                        expand(&format!("{prefix}{head}"), &inside[start..i], into);
+                        start = i + 1;
+                    }
+                    _ => {}
+                }
+            }
+        }
+    }
+}
+
+/// Without comments, and without tests, which may use anything.
+fn code(text: &str) -> String {
+    let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
+    let without = |line: &str| {
+        let quoted = |at: usize| line[..at].matches('"').count() % 2 == 1;
+        let comment = line.match_indices("//").map(|(at, _)| at).find(|&at| !quoted(at));
+        line[..comment.unwrap_or(line.len())].to_string() + "\n"
+    };
+    text.lines().map(without).collect()
+}
+
+/// The library's files.
+fn sources() -> BTreeMap<Module, Source> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut files: Vec<PathBuf> = vec![];
+    let mut folders = vec![root.clone()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => files.push(path),
+            }
+        }
+    }
+    let mut sources = BTreeMap::new();
+    for file in files.iter().filter(|file| file.extension().is_some_and(|ending| ending == "rs")) {
+        let inside = file.strip_prefix(&root).expect("a file in src").with_extension("");
+        let mut module: Module = inside.iter().map(|part| part.to_string_lossy().into_owned()).collect();
+        let name = module.last().cloned().unwrap_or_default();
+        // The program is another crate; tests may use anything.
+        if module[0] == "cli" || module[0] == "main" || name.ends_with("_tests") {
+            continue;
+        }
+        let is_parent = name == "mod" || name == "lib";
+        if is_parent {
+            module.pop();
+        }
+        let text = code(&std::fs::read_to_string(file).expect("a file"));
+        sources.insert(module, Source { text, is_parent });
+    }
+    sources
+}
