@@ -1,0 +1,103 @@
+//! Gaussians optimized to a photo, with the differentiable splat op, two losses and an optimizer:
+//!
+//!     cargo run --release --example fit_image -- photo.jpg fitted.png [STEPS]
+//!
+//! The picture shows the photo, the Gaussians as they began, and as they ended.
+
+use globalsplat::data::fit;
+use globalsplat::eval::psnr;
+use globalsplat::io::{read_image, tile_horizontally, write_png};
+use globalsplat::loss::{mse, ssim};
+use globalsplat::optim::{AdamW, ParameterGroup};
+use globalsplat::render::{Cameras, DEFAULT_EPS2D, render};
+use globalsplat::scene::{Camera, ImageSize, Intrinsics, RawGaussians};
+use globalsplat::{Error, Result};
+use std::path::Path;
+use tch::{Device, Kind, Tensor};
+
+const GAUSSIANS: i64 = 4096;
+/// Of the picture's longer side, in pixels.
+const LONGEST_SIDE: f64 = 256.;
+/// What one minus SSIM counts beside the mean squared error.
+const SSIM_FACTOR: f64 = 0.02;
+
+fn main() -> Result<()> {
+    let arguments: Vec<String> = std::env::args().collect();
+    let (photo, out, steps) = match arguments.as_slice() {
+        [_, photo, out] => (photo, out, 500),
+        [_, photo, out, steps] => {
+            let expected = || Error::Request(format!("STEPS is {steps}, expected a whole number"));
+            (photo, out, steps.parse().map_err(|_| expected())?)
+        }
+        _ => return Err(Error::Request("expected PHOTO OUT.png [STEPS]".into())),
+    };
+    let (photo, camera) = load(Path::new(photo))?;
+    let cameras = Cameras::single(&camera);
+    let gaussians = scattered(&camera);
+    let mut optimizer = AdamW::new(groups(&gaussians));
+
+    // [3, H, W], with the way back to every number of every Gaussian.
+    let draw = || -> Result<Tensor> {
+        let pictures = render(&gaussians.activate(), &cameras, DEFAULT_EPS2D)?;
+        Ok(pictures.rgb.select(0, 0).select(0, 0))
+    };
+    let before = draw()?.detach();
+    for _ in 0..steps {
+        let picture = draw()?;
+        let loss: Tensor = mse(&picture, &photo) + (1. - ssim(&picture, &photo)) * SSIM_FACTOR;
+        optimizer.zero_grad();
+        loss.backward();
+        optimizer.step();
+    }
+    let after = draw()?.detach();
+    println!("PSNR {:.2} dB, after {steps} steps {:.2} dB", psnr(&before, &photo), psnr(&after, &photo));
+    write_png(Path::new(out), &tile_horizontally(&[photo, before.clamp(0., 1.), after.clamp(0., 1.)]))
+}
+
+/// The photo [3, H, W], resized, and a camera that looks along z at a picture of that size.
+fn load(path: &Path) -> Result<(Tensor, Camera)> {
+    let image = read_image(path)?;
+    let (width, height) = (f64::from(image.width()), f64::from(image.height()));
+    let intrinsics = Intrinsics { fx: width, fy: width, cx: width / 2., cy: height / 2. };
+    let camera =
+        Camera { intrinsics, c2w: glam::DMat4::IDENTITY, width: image.width(), height: image.height() };
+    let scale = LONGEST_SIDE / width.max(height);
+    let side = |side: f64| ((side * scale).round() as u32).max(16);
+    let (planes, camera) = fit(&image, &camera, ImageSize { width: side(width), height: side(height) });
+    Ok((planes.to_tensor(), camera))
+}
+
+/// Round grey Gaussians all over the picture, about one unit away, as large as they lie apart.
+fn scattered(camera: &Camera) -> RawGaussians {
+    let options = (Kind::Float, Device::Cpu);
+    let n = GAUSSIANS;
+    tch::manual_seed(0);
+    let uniform = || Tensor::rand([1, n, 1], options) - 0.5;
+    // What the camera sees in a distance of 1.
+    let (width, height) =
+        (f64::from(camera.width) / camera.intrinsics.fx, f64::from(camera.height) / camera.intrinsics.fy);
+    let spacing = (width * height / n as f64).sqrt();
+    let leaf = |t: Tensor| t.set_requires_grad(true);
+    RawGaussians {
+        means: leaf(Tensor::cat(&[uniform() * width, uniform() * height, uniform() * 0.1 + 1.], -1)),
+        log_scales: leaf(Tensor::full([1, n, 3], (0.5 * spacing).ln(), options)),
+        quaternions: leaf(Tensor::from_slice(&[1f32, 0., 0., 0.]).expand([1, n, 4], false).contiguous()),
+        opacity_logits: leaf(Tensor::zeros([1, n], options)),
+        sh: leaf(Tensor::zeros([1, n, 1, 3], options)),
+    }
+}
+
+/// Every kind of number has its own scale, and so its own learning rate.
+fn groups(gaussians: &RawGaussians) -> Vec<ParameterGroup> {
+    let learning_rate = |name: &str| match name {
+        "means" => 1e-3,
+        "log_scales" => 2e-2,
+        _ => 3e-2,
+    };
+    let group = |(name, t): (&str, &Tensor)| ParameterGroup {
+        parameters: vec![(name.into(), t.shallow_clone())],
+        learning_rate: learning_rate(name),
+        weight_decay: 0.,
+    };
+    gaussians.named().map(group).into()
+}

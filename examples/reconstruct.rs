@@ -1,0 +1,31 @@
+//! Photos to a splat, as `globalsplat reconstruct` does it:
+//!
+//!     cargo run --release --example reconstruct -- model.safetensors captures/room room.ply
+
+use globalsplat::data::{Holdout, open_capture};
+use globalsplat::io::{Splat, write_splat};
+use globalsplat::reconstruct::{load_context, load_model, reconstruct};
+use globalsplat::{Error, Result};
+use std::path::Path;
+use tch::Device;
+
+/// Photos that the model sees, at most.
+const VIEWS: usize = 24;
+
+fn main() -> Result<()> {
+    let arguments: Vec<String> = std::env::args().collect();
+    let [_, weights, scene, out] = arguments.as_slice() else {
+        return Err(Error::Request("expected WEIGHTS SCENE OUT.ply".into()));
+    };
+    let model = load_model(Path::new(weights), Device::Cpu)?;
+    let capture = open_capture(Path::new(scene))?;
+    // Spread over the path of the camera, cut and resized to what the model takes.
+    let views = load_context(&capture, Holdout::None, Some(VIEWS), model.config.data.image_size)?;
+
+    let reconstruction = reconstruct(&model, &views, &[])?;
+    // The model works in a world in which all scenes are alike; this is the way back to the capture's own.
+    let splat = Splat::of(&reconstruction.in_world())?;
+    write_splat(Path::new(out), &splat)?;
+    println!("{out}: {} Gaussians from {} photos", splat.gaussians.count(), views.len());
+    Ok(())
+}
