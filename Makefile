@@ -18,15 +18,17 @@ weights:
 	@scripts/setup.sh weights
 
 build: setup
-	@$(CARGO) build --release --locked
+	@scripts/heartbeat.sh building $(CARGO) build --release --locked
 
 # Trains a small model, makes splats and pictures with it, and says where they are.
 demo: build
 	@scripts/demo.sh
 
 test: venv
-	$(CARGO) fmt --check
+	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+	$(CARGO) check --release --locked --lib --no-default-features
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --no-deps
 	$(CARGO) test --release --locked
 	@$(MAKE) --no-print-directory parity
 

@@ -48,7 +48,15 @@ if [ ! -x .venv/bin/python ]; then
 fi
 if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.txt \
+    if [ ! -e .venv/libtorch ]; then
+        # Meanwhile cargo compiles what needs no libtorch. What does need it fails here, and is built later.
+        "${CARGO:-cargo}" build --release --locked --keep-going >/dev/null 2>&1 &
+        early=$!
+        trap 'kill "$early" 2>/dev/null || true' EXIT
+    fi
+    # Python compiles what it imports when it first does.
+    scripts/heartbeat.sh "setup: installing" \
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.txt \
         || missing "requirements.txt can't be installed; pip's message above tells why"
     cp requirements.txt .venv/requirements.txt
 fi
@@ -56,3 +64,7 @@ fi
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch
 
 weights --if-possible
+if [ -n "${early:-}" ]; then
+    wait "$early" || true
+    trap - EXIT
+fi

@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Runs a command, and says every half minute that it still runs, where standard error is no terminal:
+#   heartbeat.sh building cargo build …
+set -uo pipefail
+what=$1
+shift
+[ ! -t 2 ] || exec "$@"
+
+# Crates and C++ files that this command's compilers work on now.
+compiled() {
+    ps -eo pgid=,args= | awk -v group="$(ps -o pgid= $$ | tr -d ' ')" '
+        $1 != group { next }
+        $2 ~ /rustc$/ && match($0, /--crate-name [^ ]+/) { name = substr($0, RSTART + 13, RLENGTH - 13) }
+        $2 ~ /cc1plus$/ && match($0, /[^ \/]+\.(cpp|cc)( |$)/) { name = substr($0, RSTART, RLENGTH); sub(/ $/, "", name) }
+        name != "" && name != "build_script_build" && !seen[name]++ { names = names (names == "" ? "" : ", ") name }
+        { name = "" }
+        END { print names }'
+}
+
+# Ends with the command, which holds the other end of this standard input and writes nothing.
+beat() {
+    local now
+    while read -rt 30; [ $? -gt 128 ] && kill -0 $$ 2>/dev/null; do
+        now="$(compiled)"
+        echo "$what: $((SECONDS / 60)) min $((SECONDS % 60)) s so far${now:+, now $now}"
+    done
+}
+
+exec 9> >(beat >&2)
+# In place of this shell, so that signals and the exit code are the command's own.
+exec "$@"
