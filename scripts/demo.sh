@@ -1,31 +1,44 @@
 #!/usr/bin/env bash
 # The whole way in minutes on two CPU cores: trains a small model on the captures at hand (or on rooms it makes itself),
 # then writes a splat, a side-by-side picture of views that training never showed, and an orbit.
-#   CAPTURES  a folder of captures; by default $GLOBALSPLAT_CAPTURES, else ../shared/data
+#   CAPTURES  a capture, or a folder with captures up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else none
 #   OUT       where everything goes; by default runs/demo
 set -euo pipefail
 cd "$(dirname "$0")/.."
 globalsplat="target/release/globalsplat"
 out="${OUT:-runs/demo}"
-captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-../shared/data}}"
-[ -d "$captures/re10k" ] && captures="$captures/re10k"
+captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-none}}"
 
-is_capture() { "$globalsplat" inspect "$1" >/dev/null 2>&1; }
-found=""
-for scene in "$captures"/*/; do
-    ! is_capture "$scene" || found=yes
-done
-if [ -z "$found" ]; then
-    echo "demo: no captures in $captures, so rooms are made and photographed" >&2
+# Folders in $1 that are captures; what lies inside of one isn't another.
+find_scenes() {
+    local folder found=""
+    scenes=()
+    while IFS= read -r folder; do
+        case "$folder/" in "${found:-/dev/null}"/*) continue ;; esac
+        if "$globalsplat" inspect "$folder" >/dev/null 2>&1; then
+            scenes+=("$folder")
+            found="$folder"
+        fi
+    done < <(find -L "$1" -maxdepth 2 -type d | sort)
+}
+
+scenes=()
+[ "$captures" = none ] || find_scenes "${captures%/}"
+if [ ${#scenes[@]} -eq 0 ]; then
+    [ "$captures" = none ] || echo "demo: there is no capture in $captures" >&2
+    echo "demo: rooms are made and photographed" >&2
     captures="$out/captures"
     "$globalsplat" synth --out "$captures" --scenes 2 --frames 12
+    find_scenes "$captures"
 fi
-"$globalsplat" train --config configs/first_light.toml --set "data.captures=[\"$captures\"]" --out "$out"
+list="$(printf ', "%s"' "${scenes[@]}")"
+"$globalsplat" train --config configs/first_light.toml --set "data.captures=[${list#, }]" --out "$out"
 "$globalsplat" export --run "$out" --out "$out/model.safetensors"
 
-for scene in "$captures"/*/; do
-    is_capture "$scene" || continue
-    name="$(basename "$scene")"
+for scene in "${scenes[@]}"; do
+    name="${scene#"${captures%/}"/}"
+    [ "$scene" != "${captures%/}" ] || name="$(basename "$scene")"
+    name="${name//\//_}"
     "$globalsplat" reconstruct --weights "$out/model.safetensors" --scene "$scene" --holdout every:3+1 --out "$out/$name.ply"
     "$globalsplat" eval --weights "$out/model.safetensors" --scene "$scene" --sheet "$out/${name}_held_out.png" >/dev/null
     "$globalsplat" render --splat "$out/$name.ply" --scene "$scene" --orbit --depth --size 256x256 --out "$out/${name}_orbit.gif" >/dev/null

@@ -49,8 +49,8 @@ fi
 if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
     if [ ! -e .venv/libtorch ]; then
-        # Meanwhile cargo compiles what needs no libtorch. What does need it fails here, and is built later.
-        "${CARGO:-cargo}" build --release --locked --keep-going >/dev/null 2>&1 &
+        # Meanwhile, in the time that this leaves, cargo compiles what needs no libtorch. What does fails, and is built later.
+        nice "${CARGO:-cargo}" build --release --locked --keep-going >/dev/null 2>&1 &
         early=$!
         trap 'kill "$early" 2>/dev/null || true' EXIT
     fi
