@@ -2,7 +2,7 @@
 
 use super::evaluation::{SceneScores, scene_file_name};
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::write_json;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -81,9 +81,4 @@ impl Journal {
     fn file(&self, key: &str) -> PathBuf {
         self.scenes.join(format!("{}.json", scene_file_name(key)))
     }
-}
-
-fn write_json(file: &Path, value: &impl Serialize) -> Result<()> {
-    let json = serde_json::to_vec_pretty(value).expect("numbers and strings");
-    write_atomically(file, |writer| writer.write_all(&json).map_err(Error::write(file)))
 }

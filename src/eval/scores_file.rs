@@ -3,7 +3,7 @@
 
 use super::evaluation::{Evaluation, scene_file_name};
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::{write_atomically, write_json};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -19,9 +19,7 @@ pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
 /// # Errors
 /// The system's refusal to write.
 pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
-    let path = folder.join(SCORES);
-    let json = serde_json::to_vec_pretty(evaluation).expect("numbers and strings");
-    write_atomically(&path, |writer| writer.write_all(&json).map_err(Error::write(&path)))
+    write_json(&folder.join(SCORES), evaluation)
 }
 
 /// Reads `folder/scores.json`.

@@ -1,6 +1,7 @@
 //! Files and folders that appear whole or not at all.
 
 use crate::error::{Error, Result};
+use serde::Serialize;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -27,6 +28,15 @@ pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result
     }
     sync_parent(path);
     Ok(())
+}
+
+/// Writes `value`, which is made of numbers, texts, lists and maps by names, as JSON that a person can read, whole or not at all.
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let json = serde_json::to_vec_pretty(value).expect("numbers and texts");
+    write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
 }
 
 /// Puts the folder that `fill` makes at `path`, whole: it is filled under another name and then renamed.

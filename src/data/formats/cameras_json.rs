@@ -6,7 +6,7 @@ use super::{Found, file_in, folder_name};
 use crate::data::capture::{Capture, Frame, Photo, check_cameras};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::write_json;
 use crate::scene::{Camera, Intrinsics, pose_to_rows};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
@@ -84,8 +84,7 @@ pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) ->
     });
     let image_shape = cameras.first().map_or([0, 0], |camera| [camera.height, camera.width]);
     let contents = File { image_shape, views: views.collect() };
-    let json = serde_json::to_vec_pretty(&contents).expect("numbers and strings");
-    write_atomically(file, |writer| writer.write_all(&json).map_err(Error::write(file)))
+    write_json(file, &contents)
 }
 
 fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {

@@ -3,7 +3,7 @@
 use super::{EXTENSION, camera_numbers};
 use crate::data::capture::Capture;
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::{write_atomically, write_json};
 use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -87,9 +87,7 @@ impl ChunkWriter {
         if !self.waiting.is_empty() {
             self.write_chunk()?;
         }
-        let file = self.folder.join(INDEX_FILE);
-        let json = serde_json::to_vec_pretty(&self.index).expect("strings");
-        write_atomically(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))?;
+        write_json(&self.folder.join(INDEX_FILE), &self.index)?;
         Ok(self.chunks)
     }
 
