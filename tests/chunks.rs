@@ -128,19 +128,25 @@ fn text(text: &str) -> Vec<u8> {
     [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
+/// BININT.
+fn int(value: u32) -> Vec<u8> {
+    [b"J", &value.to_le_bytes()[..]].concat()
+}
+
 /// A tensor of `storage` with `size` numbers by `stride` at `offset` of a storage that claims to have 64.
 fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
-    let int = |v: u32| [b"J", &v.to_le_bytes()[..]].concat();
+    let id = [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cpu"), int(64)];
+    tensor_of(&id, offset, size, stride)
+}
+
+/// A tensor of the storage that a persistent id of these parts stands for.
+fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
     let tuple = |values: &[u32]| {
         [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
     };
     [
         b"ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
-        text("storage"),
-        format!("ctorch\n{storage}\n").into_bytes(),
-        text("0"),
-        text("cpu"),
-        int(64),
+        id.concat(),
         b"tQ".to_vec(),
         int(offset),
         tuple(size),
@@ -196,20 +202,109 @@ fn what_a_pickle_may_not_do_is_not_done() {
 #[test]
 fn unsound_pickles_are_refused() {
     let nested = [b"\x80\x02".to_vec(), b"]".repeat(100_000), b"a".repeat(99_999), b".".to_vec()].concat();
-    assert_refused(&nested, "lists in each other");
+    assert_refused(&nested, "scene 0 is a list, expected a dict");
     assert_refused(b"\x80\x02]r\xff\xff\xff\xff.", "memo 4294967295");
-    assert_refused(b"\x80\x02]q\x00h\x00a.", "changes a list inside another");
-    assert_refused(b"\x80\x02]q\x00(h\x00e.", "changes a list inside another");
+    // A list that is part of itself.
+    assert_refused(b"\x80\x02]q\x00h\x00a.", "scene 0 is a list, expected a dict");
+    assert_refused(b"\x80\x02]q\x00(h\x00e.", "scene 0 is a list, expected a dict");
+    assert_refused(b"\x80\x02}K\x01a.", "appends to a dict");
+    assert_refused(b"\x80\x02](X\x01\x00\x00\x00aNu.", "sets items of a list");
     assert_refused(b"\x80\x02}(X\x01\x00\x00\x00au.", "a key without a value");
-    assert_refused(b"\x80\x02}(K\x01K\x02u.", "a Scalar where a Text belongs");
+    assert_refused(b"\x80\x02}(K\x01K\x02u.", "an integer as a key, where a string belongs");
     assert_refused(b"\x80\x02a.", "takes what isn't there");
     assert_refused(b"\x80\x02t.", "without a mark");
     assert_refused(b"\x80\x02K\x01K\x02.", "ends with 2 values");
     assert_refused(b"\x80\x02X\xff\xff\xff\x7fabc.", "cut off");
     assert_refused(b"\x80\x04N.", "protocol 4");
-    assert_refused(b"\x80\x02K\x01.", "a Int, expected a list of scenes");
-    assert_refused(b"\x80\x02](K\x01e.", "scene 0 is a Int, expected a dict");
-    assert_refused(b"\x80\x02](}e.", "scene 0 has no cameras");
+    assert_refused(b"\x80\x02K\x01.", "an integer, expected a list of scenes");
+    assert_refused(b"\x80\x02](K\x01e.", "scene 0 is an integer, expected a dict");
+    assert_refused(b"\x80\x02](}e.", "scene 0 has no images");
+}
+
+#[test]
+fn only_storages_are_storages() {
+    let float = || b"ctorch\nFloatStorage\n".to_vec();
+    let with = |id: &[Vec<u8>]| {
+        let cameras = tensor_of(id, 0, &[1, 18], &[18, 1]);
+        scene(&cameras, &good_timestamps(), &tensor("ByteStorage", 0, &[4], &[1]))
+    };
+    for id in [
+        // A number where the storage's type belongs, which libtorch takes for an address.
+        vec![text("storage"), int(u32::MAX), text("0"), text("cpu"), int(64)],
+        vec![text("module"), float(), text("0"), text("cpu"), int(64)],
+        vec![text("storage"), float(), int(0), text("cpu"), int(64)],
+        vec![text("storage"), float(), text("0"), int(0), int(64)],
+        vec![text("storage"), float(), text("0"), text("cpu"), text("64")],
+        vec![text("storage"), float(), text("0"), text("cpu")],
+        vec![text("storage"), float(), text("0"), text("cpu"), int(64), b"N".to_vec()],
+        vec![],
+    ] {
+        assert_refused(&with(&id), "a persistent id that is no storage");
+    }
+    let of = |function: &str, arguments: &[u8]| {
+        let made = [format!("c{function}\n(").as_bytes(), arguments, b"tR"].concat();
+        scene(&made, &good_timestamps(), &text("x"))
+    };
+    for arguments in [b"".as_slice(), b"NK\x00))\x89)", b"K\x00K\x00))\x89)"] {
+        assert_refused(&of("torch._utils\n_rebuild_tensor_v2", arguments), "a tensor of other than storage");
+    }
+    assert_refused(&of("torch\nFloatStorage", b"K\x04"), "calls a type");
+    assert_refused(&of("collections\nOrderedDict", b"]"), "calls a function");
+    let elsewhere = vec![text("storage"), float(), text("1"), text("cpu"), int(64)];
+    assert_refused(&with(&elsewhere), "cameras of scene 0 asks for data/1, which is not there");
+}
+
+#[test]
+fn data_saved_on_another_device_are_read_here() {
+    let png = {
+        let folder = tempfile::tempdir().unwrap();
+        write_room(&folder.path().join("room"), 1, 2, [16, 16].into()).unwrap();
+        std::fs::read(folder.path().join("room/images/000.png")).unwrap()
+    };
+    let camera = [0.5f32, 0.5, 0.5, 0.5, 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.];
+    let data =
+        [camera.map(f32::to_le_bytes).concat(), camera.map(f32::to_le_bytes).concat(), png.clone()].concat();
+    for device in ["cuda:0", "mps:0", "nowhere"] {
+        let on = |dtype: &str, offset: u32, size: &[u32], stride: &[u32]| {
+            let dtype = format!("ctorch\n{dtype}\n").into_bytes();
+            tensor_of(&[text("storage"), dtype, text("0"), text(device), int(64)], offset, size, stride)
+        };
+        let image = on("ByteStorage", 144, &[png.len() as u32], &[1]);
+        let program = scene(
+            &on("FloatStorage", 0, &[2, 18], &[18, 1]),
+            &on("LongStorage", 0, &[2], &[1]),
+            &image.repeat(2),
+        );
+        let bytes = archive(&program, &data, CompressionMethod::Stored);
+        let capture = Chunk::parse(Path::new("c.torch"), bytes).unwrap().capture("a").unwrap();
+        assert_eq!(capture.load_all(None).unwrap()[1].image.size(), [3, 16, 16]);
+    }
+}
+
+#[test]
+fn what_is_said_again_and_again_takes_no_more_than_it_says() {
+    // One image and one scene, each referred to in two bytes.
+    for (views, scenes, fits) in [(50, 50, true), (2000, 50, true), (2000, 2000, false)] {
+        let count = views as u32;
+        let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+        let image = [tensor("ByteStorage", 0, &[4], &[1]), b"q\x01".to_vec(), b"h\x01".repeat(views - 1)];
+        let program = [
+            b"\x80\x02](}q\x00(".to_vec(),
+            entry("key", &text("a")),
+            entry("url", &text("")),
+            entry("cameras", &tensor("FloatStorage", 0, &[count, 18], &[18, 1])),
+            entry("timestamps", &tensor("LongStorage", 0, &[count], &[1])),
+            entry("images", &[b"](", image.concat().as_slice(), b"e"].concat()),
+            b"u".to_vec(),
+            b"h\x00".repeat(scenes - 1),
+            b"e.".to_vec(),
+        ];
+        let bytes = archive(&program.concat(), &vec![0; 72 * views], CompressionMethod::Stored);
+        match Chunk::parse(Path::new("c.torch"), bytes) {
+            Ok(chunk) => assert!(fits && chunk.keys().count() == scenes),
+            Err(error) => assert!(!fits && error.to_string().contains("has no room"), "{error}"),
+        }
+    }
 }
 
 #[test]
@@ -233,12 +328,12 @@ fn tensors_stay_inside_their_data() {
         (image(0, 1 << 30, 0), "is no plain tensor"),
         (image(0, u32::MAX, 1), ""),
         (tensor("FloatStorage", 0, &[4], &[1]), "expected the bytes of a JPEG"),
-        (text("x"), "images of scene 0 holds a String, expected tensors"),
+        (text("x"), "images of scene 0 has a string, expected a tensor"),
     ] {
         let error = refusal(whole(&image));
         assert!(error.contains(found), "{error:?} lacks {found:?}");
     }
-    let double = tensor("DoubleStorage", 0, &[1, 17], &[17, 1]);
+    let double = tensor("DoubleStorage", 0, &[1, 8], &[8, 1]);
     assert_refused(&scene(&double, &good_timestamps(), &image(0, 4, 1)), "expected Float [1, 18]");
     // As much as there is passes, and is then no image.
     let chunk = Chunk::parse(Path::new("chunk.torch"), whole(&image(0, 72, 1))).unwrap();
@@ -257,6 +352,11 @@ fn archives_that_inflate_are_refused() {
     let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
     bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
     assert!(refusal(bytes).contains("expected inside the file"));
+    // Both entries of one place: their checksums would be computed again and again.
+    let mut bytes = archive(&pickle, &pickle, CompressionMethod::Stored);
+    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    bytes[entry + 42..entry + 46].copy_from_slice(&[0; 4]);
+    assert!(refusal(bytes).contains("in one place with another entry"));
 }
 
 #[test]

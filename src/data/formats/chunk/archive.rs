@@ -1,7 +1,7 @@
 //! The zip archive that torch.save writes: a pickle, and the bytes of its tensors, all of it stored as it is.
 
 use crate::error::{Error, Result};
-use globalsplat_csrc::chunk::ChunkRecord;
+use std::collections::HashMap;
 use std::fmt::Display;
 use std::io::Cursor;
 use std::ops::Range;
@@ -9,18 +9,26 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::read::ZipArchive;
 
-/// An archive's parts, as places in its file.
+/// An archive's parts, as places in its file. None overlaps another.
 #[derive(Debug)]
 pub(super) struct Archive {
     /// Of data.pkl.
     pub pickle: Range<usize>,
-    /// Of the tensors, in the order in which they lie in the file. None overlaps another.
-    pub records: Vec<ChunkRecord>,
+    /// Of the tensors' storages, by the keys under which the pickle asks for them.
+    pub storages: HashMap<String, Range<usize>>,
+}
+
+/// A file in the archive.
+struct Entry {
+    name: String,
+    contents: Range<usize>,
+    crc32: u32,
 }
 
 impl Archive {
     /// Finds the parts of `bytes`, which `file` holds, and checks their checksums. Whatever the archive claims, nothing is
-    /// larger than the file: compressed entries, which could inflate without end, are refused.
+    /// larger than the file, nor all of it together: compressed entries, which could inflate without end, are refused, and so
+    /// are those that share bytes.
     ///
     /// # Errors
     /// A file that is no such archive, was cut off, or has changed since it was written.
@@ -34,7 +42,7 @@ impl Archive {
                 return refuse("the file", &format!("no whole zip archive ({e})"), "what torch.save writes");
             }
         };
-        let (mut pickle, mut records) = (None, vec![]);
+        let mut entries = vec![];
         for index in 0..zip.len() {
             let entry = match zip.by_index_raw(index) {
                 Ok(entry) => entry,
@@ -49,35 +57,35 @@ impl Archive {
                 return refuse(name, &"compressed", "a stored file, as torch.save writes");
             }
             let start = entry.data_start();
-            let range = start as usize..start.saturating_add(entry.size()) as usize;
-            let Some(contents) = bytes.get(range.clone()) else {
+            let contents = start as usize..start.saturating_add(entry.size()) as usize;
+            if contents.end > bytes.len() {
                 return refuse(name, &format!("{} bytes at byte {start}", entry.size()), "inside the file");
-            };
-            if crc32fast::hash(contents) != entry.crc32() {
-                return refuse(name, &"damaged: its checksum differs", "the bytes that were written");
+            }
+            entries.push(Entry { name: name.into(), contents, crc32: entry.crc32() });
+        }
+        entries.sort_by_key(|entry| (entry.contents.start, entry.contents.end));
+        if let Some(pair) = entries.windows(2).find(|pair| pair[0].contents.end > pair[1].contents.start) {
+            return refuse(&pair[0].name, &"in one place with another entry", "a place of its own");
+        }
+        let (mut pickle, mut storages) = (None, HashMap::new());
+        for Entry { name, contents, crc32 } in entries {
+            if crc32fast::hash(&bytes[contents.clone()]) != crc32 {
+                return refuse(&name, &"damaged: its checksum differs", "the bytes that were written");
             }
             // The first folder is the archive's own name.
             match name.split_once('/').map(|(_, inside)| inside) {
-                Some("data.pkl") => pickle = Some(range),
+                Some("data.pkl") => pickle = Some(contents),
                 Some(inside) => {
                     if let Some(key) = inside.strip_prefix("data/") {
-                        records.push(ChunkRecord { key: key.into(), start, length: entry.size() });
+                        storages.insert(key.into(), contents);
                     }
                 }
                 None => {}
             }
         }
-        let Some(pickle) = pickle else {
-            return refuse("the archive", &"one without data.pkl", "what torch.save writes");
-        };
-        records.sort_by_key(|record| (record.start, record.length));
-        match records.windows(2).find(|pair| pair[0].start + pair[0].length > pair[1].start) {
-            Some(pair) => refuse(
-                &format!("data/{}", pair[0].key),
-                &"in one place with another entry",
-                "a place of its own",
-            ),
-            None => Ok(Archive { pickle, records }),
+        match pickle {
+            Some(pickle) => Ok(Archive { pickle, storages }),
+            None => refuse("the archive", &"one without data.pkl", "what torch.save writes"),
         }
     }
 }

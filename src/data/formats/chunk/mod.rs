@@ -1,9 +1,9 @@
 //! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key",
-//! "url", "timestamps", "cameras" [n, 18], "images": n encoded images}, read and written by libtorch's own pickler
-//! (spec 10.7).
+//! "url", "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
 
 mod archive;
 mod pickle;
+mod scenes;
 mod write;
 
 pub use write::{ChunkWriter, INDEX_FILE};
@@ -16,8 +16,7 @@ use crate::io::encoded_image_size;
 use crate::scene::{Camera, Intrinsics};
 use archive::Archive;
 use glam::{DMat4, DVec4};
-use globalsplat_csrc::chunk::{ChunkScene, unpickle_scenes};
-use std::ops::Range;
+use scenes::{Scene, scenes};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -31,7 +30,7 @@ const CAMERA_NUMBERS: usize = 18;
 pub struct Chunk {
     file: PathBuf,
     bytes: Arc<Vec<u8>>,
-    scenes: Vec<ChunkScene>,
+    scenes: Vec<Scene>,
 }
 
 /// `CHUNK.torch#KEY`, or `CHUNK.torch` with one scene alone.
@@ -67,13 +66,8 @@ impl Chunk {
     pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
         let archive = Archive::open(file, &bytes)?;
         let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
-        let refuse = |found: String| Error::input(file, "data.pkl", found, expected);
-        let program = &bytes[archive.pickle];
-        pickle::check_pickle(program).map_err(refuse)?;
-        // libtorch appends where in its source it stood.
-        let first_line = |e: cxx::Exception| e.what().lines().next().unwrap_or_default().to_string();
-        let scenes = unpickle_scenes(&bytes, program, &archive.records);
-        let scenes = scenes.map_err(|e| refuse(format!("unusable ({})", first_line(e))))?;
+        let scenes =
+            scenes(&bytes, &archive).map_err(|found| Error::input(file, "data.pkl", found, expected))?;
         Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
     }
 
@@ -124,28 +118,28 @@ impl Chunk {
         format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
     }
 
-    fn capture_of(&self, scene: &ChunkScene) -> Result<Capture> {
+    fn capture_of(&self, scene: &Scene) -> Result<Capture> {
         let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
-        let ranges: Vec<Range<usize>> = scene
-            .images
-            .iter()
-            .map(|image| image.start as usize..(image.start + image.length) as usize)
-            .collect();
         // A frame that is damaged is found when it is loaded; until then it is as large as the others.
         let sizes: Vec<_> =
-            ranges.iter().map(|range| encoded_image_size(&self.bytes[range.clone()])).collect();
+            scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
         let Some(usual) = sizes.iter().flatten().next() else {
             return Err(Error::input(&named, "every image", "undecodable", "a JPEG or PNG"));
         };
-        let cameras = scene.cameras.chunks_exact(CAMERA_NUMBERS);
-        let frames = ranges.into_iter().zip(cameras).zip(&sizes).enumerate().map(
-            |(index, ((bytes, numbers), size))| {
+        let cameras = scene.cameras(&self.bytes);
+        let frames = scene
+            .images
+            .iter()
+            .cloned()
+            .zip(cameras.chunks_exact(CAMERA_NUMBERS))
+            .zip(&sizes)
+            .enumerate()
+            .map(|(index, ((bytes, numbers), size))| {
                 let name = format!("{index:06}");
                 let camera = camera(numbers, size.unwrap_or(*usual));
                 let photo = Photo::Part { file: self.bytes.clone(), bytes, name: named.join(&name) };
                 Frame { photo, name, camera, distortion: Distortion::default() }
-            },
-        );
+            });
         Capture::new(scene.key.clone(), named.clone(), frames.collect())
     }
 }
