@@ -1,6 +1,6 @@
 //! What fuzzing found, and what it began with, goes through the readers once more: see `scripts/fuzz.sh`.
 
-#[path = "common/readers.rs"]
+#[path = "common/readers/mod.rs"]
 mod readers;
 
 use std::path::Path;

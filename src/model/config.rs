@@ -83,21 +83,23 @@ impl ModelConfig {
     /// # Errors
     /// Names the first field that doesn't.
     pub fn check(&self) -> Result<()> {
+        // The upper ends are far beyond any model: they keep products of the numbers from overflowing.
         let fields = [
-            ("patch_size", self.patch_size, 1),
-            ("latents", self.latents, 1),
-            ("width", self.width, 1),
-            ("rgb_width", self.rgb_width, 1),
-            ("ray_width", self.ray_width, 1),
-            ("rounds", self.rounds, 0),
-            ("self_attention_blocks", self.self_attention_blocks, 0),
-            ("heads", self.heads, 1),
-            ("candidates", self.candidates, 1),
-            ("sh_degree", self.sh_degree, 0),
+            ("patch_size", self.patch_size, 1..=1 << 10),
+            ("latents", self.latents, 1..=1 << 20),
+            ("width", self.width, 1..=1 << 16),
+            ("rgb_width", self.rgb_width, 1..=1 << 16),
+            ("ray_width", self.ray_width, 1..=1 << 16),
+            ("rounds", self.rounds, 0..=1 << 10),
+            ("self_attention_blocks", self.self_attention_blocks, 0..=1 << 10),
+            ("heads", self.heads, 1..=1 << 16),
+            ("candidates", self.candidates, 1..=1 << 10),
+            ("sh_degree", self.sh_degree, 0..=3),
         ];
-        for (name, value, least) in fields {
-            if value < least {
-                return Err(Error::Request(format!("model.{name} is {value}, expected {least} or more")));
+        for (name, value, range) in fields {
+            if !range.contains(&value) {
+                let (least, most) = (range.start(), range.end());
+                return Err(Error::setting(&format!("model.{name}"), value, format!("{least} to {most}")));
             }
         }
         let expect = |holds: bool, field: &str, value: i64, expected: String| match holds {
@@ -115,8 +117,14 @@ impl ModelConfig {
             "candidates",
             self.candidates,
             "a power of two".into(),
-        )?;
-        expect(self.sh_degree <= 3, "sh_degree", self.sh_degree, "0 to 3".into())
+        )
+    }
+
+    /// Numbers that the weights of such a model have at least: a file with fewer can't hold it.
+    pub fn least_parameters(&self) -> i64 {
+        let attention = self.rounds * (1 + self.self_attention_blocks) * self.width * self.width;
+        let patches = 3 * self.patch_size * self.patch_size * self.rgb_width + self.ray_width;
+        self.latents * self.width + attention + patches + self.candidates * self.width
     }
 
     /// Whether images of this size can be cut into patches.

@@ -61,6 +61,13 @@ pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
         )
     })?;
     let config = Config::parse(config, &[], path)?;
+    // Before a model of whatever size is made.
+    let numbers: usize = weights.tensors.values().map(Tensor::numel).sum();
+    let least = config.model.least_parameters();
+    if (numbers as i64) < least {
+        let expected = format!("{least} or more, as its configuration says");
+        return Err(Error::input(path, "the number of weights", numbers, expected));
+    }
     let vs = nn::VarStore::new(device);
     let model = GlobalSplat::new(&vs.root(), &config.model)?;
     weights.load_into(&vs, path)?;

@@ -1,7 +1,0 @@
-#![no_main]
-
-#[path = "../../tests/common/readers.rs"]
-#[allow(dead_code)] // every target uses one
-mod readers;
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| readers::chunk(bytes));

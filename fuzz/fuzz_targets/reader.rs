@@ -1,0 +1,14 @@
+//! Every target is this file: the name of the binary is that of the reader.
+#![no_main]
+
+#[path = "../../tests/common/readers/mod.rs"]
+#[allow(dead_code)] // every target uses one
+mod readers;
+
+use std::sync::OnceLock;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    static READER: OnceLock<readers::Reader> = OnceLock::new();
+    let named = || readers::READERS.iter().find(|(name, _)| *name == env!("CARGO_BIN_NAME"));
+    READER.get_or_init(|| named().expect("a reader of that name").1)(bytes);
+});

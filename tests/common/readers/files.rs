@@ -1,0 +1,87 @@
+//! Readers that are given a file's bytes.
+
+use super::{file, folder, load};
+use globalsplat::config::Config;
+use globalsplat::data::{Chunk, Dataset, Split, open_capture, read_camera_path};
+use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
+use globalsplat::io::{decode_photo, read_splat, read_weights};
+use globalsplat::reconstruct::load_model;
+use globalsplat::train::latest_checkpoint;
+use std::path::Path;
+use tch::Device;
+
+pub fn cameras_json(bytes: &[u8]) {
+    let file = file("cameras_json", "cameras.json", bytes);
+    let _ = open_capture(&file).map(|capture| load(&capture));
+    let _ = read_camera_path(&file);
+}
+
+pub fn transforms_json(bytes: &[u8]) {
+    let _ = open_capture(&file("transforms_json", "transforms.json", bytes)).map(|capture| load(&capture));
+}
+
+pub fn chunk(bytes: &[u8]) {
+    let Ok(chunk) = Chunk::parse(Path::new("chunk.torch"), bytes.to_vec()) else { return };
+    for key in chunk.keys().take(2) {
+        let _ = chunk.capture(key).map(|capture| load(&capture));
+    }
+}
+
+/// Both of a model's files in one: how long the first is, in two bytes, then one after the other.
+fn colmap(reader: &str, bytes: &[u8], ending: &str) {
+    let Some((length, rest)) = bytes.split_first_chunk::<2>() else { return };
+    let (cameras, images) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
+    file(reader, &format!("sparse/0/cameras.{ending}"), cameras);
+    file(reader, &format!("sparse/0/images.{ending}"), images);
+    let _ = open_capture(&folder(reader)).map(|capture| load(&capture));
+}
+
+pub fn colmap_binary(bytes: &[u8]) {
+    colmap("colmap_binary", bytes, "bin");
+}
+
+pub fn colmap_text(bytes: &[u8]) {
+    colmap("colmap_text", bytes, "txt");
+}
+
+pub fn dataset_index(bytes: &[u8]) {
+    let file = file("dataset_index", "index.json", bytes);
+    let Ok(dataset) = Dataset::open(file.parent().unwrap(), Split::Train) else { return };
+    for group in dataset.groups().iter().take(2) {
+        let _ = group.open();
+    }
+}
+
+pub fn evaluation_index(bytes: &[u8]) {
+    let _ = EvaluationIndex::read(&file("evaluation_index", "index.json", bytes));
+}
+
+pub fn evaluation(bytes: &[u8]) {
+    let folder = file("evaluation", "scores.json", bytes).parent().unwrap().to_owned();
+    let Ok(evaluation) = read_evaluation(&folder) else { return };
+    let _ = write_report(&folder.join("report.html"), &[(folder.clone(), evaluation)]);
+}
+
+pub fn checkpoint(bytes: &[u8]) {
+    let state = file("checkpoint", "checkpoints/step-00000001/state.json", bytes);
+    std::fs::write(state.with_file_name("model.safetensors"), [0; 3]).unwrap();
+    let _ = latest_checkpoint(&folder("checkpoint"));
+}
+
+pub fn photo(bytes: &[u8]) {
+    let _ = decode_photo(bytes, Path::new("photo.jpg"), (8, 8));
+}
+
+pub fn ply(bytes: &[u8]) {
+    let _ = read_splat(&file("ply", "splat.ply", bytes));
+}
+
+pub fn weights(bytes: &[u8]) {
+    let file = file("weights", "model.safetensors", bytes);
+    let _ = read_weights(&file);
+    let _ = load_model(&file, Device::Cpu);
+}
+
+pub fn configuration(bytes: &[u8]) {
+    let _ = std::str::from_utf8(bytes).map(|text| Config::parse(text, &[], Path::new("config.toml")));
+}
