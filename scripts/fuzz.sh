@@ -21,7 +21,8 @@ export OMP_NUM_THREADS=1 ASAN_OPTIONS="detect_leaks=0:allocator_may_return_null=
 if command -v clang++ >/dev/null; then
     export CXX=clang++
     export CXXFLAGS="-fsanitize=address,undefined -fno-sanitize=vptr,function -fno-sanitize-recover=undefined \
--fsanitize-coverage=inline-8bit-counters,pc-table,trace-cmp -fno-omit-frame-pointer -gline-tables-only"
+-fsanitize-coverage=inline-8bit-counters,pc-table,trace-cmp -fsanitize-coverage-ignorelist=$PWD/fuzz/uninstrumented.txt \
+-fsanitize-ignorelist=$PWD/fuzz/uninstrumented.txt -fno-omit-frame-pointer -gline-tables-only"
 fi
 
 cargo fuzz build

@@ -80,6 +80,27 @@ fn a_data_set_is_found_split_by_split() {
 }
 
 #[test]
+fn what_is_in_the_folder_of_one_part_is_not_in_the_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("set");
+    let write = |name: &str| write_room(&root.join(name), 0, 3, [24, 24].into()).unwrap();
+    let scenes = |split: Split| -> Vec<String> {
+        let dataset = Dataset::open(&root, split).unwrap();
+        dataset.groups().iter().flat_map(|group| group.keys.clone()).collect()
+    };
+    write("test/seen_never");
+    let error = Dataset::open(&root, Split::Train).unwrap_err().to_string();
+    assert!(error.contains("without captures but those in") && error.contains("test"), "{error}");
+    write("a");
+    write("more/b");
+    assert_eq!(scenes(Split::Train), ["a", "b"]);
+    assert_eq!(scenes(Split::Test), ["seen_never"]);
+    std::fs::rename(root.join("test"), root.join("train")).unwrap();
+    assert_eq!(scenes(Split::Test), ["a", "b"]);
+    assert_eq!(scenes(Split::Train), ["seen_never"]);
+}
+
+#[test]
 fn pack_and_inspect_tell_what_they_did() {
     let folder = tempfile::tempdir().unwrap();
     write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();

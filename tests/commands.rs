@@ -74,6 +74,31 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
 }
 
 #[test]
+fn memory_before_is_not_counted() {
+    let (large, small) = (100_000, 1_000);
+    let working = |gaussians: usize| {
+        let (gaussians, cameras) = globalsplat::bench::made_up_scene(gaussians, 1, [256, 256].into());
+        globalsplat::bench::bench_raster(&gaussians, &cameras, 1).expect("a measurement").working_bytes
+    };
+    // In one process, the large one first.
+    let (first, second) = (working(large), working(small));
+    if cfg!(target_os = "linux") {
+        assert!(first > 20_000_000 && second < first / 2, "{first} {second}");
+    }
+}
+
+#[test]
+fn frames_without_an_orbit_are_refused() {
+    let (_folder, room) = room();
+    let (splat, out) = (room.join("truth.ply"), room.join("out"));
+    let arguments =
+        ["render", "--splat", arg(&splat), "--scene", arg(&room), "--frames", "3", "--out", arg(&out)];
+    let output = globalsplat(&arguments);
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && err.contains("--orbit"), "{err}");
+}
+
+#[test]
 fn bench_train_tells_where_a_step_goes() {
     let (folder, capture) = room();
     let config = tiny_config(folder.path(), &capture);

@@ -243,3 +243,22 @@ fn what_an_index_gets_wrong_is_named() {
     let error = fail(&strs(&arguments), 1);
     assert!(error.contains("room_000: ") && error.contains("000000.torch can't be read"), "{error}");
 }
+
+#[test]
+fn the_first_scene_that_can_be_judged_warms_up() {
+    let set = Set::new();
+    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
+    std::fs::write(set.path("captures/room_000/images/000.png"), "no photo").unwrap();
+    let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
+    set.write_index(&json!({"room_000": frames, "room_001": frames, "room_002": frames}));
+    let (code, _, err) = run(&set.arguments(&["--weights", arg(&weights)], "captures"), set.folder.path());
+    assert_eq!(code, Some(1), "{err}");
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 1));
+    let efficiency = evaluation.efficiency.expect("a model's cost");
+    assert_eq!(efficiency.timed_scenes, 1);
+    assert!(efficiency.peak_memory_bytes > 1_000_000);
+    let [first, second] = evaluation.scenes.as_slice() else { panic!("two scenes") };
+    assert!(first.warm_up && first.peak_memory_bytes.is_some());
+    assert!(!second.warm_up && second.peak_memory_bytes.is_none());
+}

@@ -378,17 +378,20 @@ fn what_kills_left_is_put_right() {
     succeed(&text(&train(&config, &run, &["train.steps=3"])));
     // Between the two renames of a save, and within an earlier one.
     let folder = run.join("checkpoints");
-    for (from, to) in [("step-00000003", ".step-00000003.old"), ("step-00000002", ".step-00000001.partial")] {
+    for (from, to) in [
+        ("step-00000003", ".step-00000003.globalsplat-old"),
+        ("step-00000002", ".step-00000001.globalsplat-partial"),
+    ] {
         std::fs::rename(folder.join(from), folder.join(to)).unwrap();
     }
-    std::fs::rename(run.join("best"), run.join(".best.old")).unwrap();
+    std::fs::rename(run.join("best"), run.join(".best.globalsplat-old")).unwrap();
     succeed(&text(&train(&config, &run, &["train.steps=4"])));
     assert_eq!(steps(&run).0, [0, 1, 2, 3], "it went on from step 3");
     let mut left: Vec<_> =
         std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
     assert_eq!(left, ["step-00000003", "step-00000004"]);
-    assert!(run.join("best").is_dir() && !run.join(".best.old").exists());
+    assert!(run.join("best").is_dir() && !run.join(".best.globalsplat-old").exists());
 }
 
 #[test]
@@ -446,4 +449,83 @@ fn held_out_scenes_are_checked_before_training() {
     let out = succeed(&text(&train(&config, &run, &[&scenes, "train.steps=1"])));
     assert_eq!(out.lines().filter(|line| line.starts_with("room_000")).count(), 2, "{out}");
     assert_eq!(metrics(&run).last().unwrap()["validation"]["scenes"], 2);
+}
+
+#[test]
+fn weights_are_used_at_the_stage_that_they_were_trained_to() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    // Stages 1 and 2 begin at steps 2 and 4, and take two steps each to come.
+    let settings = ["train.checkpoint_every=1", "train.keep_checkpoints=6", "train.validate_every=1"];
+    let out = command(&text(&train(&config, &run, &settings))).output().unwrap();
+    assert!(out.status.success());
+    let validations: Vec<Value> = metrics(&run)
+        .into_iter()
+        .map(|mut line| line["validation"].take())
+        .filter(Value::is_object)
+        .collect();
+    let stages: Vec<_> =
+        validations.iter().map(|v| (v["stage"].as_u64().unwrap(), v["mix"].as_f64().unwrap())).collect();
+    assert_eq!(
+        stages,
+        [(0, 1.), (0, 1.), (1, 0.), (1, 0.5), (2, 0.), (2, 1.)],
+        "the last one is a finished run's"
+    );
+    let splat = folder.path().join("room.ply");
+    for (step, gaussians, said) in
+        [(1, 16, Some("stage 0 (λ 1.00) of 2")), (4, 32, Some("stage 1 (λ 0.50) of 2")), (6, 64, None)]
+    {
+        let weights = run.join(format!("checkpoints/step-{step:08}/model.safetensors"));
+        let arguments = [
+            "reconstruct",
+            "--weights",
+            arg(&weights),
+            "--scene",
+            arg(&room),
+            "--out",
+            arg(&splat),
+            "--json",
+        ];
+        let output = command(&arguments).output().unwrap();
+        let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(told["gaussians"], gaussians);
+        let err = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(said.map(|said| err.contains(said)), (!err.is_empty()).then_some(true), "{err}");
+        // Weights go from file to file with their stage, and are the same bytes each time.
+        let file = globalsplat::io::read_weights(&weights).unwrap();
+        let bytes: Vec<Vec<u8>> = (0..4)
+            .map(|_| {
+                let copy = folder.path().join("copy.safetensors");
+                globalsplat::io::write_weights(&copy, &file.tensors, file.metadata.clone()).unwrap();
+                std::fs::read(copy).unwrap()
+            })
+            .collect();
+        assert!(bytes.iter().all(|copy| *copy == std::fs::read(&weights).unwrap()));
+    }
+    let broken = folder.path().join("broken.safetensors");
+    let mut file =
+        globalsplat::io::read_weights(&run.join("checkpoints/step-00000001/model.safetensors")).unwrap();
+    for stage in ["{}", "3", "{\"index\": 3, \"mix\": 1.0}", "{\"index\": 1, \"mix\": 1.5}"] {
+        file.metadata.insert("globalsplat.stage".into(), stage.into());
+        globalsplat::io::write_weights(&broken, &file.tensors, file.metadata.clone()).unwrap();
+        let error =
+            fail(&["reconstruct", "--weights", arg(&broken), "--scene", arg(&room), "--out", arg(&splat)], 2);
+        assert!(error.contains("metadata globalsplat.stage is"), "{error}");
+    }
+}
+
+#[test]
+fn scenes_of_training_among_those_held_out_are_told() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let said = |scenes: &Path| {
+        let scenes = format!("data.validation=[{:?}]", arg(scenes));
+        let output = command(&text(&train(&config, &run, &[&scenes, "train.steps=1"]))).output().unwrap();
+        assert!(output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert!(said(folder.path()).contains("room_000 of data.validation is trained on, too"));
+    let other = folder.path().join("other");
+    globalsplat::data::write_room(&other, 9, 5, [40, 40].into()).unwrap();
+    assert_eq!(said(&other).matches("trained on").count(), 0);
 }

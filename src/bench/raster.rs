@@ -2,7 +2,7 @@
 
 use super::{Section, Spread};
 use crate::error::Result;
-use crate::eval::{peak_memory_bytes, resident_memory_bytes};
+use crate::eval::{forget_peak_memory, peak_memory_bytes, resident_memory_bytes};
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use crate::scene::{Gaussians, ImageSize};
@@ -82,6 +82,7 @@ const PEAK_SECONDS: f64 = 0.2;
 pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
     let per_view = |seconds: f64| seconds * 1e3 / views as f64;
+    forget_peak_memory();
     let memory_before = resident_memory_bytes();
     let (mut forward, mut forward_backward) = (vec![], vec![]);
     let mut stages: Vec<StageTimes> = vec![];

@@ -19,11 +19,12 @@ const STEP: u32 = 2;
 /// Writes `videos` videos of `frames` frames into chunks of about `chunk_bytes` in `root`, which is there already.
 pub(super) fn write_videos(root: &Path, videos: usize, frames: usize, chunk_bytes: usize) -> Result<()> {
     let mut writer = ChunkWriter::new(root, chunk_bytes)?;
-    let folder = root.join("frames");
+    let folder = root.join(format!(".globalsplat-frames-{}", std::process::id()));
+    std::fs::create_dir(&folder).map_err(Error::write(&folder))?;
     for video in 0..videos {
         // A capture is named by its folder.
         let capture = folder.join(format!("video_{video:03}"));
-        std::fs::create_dir_all(&capture).map_err(Error::write(&capture))?;
+        std::fs::create_dir(&capture).map_err(Error::write(&capture))?;
         let panorama = panorama(WIDTH + STEP * frames as u32, video as u64);
         let names: Vec<String> = (0..frames).map(|frame| format!("{frame:04}.jpg")).collect();
         for (frame, name) in names.iter().enumerate() {

@@ -1,4 +1,4 @@
-use super::print_json;
+use super::{model, print_json};
 use anyhow::Result;
 use clap::{ArgGroup, Args, ValueEnum};
 use globalsplat::config::Config;
@@ -46,31 +46,36 @@ enum Dtype {
 impl Export {
     pub fn run(self) -> Result<()> {
         check_writable_file(&self.out)?;
-        let (vs, config) = match (&self.run, &self.config) {
+        let (vs, config, stage) = match (&self.run, &self.config) {
             (Some(run), _) => {
                 let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };
                 let loaded = load_model(&checkpoint.join(MODEL_FILE), Device::Cpu)?;
-                (loaded.vs, loaded.config)
+                (loaded.vs, loaded.config, loaded.stage)
             }
             (None, config) => {
                 let config = Config::read(config.as_ref().expect("clap asks for one of the two"), &[])?;
                 tch::manual_seed(config.train.seed as i64);
                 let vs = nn::VarStore::new(Device::Cpu);
                 GlobalSplat::new(&vs.root(), &config.model)?;
-                (vs, config)
+                let stage = config.curriculum.final_stage();
+                (vs, config, stage)
             }
         };
         let dtype = match self.dtype {
             Dtype::F32 => ModelDtype::F32,
             Dtype::Bf16 => ModelDtype::BF16,
         };
-        save_model(&self.out, &vs, &config, dtype)?;
+        save_model(&self.out, &vs, &config, stage, dtype)?;
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
         let bytes = std::fs::metadata(&self.out)?.len();
         if self.json {
-            print_json(&json!({ "weights": self.out, "parameters": parameters, "bytes": bytes }));
+            let told =
+                json!({ "weights": self.out, "parameters": parameters, "bytes": bytes, "stage": stage });
+            print_json(&told);
         } else {
-            println!("{}: {parameters} parameters, {:.1} MB", self.out.display(), bytes as f64 / 1e6);
+            let early =
+                model::early_stage(stage, &config).map_or(String::new(), |early| format!(", {early}"));
+            println!("{}: {parameters} parameters, {:.1} MB{early}", self.out.display(), bytes as f64 / 1e6);
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{read_splat, read_weights};
-use globalsplat::reconstruct::CONFIG_KEY;
+use globalsplat::reconstruct::{CONFIG_KEY, STAGE_KEY};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -90,6 +90,7 @@ fn weights(path: &Path) -> Result<Value> {
         "types": kinds,
         "bytes": std::fs::metadata(path)?.len(),
         "configuration": weights.metadata.get(CONFIG_KEY),
+        "stage": weights.metadata.get(STAGE_KEY).map_or("final", String::as_str),
     }))
 }
 

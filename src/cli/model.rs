@@ -1,5 +1,7 @@
 //! `--weights` and `--precision f32|bf16`.
 
+use globalsplat::config::Config;
+use globalsplat::model::Stage;
 use globalsplat::reconstruct::{LoadedModel, load_model};
 use globalsplat::{Error, Result};
 use std::path::Path;
@@ -10,5 +12,16 @@ pub fn load(weights: &Path, precision: &str, device: Device) -> Result<LoadedMod
     let precision = precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
     let mut loaded = load_model(weights, device)?;
     loaded.model.set_precision(precision);
+    if let Some(early) = early_stage(loaded.stage, &loaded.config) {
+        eprintln!("{}: {early}, and are used so", weights.display());
+    }
     Ok(loaded)
+}
+
+/// What is to be told of weights whose training was stopped on the way.
+pub fn early_stage(stage: Stage, config: &Config) -> Option<String> {
+    let last = config.curriculum.final_stage();
+    let Stage { index, mix } = stage;
+    (stage != last)
+        .then(|| format!("the weights were trained to stage {index} (λ {mix:.2}) of {}", last.index))
 }

@@ -2,7 +2,7 @@ use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::{DMat4, DVec3};
-use globalsplat::data::{open_capture, read_camera_path};
+use globalsplat::data::{Capture, open_capture, read_camera_path};
 use globalsplat::error::Error;
 use globalsplat::io::{
     Splat, check_writable_dir, check_writable_file, colourize_depth, read_splat, tile_horizontally,
@@ -11,10 +11,12 @@ use globalsplat::io::{
 use globalsplat::render::{Rendered, render_views};
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_cameras, orbit_around_point};
 use serde_json::json;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use tch::{Kind, Tensor};
 
 const FRAMES_PER_SECOND: u32 = 20;
+/// Of an orbit.
+const DEFAULT_FRAMES: usize = 60;
 /// Of a picture when no capture tells one.
 const DEFAULT_SIZE: u32 = 512;
 
@@ -49,9 +51,9 @@ pub struct Render {
     /// Also accumulated opacity
     #[arg(long)]
     alpha: bool,
-    /// Frames of an orbit
-    #[arg(long, value_name = "N", default_value_t = 60)]
-    frames: usize,
+    /// Frames of an orbit; by default 60
+    #[arg(long, value_name = "N", requires = "orbit")]
+    frames: Option<usize>,
     /// Picture size, as in 640x480; by default the capture's
     #[arg(long, value_name = "WxH")]
     size: Option<String>,
@@ -70,7 +72,8 @@ impl Render {
             check_writable_dir(&self.out)?
         }
         let splat = read_splat(&self.splat)?;
-        let (names, cameras) = self.cameras(&splat)?;
+        let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let (names, cameras) = self.cameras(&splat, capture.as_ref())?;
 
         let bar = progress::bar(cameras.len() as u64, "views");
         let mut written = vec![];
@@ -84,6 +87,13 @@ impl Render {
             } else {
                 for (suffix, picture) in parts {
                     let file = self.out.join(format!("{name}{suffix}.png"));
+                    check_writable_file(&file)?;
+                    if capture.as_ref().is_some_and(|capture| capture.has_photo(&file)) {
+                        let expected = "a folder without the capture's photos";
+                        return Err(
+                            Error::input(&file, "the output", "a photo of the capture", expected).into()
+                        );
+                    }
                     write_png(&file, &picture)?;
                     written.push(file);
                 }
@@ -120,7 +130,8 @@ impl Render {
         parts
     }
 
-    fn cameras(&self, splat: &Splat) -> Result<(Vec<String>, Vec<Camera>)> {
+    /// What pictures are called, and their cameras.
+    fn cameras(&self, splat: &Splat, capture: Option<&Capture>) -> Result<(Vec<String>, Vec<Camera>)> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let resized = |cameras: Vec<Camera>| -> Vec<Camera> {
             match size {
@@ -133,24 +144,22 @@ impl Render {
             let cameras = resized(read_camera_path(path)?);
             return Ok((numbered(&cameras), cameras));
         }
-        if self.frames == 0 {
+        let frames = self.frames.unwrap_or(DEFAULT_FRAMES);
+        if frames == 0 {
             return Err(Error::Request("--frames is 0, expected 1 or more".into()).into());
         }
-        let Some(scene) = &self.scene else {
+        let Some(capture) = capture else {
             let size = size.unwrap_or(ImageSize { width: DEFAULT_SIZE, height: DEFAULT_SIZE });
-            let cameras = orbit_around_splat(splat, size, self.frames);
+            let cameras = orbit_around_splat(splat, size, frames);
             return Ok((numbered(&cameras), cameras));
         };
-        let capture = open_capture(scene)?;
         let cameras = resized(capture.cameras());
         if self.orbit {
             let distance = median_depth(splat, &cameras)?;
-            let cameras = orbit_around_cameras(&cameras, distance, self.frames)?;
+            let cameras = orbit_around_cameras(&cameras, distance, frames)?;
             return Ok((numbered(&cameras), cameras));
         }
-        let stem =
-            |name: &str| Path::new(name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok((capture.names().map(stem).collect(), cameras))
+        Ok((capture.picture_names(), cameras))
     }
 }
 

@@ -65,6 +65,12 @@ impl Train {
         }
         check_writable_dir(&self.out)?;
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
+        if let [first, others @ ..] = held_out.trained_on() {
+            let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
+            eprintln!(
+                "{first}{more} of data.validation is trained on, too: its score tells nothing of unseen scenes"
+            );
+        }
         let mut trainer = Trainer::new(&config, scenes, device)?;
 
         let start = Instant::now();
@@ -80,8 +86,8 @@ impl Train {
         if !outcome.complete {
             let checkpoint = outcome.checkpoint.display();
             let command = match resume {
-                Resume::From(_) => "the same command with --resume auto",
-                _ => "the same command",
+                Resume::Auto => "the same command",
+                Resume::Never | Resume::From(_) => "the same command with --resume auto",
             };
             anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
         }
@@ -107,7 +113,7 @@ impl Train {
             let (report, samples_per_second) = match event {
                 Event::Step { report, samples_per_second } => (report, samples_per_second),
                 Event::Validation(score) => {
-                    validation = format!(" held out {:.2} dB", score.psnr);
+                    validation = format!(" held out {:.2} dB (stage {})", score.psnr, score.stage.index);
                     return go_on;
                 }
                 Event::Notice(text) => {

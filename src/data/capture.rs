@@ -6,8 +6,9 @@ use crate::io;
 use crate::scene::{Camera, ImageSize, check_pose};
 use image::RgbImage;
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 use tch::Tensor;
 
@@ -108,6 +109,24 @@ impl Capture {
         self.frames.iter().map(|frame| frame.name.as_str())
     }
 
+    /// What pictures of the views are called, one by one, without their ending: as the photos are, in folders below the one
+    /// that all of them share. Each is another one: where endings alone tell photos apart they are part of the name, and where
+    /// nothing does, numbers stand for the names.
+    pub fn picture_names(&self) -> Vec<String> {
+        picture_names(&self.names().collect::<Vec<_>>())
+    }
+
+    /// Whether `path` is a photo of the capture.
+    pub fn has_photo(&self, path: &Path) -> bool {
+        let is_same = |photo: &Path| photo.canonicalize().ok() == path.canonicalize().ok();
+        let name = path.file_name();
+        path.is_file()
+            && self.frames.iter().any(|frame| match &frame.photo {
+                Photo::File(photo) => photo.file_name() == name && is_same(photo),
+                Photo::Part { .. } => false,
+            })
+    }
+
     /// Reads the views of `indices`, fitted to `size`, or as they are.
     ///
     /// # Errors
@@ -171,6 +190,28 @@ impl Capture {
     }
 }
 
+fn picture_names(names: &[&str]) -> Vec<String> {
+    let plain = |part: Component| match part {
+        Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+        Component::ParentDir => Some("up".to_string()),
+        _ => None,
+    };
+    let paths: Vec<Vec<String>> =
+        names.iter().map(|name| Path::new(name).components().filter_map(plain).collect()).collect();
+    let folders = || paths.iter().map(|path| &path[..path.len().saturating_sub(1)]);
+    let shared = |depth: &usize| {
+        let first = paths[0].get(*depth);
+        folders().all(|folder| folder.get(*depth).is_some_and(|name| Some(name) == first))
+    };
+    let skipped = if paths.is_empty() { 0 } else { (0..).take_while(shared).count() };
+    let below = |path: &Vec<String>| path[skipped..].join("/");
+    let stem = |path: &Vec<String>| Path::new(&below(path)).with_extension("").to_string_lossy().into_owned();
+    let numbered = |index: usize| format!("{index:06}");
+    let choices: [Vec<String>; 2] = [paths.iter().map(stem).collect(), paths.iter().map(below).collect()];
+    let is_unique = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
+    choices.into_iter().find(is_unique).unwrap_or_else(|| (0..names.len()).map(numbered).collect())
+}
+
 /// Rigid poses and sensible intrinsics.
 pub(super) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a Camera>) -> Result<()> {
     for (i, camera) in cameras.enumerate() {
@@ -183,4 +224,22 @@ pub(super) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a C
             .map_err(|(name, found, expected)| Error::input(file, field(name), found, expected))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::picture_names;
+
+    #[test]
+    fn pictures_are_named_as_photos_and_none_twice() {
+        assert_eq!(picture_names(&["images/000.png", "images/001.png"]), ["000", "001"]);
+        assert_eq!(picture_names(&["./images/left/0.png", "./images/right/0.png"]), ["left/0", "right/0"]);
+        assert_eq!(picture_names(&["left/0.png", "1.png"]), ["left/0", "1"]);
+        assert_eq!(picture_names(&["a/0.png", "a/0.jpg"]), ["0.png", "0.jpg"]);
+        assert_eq!(picture_names(&["0.v1.png", "0.v2.png"]), ["0.v1", "0.v2"]);
+        assert_eq!(picture_names(&["../a/0.png", "b/0.png"]), ["up/a/0", "b/0"]);
+        assert_eq!(picture_names(&["0.png", "0.png"]), ["000000", "000001"]);
+        assert_eq!(picture_names(&["000000", "000001"]), ["000000", "000001"]);
+        assert!(picture_names(&[]).is_empty());
+    }
 }

@@ -22,6 +22,13 @@ impl Split {
             Split::Test => "test",
         }
     }
+
+    fn other(self) -> Self {
+        match self {
+            Split::Train => Split::Test,
+            Split::Test => Split::Train,
+        }
+    }
 }
 
 /// Captures that are read from disk together, and their names.
@@ -53,7 +60,8 @@ pub enum OpenGroup {
 
 impl Dataset {
     /// The data set at `root`: a folder of chunks with an `index.json`, {key: chunk}, or one with such folders named `train`
-    /// and `test`, of which `split` is taken; else every capture in it, as by [`super::find_captures`].
+    /// and `test`, of which `split` is taken; else every capture in it, as by [`super::find_captures`], but for those in the
+    /// folder of the other part.
     ///
     /// # Errors
     /// Nothing of that kind there, or an index that is no such object. Chunks that the index names are looked for when they
@@ -66,7 +74,7 @@ impl Dataset {
             Some(folder) => chunk_groups(&folder)?,
             None => {
                 let part = Some(root.join(split.folder())).filter(|folder| folder.is_dir());
-                capture_groups(&part.unwrap_or(root.to_owned()))?
+                capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
             }
         };
         Ok(Dataset { name, groups })
@@ -142,8 +150,14 @@ fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
     Ok(chunks.into_iter().map(group).collect())
 }
 
-fn capture_groups(root: &Path) -> Result<Vec<SceneGroup>> {
-    let folders = capture_folders(root)?;
+/// Of the captures in `root` those that aren't in `except`.
+fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
+    let mut folders = capture_folders(root)?;
+    folders.retain(|folder| !folder.starts_with(except));
+    if folders.is_empty() {
+        let found = format!("without captures but those in {}", except.display());
+        return Err(Error::input(root, "the folder", found, "captures of the other part, too"));
+    }
     Ok(folders
         .into_iter()
         .map(|path| SceneGroup { keys: vec![folder_name(&path)], path, is_chunk: false })

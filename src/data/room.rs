@@ -8,21 +8,67 @@ use crate::scene::ImageSize;
 use crate::synth::Room;
 use std::path::Path;
 
-/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `truth.ply`.
+const PHOTOS: &str = "images";
+const TRUTH: &str = "truth.ply";
+/// All that a room's folder has.
+const FILES: [&str; 3] = ["cameras.json", TRUTH, PHOTOS];
+
+/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `truth.ply`. A room that is there is
+/// replaced.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Anything but a room there, or the system's refusal to write.
 pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> Result<()> {
+    check_free(path)?;
     let Room { gaussians, cameras } = Room::new(seed, frames, size);
     let rendered = render_views(&gaussians, &cameras)?;
-    let names: Vec<String> = (0..frames).map(|i| format!("images/{i:03}.png")).collect();
-    replace_dir(path, |folder| {
-        let images = folder.join("images");
+    let names: Vec<String> = (0..frames).map(|i| format!("{PHOTOS}/{}", photo_name(i))).collect();
+    replace_dir(path, &FILES, |folder| {
+        let images = folder.join(PHOTOS);
         std::fs::create_dir(&images).map_err(Error::write(&images))?;
         for (name, view) in names.iter().zip(&rendered) {
             write_png(&folder.join(name), &view.rgb)?;
         }
-        write_splat(&folder.join("truth.ply"), &Splat::of(&gaussians)?)?;
+        write_splat(&folder.join(TRUTH), &Splat::of(&gaussians)?)?;
         write_cameras_json(&folder.join("cameras.json"), &names, &cameras)
     })
+}
+
+fn photo_name(index: usize) -> String {
+    format!("{index:03}.png")
+}
+
+/// That nothing is at `path`, or a room and nothing else.
+fn check_free(path: &Path) -> Result<()> {
+    if !path.exists() {
+        return Ok(());
+    }
+    let names = |folder: &Path| -> Result<Vec<String>> {
+        let entries = std::fs::read_dir(folder).map_err(Error::read(folder))?;
+        let name = |entry: std::io::Result<std::fs::DirEntry>| {
+            Ok(entry.map_err(Error::read(folder))?.file_name().to_string_lossy().into_owned())
+        };
+        entries.map(name).collect()
+    };
+    let refuse = |found: String| {
+        Err(Error::input(path, "the output", found, "a name that is free, or a room made before"))
+    };
+    if !path.is_dir() {
+        return refuse("a file".into());
+    }
+    let (found, photos) = (names(path)?, path.join(PHOTOS));
+    if let Some(other) = found.iter().find(|name| !FILES.contains(&name.as_str())) {
+        return refuse(format!("a folder with {other} in it"));
+    }
+    if !found.is_empty() && !found.iter().any(|name| name == TRUTH) {
+        return refuse(format!("a capture without {TRUTH}"));
+    }
+    let is_ours = |name: &&String| {
+        let index = name.strip_suffix(".png").and_then(|index| index.parse().ok());
+        index.is_some_and(|index| **name == photo_name(index))
+    };
+    match photos.is_dir().then(|| names(&photos)).transpose()?.iter().flatten().find(|name| !is_ours(name)) {
+        Some(other) => refuse(format!("a folder with {PHOTOS}/{other} in it")),
+        None => Ok(()),
+    }
 }

@@ -139,11 +139,17 @@ impl Efficiency {
     }
 }
 
-/// What a scene's files are called, before the ending: its name with `_` for everything that a file system, a shell or a
-/// web page could read as more than a name.
+/// What a scene's files are called, before the ending: its name, or, where a file system, a shell or a web page could read that
+/// as more than a name, one with `_` in such places and a checksum that tells it from others.
 pub fn scene_file_name(scene: &str) -> String {
+    /// File systems allow 255 bytes, of which an ending and a temporary file's name need some.
+    const LONGEST: usize = 128;
     let harmless = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
-    scene.chars().map(|c| if harmless(c) { c } else { '_' }).collect()
+    if scene.len() <= LONGEST && scene.chars().all(harmless) {
+        return scene.into();
+    }
+    let plain: String = scene.chars().take(LONGEST).map(|c| if harmless(c) { c } else { '_' }).collect();
+    format!("{plain}-{:08x}", crc32fast::hash(scene.as_bytes()))
 }
 
 #[cfg(test)]
@@ -153,6 +159,10 @@ mod tests {
     #[test]
     fn odd_scene_names_make_plain_file_names() {
         assert_eq!(scene_file_name("a0-B_9.x"), "a0-B_9.x");
-        assert_eq!(scene_file_name("../up/<b>é \n"), ".._up__b____");
+        assert_eq!(scene_file_name("../up/<b>é \n"), format!(".._up__b____-{:08x}", 0x91f3_02e8_u32));
+        assert_ne!(scene_file_name("a/b"), scene_file_name("a_b"));
+        assert_ne!(scene_file_name("a/b"), scene_file_name("a:b"));
+        let long = |end: &str| scene_file_name(&("x".repeat(300) + end));
+        assert!(long("1").len() < 200 && long("1") != long("2"));
     }
 }

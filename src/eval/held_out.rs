@@ -7,12 +7,15 @@ use crate::data::{Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, Trai
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
 pub struct HeldOut {
     config: DataConfig,
     scenes: Vec<HeldOutScene>,
+    trained_on: Vec<String>,
     scores: Vec<HeldOutScores>,
 }
 
@@ -57,16 +60,30 @@ impl HeldOut {
         for path in config.validation_paths()? {
             groups.extend_from_slice(Dataset::open(&path, Split::Test)?.groups());
         }
+        let (trained, mut trained_on) = (places(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
-            split_scene(&group.open()?.capture(&key)?, config)?;
+            let capture = group.open()?.capture(&key)?;
+            split_scene(&capture, config)?;
+            let place = match group.is_chunk() {
+                true => place(group.path(), Some(&key)),
+                false => place(capture.file(), None),
+            };
+            if trained.contains(&place) {
+                trained_on.push(capture.name.clone());
+            }
             scenes.push(HeldOutScene::Whole(group, key));
         }
-        Ok(HeldOut { config: config.clone(), scenes, scores: vec![] })
+        Ok(HeldOut { config: config.clone(), scenes, trained_on, scores: vec![] })
     }
 
     /// Whether nothing is held out.
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
+    }
+
+    /// Scenes held out as a whole that are learned all the same: their scores tell nothing of scenes never seen.
+    pub fn trained_on(&self) -> &[String] {
+        &self.trained_on
     }
 
     /// What the last validation found.
@@ -79,13 +96,18 @@ impl HeldOutScene {
     /// Its name, context and target views.
     fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
         let size = Some(config.image_size);
+        // As many as in training: a model that has seen few at a time needn't fit in memory with hundreds.
+        let context_views = config.context_views.max(2);
         let (capture, (context, target)) = match self {
-            HeldOutScene::Views(capture) => (capture.clone(), split_views(capture, config.holdout)?),
+            HeldOutScene::Views(capture) => {
+                let (shown, held_out) = split_views(capture, config.holdout)?;
+                (capture.clone(), (spread_over_path(&capture.cameras(), &shown, context_views), held_out))
+            }
             HeldOutScene::ViewsInChunk(group, key) => {
                 let capture = group.open()?.capture(key)?;
                 let (shown, held_out) = split_views(&capture, config.holdout)?;
                 let cameras = capture.cameras();
-                let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
+                let context = spread_over_path(&cameras, &shown, context_views);
                 let target = spread_over_path(&cameras, &held_out, config.target_views);
                 (capture, (context, target))
             }
@@ -132,10 +154,25 @@ impl Validator for HeldOut {
         let mean =
             |value: fn(&HeldOutScores) -> f64| scores.iter().map(value).sum::<f64>() / scores.len() as f64;
         let (psnr, ssim) = (mean(|s| s.ours.psnr), mean(|s| s.ours.ssim));
-        let score = Score { psnr, ssim, scenes: scores.len(), left_out };
+        let score = Score { psnr, ssim, scenes: scores.len(), stage: trainer.stage(), left_out };
         self.scores = scores;
         Ok(Some(score))
     }
+}
+
+/// By which a scene is known again: the file that it lies in, and its key there.
+type Place = (PathBuf, Option<String>);
+
+fn place(file: &Path, key: Option<&String>) -> Place {
+    (file.canonicalize().unwrap_or(file.to_owned()), key.cloned())
+}
+
+/// Of every scene of `training`.
+fn places(training: &TrainingScenes) -> BTreeSet<Place> {
+    let captures = training.captures().iter().map(|capture| place(capture.file(), None));
+    let chunks = training.chunks().iter();
+    let in_chunks = chunks.flat_map(|group| group.keys.iter().map(|key| place(group.path(), Some(key))));
+    captures.chain(in_chunks).collect()
 }
 
 /// At most so many scenes of `groups`, spread evenly over all of them.
@@ -147,8 +184,7 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
-/// The context and target views of a held-out scene, always the same: as many as in
-/// training, at even distances along the camera's path, from the middle of a video that is longer than training's.
+/// The context and target views of a held-out scene, always the same: as many as in training, at even distances along the camera's path, from the middle of a video that is longer than training's.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
     if cameras.len() < 3 {
@@ -161,4 +197,32 @@ fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Ve
     let between: Vec<usize> = window.into_iter().filter(|view| !context.contains(view)).collect();
     let target = spread_over_path(&cameras, &between, config.target_views);
     Ok((context, target))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::{open_capture, write_room};
+
+    #[test]
+    fn the_model_sees_as_many_views_as_in_training() {
+        let folder = tempfile::tempdir().unwrap();
+        let room = folder.path().join("room");
+        write_room(&room, 0, 12, [16, 16].into()).unwrap();
+        let capture = open_capture(&room).unwrap();
+        let config = DataConfig {
+            image_size: [16, 16].into(),
+            context_views: 4,
+            target_views: 2,
+            holdout: "every:3+1".parse().unwrap(),
+            ..Default::default()
+        };
+        let (_, context, target) = HeldOutScene::Views(capture).load(&config).unwrap();
+        let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+        // Of views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
+        let context = names(&context);
+        assert_eq!((context.len(), target.len()), (4, 4));
+        assert_eq!((context[0].as_str(), context[3].as_str()), ("images/000.png", "images/011.png"));
+        assert_eq!(names(&target)[3], "images/010.png");
+    }
 }

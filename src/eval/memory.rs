@@ -33,6 +33,12 @@ fn of_process(table: &str, process: u32) -> Option<u64> {
     })
 }
 
+/// Forgets the largest resident size so far: [`peak_memory_bytes`] is of what comes from now on. Only Linux can.
+pub fn forget_peak_memory() {
+    // Where it can't be, the peak stays what it was.
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
 /// The largest resident size so far, in bytes.
 pub fn peak_memory_bytes() -> u64 {
     // SAFETY: rusage is plain numbers, for which zero is valid, and getrusage only writes into it.
@@ -49,6 +55,17 @@ pub fn peak_memory_bytes() -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn a_peak_is_forgotten() {
+        const BYTES: usize = 300_000_000;
+        drop(std::hint::black_box(vec![1u8; BYTES]));
+        let with = peak_memory_bytes();
+        forget_peak_memory();
+        // Other tests take memory meanwhile, but less.
+        assert!(peak_memory_bytes() + (BYTES as u64) / 2 < with);
+    }
 
     #[test]
     fn a_process_is_found_in_what_nvidia_smi_tells() {

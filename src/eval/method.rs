@@ -21,7 +21,7 @@ pub enum Method<'a> {
     Model(&'a LoadedModel),
     /// A splat in the capture's own world.
     Splat(PathBuf),
-    /// A folder of pictures named as the photos.
+    /// A folder of pictures named as the photos ([`crate::data::Capture::picture_names`]).
     Renders(PathBuf),
 }
 
@@ -84,8 +84,11 @@ impl Method<'_> {
                 Ok(of_splat(&splat, file.metadata().map_err(Error::read(file))?.len(), rendered))
             }
             Method::Renders(folder) => {
-                let pictures =
-                    scene.target.iter().map(|view| read_picture(folder, view)).collect::<Result<_>>()?;
+                let pictures = scene
+                    .picture_names
+                    .iter()
+                    .map(|name| read_picture(folder, name))
+                    .collect::<Result<_>>()?;
                 Ok(Synthesis {
                     pictures,
                     rendered: vec![],
@@ -168,9 +171,8 @@ pub(super) fn colours(rendered: &[Rendered]) -> Vec<Tensor> {
     rendered.iter().map(|rendered| rendered.rgb.shallow_clone()).collect()
 }
 
-/// The picture in `folder` that is named as the photo of `view`, whatever its ending, [3, H, W].
-fn read_picture(folder: &Path, view: &View) -> Result<Tensor> {
-    let name = Path::new(&view.name).file_stem().unwrap_or_default().to_string_lossy();
+/// The picture `name` in `folder`, whatever its ending, [3, H, W].
+fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
     let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(format!("{name}.{ending}")));
     match candidates.iter().find(|path| path.is_file()) {
         Some(path) => Ok(tensor_from_rgb(&read_image(path)?)),

@@ -24,7 +24,7 @@ pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use machine::machine;
 pub use memory::peak_memory_bytes;
-pub(crate) use memory::resident_memory_bytes;
+pub(crate) use memory::{forget_peak_memory, resident_memory_bytes};
 pub use method::{Method, Synthesis, judge};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;

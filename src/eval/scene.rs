@@ -16,6 +16,8 @@ pub struct EvalScene {
     pub context: Vec<View>,
     /// What has to be matched.
     pub target: Vec<View>,
+    /// What pictures of the targets are called, without their ending.
+    pub picture_names: Vec<String>,
     /// Their positions in the capture, where an index tells them.
     pub frames: Option<SceneFrames>,
 }
@@ -26,8 +28,8 @@ impl EvalScene {
     /// # Errors
     /// Photos that can't be read.
     pub fn all_views(capture: &Capture) -> Result<Self> {
-        let target = capture.load_all(None)?;
-        Ok(EvalScene { name: capture.name.clone(), context: vec![], target, frames: None })
+        let (target, picture_names) = (capture.load_all(None)?, capture.picture_names());
+        Ok(EvalScene { name: capture.name.clone(), context: vec![], target, picture_names, frames: None })
     }
 
     /// For a model that takes pictures of `size`: it sees the views that `holdout` leaves, or so many of them, spread over the
@@ -44,7 +46,9 @@ impl EvalScene {
         let (_, held_out) = split_views(capture, holdout)?;
         let context = load_context(capture, holdout, views, size)?;
         let target = capture.load(&held_out, Some(size))?;
-        Ok(EvalScene { name: capture.name.clone(), context, target, frames: None })
+        let all = capture.picture_names();
+        let picture_names = held_out.iter().map(|&view| all[view].clone()).collect();
+        Ok(EvalScene { name: capture.name.clone(), context, target, picture_names, frames: None })
     }
 
     /// The frames of scene `key` in `index`, named by their numbers.
@@ -53,10 +57,11 @@ impl EvalScene {
         let size = Some(loader.image_size);
         let context = if loader.with_context { capture.load(&frames.context, size)? } else { vec![] };
         let mut target = capture.load(&frames.target, size)?;
-        for (view, frame) in target.iter_mut().zip(&frames.target) {
-            view.name = frame_name(*frame);
+        let picture_names: Vec<String> = frames.target.iter().map(|&frame| frame_name(frame)).collect();
+        for (view, name) in target.iter_mut().zip(&picture_names) {
+            view.name = name.clone();
         }
-        Ok(EvalScene { name: key.into(), context, target, frames: Some(frames) })
+        Ok(EvalScene { name: key.into(), context, target, picture_names, frames: Some(frames) })
     }
 }
 

@@ -5,7 +5,7 @@ use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 use super::index::EvaluationIndex;
 use super::journal::{Identity, Journal};
-use super::method::{Memory, Method, Synthesis, judge};
+use super::method::{Method, Synthesis, judge};
 use super::perceptual::Perceptual;
 use super::scene::{EvalScene, SceneLoader};
 use super::scores_file::comparison_path;
@@ -66,8 +66,9 @@ impl Sweep<'_> {
         }
         let mut failures = vec![];
         let mut go_on = observe(scenes.len(), total);
-        // Loading the judges' networks would count as the method's memory.
-        let (mut judges, mut perceptual) = (Some(judges), None);
+        // Loading the judges' networks would count as the method's memory, so they come after the first scene of which pictures
+        // were made, whatever failed before it.
+        let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
         let with_context = matches!(self.method, Method::Model(_));
         let loader = SceneLoader { index: self.index, image_size: self.image_size, with_context };
         std::thread::scope(|scope| -> Result<()> {
@@ -76,19 +77,26 @@ impl Sweep<'_> {
             while go_on && let Ok((key, loaded)) = receiver.recv() {
                 let method = self.method.of_scene(&key);
                 let made = loaded.and_then(|scene| Ok((method.synthesize(&scene)?, scene)));
-                let first = judges.take();
-                let memory = first.is_some().then(|| method.memory()).flatten();
+                let first = made.is_ok().then(|| judges.take()).flatten();
+                let warm_up = first.is_some();
                 if let Some(judges) = first {
+                    memory = method.memory();
                     perceptual = Some(judges()?);
                 }
                 let judged = made.and_then(|(made, scene)| {
                     let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    let scores = self.judge(&scene, &made, memory, perceptual)?;
+                    let mut scores = self.judge(&scene, &made, perceptual)?;
+                    scores.warm_up = warm_up && made.forward_seconds.is_some();
+                    scores.peak_memory_bytes = memory.map(|memory| memory.host);
+                    scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
                     journal.keep(&key, &scores, method.files())?;
                     Ok(scores)
                 });
                 match judged {
-                    Ok(scene) => scenes.push(scene),
+                    Ok(scene) => {
+                        memory = None;
+                        scenes.push(scene);
+                    }
                     // What can't be written now can't be written for the next scene.
                     Err(e @ Error::Write { .. }) => return Err(e),
                     Err(e) => failures.push(Failure { scene: key, error: e.to_string() }),
@@ -170,13 +178,7 @@ impl Sweep<'_> {
     }
 
     /// The scene's scores; its worst view is drawn.
-    fn judge(
-        &self,
-        scene: &EvalScene,
-        made: &Synthesis,
-        memory: Option<Memory>,
-        perceptual: &Perceptual,
-    ) -> Result<SceneScores> {
+    fn judge(&self, scene: &EvalScene, made: &Synthesis, perceptual: &Perceptual) -> Result<SceneScores> {
         let scores = judge(scene, made, perceptual)?;
         let psnr = |&view: &usize| scores.views[view].psnr;
         let views = 0..made.pictures.len();
@@ -191,9 +193,9 @@ impl Sweep<'_> {
             target: frames.target.clone(),
             splat_bytes: made.splat_bytes,
             forward_seconds: made.forward_seconds,
-            warm_up: memory.is_some(),
-            peak_memory_bytes: memory.map(|memory| memory.host),
-            peak_device_memory_bytes: memory.and_then(|memory| memory.device),
+            warm_up: false,
+            peak_memory_bytes: None,
+            peak_device_memory_bytes: None,
         })
     }
 }

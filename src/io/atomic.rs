@@ -1,4 +1,5 @@
-//! Files and folders that appear whole or not at all.
+//! Files and folders that appear whole or not at all. Nothing is removed but what the program made: its temporary files and
+//! folders bear its name, and of a folder that is replaced only the files go that it is known to make.
 
 use crate::error::{Error, Result};
 use serde::Serialize;
@@ -6,13 +7,18 @@ use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+/// What is being written.
+const PARTIAL: &str = "globalsplat-partial";
+/// What has been moved away to make room.
+const OLD: &str = "globalsplat-old";
+
 /// Writes `path` by way of a temporary file beside it: a reader sees the older file or the new one, never a part, and a
 /// full disk leaves the older one as it was.
 ///
 /// # Errors
 /// What `fill` returns, or the system's refusal to write.
 pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let temporary = sibling(path, "partial");
+    let temporary = partial_file(path);
     let attempt = || {
         let file = File::create(&temporary).map_err(Error::write(path))?;
         let mut writer = BufWriter::new(file);
@@ -39,31 +45,68 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
 }
 
-/// Puts the folder that `fill` makes at `path`, whole: it is filled under another name and then renamed.
+/// Puts the folder that `fill` makes at `path`, whole: it is filled under another name and then renamed. `made` are the names
+/// that such a folder has; whatever else is in one that was there before is there afterwards.
 ///
 /// # Errors
 /// What `fill` returns, or the system's refusal to write.
-pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let (temporary, retired) = (sibling(path, "partial"), sibling(path, "old"));
+pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let (temporary, retired) = (sibling(path, PARTIAL), sibling(path, OLD));
     let attempt = || {
         remove_dir_if_there(&temporary)?;
         fs::create_dir_all(&temporary).map_err(Error::write(&temporary))?;
         fill(&temporary)?;
         sync_dir(&temporary);
-        remove_dir_if_there(&retired)?;
+        retire(&retired, path, made)?;
         if path.exists() {
             fs::rename(path, &retired).map_err(Error::write(path))?;
         }
         fs::rename(&temporary, path).map_err(Error::write(path))?;
-        remove_dir_if_there(&retired)
+        retire(&retired, path, made)
     };
     let result = attempt();
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
+        if !path.exists() {
+            let _ = fs::rename(&retired, path);
+        }
         return result;
     }
     sync_parent(path);
     Ok(())
+}
+
+/// Removes the folder `retired`, of whose files `made` are the program's, once the others are in the folder `heir`.
+fn retire(retired: &Path, heir: &Path, made: &[&str]) -> Result<()> {
+    if !retired.is_dir() {
+        return Ok(());
+    }
+    if heir.is_dir() {
+        for entry in fs::read_dir(retired).map_err(Error::read(retired))? {
+            let name = entry.map_err(Error::read(retired))?.file_name();
+            let to = heir.join(&name);
+            if !made.iter().any(|made| name == *made) && !to.exists() {
+                fs::rename(retired.join(&name), &to).map_err(Error::write(&to))?;
+            }
+        }
+    }
+    remove_made(retired, made)
+}
+
+/// Removes `made` from `folder`, and the folder itself, if nothing else is in it.
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
+    for name in made {
+        let path = folder.join(name);
+        let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+        unless_missing(removed).map_err(Error::write(&path))?;
+    }
+    match fs::remove_dir(folder) {
+        Err(e) if e.kind() == std::io::ErrorKind::DirectoryNotEmpty => Ok(()),
+        removed => unless_missing(removed).map_err(Error::write(folder)),
+    }
 }
 
 /// Puts right what [`replace_dir`] left in `folder` when its process was ended: folders that it had moved away come back where
@@ -71,7 +114,7 @@ pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Resul
 ///
 /// # Errors
 /// The system's refusal to read, rename or remove.
-pub fn recover_dirs(folder: &Path) -> Result<()> {
+pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
     if !folder.is_dir() {
         return Ok(());
     }
@@ -81,15 +124,23 @@ pub fn recover_dirs(folder: &Path) -> Result<()> {
         if !left.is_dir() {
             continue;
         }
-        let of = |suffix: &str| name.strip_prefix('.')?.strip_suffix(suffix).map(|of| folder.join(of));
-        match of(".old") {
+        let of = |suffix: &str| {
+            let name = name.strip_prefix('.')?.strip_suffix(suffix)?.strip_suffix('.')?;
+            Some(folder.join(name))
+        };
+        match of(OLD) {
             Some(path) if !path.exists() => fs::rename(&left, &path).map_err(Error::write(&path))?,
-            Some(_) => remove_dir_if_there(&left)?,
-            None if of(".partial").is_some() => remove_dir_if_there(&left)?,
+            Some(path) => retire(&left, &path, made)?,
+            None if of(PARTIAL).is_some() => remove_dir_if_there(&left)?,
             None => {}
         }
     }
     Ok(())
+}
+
+/// Where what is to become the file at `path` is written.
+pub fn partial_file(path: &Path) -> PathBuf {
+    sibling(path, PARTIAL)
 }
 
 /// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
@@ -130,8 +181,13 @@ fn sibling(path: &Path, suffix: &str) -> PathBuf {
 }
 
 fn remove_dir_if_there(path: &Path) -> Result<()> {
-    match fs::remove_dir_all(path) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::write(path)(e)),
+    unless_missing(fs::remove_dir_all(path)).map_err(Error::write(path))
+}
+
+/// What isn't there needs no removing.
+fn unless_missing(removed: std::io::Result<()>) -> std::io::Result<()> {
+    match removed {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e),
         _ => Ok(()),
     }
 }

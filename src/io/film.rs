@@ -1,7 +1,7 @@
 //! Moving pictures: GIF by ourselves, MP4 by the ffmpeg on the PATH.
 
+use super::atomic::{partial_file, write_atomically};
 use super::images::{padded, rgb_from_tensor};
-use super::write_atomically;
 use crate::error::{Error, Result};
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, RgbImage};
@@ -47,7 +47,7 @@ fn write_mp4(path: &Path, frames: &[RgbImage], frames_per_second: u32) -> Result
     let Some(first) = frames.first() else {
         return Err(Error::Request("a film needs a frame".into()));
     };
-    let partial = path.with_extension("partial.mp4");
+    let partial = partial_file(path);
     let size = format!("{}x{}", first.width(), first.height());
     let rate = frames_per_second.to_string();
     let child = Command::new("ffmpeg")
@@ -55,7 +55,7 @@ fn write_mp4(path: &Path, frames: &[RgbImage], frames_per_second: u32) -> Result
             "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", &size, "-r", &rate, "-i", "-",
         ])
         // H.264 in 4:2:0, which every player shows, wants even sides.
-        .args(["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p"])
+        .args(["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p", "-f", "mp4"])
         .arg(&partial)
         .stdin(Stdio::piped())
         .stderr(Stdio::piped())

@@ -62,9 +62,24 @@ pub fn write_weights(
 ) -> Result<()> {
     let stored = tensors.iter().map(|(name, t)| Ok((name, Stored::new(t)?))).collect::<Result<Vec<_>>>()?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
-    let bytes = safetensors::serialize(views, Some(metadata))
-        .map_err(|e| Error::Failed(format!("{}: weights can't be serialized: {e}", path.display())))?;
+    let failed = |e: &dyn std::fmt::Display| {
+        Error::Failed(format!("{}: weights can't be serialized: {e}", path.display()))
+    };
+    let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
+    sort_header(&mut bytes).map_err(|e| failed(&e))?;
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+}
+
+/// The metadata come in the order of a hash map, another one in each process: sorted, the same weights are the same bytes.
+fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
+    let (length, rest) = bytes.split_at_mut(8);
+    let length = u64::from_le_bytes(length.try_into().expect("eight bytes")) as usize;
+    let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
+    let sorted = serde_json::to_vec(&header)?;
+    // What was padded with spaces stays so.
+    rest[..sorted.len()].copy_from_slice(&sorted);
+    rest[sorted.len()..length].fill(b' ');
+    Ok(())
 }
 
 /// A tensor's bytes in row-major order.

@@ -6,14 +6,14 @@ mod model_file;
 mod spread;
 
 pub use context::load_context;
-pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, load_model, save_model};
+pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, STAGE_KEY, load_model, save_model};
 
 pub(crate) use spread::spread_over_path;
 
 use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
-use crate::model::GlobalSplat;
+use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Similarity, normalize};
 use glam::DMat4;
@@ -27,13 +27,16 @@ pub struct Model<'a> {
     pub network: &'a GlobalSplat,
     /// What it was built and trained from.
     pub config: &'a Config,
+    /// To which it was trained.
+    pub stage: Stage,
     /// Where the weights are.
     pub device: Device,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
-        Model { network: &loaded.model, config: &loaded.config, device: loaded.vs.device() }
+        let LoadedModel { model: network, config, stage, vs } = loaded;
+        Model { network, config, stage: *stage, device: vs.device() }
     }
 }
 
@@ -67,7 +70,7 @@ pub fn reconstruct<'a>(
     context: &[View],
     targets: &[DMat4],
 ) -> Result<Reconstruction> {
-    let Model { network, config, device } = model.into();
+    let Model { network, config, stage, device } = model.into();
     if context.len() < 2 {
         return Err(Error::Request(format!(
             "a reconstruction needs two views or more, found {}",
@@ -82,7 +85,6 @@ pub fn reconstruct<'a>(
     config.model.check_image(images.size()[3], images.size()[4])?;
 
     let start = Instant::now();
-    let stage = config.curriculum.final_stage();
     let decoded = tch::no_grad(|| network.forward(&images, &c2w, &intrinsics, stage));
     // Bringing the Gaussians to the host also waits for a GPU.
     let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);

@@ -3,13 +3,15 @@
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::io::{read_weights, write_weights};
-use crate::model::GlobalSplat;
+use crate::model::{GlobalSplat, Stage};
 use std::collections::HashMap;
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn};
 
 /// The metadata's key for the configuration, as TOML.
 pub const CONFIG_KEY: &str = "globalsplat.config";
+/// The metadata's key for the stage that the weights were trained to, as JSON, where it isn't the final one.
+pub const STAGE_KEY: &str = "globalsplat.stage";
 
 /// How weights are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,22 +29,32 @@ pub struct LoadedModel {
     pub model: GlobalSplat,
     /// As the file says.
     pub config: Config,
+    /// To which the weights were trained: the final one, unless the file says otherwise.
+    pub stage: Stage,
     /// Holds the weights.
     pub vs: nn::VarStore,
 }
 
-/// Writes the variables of `vs` and `config`, whole or not at all.
+/// Writes the variables of `vs`, which were trained to `stage`, and `config`, whole or not at all.
 ///
 /// # Errors
 /// The system's refusal to write.
-pub fn save_model(path: &Path, vs: &nn::VarStore, config: &Config, dtype: ModelDtype) -> Result<()> {
+pub fn save_model(
+    path: &Path,
+    vs: &nn::VarStore,
+    config: &Config,
+    stage: Stage,
+    dtype: ModelDtype,
+) -> Result<()> {
     let stored = |t: Tensor| match dtype {
         ModelDtype::F32 => t.to_kind(Kind::Float),
         ModelDtype::BF16 => t.to_kind(Kind::BFloat16),
     };
     let tensors = vs.variables().into_iter().map(|(name, t)| (name, stored(t))).collect();
-    // A second key would stand before or after it by chance, and the same model wouldn't be the same bytes.
-    let metadata = HashMap::from([(CONFIG_KEY.to_string(), config.to_toml())]);
+    let mut metadata = HashMap::from([(CONFIG_KEY.to_string(), config.to_toml())]);
+    if stage != config.curriculum.final_stage() {
+        metadata.insert(STAGE_KEY.into(), serde_json::to_string(&stage).expect("two numbers"));
+    }
     write_weights(path, &tensors, metadata)
 }
 
@@ -71,5 +83,18 @@ pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
     let vs = nn::VarStore::new(device);
     let model = GlobalSplat::new(&vs.root(), &config.model)?;
     weights.load_into(&vs, path)?;
-    Ok(LoadedModel { model, config, vs })
+    let stage = match weights.metadata.get(STAGE_KEY) {
+        Some(text) => read_stage(path, text, &config)?,
+        None => config.curriculum.final_stage(),
+    };
+    Ok(LoadedModel { model, config, stage, vs })
+}
+
+fn read_stage(path: &Path, text: &str, config: &Config) -> Result<Stage> {
+    let most = config.curriculum.final_stage;
+    let is_known = |stage: &Stage| stage.index <= most && (0. ..=1.).contains(&stage.mix);
+    serde_json::from_str(text).ok().filter(is_known).ok_or_else(|| {
+        let expected = format!("{{\"index\": 0 to {most}, \"mix\": 0 to 1}}");
+        Error::input(path, format!("metadata {STAGE_KEY}"), text, expected)
+    })
 }

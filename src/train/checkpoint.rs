@@ -7,7 +7,7 @@
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
-use crate::io::{read_weights, recover_dirs, replace_dir, write_atomically, write_weights};
+use crate::io::{read_weights, recover_dirs, remove_made, replace_dir, write_atomically, write_weights};
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -22,6 +22,8 @@ const PREFIX: &str = "step-";
 pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
+/// All that a checkpoint's folder has of ours. The state comes first, without which there is no checkpoint.
+const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
 
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct State {
@@ -46,6 +48,11 @@ pub(super) struct Validation {
     pub settings: String,
 }
 
+/// Of the checkpoint after so many steps.
+fn folder_name(step: u64) -> String {
+    format!("{PREFIX}{step:08}")
+}
+
 /// The run's checkpoints, oldest first.
 ///
 /// # Errors
@@ -59,7 +66,9 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
     for entry in fs::read_dir(&folder).map_err(Error::read(&folder))? {
         let path = entry.map_err(Error::read(&folder))?.path();
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        if let Some(step) = name.strip_prefix(PREFIX).and_then(|digits| digits.parse::<u64>().ok()) {
+        let step = name.strip_prefix(PREFIX).and_then(|digits| digits.parse::<u64>().ok());
+        // A name that we don't give is somebody's own.
+        if let Some(step) = step.filter(|&step| name == folder_name(step)) {
             found.push((step, path));
         }
     }
@@ -100,8 +109,8 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
 /// # Errors
 /// The system's refusal.
 pub(super) fn recover(run: &Path) -> Result<()> {
-    recover_dirs(run)?;
-    recover_dirs(&run.join(FOLDER))
+    recover_dirs(run, &FILES)?;
+    recover_dirs(&run.join(FOLDER), &FILES)
 }
 
 /// What validation, by `settings`, found the run's best checkpoint to be worth, in dB.
@@ -128,7 +137,7 @@ pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
 /// The system's refusal to write; the best one before is left whole.
 pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -> Result<()> {
     let state = State { validation: Some(validation), ..read_state(checkpoint)? };
-    replace_dir(&run.join(BEST), |folder| {
+    replace_dir(&run.join(BEST), &FILES, |folder| {
         for name in state.files.keys() {
             let (from, to) = (checkpoint.join(name), folder.join(name));
             if fs::hard_link(&from, &to).is_err() {
@@ -146,9 +155,9 @@ impl Trainer {
     /// # Errors
     /// The system's refusal to write; older checkpoints are left whole.
     pub fn save(&self, run: &Path) -> Result<PathBuf> {
-        let path = run.join(FOLDER).join(format!("{PREFIX}{:08}", self.step));
-        replace_dir(&path, |folder| {
-            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, ModelDtype::F32)?;
+        let path = run.join(FOLDER).join(folder_name(self.step));
+        replace_dir(&path, &FILES, |folder| {
+            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
             write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
             let files =
                 [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
@@ -156,10 +165,14 @@ impl Trainer {
             let (step, samples) = (self.step, self.samples);
             write_state(folder, &State { step, samples, files, validation: None })
         })?;
-        let all = list_checkpoints(run)?;
-        let surplus = all.len().saturating_sub(self.config.train.keep_checkpoints);
-        for old in all.iter().take(surplus).filter(|old| **old != path) {
-            fs::remove_dir_all(old).map_err(Error::write(old))?;
+        // Broken ones are worth nothing: they don't count, and go with what they are older than.
+        let mut others = list_checkpoints(run)?;
+        others.retain(|other| *other != path);
+        let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| seems_whole(other));
+        let surplus = (whole.len() + 1).saturating_sub(self.config.train.keep_checkpoints);
+        let useless = broken.iter().filter(|broken| **broken < path);
+        for old in whole.iter().take(surplus).chain(useless) {
+            remove_made(old, &FILES)?;
         }
         Ok(path)
     }
@@ -193,6 +206,14 @@ pub(super) fn check(checkpoint: &Path) -> Result<State> {
         }
     }
     Ok(state)
+}
+
+/// Whether a checkpoint's files are there and as long as they were. [`check`] reads all of them.
+fn seems_whole(checkpoint: &Path) -> bool {
+    let is_long = |(name, (bytes, _)): (&String, &(u64, u32))| {
+        fs::metadata(checkpoint.join(name)).is_ok_and(|file| file.len() == *bytes)
+    };
+    read_state(checkpoint).is_ok_and(|state| state.files.iter().all(is_long))
 }
 
 fn read_state(checkpoint: &Path) -> Result<State> {

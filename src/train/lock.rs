@@ -14,6 +14,11 @@ pub(super) struct RunLock {
 }
 
 impl RunLock {
+    /// Whether a run ever had the folder `run`.
+    pub(super) fn was_taken(run: &Path) -> bool {
+        run.join(FILE).exists()
+    }
+
     /// Takes the folder `run`, which is there.
     ///
     /// # Errors

@@ -75,10 +75,11 @@ impl Metrics {
 
     /// Scores after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
-        let Score { psnr, ssim, scenes, .. } = score;
-        self.append(
-            &json!({ "step": step, "validation": { "psnr": psnr, "ssim": ssim, "scenes": scenes } }),
-        )?;
+        let Score { psnr, ssim, scenes, stage, .. } = score;
+        let validation = json!({
+            "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
+        });
+        self.append(&json!({ "step": step, "validation": validation }))?;
         self.validated.insert(step);
         Ok(())
     }

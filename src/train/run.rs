@@ -16,6 +16,11 @@ use crate::io::write_atomically;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+/// The run's configuration, every key written out.
+const CONFIG_FILE: &str = "config.toml";
+/// A line for every step and every validation.
+const METRICS_FILE: &str = "metrics.jsonl";
+
 /// Where a run begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Resume {
@@ -69,10 +74,11 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
+    check_books(out)?;
     let _lock = RunLock::take(out)?;
     recover(out)?;
     let begun = begin(trainer, out, resume, &mut observe)?;
-    let config = out.join("config.toml");
+    let config = out.join(CONFIG_FILE);
     let toml = trainer.config.to_toml();
     let changes = match std::fs::read_to_string(&config) {
         Ok(before) if trainer.step > 0 => changed_keys(&before, &toml),
@@ -84,7 +90,7 @@ pub fn run(
     patiently(&mut observe, || {
         write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))
     })?;
-    let metrics = patiently(&mut observe, || Metrics::open(&out.join("metrics.jsonl"), trainer.step))?;
+    let metrics = patiently(&mut observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
     let mut tensorboard =
         patiently(&mut observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
     patiently(&mut observe, || tensorboard.start(trainer.step))?;
@@ -94,6 +100,25 @@ pub fn run(
         None
     });
     Run { trainer, out, validator, observe, metrics, tensorboard, best, settings }.train(begun)
+}
+
+/// That a run may keep its books in `out`: it did before, or there are none of somebody else's.
+fn check_books(out: &Path) -> Result<()> {
+    if RunLock::was_taken(out) || !list_checkpoints(out)?.is_empty() {
+        return Ok(());
+    }
+    match [CONFIG_FILE, METRICS_FILE].into_iter().find(|name| out.join(name).exists()) {
+        Some(name) => {
+            let expected = "a folder of its own (choose another --out)";
+            Err(Error::input(
+                out,
+                "the run's folder",
+                format!("one with a {name} that no run wrote"),
+                expected,
+            ))
+        }
+        None => Ok(()),
+    }
 }
 
 /// A run that goes on.

@@ -58,7 +58,11 @@ impl TensorBoard {
 
     /// Scores after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
-        let values = [("validation/psnr", score.psnr), ("validation/ssim", score.ssim)];
+        let values = [
+            ("validation/psnr", score.psnr),
+            ("validation/ssim", score.ssim),
+            ("validation/stage", f64::from(score.stage.index)),
+        ];
         self.file.scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
     }
 }

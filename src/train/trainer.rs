@@ -172,6 +172,14 @@ impl Trainer {
         &self.model
     }
 
+    /// The stage that the weights were trained to: that of the last step, or, once all are done, the final one (spec 8.7).
+    pub fn stage(&self) -> Stage {
+        match self.step < self.config.train.steps {
+            true => stage_at(&self.config.curriculum, self.step.saturating_sub(1)),
+            false => self.config.curriculum.final_stage(),
+        }
+    }
+
     /// Where the weights are.
     pub fn device(&self) -> Device {
         self.vs.device()
@@ -179,6 +187,7 @@ impl Trainer {
 
     /// The model as it is now, to reconstruct with.
     pub fn as_model(&self) -> Model<'_> {
-        Model { network: &self.model, config: &self.config, device: self.vs.device() }
+        let stage = self.stage();
+        Model { network: &self.model, config: &self.config, stage, device: self.vs.device() }
     }
 }

@@ -2,6 +2,7 @@
 
 use super::trainer::Trainer;
 use crate::error::Result;
+use crate::model::Stage;
 
 /// Means over everything that is held out.
 #[derive(Debug, Clone, PartialEq)]
@@ -12,6 +13,8 @@ pub struct Score {
     pub ssim: f64,
     /// How many there are.
     pub scenes: usize,
+    /// At which the model was judged: the one that it has been trained to.
+    pub stage: Stage,
     /// What is wrong with those that can't be used, each told once.
     pub left_out: Vec<String>,
 }

@@ -98,6 +98,10 @@ impl ChunkWriter {
     fn write_chunk(&mut self) -> Result<()> {
         let file = self.folder.join(self.chunk_name());
         let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
+        // The same bytes are what was left when the same work was interrupted.
+        if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes.as_slice() {
+            return Err(Error::input(&file, "the output", "a chunk already", "a folder without chunks"));
+        }
         write_atomically(&file, |writer| writer.write_all(bytes.as_slice()).map_err(Error::write(&file)))?;
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
         Ok(())

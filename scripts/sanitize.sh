@@ -1,0 +1,90 @@
+#!/usr/bin/env bash
+# Runs csrc/checks on the rasterizer as it is released, under ThreadSanitizer, and under AddressSanitizer with
+# UndefinedBehaviorSanitizer, for every instruction set that this machine has, and prints how much was checked:
+#   scripts/sanitize.sh          every degree of spherical harmonics on 1 to 16 threads
+#   scripts/sanitize.sh short    one degree for each scene, on few; what knows no instruction set, with the best alone
+# Fails if anything is found. Needs g++ or the compiler that CXX names; not clang++ 14, whose ThreadSanitizer keeps others from
+# replacing `operator new`, as the checks do.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+form=${1:-long}
+out=target/sanitize
+mkdir -p "$out"
+
+# The same as in csrc/build.rs.
+case $(uname -m) in
+x86_64) isas="avx512 avx2 portable" ;;
+aarch64) isas="neon" ;;
+*) isas="portable" ;;
+esac
+declare -A flags_of=(
+    [avx512]="-mavx512f -mavx512dq -mavx512vl -mavx512bw -mfma"
+    [avx2]="-mavx2 -mfma"
+    [plain]="-O3"
+    [thread]="-O1 -g1 -fsanitize=thread"
+    # What is left out takes half of the compiler's time, and AddressSanitizer notices it, too.
+    [address]="-O1 -g1 -fno-omit-frame-pointer -D_GLIBCXX_ASSERTIONS -fsanitize=address,undefined,float-cast-overflow \
+-fno-sanitize=null,object-size -fno-sanitize-recover=all"
+)
+sanitizers="address thread plain"
+
+compile() { # OBJECT SOURCE FLAG…
+    echo "${CXX:-g++} -std=c++17 -fno-math-errno -Wall -Wextra -Wno-maybe-uninitialized -Wno-unknown-warning-option ${*:3} -c csrc/$2 -o $out/$1.o"
+}
+# Those that take long come first.
+for sanitizer in $sanitizers; do
+    for isa in $isas; do
+        compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
+            "${flags_of[$isa]:-}"
+    done
+    for source in raster/{raster,parallel,kernels}.cpp checks/{checks,refusals}.cpp; do
+        compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}"
+    done
+done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
+for sanitizer in $sanitizers; do
+    objects=()
+    for part in $isas raster parallel kernels checks refusals; do objects+=("$out/$sanitizer-$part.o"); done
+    # shellcheck disable=SC2086
+    ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
+done
+
+# Newer kernels scatter addresses more widely than the sanitizers' shadows are laid out for.
+unscattered=()
+! setarch -R true 2>/dev/null || unscattered=(setarch -R)
+export TSAN_OPTIONS="halt_on_error=1" UBSAN_OPTIONS="print_stacktrace=1"
+export ASAN_OPTIONS="detect_leaks=1:detect_stack_use_after_return=1"
+
+declare -A name_of=([plain]="none, as released" [thread]="thread" [address]="address, undefined")
+compiler=$("${CXX:-g++}" --version | head -1)
+processor=$(sed -n 's/^model name[^:]*: //p' /proc/cpuinfo | head -1)
+echo "Renders, forward and backward, that were checked: $form, $compiler, $(nproc) × ${processor:-$(uname -m)}"
+echo
+echo "| sanitizer | instructions | bits | callers | threads | memory | children | seconds | found |"
+echo "|---|---|---|---|---|---|---|---|---|"
+found=0
+for sanitizer in $sanitizers; do
+    shared="threads memory children"
+    for isa in $isas; do
+        export GLOBALSPLAT_SIMD=$isa
+        "${unscattered[@]}" "$out/$sanitizer" simd >/dev/null || continue
+        row="| ${name_of[$sanitizer]} | $isa |"
+        began=$(date +%s)
+        result=nothing
+        for check in bits callers threads memory children; do
+            # ThreadSanitizer doesn't follow a child that starts threads.
+            if [[ $sanitizer-$check = thread-children || ($check != bits && $check != callers && -z $shared) ]]; then
+                row+=" – |"
+            elif count=$("${unscattered[@]}" "$out/$sanitizer" "$check" "$form" 2>"$out/log"); then
+                row+=" $count |"
+            else
+                row+=" **FAILED** |"
+                result="**see above**"
+                found=1
+                head -60 "$out/log" >&2
+            fi
+        done
+        echo "$row $(($(date +%s) - began)) | $result |"
+        [ "$form" != short ] || shared=
+    done
+done
+exit "$found"
