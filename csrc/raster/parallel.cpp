@@ -1,9 +1,14 @@
 #include "parallel.h"
 
+#include <pthread.h>
+
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <exception>
 #include <mutex>
+#include <new>
+#include <system_error>
 #include <thread>
 #include <utility>
 
@@ -14,29 +19,37 @@ namespace {
 // thread that the operating system has already ended.
 class Pool {
  public:
+  // False if another call is running.
   bool try_run(int threads, int64_t count, const std::function<void(int64_t)>& task) {
-    std::unique_lock<std::mutex> owner(in_use_, std::try_to_lock);
-    if (!owner.owns_lock()) return false;
-    const int helpers = threads - 1;
-    {
-      std::lock_guard<std::mutex> lock(mutex_);
-      while (workers_ < helpers) std::thread([this, id = workers_++] { work(id); }).detach();
-      task_ = &task;
-      count_ = count;
-      next_ = 0;
-      active_ = helpers;
-      running_ = helpers;
-      ++generation_;
-    }
+    std::unique_lock<std::mutex> lock(mutex_);
+    if (task_ != nullptr) return false;
+    active_ = running_ = start(threads - 1);
+    task_ = &task;
+    count_ = count;
+    next_ = 0;
+    ++generation_;
+    lock.unlock();
     wake_.notify_all();
     drain(task, count);
-    std::unique_lock<std::mutex> lock(mutex_);
+    lock.lock();
     done_.wait(lock, [this] { return running_ == 0; });
+    task_ = nullptr;
     if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
     return true;
   }
 
  private:
+  // How many of `wanted` threads there are, once those that are missing were asked for. The machine may refuse some: the
+  // work is done without them, and the next call asks again.
+  int start(int wanted) {
+    try {
+      for (; workers_ < wanted; ++workers_) std::thread([this, id = workers_] { work(id); }).detach();
+    } catch (const std::system_error&) {
+    } catch (const std::bad_alloc&) {
+    }
+    return std::min(wanted, workers_);
+  }
+
   void drain(const std::function<void(int64_t)>& task, int64_t count) {
     try {
       for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
@@ -63,9 +76,9 @@ class Pool {
     }
   }
 
-  std::mutex in_use_, mutex_;
+  std::mutex mutex_;
   std::condition_variable wake_, done_;
-  const std::function<void(int64_t)>* task_ = nullptr;
+  const std::function<void(int64_t)>* task_ = nullptr;  // of the call that is running
   int64_t count_ = 0;
   std::atomic<int64_t> next_{0};
   int workers_ = 0, active_ = 0, running_ = 0;
@@ -73,11 +86,20 @@ class Pool {
   std::exception_ptr failure_;  // the first one, rethrown to the caller
 };
 
+// Never destroyed: its threads outlive main. A child of fork() inherits none of them, so its pool begins anew, in the same
+// place: what comes before exec() shouldn't ask for memory.
+Pool& pool() {
+  static Pool* shared = [] {
+    pthread_atfork(nullptr, nullptr, [] { new (shared) Pool; });
+    return new Pool;
+  }();
+  return *shared;
+}
+
 }  // namespace
 
 void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task) {
-  static Pool* pool = new Pool;  // never destroyed: its threads outlive main
-  if (threads > 1 && count > 1 && pool->try_run(threads, count, task)) return;
+  if (threads > 1 && count > 1 && pool().try_run(threads, count, task)) return;
   for (int64_t i = 0; i < count; ++i) task(i);
 }
 

@@ -269,7 +269,9 @@ GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
 #if defined(__AVX512F__)
   return _mm512_maskz_scalef_ps(m, p, n);  // other lanes may be small enough to stumble over
 #else
-  return select(m, (V)((Simd<float>::bits)p + ((Simd<float>::bits)shifted << 23)), V{});
+  // Other lanes overflow, which only unsigned numbers may.
+  typedef uint32_t Unsigned __attribute__((vector_size(kVectorBytes)));
+  return select(m, (V)((Unsigned)p + ((Unsigned)shifted << 23)), V{});
 #endif
 }
 

@@ -1,0 +1,412 @@
+// What a render may never do, whatever is asked of it and whatever the machine refuses: race, read what isn't its own, wait
+// for ever, lose memory, or depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
+//
+//   checks CHECK short|long     tells how many renders, forward and backward, or calls were checked
+//   checks simd                 tells the instruction set
+#include <signal.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <atomic>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <thread>
+
+#include "../raster/kernels.h"
+#include "../raster/parallel.h"
+#include "refusals.h"
+#include "scenes.h"
+
+namespace globalsplat::checks {
+namespace {
+
+using raster::parallel_for;
+
+constexpr unsigned kPatience = 120;  // seconds that nothing takes, unless it waits for ever
+
+std::string now;  // what is being checked
+
+[[noreturn]] void fail(const std::string& what) {
+  std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what.c_str());
+  std::_Exit(1);
+}
+
+void expect(bool holds, const char* what) {
+  if (!holds) fail(what);
+}
+
+void begin(std::string what) {
+  now = std::move(what);
+  alarm(kPatience);
+}
+
+void out_of_patience(int) {
+  const auto say = [](const char* text, size_t length) { return write(2, text, length) == ssize_t(length); };
+  const char end[] = ": never ends\n";
+  _exit(say("FOUND: ", 7) && say(now.data(), now.size()) && say(end, sizeof end - 1) ? 1 : 2);
+}
+
+// A frame of a scene, with all that it reads and writes.
+template <class T>
+class Render {
+ public:
+  Render(const Scene<T>& scene, int threads) : settings_{scene.width, scene.height, 0.05, threads}, views_(scene.views) {
+    // What isn't written differs from what another number of threads doesn't write.
+    const T unwritten = T(threads);
+    const size_t pixels = size_t(scene.width) * size_t(scene.height);
+    for (const Arrays<T>& g : scene.gaussians) {
+      scenes_.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(),
+                         int64_t(g.opacities.size()), scene.bases});
+      gradients_.push_back(g);
+      for (auto* array : arrays(gradients_.back())) std::fill(array->begin(), array->end(), unwritten);
+    }
+    Random random(9);
+    for (size_t k = 0; k < views_.size(); ++k) {
+      pictures_.push_back({std::vector<T>(3 * pixels, unwritten), std::vector<T>(pixels, unwritten),
+                           std::vector<T>(pixels, unwritten)});
+      asked_.push_back(pictures_.back());
+      for (auto* plane : {&asked_.back().rgb, &asked_.back().alpha, &asked_.back().depth})
+        for (T& value : *plane) value = T(random.uniform(-1, 1));
+    }
+  }
+
+  void draw() {
+    raster::StageTimes times;
+    frame_ = raster::Frame<T>::draw(scenes_, views_, settings_, places<T>(pictures_), times);
+  }
+
+  void backward() {
+    std::vector<raster::GaussianGradients<T>> out;
+    for (Arrays<T>& g : gradients_)
+      out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data()});
+    raster::StageTimes times;
+    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(asked_), out, times);
+  }
+
+  void drop() { frame_.reset(); }
+
+  void expect_bits_of(Render& other) {
+    for (size_t k = 0; k < pictures_.size(); ++k) {
+      expect(same(pictures_[k].rgb, other.pictures_[k].rgb), "colours differ from one thread's");
+      expect(same(pictures_[k].alpha, other.pictures_[k].alpha), "opacities differ from one thread's");
+      expect(same(pictures_[k].depth, other.pictures_[k].depth), "depths differ from one thread's");
+    }
+    for (size_t b = 0; b < gradients_.size(); ++b) {
+      const auto ours = arrays(gradients_[b]), theirs = arrays(other.gradients_[b]);
+      for (size_t k = 0; k < ours.size(); ++k) expect(same(*ours[k], *theirs[k]), "gradients differ from one thread's");
+    }
+  }
+
+ private:
+  struct Planes {
+    std::vector<T> rgb, alpha, depth;
+  };
+
+  static std::vector<std::vector<T>*> arrays(Arrays<T>& g) {
+    return {&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh};
+  }
+
+  template <class Pixel>
+  static std::vector<raster::Pictures<Pixel>> places(std::vector<Planes>& of) {
+    std::vector<raster::Pictures<Pixel>> out;
+    for (Planes& p : of) out.push_back({p.rgb.data(), p.alpha.data(), p.depth.data()});
+    return out;
+  }
+
+  static bool same(const std::vector<T>& a, const std::vector<T>& b) {
+    return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0);
+  }
+
+  raster::Settings settings_;
+  std::vector<raster::Gaussians<T>> scenes_;
+  std::vector<raster::View<T>> views_;
+  std::vector<Planes> pictures_, asked_;  // asked_: the loss's gradients
+  std::vector<Arrays<T>> gradients_;
+  std::unique_ptr<raster::Frame<T>> frame_;
+};
+
+template <class T>
+std::string type_name() {
+  return sizeof(T) == sizeof(float) ? "float32" : "float64";
+}
+
+// Calls check(scene) for both types.
+template <class Check>
+void for_both(const Scene<double>& scene, const Check& check) {
+  check(as<float>(scene));
+  check(as<double>(scene));
+}
+
+// On one thread, which nothing is refused.
+template <class T>
+Render<T> expected(const Scene<T>& scene) {
+  Render<T> render(scene, 1);
+  render.draw();
+  render.backward();
+  return render;
+}
+
+template <class T>
+int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) {
+  const std::string name = scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases";
+  begin(name);
+  Render<T> one = expected(scene);
+  for (const int threads : thread_counts) {
+    begin(name + ", " + std::to_string(threads) + " threads");
+    Render<T> render(scene, threads);
+    render.draw();
+    render.backward();
+    render.expect_bits_of(one);
+  }
+  return 1 + int64_t(thread_counts.size());
+}
+
+// Every scene's pictures and gradients on any number of threads.
+int64_t bits(bool is_short) {
+  std::vector<int> thread_counts = {2, 3, 16};
+  if (!is_short)
+    for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
+  int64_t count = 0;
+  size_t turn = 0;  // the short form has one degree for each scene, and all degrees for all of them
+  for (const int bases : {1, 4, 9, 16}) {
+    const std::vector<Scene<double>> scenes = all_scenes(bases);
+    for (size_t i = 0; i < scenes.size(); ++i)
+      if (!is_short || i % 4 == turn)
+        for_both(scenes[i], [&](const auto& scene) { count += same_bits(scene, thread_counts); });
+    ++turn;
+  }
+  for_both(crowd(1), [&](const auto& scene) { count += same_bits(scene, {16}); });
+  return count;
+}
+
+void in_another_thread(const std::function<void()>& what) { std::thread(what).join(); }
+
+// Several threads render at once, each on several threads, if it can have them; frames go backward in any order, from other
+// threads than drew them, or never.
+template <class T>
+int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
+  std::vector<Scene<T>> scenes;
+  std::vector<Render<T>> one;
+  begin("one thread");
+  for (const Scene<double>& scene : all) scenes.push_back(as<T>(scene));
+  for (const Scene<T>& scene : scenes) one.push_back(expected(scene));
+  const size_t count = scenes.size();
+  int64_t checked = 0;
+  for (int round = 0; round < rounds; ++round) {
+    begin("several callers, " + type_name<T>());
+    std::vector<Render<T>> renders;
+    for (const Scene<T>& scene : scenes) renders.emplace_back(scene, 2 + round % 3);
+    const auto at_once = [&](const auto& act) {
+      std::vector<std::thread> callers;
+      for (size_t i = 0; i < count; ++i) callers.emplace_back([&, i] { act(i); });
+      for (std::thread& caller : callers) caller.join();
+    };
+    at_once([&](size_t i) {
+      renders[i].draw();
+      renders[i].backward();
+    });
+    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+
+    begin("frames out of order, " + type_name<T>());
+    at_once([&](size_t i) { renders[i].draw(); });
+    for (size_t i = 0; i < count; ++i) in_another_thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); });
+    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+
+    begin("frames dropped while others are drawn, " + type_name<T>());
+    at_once([&](size_t i) {
+      if (i % 2 == 0) renders[i].backward();
+      renders[i].drop();
+      renders[i].draw();
+      if (i % 2 == 1) renders[i].backward();
+    });
+    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+    checked += 3 * int64_t(count);
+  }
+  return checked;
+}
+
+int64_t callers(bool is_short) {
+  std::vector<Scene<double>> scenes;
+  for (const Scene<double>& scene : all_scenes(4))
+    for (const char* name : {"two scenes, two views", "17x3", "several tasks", "opaque stack", "no Gaussian"})
+      if (scene.name == name) scenes.push_back(scene);
+  const int rounds = is_short ? 3 : 12;
+  return callers_of<float>(scenes, rounds) + callers_of<double>(scenes, rounds);
+}
+
+// Returns once so many threads work at the same time.
+void meet(int threads) {
+  std::atomic<int> arrived{0};
+  parallel_for(threads, threads, [&](int64_t) {
+    ++arrived;
+    while (arrived < threads) std::this_thread::yield();
+  });
+}
+
+Scene<double> small_scene() {
+  Random random(10);
+  return scattered(random, "small", 20, 20, 2, 2, 40, 4);
+}
+
+// Threads refused, all of them or some, and what else a call of parallel_for() has to bear.
+int64_t threads(bool is_short) {
+  const Scene<float> scene = as<float>(small_scene());
+  Render<float> one = expected(scene);
+  int64_t count = 0;
+  const auto renders = [&](const char* what) {
+    begin(what);
+    Render<float> render(scene, 8);
+    render.draw();
+    render.backward();
+    render.expect_bits_of(one);
+    ++count;
+  };
+  refuse_threads();
+  renders("every thread refused");
+  renders("every thread refused again");
+
+  begin("no memory for a thread");
+  allow_threads();
+  std::atomic<int64_t> sum{0};
+  const std::function<void(int64_t)> add = [&](int64_t i) { sum += i; };
+  refuse_memory(0, true);
+  parallel_for(8, 100, add);
+  expect(allow_memory() > 0 && sum == 4950, "the work wasn't done on the caller");
+  ++count;
+
+  meet(3);
+  refuse_threads();
+  renders("the first two threads given, the others refused");
+  allow_threads();
+  renders("threads refused before");
+  begin("threads given at last");
+  meet(8);
+  ++count;
+
+  for (int round = 0; round < (is_short ? 20 : 1000); ++round) {
+    begin("a call from a task");
+    sum = 0;
+    parallel_for(4, 10, [&](int64_t) { parallel_for(4, 100, add); });
+    expect(sum == 49500, "tasks were lost");
+
+    begin("a task that fails");
+    bool caught = false;
+    try {
+      parallel_for(4, 100, [&](int64_t i) {
+        if (i % 10 == round % 10) throw std::runtime_error("task");
+      });
+    } catch (const std::runtime_error&) {
+      caught = true;
+    }
+    expect(caught, "the caller doesn't hear of it");
+    sum = 0;
+    parallel_for(4, 100, add);
+    expect(sum == 4950, "the next call doesn't do its work");
+    count += 3;
+  }
+  return count;
+}
+
+// Every single allocation of a render refused, and all from one on.
+template <class T>
+int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
+  begin("memory refused, " + type_name<T>() + ", " + std::to_string(threads) + " threads");
+  Render<T> one = expected(scene), render(scene, threads);
+  meet(threads);
+  for (int64_t n = 0;; ++n) {
+    alarm(kPatience);
+    const int64_t before = blocks();
+    bool caught = false;
+    refuse_memory(n, all_after);
+    try {
+      render.draw();
+      render.backward();
+    } catch (const std::bad_alloc&) {
+      caught = true;
+    }
+    const int64_t refused = allow_memory();
+    render.drop();
+    expect(caught == (refused > 0), "the caller doesn't hear of it");
+    expect(blocks() == before, "memory is lost");
+    if (!caught) {
+      expect(n > 0, "nothing asks for memory");
+      render.expect_bits_of(one);
+      return n;
+    }
+    render.draw();
+    render.backward();
+    render.expect_bits_of(one);
+    render.drop();
+  }
+}
+
+int64_t memory(bool is_short) {
+  int64_t count = 0;
+  for_both(small_scene(), [&](const auto& scene) {
+    for (const int threads : is_short ? std::vector<int>{3} : std::vector<int>{1, 2, 8})
+      for (const bool all_after : {false, true}) count += memory_of(scene, threads, all_after);
+  });
+  return count;
+}
+
+// A child process, which has a copy of everything but the threads.
+int64_t children(bool is_short) {
+  const Scene<float> scene = as<float>(small_scene());
+  Render<float> one = expected(scene);
+  const auto render_as = [&](const char* what) {
+    begin(what);
+    Render<float> render(scene, 4);
+    render.draw();
+    render.backward();
+    render.expect_bits_of(one);
+  };
+  const int count = is_short ? 3 : 30;
+  for (int i = 0; i < count; ++i) {
+    render_as("parent");
+    const pid_t child = fork();
+    if (child == 0) {
+      render_as("child");
+      _exit(0);
+    }
+    int status = 0;
+    expect(child > 0 && waitpid(child, &status, 0) == child && status == 0, "the child fails");
+  }
+  return count;
+}
+
+}  // namespace
+}  // namespace globalsplat::checks
+
+int main(int count, char** arguments) {
+  using namespace globalsplat;
+  const struct {
+    const char* name;
+    int64_t (*run)(bool is_short);
+  } known[] = {{"bits", checks::bits},
+               {"callers", checks::callers},
+               {"threads", checks::threads},
+               {"memory", checks::memory},
+               {"children", checks::children}};
+  signal(SIGALRM, checks::out_of_patience);
+  const std::string check = count > 1 ? arguments[1] : "";
+  if (check == "simd") {
+    try {
+      std::puts(raster::kernels().name);
+      return 0;
+    } catch (const std::invalid_argument&) {
+      return 1;  // named by GLOBALSPLAT_SIMD, and not to be had
+    }
+  }
+  for (const auto& one : known)
+    if (check == one.name && count == 3) {
+      std::printf("%lld\n", static_cast<long long>(one.run(std::strcmp(arguments[2], "short") == 0)));
+      return 0;
+    }
+  std::fprintf(stderr, "checks simd, or bits, callers, threads, memory or children, and short or long\n");
+  return 2;
+}

@@ -1,0 +1,230 @@
+// Gaussians and cameras, drawn with a fixed seed: the kinds of parity/harness/scenes.py, numbers for which nobody has an
+// answer, and as many as it takes to share out every stage's work.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "../raster/raster.h"
+
+namespace globalsplat::checks {
+
+// Every array is a vector of its own, so that reading beyond it is noticed.
+template <class T>
+struct Arrays {
+  std::vector<T> means, scales, quaternions, opacities, sh;
+};
+
+template <class T>
+struct Scene {
+  std::string name;
+  int width, height, bases;
+  std::vector<Arrays<T>> gaussians;  // of every scene
+  std::vector<raster::View<T>> views;
+};
+
+class Random {
+ public:
+  explicit Random(uint64_t seed) : bits_(seed) {}
+  double uniform(double low, double high) { return low + (high - low) * std::ldexp(double(bits_() >> 11), -53); }
+  double normal() { return std::sqrt(-2 * std::log(1 - uniform(0, 1))) * std::cos(6.283185307179586 * uniform(0, 1)); }
+  std::vector<double> uniform(size_t n, double low, double high) {
+    std::vector<double> values(n);
+    for (double& value : values) value = uniform(low, high);
+    return values;
+  }
+  std::vector<double> normal(size_t n, double deviation) {
+    std::vector<double> values(n);
+    for (double& value : values) value = deviation * normal();
+    return values;
+  }
+
+ private:
+  std::mt19937_64 bits_;
+};
+
+// Of the quaternion (1, x, y, z).
+inline raster::Camera<double> turned(double x, double y, double z) {
+  const double s = 2 / (1 + x * x + y * y + z * z);
+  return {{1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y),      //
+           s * (x * y + z), 1 - s * (x * x + z * z), s * (y * z - x),      //
+           s * (x * z - y), s * (y * z + x), 1 - s * (x * x + y * y)},
+          {0, 0, 0}, 1, 1, 0, 0};
+}
+
+// From under a pixel to a third of the picture, some outside of it, at all opacities.
+inline Scene<double> scattered(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
+                               int bases) {
+  Scene<double> scene{name, width, height, bases, {}, {}};
+  const double side = std::max(width, height);
+  for (int b = 0; b < batch; ++b) {
+    Arrays<double> g;
+    for (size_t i = 0; i < count; ++i) {
+      const double depth = random.uniform(1, 5);
+      for (int k = 0; k < 3; ++k) {
+        g.means.push_back(k == 2 ? depth : random.uniform(-0.8, 0.8) * depth);
+        g.scales.push_back(std::exp(random.uniform(std::log(0.3), std::log(0.3 * side + 1))) * depth / side);
+      }
+    }
+    g.quaternions = random.normal(4 * count, random.uniform(0.2, 3));
+    g.opacities = random.uniform(count, 0, 1);
+    g.sh = random.normal(size_t(bases) * 3 * count, 0.3);
+    scene.gaussians.push_back(g);
+    for (int c = 0; c < cameras; ++c) {
+      raster::Camera<double> camera = turned(0.04 * random.normal(), 0.04 * random.normal(), 0.04 * random.normal());
+      for (double& t : camera.translation) t = 0.2 * random.normal();
+      camera.fx = side * random.uniform(0.8, 1.2);
+      camera.fy = side * random.uniform(0.8, 1.2);
+      camera.cx = width * random.uniform(0.4, 0.6);
+      camera.cy = height * random.uniform(0.4, 0.6);
+      scene.views.push_back({camera, b});
+    }
+  }
+  return scene;
+}
+
+// Before a camera that isn't turned, and maybe a second one beside it.
+inline Scene<double> before(Random& random, std::string name, int bases, std::vector<double> means,
+                            std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
+                            int height = 33) {
+  const size_t count = opacities.size();
+  Scene<double> scene{name, width, height, bases, {}, {}};
+  scene.gaussians.push_back({means, scales, random.normal(4 * count, 1), opacities,
+                             random.normal(size_t(bases) * 3 * count, 0.3)});
+  for (int c = 0; c < cameras; ++c)
+    scene.views.push_back({{{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0.25 * c, 0, -0.5 * c}, 32, 32, 0.5 * width, 0.5 * height}, 0});
+  return scene;
+}
+
+// Means at the given depths, within the view of `before` and a little beyond.
+inline std::vector<double> around(Random& random, const std::vector<double>& depths, double spread = 0.6) {
+  std::vector<double> means;
+  for (const double depth : depths)
+    means.insert(means.end(), {spread * random.uniform(-1, 1) * depth, spread * random.uniform(-1, 1) * depth, depth});
+  return means;
+}
+
+// `values` again and again, `count` numbers in all.
+inline std::vector<double> repeated(const std::vector<double>& values, size_t count) {
+  std::vector<double> out(count);
+  for (size_t i = 0; i < count; ++i) out[i] = values[i % values.size()];
+  return out;
+}
+
+inline std::vector<Scene<double>> all_scenes(int bases) {
+  Random random(7);
+  std::vector<Scene<double>> scenes;
+  const auto add_scattered = [&](const char* name, int width, int height, int batch, int cameras, size_t count) {
+    scenes.push_back(scattered(random, name, width, height, batch, cameras, count, bases));
+  };
+  const auto add = [&](const char* name, std::vector<double> means, std::vector<double> scales,
+                       std::vector<double> opacities, int cameras = 1, int width = 48, int height = 33) {
+    scenes.push_back(before(random, name, bases, means, scales, opacities, cameras, width, height));
+  };
+  const auto depths = [&](size_t count) { return random.uniform(count, 1, 3); };
+
+  add_scattered("two scenes, two views", 40, 24, 2, 2, 50);
+  add_scattered("three views", 19, 31, 1, 3, 30);
+  add_scattered("three scenes", 16, 16, 3, 1, 20);
+  add_scattered("a wide picture", 50, 9, 1, 1, 40);
+  add_scattered("a single pixel", 1, 1, 2, 2, 12);
+  add_scattered("17x3", 17, 3, 1, 2, 20);
+  add_scattered("257x255", 257, 255, 1, 1, 24);
+  add_scattered("several tasks", 70, 50, 1, 2, 1300);
+  add_scattered("no scene", 16, 16, 0, 0, 0);
+  add_scattered("no view", 16, 16, 1, 0, 5);
+
+  const double just_above = std::nextafter(0.01f, 1.f);
+  std::vector<double> near = {-3, -0.01, 0, 1e-9, 0.0099, 0.01, just_above, 0.0101, 0.02, 0.1};
+  near = repeated(near, 30);
+  std::vector<double> scales = random.uniform(90, 0.05, 0.4);
+  for (size_t i = 0; i < 90; ++i) scales[i] *= std::max(std::abs(near[i / 3]), 1e-3);
+  add("near plane", around(random, near), scales, repeated({0.4}, 30));
+
+  std::vector<double> means;
+  scales.clear();
+  for (const double far : {2., 10., 1000.})
+    for (int i = 0; i < 8; ++i) {
+      const double depth = random.uniform(1, 3);
+      means.insert(means.end(), {far * random.uniform(-1, 1) * depth, far * random.uniform(-1, 1) * depth, depth});
+      for (int k = 0; k < 3; ++k) scales.push_back(far * depth * random.uniform(0.1, 1));
+    }
+  add("far outside", means, scales, repeated({0.5}, 24), 2);
+  add("needles and discs", around(random, depths(24)),
+      repeated({1e-7, 1e-7, 1, 1, 1e-7, 1, 1e-3, 1e-4, 0.5, 1e-12, 1e-12, 1e-12}, 72), repeated({0.5}, 24));
+  scales = random.uniform(24, 0.5, 1.5);
+  for (double& scale : scales) scale *= std::pow(10, random.uniform(1, 3));
+  add("huge", around(random, depths(8)), scales, repeated({0.3}, 8));
+  // More pairs than there is room for at first.
+  add("huge in many tiles", around(random, depths(150)), random.uniform(450, 5, 50), random.uniform(150, 0, 0.05), 1, 128, 96);
+  add("opacities", around(random, depths(24)), random.uniform(72, 0.02, 0.3),
+      repeated({0, 1e-12, 0.0039, 0.0040, 0.5, 1}, 24));  // 1/255 is 0.00392
+  means = around(random, repeated({2}, 30));
+  std::copy_n(means.begin(), 30, means.begin() + 60);
+  add("equal depths", means, random.uniform(90, 0.05, 0.4), random.uniform(30, 0.1, 0.9), 2);
+  means.clear();
+  for (const double v : {0., 16., 16.5, 32., 33.})
+    for (const double u : {0., 16., 32., 48.}) means.insert(means.end(), {(u - 24) / 16, (v - 16.5) / 16, 2});
+  scales.clear();
+  const double sizes[] = {0.001, 0.0625, 1, 0.5};
+  for (int i = 0; i < 20; ++i) scales.insert(scales.end(), 3, sizes[(i + i / 4) % 4]);
+  add("tile borders", means, scales, random.uniform(20, 0.1, 0.9));
+  std::vector<double> stack(60);
+  for (size_t i = 0; i < 60; ++i) stack[i] = 1 + 3 * double(i) / 59;
+  add("opaque stack", around(random, stack, 0.2), repeated({1}, 180), random.uniform(60, 0.3, 1));
+  add("all behind", around(random, repeated({-2}, 5)), repeated({0.3}, 15), repeated({0.9}, 5));
+  add("no Gaussian", {}, {}, {});
+
+  // Every strange number in every place, each in a Gaussian of its own.
+  const double infinity = std::numeric_limits<double>::infinity();
+  const std::vector<double> strange = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,
+                                       1e-30,        1e30,     3e38,      -3e38, 1e18, 1e5};
+  add_scattered("strange numbers", 48, 33, 1, 2, 15 * strange.size() + 4);
+  Arrays<double>& g = scenes.back().gaussians[0];
+  for (size_t n = 0; n < strange.size(); ++n) {
+    size_t i = 15 * n;
+    for (size_t k = 0; k < 3; ++k) g.means[3 * i++ + k] = strange[n];
+    for (size_t k = 0; k < 3; ++k) g.scales[3 * i++ + k] = strange[n];
+    for (size_t k = 0; k < 4; ++k) g.quaternions[4 * i++ + k] = strange[n];
+    for (size_t k = 0; k < 4; ++k) g.sh[size_t(bases) * 3 * i++ + k % size_t(3 * bases)] = strange[n];
+    g.opacities[i] = strange[n];
+  }
+  for (size_t k = 0; k < 4; ++k) g.quaternions[60 * strange.size() + k] = 0;  // no rotation at all
+
+  // And in every camera.
+  add_scattered("strange cameras", 17, 9, 1, int(4 * strange.size()), 6);
+  for (size_t n = 0; n < 4 * strange.size(); ++n) {
+    raster::Camera<double>& camera = scenes.back().views[n].camera;
+    double* const places[] = {&camera.fx, &camera.cy, &camera.rotation[4], &camera.translation[2]};
+    *places[n % 4] = strange[n / 4];
+  }
+  return scenes;
+}
+
+// More Gaussians than are sorted and binned in one go.
+inline Scene<double> crowd(int bases) {
+  Random random(8);
+  return scattered(random, "crowd", 20, 20, 1, 1, 66000, bases);
+}
+
+template <class T>
+Scene<T> as(const Scene<double>& scene) {
+  const auto numbers = [](const std::vector<double>& from) { return std::vector<T>(from.begin(), from.end()); };
+  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}};
+  for (const Arrays<double>& g : scene.gaussians)
+    out.gaussians.push_back({numbers(g.means), numbers(g.scales), numbers(g.quaternions), numbers(g.opacities), numbers(g.sh)});
+  for (const raster::View<double>& view : scene.views) {
+    const raster::Camera<double>& from = view.camera;
+    raster::Camera<T> camera{{}, {}, T(from.fx), T(from.fy), T(from.cx), T(from.cy)};
+    std::transform(from.rotation, from.rotation + 9, camera.rotation, [](double x) { return T(x); });
+    std::transform(from.translation, from.translation + 3, camera.translation, [](double x) { return T(x); });
+    out.views.push_back({camera, view.scene});
+  }
+  return out;
+}
+
+}  // namespace globalsplat::checks
