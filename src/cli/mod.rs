@@ -10,6 +10,7 @@ mod doctor;
 mod eval;
 mod export;
 mod inspect;
+mod memory;
 mod model;
 mod pack;
 mod parity;
@@ -98,12 +99,17 @@ pub fn main() -> ExitCode {
     match result {
         Ok(Ok(())) => ExitCode::from(DONE),
         Ok(Err(error)) => {
-            eprintln!("globalsplat: {error}");
+            eprintln!("globalsplat: {}", memory::told(&error.to_string()));
             let request = error.downcast_ref::<Error>().is_some_and(Error::is_request);
             ExitCode::from(if request { WRONG_REQUEST } else { FAILED })
         }
         Err(panic) => {
-            eprintln!("globalsplat: the work failed inside: {}", panic_message(&*panic));
+            match (panic_message(&*panic), memory::told(panic_message(&*panic))) {
+                (message, told) if message == told => {
+                    eprintln!("globalsplat: the work failed inside: {told}")
+                }
+                (_, told) => eprintln!("globalsplat: {told}"),
+            }
             ExitCode::from(FAILED)
         }
     }

@@ -1,0 +1,106 @@
+//! Memory that the system refuses, at any moment: one sentence, exit code 1, and nothing lost.
+#![cfg(target_os = "linux")]
+
+mod common;
+
+use common::program::{arg, room, succeed, tiny_config, tiny_weights};
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// The program, allowed so much address space in KiB.
+fn limited(kibibytes: u64, arguments: &[&str]) -> Output {
+    Command::new("bash")
+        .args(["-c", "ulimit -v $0; exec \"$@\"", &kibibytes.to_string(), env!("CARGO_BIN_EXE_globalsplat")])
+        .args(arguments)
+        .env("OMP_NUM_THREADS", "1")
+        .output()
+        .expect("a shell")
+}
+
+/// The least address space in KiB that the program starts with, and what it does `arguments` with, to a MiB or two.
+fn range(arguments: &[&str]) -> (u64, u64) {
+    let search = |works: &dyn Fn(u64) -> bool| {
+        let (mut fails, mut enough) = (0, 1 << 25);
+        while enough - fails > 2048 {
+            let middle = (fails + enough) / 2;
+            if works(middle) { enough = middle } else { fails = middle }
+        }
+        enough
+    };
+    let starts = search(&|limit| limited(limit, &["--version"]).status.success());
+    (starts, search(&|limit| limit >= starts && limited(limit, arguments).status.success()))
+}
+
+/// Between starting and having enough, `arguments` end with a sentence and leave `file` as it was or as it is to be.
+fn refused_politely(arguments: &[&str], file: &Path) {
+    let before = b"what was there before".to_vec();
+    std::fs::write(file, &before).unwrap();
+    let (starts, enough) = range(arguments);
+    let whole = std::fs::read(file).unwrap();
+    assert_ne!(whole, before);
+    const LIMITS: u64 = 12;
+    let mut refusals = 0;
+    for i in 0..LIMITS {
+        std::fs::write(file, &before).unwrap();
+        let output = limited(starts + (enough - starts) * i / LIMITS, arguments);
+        let (code, err) = (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
+        let left = std::fs::read(file).unwrap();
+        if code == Some(0) {
+            assert_eq!(left, whole);
+            continue;
+        }
+        refusals += 1;
+        assert_eq!(code, Some(1), "{:?}: {err}", output.status);
+        assert!(err.lines().count() == 1 && !err.contains("panicked"), "{err}");
+        assert_eq!(left, before);
+    }
+    assert!(refusals > 0, "none of {LIMITS} limits was too low");
+    // What was left lying around is in nobody's way.
+    succeed(arguments);
+    assert_eq!(std::fs::read(file).unwrap(), whole);
+}
+
+#[test]
+fn a_splat_is_made_or_not() {
+    let (folder, room) = room();
+    let (weights, out) = (tiny_weights(folder.path(), &room), folder.path().join("out.ply"));
+    refused_politely(
+        &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&out)],
+        &out,
+    );
+}
+
+#[test]
+fn weights_are_exported_or_not() {
+    let (folder, room) = room();
+    let (config, out) = (tiny_config(folder.path(), &room), folder.path().join("out.safetensors"));
+    refused_politely(&["export", "--config", arg(&config), "--out", arg(&out)], &out);
+}
+
+#[test]
+fn a_run_goes_on_where_memory_ended_it() {
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let whole = folder.path().join("whole");
+    let train = |out: &Path| ["train", "--config", arg(&config), "--out", arg(out)].map(String::from);
+    let strs = |arguments: &[String; 5]| arguments.each_ref().map(|argument| argument.to_owned());
+    let arguments = train(&whole);
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let (starts, enough) = range(&arguments);
+    for i in 0..8 {
+        let arguments = strs(&train(&run));
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        let output = limited(starts + (enough - starts) * i / 8, &arguments);
+        let err = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}: {err}", output.status);
+        assert!(!err.contains("panicked"), "{err}");
+    }
+    let arguments = train(&run);
+    succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    let weights = |run: &Path| {
+        let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
+        globalsplat::io::read_weights(&checkpoint.join("model.safetensors")).unwrap().tensors
+    };
+    let (a, b) = (weights(&run), weights(&whole));
+    assert!(!a.is_empty() && a.iter().zip(&b).all(|((_, x), (_, y))| x.equal(y)));
+}
