@@ -262,3 +262,14 @@ fn the_first_scene_that_can_be_judged_warms_up() {
     assert!(first.warm_up && first.peak_memory_bytes.is_some());
     assert!(!second.warm_up && second.peak_memory_bytes.is_none());
 }
+
+#[test]
+fn scores_of_somebody_else_are_kept() {
+    let set = Set::new();
+    let (splats, scores) = (set.path("splats"), set.path("out/scores.csv"));
+    std::fs::create_dir(set.path("out")).unwrap();
+    std::fs::write(&scores, "mine").unwrap();
+    let (code, _, err) = run(&set.arguments(&["--splat", arg(&splats)], "chunks"), set.folder.path());
+    assert!(code == Some(2) && err.contains("a scores.csv that no evaluation wrote"), "{err}");
+    assert_eq!(std::fs::read_to_string(&scores).unwrap(), "mine");
+}

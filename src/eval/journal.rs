@@ -37,6 +37,12 @@ impl Journal {
     /// Scores of something else in it, or the system's refusal to write.
     pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
         let file = out.join("evaluation.json");
+        // An evaluation begins with that file, so these would be somebody else's.
+        let others = ["scores.json", "scores.csv", "report.html"];
+        if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists())) {
+            let found = format!("a folder with a {name} that no evaluation wrote");
+            return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
+        }
         let scenes = out.join("scenes");
         std::fs::create_dir_all(&scenes).map_err(Error::write(&scenes))?;
         let journal = Journal { scenes };
