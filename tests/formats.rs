@@ -110,6 +110,36 @@ fn captures_of_all_formats_are_found() {
     assert_eq!(found, ["0", "2", "1", "3"]);
 }
 
+#[test]
+fn views_and_captures_come_in_the_order_of_their_numbers() {
+    let names: Vec<String> = (1..=12).map(|i| format!("r_{i}.png")).collect();
+    let shuffled: Vec<&String> = [6, 1, 9, 0, 11, 4, 2, 10, 8, 3, 7, 5].map(|i| &names[i]).to_vec();
+    let poses: Vec<_> = cameras().into_iter().cycle().take(names.len()).collect();
+    let above = tempfile::tempdir().unwrap();
+    for (i, format) in [None, Some(Format::Transforms), Some(Format::ColmapText), Some(Format::ColmapBinary)]
+        .iter()
+        .enumerate()
+    {
+        let folder = above.path().join(format!("scene_{}", 8 + i));
+        std::fs::create_dir_all(folder.join("images")).unwrap();
+        for name in &names {
+            RgbImage::new(WIDTH, HEIGHT).save(folder.join("images").join(name)).unwrap();
+        }
+        let images: Vec<String> = shuffled.iter().map(|name| format!("images/{name}")).collect();
+        write_cameras_json(&folder.join("cameras.json"), &images, &poses).unwrap();
+        format.iter().for_each(|&format| rewrite(&folder, format));
+        let found: Vec<String> =
+            open_capture(&folder).unwrap().names().map(|name| name.replace("images/", "")).collect();
+        match format {
+            // The author's own order.
+            None => assert!(found.iter().eq(shuffled.iter().copied()), "{found:?}"),
+            Some(format) => assert_eq!(found, names, "{format:?}"),
+        }
+    }
+    let captures: Vec<String> = find_captures(above.path()).unwrap().into_iter().map(|c| c.name).collect();
+    assert_eq!(captures, ["scene_8", "scene_9", "scene_10", "scene_11"]);
+}
+
 /// Opens `transforms.json` with [`cameras`] and `change`s, beside the photos.
 fn changed_transforms(change: impl FnOnce(&mut Value)) -> Capture {
     let folder = original();

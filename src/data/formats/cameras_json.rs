@@ -39,6 +39,7 @@ pub(super) fn find(path: &Path) -> Option<Found> {
     Some(Box::new(move || read(&file)))
 }
 
+/// Reads the capture that `file` describes. Views come as its author put them, whatever they are called.
 fn read(file: &Path) -> Result<Capture> {
     let parsed = parse(file)?;
     let root = file.parent().unwrap_or(Path::new("."));

@@ -1,6 +1,7 @@
 //! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. Pixel
 //! (0, 0) has its centre at (½, ½), as everywhere here. The points are not needed (spec 10.4).
 
+use super::natural::natural_order;
 use super::{Found, folder_name};
 use crate::data::capture::{Capture, Frame, Photo};
 use crate::data::pixels::Distortion;
@@ -82,7 +83,7 @@ pub(super) fn find(folder: &Path) -> Option<Found> {
     Some(Box::new(move || read(&folder, &model)))
 }
 
-/// Reads `model` as the capture in `folder`. Frames come in the order of their names.
+/// Reads `model` as the capture in `folder`. Frames come in the order of their names, numbers in them by value.
 fn read(folder: &Path, model: &Model) -> Result<Capture> {
     let text = model.cameras.extension().is_some_and(|form| form == "txt");
     let (cameras, images) = match text {
@@ -131,7 +132,7 @@ fn read(folder: &Path, model: &Model) -> Result<Capture> {
         let camera = Camera { c2w, ..*camera };
         frames.push(Frame { photo: Photo::File(photo), name: image.name, camera, distortion: *distortion });
     }
-    frames.sort_by(|a, b| a.name.cmp(&b.name));
+    frames.sort_by(|a, b| natural_order(&a.name, &b.name));
     Capture::new(folder_name(folder), model.images.clone(), frames)
 }
 

@@ -4,6 +4,7 @@ mod cameras_json;
 mod chunk;
 mod colmap;
 mod json;
+mod natural;
 mod transforms_json;
 
 pub use cameras_json::write_cameras_json;
@@ -12,6 +13,7 @@ pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
 use super::capture::Capture;
 use crate::error::{Error, Result};
 use crate::scene::Camera;
+use natural::natural_order;
 use std::path::{Path, PathBuf};
 
 /// Looks for a capture of one format at a path, a folder or the file that describes it.
@@ -75,7 +77,8 @@ pub fn read_camera_path(file: &Path) -> Result<Vec<Camera>> {
 /// How many folders deep captures are looked for.
 const DEPTH: usize = 2;
 
-/// Every capture in `path`: itself, or those in the folders up to two levels below it, in the order of their paths.
+/// Every capture in `path`: itself, or those in the folders up to two levels below it, in the order of their paths, numbers in
+/// them by value.
 ///
 /// # Errors
 /// A folder that can't be read or holds no capture.
@@ -91,7 +94,7 @@ pub(in crate::data) fn capture_folders(path: &Path) -> Result<Vec<PathBuf>> {
         let expected = format!("{KNOWN} or in folders below it");
         return Err(Error::input(path, "the folder", "without captures", expected));
     }
-    folders.sort();
+    folders.sort_by(natural_order);
     Ok(folders)
 }
 

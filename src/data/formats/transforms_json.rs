@@ -3,6 +3,7 @@
 //! and `camera_angle_y` in radians, and the distortion `k1` to `k4`, `p1`, `p2` (spec 10.3).
 
 use super::json::null_for_not_a_number;
+use super::natural::natural_order;
 use super::{Found, file_in, folder_name};
 use crate::data::capture::{Capture, Frame, Photo};
 use crate::data::pixels::Distortion;
@@ -31,8 +32,8 @@ pub(super) fn find(path: &Path) -> Option<Found> {
     Some(Box::new(move || read(&file)))
 }
 
-/// Reads the capture that `file` describes. Frames come in the order of their names. Those whose image isn't there are left
-/// out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
+/// Reads the capture that `file` describes. Frames come in the order of their names, numbers in them by value. Those whose
+/// image isn't there are left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
 fn read(file: &Path) -> Result<Capture> {
     let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
@@ -56,7 +57,7 @@ fn read(file: &Path) -> Result<Capture> {
         let found = format!("{} of {}, {name:?} is not there", frames.len(), entries.len());
         return Err(Error::input(file, "the number of frames with an image", found, "two or more"));
     }
-    frames.sort_by(|a, b| a.name.cmp(&b.name));
+    frames.sort_by(|a, b| natural_order(&a.name, &b.name));
     Capture::new(folder_name(root), file.to_owned(), frames)
 }
 
