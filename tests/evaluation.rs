@@ -221,6 +221,57 @@ fn several_indices_make_one_report() {
 }
 
 #[test]
+fn what_data_sets_are_called_is_told_apart() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let frames = std::fs::read(set.path("re10k_3v.json")).unwrap();
+    let named = |data: &str, index: &str| -> Vec<String> {
+        std::fs::write(set.path(index), &frames).unwrap();
+        let mut arguments = set.arguments(&["--splat", arg(&splats)], data);
+        let at = arguments.iter().position(|argument| argument == "--index").expect("an index");
+        arguments[at + 1] = arg(&set.path(index)).into();
+        arguments
+    };
+    // Two names, and none that the folder decides for.
+    let mut ambiguous = named("chunks", "acid_from_re10k_3v.json");
+    let error = refuse(&strs(&ambiguous));
+    assert!(error.contains("acid_from_re10k_3v.json: ") && error.contains("acid or re10k"), "{error}");
+    assert!(error.contains("--dataset"), "{error}");
+    assert!(!set.path("out").exists(), "nothing was begun");
+    ambiguous.extend(["--dataset".into(), "ACID".into()]);
+    assert_eq!(run(&ambiguous, set.folder.path()).0, Some(0));
+    assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, "acid");
+
+    // The folder decides; a part of a word is none.
+    for folder in ["acid/test", "placid/test"] {
+        std::fs::create_dir_all(set.path(folder)).unwrap();
+        for file in ["000000.torch", "index.json"] {
+            std::fs::copy(set.path("chunks").join(file), set.path(folder).join(file)).unwrap();
+        }
+    }
+    for (folder, index, name) in [
+        ("acid", "acid_from_re10k_3v.json", "acid"),
+        ("acid/test", "acid_from_re10k_3v.json", "acid"),
+        ("placid/test", "index_3v.json", "placid"),
+    ] {
+        std::fs::remove_dir_all(set.path("out")).unwrap();
+        let (code, _, err) = run(&named(folder, index), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, name);
+    }
+    let error = refuse(&strs(&named("acid/test", "re10k_3v.json")));
+    assert!(error.contains("acid") && error.contains("re10k") && error.contains("--dataset"), "{error}");
+
+    // Another data set whose folder is called the same.
+    let error = refuse(&strs(&named("acid/test", "index_3v.json")));
+    assert!(
+        error.contains("evaluation.json: the evaluation is of ") && error.contains("placid/test"),
+        "{error}"
+    );
+    assert!(error.contains("choose another --out"), "{error}");
+}
+
+#[test]
 fn what_an_index_gets_wrong_is_named() {
     let set = Set::new();
     let splats = set.path("splats");

@@ -54,6 +54,10 @@ pub struct Eval {
     /// How the report calls what is scored; by default as its file or folder
     #[arg(long, requires = "data", conflicts_with = "scene")]
     name: Option<String>,
+    /// How the report calls the data set; by default re10k, acid or dl3dv, if its folder or the index bears one of these names as
+    /// a whole word, else as its folder
+    #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
+    dataset: Option<String>,
     /// Target views: every:N or every:N+K; by default as the model was trained
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
@@ -153,12 +157,14 @@ impl Eval {
             return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
         }
         let dataset = Dataset::open(data, Split::Test)?;
+        let dataset_name = |index| Sweep::dataset_name(self.dataset.as_deref(), data, index);
+        let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
         let (loaded, path) = (self.load_model(device)?, self.path());
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
-        for (index, folder) in indices.iter().zip(folders) {
+        for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             let precision = match self.precision.as_str() {
                 "f32" => String::new(),
@@ -169,6 +175,8 @@ impl Eval {
                 name: self.name.clone().unwrap_or(stem + &precision),
                 fingerprint: fingerprint(path)? + &precision,
                 dataset: &dataset,
+                root: data,
+                dataset_name,
                 index,
                 image_size: loaded
                     .as_ref()

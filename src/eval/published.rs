@@ -21,6 +21,17 @@ pub struct Published {
 /// [height, width] of the pictures in [`Published::novel_views`].
 pub const IMAGE_SIZE: [u32; 2] = [256, 256];
 
+/// Data sets that are known by a name: in [`PublishedMethod::dataset`] and in files, and as people call them.
+pub(super) const DATASETS: [(&str, &str); 3] =
+    [("re10k", "RealEstate10K"), ("acid", "ACID"), ("dl3dv", "DL3DV")];
+
+/// The name in files of the data set that is called `name`, either way.
+pub(super) fn known_dataset(name: &str) -> Option<&'static str> {
+    let is =
+        |(file, people): &(&str, &str)| [file, people].iter().any(|known| known.eq_ignore_ascii_case(name));
+    DATASETS.iter().find(|names| is(names)).map(|(file, _)| *file)
+}
+
 /// One method on one data set.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

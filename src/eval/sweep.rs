@@ -7,12 +7,14 @@ use super::index::EvaluationIndex;
 use super::journal::{Identity, Journal};
 use super::method::{Method, Synthesis, judge};
 use super::perceptual::Perceptual;
+use super::published::known_dataset;
 use super::scene::{EvalScene, SceneLoader};
 use super::scores_file::comparison_path;
 use crate::data::{Dataset, SceneGroup};
 use crate::error::{Error, Result};
 use crate::io::write_jpeg;
 use crate::scene::ImageSize;
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::mpsc::sync_channel;
 
@@ -27,6 +29,10 @@ pub struct Sweep<'a> {
     pub fingerprint: String,
     /// The scenes.
     pub dataset: &'a Dataset,
+    /// The folder that they were found in.
+    pub root: &'a Path,
+    /// How the report calls them, as [`Sweep::dataset_name`] tells.
+    pub dataset_name: String,
     /// Their frames.
     pub index: &'a EvaluationIndex,
     /// To which photos are fitted, and which pictures have.
@@ -41,6 +47,31 @@ pub struct Sweep<'a> {
 const LOADED_AHEAD: usize = 1;
 
 impl Sweep<'_> {
+    /// How the report calls the data set at `root`: as `said`, else by the name of a known one that is a word of its folder's
+    /// name, else of the index's, else as its folder.
+    ///
+    /// # Errors
+    /// Two known names in the one that decides, or another in the index than in the folder.
+    pub fn dataset_name(said: Option<&str>, root: &Path, index: &EvaluationIndex) -> Result<String> {
+        if let Some(name) = said {
+            return Ok(known_dataset(name).unwrap_or(name).to_string());
+        }
+        let folder = own_folder(root);
+        let (of_folder, of_index) = (known_words(&folder), known_words(&index.name()));
+        let found = match (of_folder.as_slice(), of_index.as_slice()) {
+            ([], []) => return Ok(folder),
+            ([one], []) | ([], [one]) => return Ok(one.to_string()),
+            ([one], of_index) if of_index.contains(one) => return Ok(one.to_string()),
+            ([], _) => format!("{} by its name", of_index.join(" or ")),
+            ([..], []) => format!("{} by the name of {}", of_folder.join(" or "), root.display()),
+            ([..], [..]) => {
+                let (ours, theirs) = (of_index.join(" or "), of_folder.join(" or "));
+                format!("{ours} by its name and {theirs} by that of {}", root.display())
+            }
+        };
+        Err(Error::input(&index.file, "the data set", found, "a single one, as --dataset names"))
+    }
+
     /// Runs over the scenes that the index and the data set share. `observe` hears how many of how many are done, and says
     /// whether to go on.
     ///
@@ -122,7 +153,7 @@ impl Sweep<'_> {
         scenes.sort_by(|a, b| a.scores.scene.cmp(&b.scores.scene));
         Ok(Evaluation {
             method: self.name.clone(),
-            dataset: self.dataset_name(),
+            dataset: self.dataset_name.clone(),
             index: self.index.name(),
             context_views: self.index.context_views(),
             image_size: self.image_size.into(),
@@ -135,21 +166,14 @@ impl Sweep<'_> {
         })
     }
 
-    /// The name by which the paper's tables know the data set, if the index or the data set bears it.
-    fn dataset_name(&self) -> String {
-        let known = |name: &str| {
-            ["re10k", "acid", "dl3dv"].into_iter().find(|known| name.to_lowercase().contains(known))
-        };
-        let found = known(&self.index.name()).or_else(|| known(&self.dataset.name));
-        found.map_or(self.dataset.name.clone(), String::from)
-    }
-
     /// By which a sweep that goes on is recognized.
     fn identity(&self) -> Result<Identity> {
         let index = std::fs::read(&self.index.file).map_err(Error::read(&self.index.file))?;
+        // Its name alone doesn't tell: many a folder is called `test`.
+        let root = self.root.canonicalize().map_err(Error::read(self.root))?;
         Ok(Identity {
             method: self.fingerprint.clone(),
-            dataset: self.dataset.name.clone(),
+            dataset: root.display().to_string(),
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
             image_size: self.image_size.into(),
         })
@@ -197,5 +221,69 @@ impl Sweep<'_> {
             peak_memory_bytes: None,
             peak_device_memory_bytes: None,
         })
+    }
+}
+
+/// What the folder of the data set at `root` is called; of a part, `test` or `train`, the folder that it is a part of.
+fn own_folder(root: &Path) -> String {
+    let root = root.canonicalize().unwrap_or(root.to_owned());
+    let folders = root.ancestors().take(3).filter_map(|folder| folder.file_name());
+    let names: Vec<_> = folders.map(|name| name.to_string_lossy().into_owned()).collect();
+    let own = names.iter().find(|name| !["train", "test"].contains(&name.as_str()));
+    own.or(names.first()).cloned().unwrap_or_default()
+}
+
+/// The known data sets that words of `name` name.
+fn known_words(name: &str) -> Vec<&'static str> {
+    let words = name.split(|c: char| !c.is_alphanumeric());
+    let known: BTreeSet<_> = words.filter_map(known_dataset).collect();
+    known.into_iter().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeMap;
+
+    fn name(root: &str, index: &str) -> Result<String> {
+        let index = EvaluationIndex { file: index.into(), scenes: BTreeMap::new() };
+        Sweep::dataset_name(None, Path::new(root), &index)
+    }
+
+    #[test]
+    fn data_sets_are_called_by_whole_words() {
+        for (root, index, expected) in [
+            ("data/re10k", "evaluation_index.json", "re10k"),
+            ("data/RealEstate10K-small", "index.json", "re10k"),
+            ("data/re10k/test", "index.json", "re10k"),
+            ("data/re10k/test/train", "index.json", "re10k"),
+            ("data/DL3DV.960P", "dl3dv_12v.json", "dl3dv"),
+            ("data/chunks", "re10k_24v.json", "re10k"),
+            ("data/chunks", "RE10K.acidic.json", "re10k"),
+            ("data/acid", "acid_from_re10k_3v.json", "acid"),
+            ("data/re10k", "acid_from_re10k_3v.json", "re10k"),
+            ("data/placid", "myre10k_3v.json", "placid"),
+            // What is above isn't the data's own.
+            ("re10k/mine", "index.json", "mine"),
+            ("mine/test", "index.json", "mine"),
+            ("test/test/test", "index.json", "test"),
+        ] {
+            assert_eq!(name(root, index).unwrap(), expected, "{root} {index}");
+        }
+    }
+
+    #[test]
+    fn two_names_are_refused() {
+        for (root, index, found) in [
+            ("chunks", "acid_from_re10k_3v.json", "acid or re10k by its name,"),
+            ("acid", "re10k_3v.json", "re10k by its name and acid by that of acid,"),
+            ("dl3dv/test", "acid_re10k.json", "acid or re10k by its name and dl3dv by that of dl3dv/test,"),
+            ("acid_and_re10k", "index.json", "acid or re10k by the name of acid_and_re10k,"),
+            ("acid_re10k", "acid.json", "acid by its name and acid or re10k by that of acid_re10k,"),
+        ] {
+            let error = name(root, index).unwrap_err().to_string();
+            assert!(error.contains(&format!("{index}: the data set is {found}")), "{error}");
+            assert!(error.ends_with("expected a single one, as --dataset names"), "{error}");
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! What was measured, and how the page calls and colours it.
 
 use super::super::evaluation::Evaluation;
+use super::super::published::{DATASETS, known_dataset};
 use std::path::{Path, PathBuf};
 
 /// Colours that the style sheet has for what was measured; further ones begin again.
@@ -12,7 +13,7 @@ pub struct Entry<'a> {
     pub evaluation: &'a Evaluation,
     /// The method, and the folder where that alone doesn't tell it from another.
     pub name: String,
-    /// `re10k`, `acid`, or another name as it was found.
+    /// `re10k`, `acid`, `dl3dv`, or another name as it was found.
     pub dataset: String,
     /// Class that gives it its colour: one for each name, so that a method keeps its own over data sets and view counts.
     pub colour: String,
@@ -48,20 +49,12 @@ pub fn entries(evaluations: &[(PathBuf, Evaluation)]) -> Vec<Entry<'_>> {
 }
 
 fn dataset_key(name: &str) -> String {
-    match name.to_ascii_lowercase().as_str() {
-        "re10k" | "realestate10k" => "re10k".into(),
-        "acid" => "acid".into(),
-        _ => name.into(),
-    }
+    known_dataset(name).map_or(name.into(), String::from)
 }
 
 /// A data set as people call it.
 pub fn dataset_name(key: &str) -> &str {
-    match key {
-        "re10k" => "RealEstate10K",
-        "acid" => "ACID",
-        other => other,
-    }
+    DATASETS.iter().find(|(file, _)| *file == key).map_or(key, |(_, people)| people)
 }
 
 impl Entry<'_> {
