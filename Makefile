@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 CARGO ?= cargo
 
-.PHONY: all setup venv weights build demo test parity bench docker clean
+.PHONY: all setup venv weights build demo test checks parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
@@ -24,7 +24,11 @@ build: setup
 demo: build
 	@scripts/demo.sh
 
-test: venv
+# Every check; the last line says how many tests were skipped for want of something.
+test:
+	@scripts/count_skips.sh $(MAKE) --no-print-directory checks
+
+checks: venv
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
 	$(CARGO) check --release --locked --lib --no-default-features

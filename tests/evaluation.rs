@@ -2,6 +2,7 @@
 
 mod common;
 
+use common::has_lpips;
 use common::program::{arg, command, fail, refuse, succeed, tiny_weights};
 use globalsplat::eval::read_evaluation;
 use serde_json::{Value, json};
@@ -147,8 +148,7 @@ fn what_changed_since_is_scored_again() {
     assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
 
     // LPIPS, once its weights are there.
-    if globalsplat::io::find_pretrained("lpips_alex.safetensors").is_none() {
-        println!("skipped: the weights of LPIPS are not there; run make weights");
+    if !has_lpips() {
         return;
     }
     assert!(second.scenes.iter().all(|scene| scene.scores.lpips_alex.is_none()));

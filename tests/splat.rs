@@ -329,8 +329,11 @@ fn instruction_sets_agree() {
         }
     }
     println!("compared: {:?}", answers.iter().map(|(level, _)| level).collect::<Vec<_>>());
-    assert!(!answers.is_empty());
-    let (_, first) = &answers[0];
+    // For other processors there is one alone.
+    if answers.len() < 2 && cfg!(target_arch = "x86_64") {
+        common::skip("a second instruction set", "the processor has none but the portable one");
+    }
+    let (_, first) = answers.first().expect("an instruction set");
     for (level, tensors) in &answers[1..] {
         for (name, expected) in first {
             let found = &tensors[name];

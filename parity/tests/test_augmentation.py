@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "parity"))
 
 from reference import jitter, resample  # noqa: E402
-
-Image = pytest.importorskip("PIL.Image")
 
 
 def saturated(rng, height, width):

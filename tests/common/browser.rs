@@ -37,10 +37,11 @@ fn find() -> Option<PathBuf> {
 }
 
 impl Browser {
-    /// With one empty page. Where there is no browser, says so.
+    /// With one empty page. Where there is no browser, the test is skipped.
     pub fn start() -> Option<Self> {
         let Some(program) = find() else {
-            println!("skipped: no chromium, chromium-browser or google-chrome on the path; set CHROME");
+            let why = "no chromium, chromium-browser or google-chrome is on the path; set CHROME";
+            super::skip("a browser", why);
             return None;
         };
         let profile = tempfile::tempdir().expect("a folder");

@@ -1,16 +1,49 @@
-//! Where real data and golden tensors are found, and how tensors are compared.
+//! Where real data and golden tensors are found, what is done without them, and how tensors are compared.
 #![allow(dead_code)] // every test binary uses its own part
 
 pub mod browser;
 pub mod formats;
 pub mod program;
 
+use globalsplat::io::find_pretrained;
+use globalsplat::loss::LpipsNetwork;
 use rand::{Rng, SeedableRng, rngs::StdRng};
+use std::fs::OpenOptions;
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use tch::{Kind, Tensor};
 
-/// The folder that `variable` names, else `../shared/<name>`. Where neither is there, says so: the caller returns early.
-fn outside(variable: &str, name: &str) -> Option<PathBuf> {
+/// Says that a test is skipped for want of `what`, and why; its caller returns early. `GLOBALSPLAT_SKIPPED` names the file in
+/// which `make test` counts it. Where `GLOBALSPLAT_NO_SKIPS` is set, it is a failure.
+pub fn skip(what: &str, why: &str) {
+    let set = |variable| std::env::var_os(variable).filter(|value| !value.is_empty());
+    assert!(set("GLOBALSPLAT_NO_SKIPS").is_none(), "no test may be skipped, but {why}");
+    println!("skipped: {why}");
+    if let Some(file) = set("GLOBALSPLAT_SKIPPED") {
+        let file = OpenOptions::new().create(true).append(true).open(file);
+        file.and_then(|mut file| file.write_all(format!("{what}\n").as_bytes())).expect("a file to count in");
+    }
+}
+
+/// Runs the test `name` of the running file once more, by itself and with `variables`: whether it passes, and what it was
+/// skipped for.
+pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
+    let skipped = tempfile::NamedTempFile::new().expect("a file");
+    let output = Command::new(std::env::current_exe().expect("a program"))
+        .args([name, "--exact"])
+        .env_remove("GLOBALSPLAT_NO_SKIPS")
+        .env("GLOBALSPLAT_SKIPPED", skipped.path())
+        .envs(variables.iter().copied())
+        .output()
+        .expect("a program that starts");
+    let told = String::from_utf8_lossy(&output.stdout);
+    assert!(told.contains("running 1 test"), "{name}: {told}");
+    (output.status.success(), std::fs::read_to_string(skipped.path()).expect("a file"))
+}
+
+/// The folder that `variable` names, else `../shared/<name>`; where neither is there, the test is skipped for want of `what`.
+fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     let path = match std::env::var_os(variable) {
         Some(path) => PathBuf::from(path),
         None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared").join(name),
@@ -18,18 +51,18 @@ fn outside(variable: &str, name: &str) -> Option<PathBuf> {
     if path.is_dir() {
         return Some(path);
     }
-    println!("skipped: {} is not there; set {variable}", path.display());
+    skip(what, &format!("{} is not there; set {variable}", path.display()));
     None
 }
 
 /// Golden tensors.
 pub fn golden() -> Option<PathBuf> {
-    outside("GLOBALSPLAT_GOLDEN", "golden")
+    outside("GLOBALSPLAT_GOLDEN", "golden", "golden tensors")
 }
 
-/// Real captures: folders with `cameras.json` and a published `reference.ply` under `re10k`.
+/// Real captures, one at least: folders with `cameras.json` and a published `reference.ply` under `re10k`.
 pub fn captures() -> Option<Vec<PathBuf>> {
-    let root = outside("GLOBALSPLAT_CAPTURES", "data")?;
+    let root = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?;
     let root = if root.join("re10k").is_dir() { root.join("re10k") } else { root };
     let mut captures: Vec<PathBuf> = std::fs::read_dir(&root)
         .expect("a readable folder")
@@ -38,7 +71,7 @@ pub fn captures() -> Option<Vec<PathBuf>> {
         .collect();
     captures.sort();
     if captures.is_empty() {
-        println!("skipped: no capture under {}", root.display());
+        skip("captures", &format!("no capture is in {}", root.display()));
         return None;
     }
     Some(captures)
@@ -46,12 +79,21 @@ pub fn captures() -> Option<Vec<PathBuf>> {
 
 /// A real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
 pub fn fox() -> Option<PathBuf> {
-    let fox = outside("GLOBALSPLAT_CAPTURES", "data")?.join("nerfstudio/fox");
+    let fox = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?.join("nerfstudio/fox");
     if fox.is_dir() {
         return Some(fox);
     }
-    println!("skipped: {} is not there", fox.display());
+    skip("captures", &format!("{} is not there", fox.display()));
     None
+}
+
+/// Whether the weights of LPIPS are there; without them, the test is skipped.
+pub fn has_lpips() -> bool {
+    let has = LpipsNetwork::ALL.iter().all(|network| find_pretrained(network.file_name()).is_some());
+    if !has {
+        skip("the weights of LPIPS", "the weights of LPIPS are not there; run make weights");
+    }
+    has
 }
 
 /// ‖a − b‖ / ‖b‖.
