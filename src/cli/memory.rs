@@ -55,11 +55,3 @@ fn end(bytes: usize) -> ! {
         libc::_exit(FAILED.into())
     }
 }
-
-/// What libtorch, which has its own allocator, says when it is refused memory, as a person would.
-pub fn told(message: &str) -> &str {
-    match message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
-        true => "the system refuses memory",
-        false => message,
-    }
-}

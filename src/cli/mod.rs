@@ -99,19 +99,26 @@ pub fn main() -> ExitCode {
     match result {
         Ok(Ok(())) => ExitCode::from(DONE),
         Ok(Err(error)) => {
-            eprintln!("globalsplat: {}", memory::told(&error.to_string()));
+            tell(&error.to_string());
             let request = error.downcast_ref::<Error>().is_some_and(Error::is_request);
             ExitCode::from(if request { WRONG_REQUEST } else { FAILED })
         }
         Err(panic) => {
-            match (panic_message(&*panic), memory::told(panic_message(&*panic))) {
-                (message, told) if message == told => {
-                    eprintln!("globalsplat: the work failed inside: {told}")
-                }
-                (_, told) => eprintln!("globalsplat: {told}"),
-            }
+            tell(&format!("the work failed inside: {}", panic_message(&*panic)));
             ExitCode::from(FAILED)
         }
+    }
+}
+
+/// Says what went wrong. What comes from below the program's own checks is told as a person would.
+fn tell(message: &str) {
+    const PRINTING: &str = "failed printing to stdout: ";
+    if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
+        eprintln!("globalsplat: the system refuses memory");
+    } else if let Some((_, why)) = message.split_once(PRINTING) {
+        eprintln!("globalsplat: standard output can't be written: {why}");
+    } else {
+        eprintln!("globalsplat: {message}");
     }
 }
 

@@ -87,7 +87,8 @@ impl Render {
             } else {
                 for (suffix, picture) in parts {
                     let file = self.out.join(format!("{name}{suffix}.png"));
-                    check_writable_file(&file)?;
+                    let folder = file.parent().expect("it is in the output");
+                    std::fs::create_dir_all(folder).map_err(Error::write(folder))?;
                     if capture.as_ref().is_some_and(|capture| capture.has_photo(&file)) {
                         let expected = "a folder without the capture's photos";
                         return Err(

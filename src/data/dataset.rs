@@ -37,7 +37,7 @@ pub struct SceneGroup {
     /// A chunk, or a capture's folder.
     path: PathBuf,
     is_chunk: bool,
-    /// Which of a chunk's scenes belong to the data set; a folder's own name.
+    /// Which of a chunk's scenes belong to the data set; a folder's own name, or its path where others have that name.
     pub keys: Vec<String>,
 }
 
@@ -158,8 +158,13 @@ fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
         let found = format!("without captures but those in {}", except.display());
         return Err(Error::input(root, "the folder", found, "captures of the other part, too"));
     }
-    Ok(folders
-        .into_iter()
-        .map(|path| SceneGroup { keys: vec![folder_name(&path)], path, is_chunk: false })
-        .collect())
+    let names: Vec<String> = folders.iter().map(|folder| folder_name(folder)).collect();
+    // Of two folders of one name, the path below the root tells which.
+    let key = |folder: &Path, name: &String| match names.iter().filter(|other| *other == name).count() {
+        1 => name.clone(),
+        _ => folder.strip_prefix(root).unwrap_or(folder).to_string_lossy().into_owned(),
+    };
+    let keys: Vec<String> = folders.iter().zip(&names).map(|(folder, name)| key(folder, name)).collect();
+    let group = |(path, key)| SceneGroup { path, is_chunk: false, keys: vec![key] };
+    Ok(folders.into_iter().zip(keys).map(group).collect())
 }

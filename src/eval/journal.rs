@@ -39,7 +39,8 @@ impl Journal {
         let file = out.join("evaluation.json");
         // An evaluation begins with that file, so these would be somebody else's.
         let others = ["scores.json", "scores.csv", "report.html"];
-        if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists())) {
+        if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
+        {
             let found = format!("a folder with a {name} that no evaluation wrote");
             return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
         }

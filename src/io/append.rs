@@ -30,8 +30,11 @@ impl AppendFile {
     /// # Errors
     /// The system's refusal to write.
     pub fn append(&mut self, record: &[u8]) -> Result<()> {
-        let written = self.file.set_len(self.length).and_then(|()| self.file.write_all(record));
-        written.map_err(Error::write(&self.path))?;
+        // Before, in case that what was left of an earlier one couldn't be taken away after it.
+        if let Err(e) = self.file.set_len(self.length).and_then(|()| self.file.write_all(record)) {
+            let _ = self.file.set_len(self.length);
+            return Err(Error::write(&self.path)(e));
+        }
         self.length += record.len() as u64;
         Ok(())
     }

@@ -57,6 +57,9 @@ pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Resul
         fs::create_dir_all(&temporary).map_err(Error::write(&temporary))?;
         fill(&temporary)?;
         sync_dir(&temporary);
+        if retired.is_dir() && !path.exists() {
+            fs::rename(&retired, path).map_err(Error::write(path))?;
+        }
         retire(&retired, path, made)?;
         if path.exists() {
             fs::rename(path, &retired).map_err(Error::write(path))?;
@@ -167,11 +170,16 @@ pub fn check_writable_dir(path: &Path) -> Result<()> {
 }
 
 fn probe(dir: &Path, named: &Path) -> Result<()> {
-    let refused = |e: std::io::Error| Error::Request(format!("{} can't be written: {e}", named.display()));
+    let refused = |e: std::io::Error| match Error::write(named)(e) {
+        // There may be room later: that is no wrong request.
+        full if full.is_disk_full() => full,
+        other => Error::Request(other.to_string()),
+    };
     fs::create_dir_all(dir).map_err(refused)?;
-    let file = dir.join(format!(".globalsplat-{}", std::process::id()));
+    // What a process that was ended left of it, the next one removes.
+    let file = dir.join(".globalsplat-probe");
     File::create(&file).map_err(refused)?;
-    fs::remove_file(&file).map_err(refused)
+    unless_missing(fs::remove_file(&file)).map_err(refused)
 }
 
 /// `.name.suffix` beside `path`.

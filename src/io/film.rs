@@ -81,5 +81,6 @@ fn write_mp4(path: &Path, frames: &[RgbImage], frames_per_second: u32) -> Result
         let why = String::from_utf8_lossy(&output.stderr).trim().replace('\n', "; ");
         return Err(Error::Failed(format!("{}: ffmpeg failed: {why}", path.display())));
     }
-    std::fs::rename(&partial, path).map_err(Error::write(path))
+    let whole = std::fs::File::open(&partial).and_then(|film| film.sync_all());
+    whole.and_then(|()| std::fs::rename(&partial, path)).map_err(Error::write(path))
 }

@@ -99,7 +99,7 @@ impl ModelConfig {
         for (name, value, range) in fields {
             if !range.contains(&value) {
                 let (least, most) = (range.start(), range.end());
-                return Err(Error::setting(&format!("model.{name}"), value, format!("{least} to {most}")));
+                return Err(Error::setting(format!("model.{name}"), value, format!("{least} to {most}")));
             }
         }
         let expect = |holds: bool, field: &str, value: i64, expected: String| match holds {

@@ -165,15 +165,7 @@ impl Trainer {
             let (step, samples) = (self.step, self.samples);
             write_state(folder, &State { step, samples, files, validation: None })
         })?;
-        // Broken ones are worth nothing: they don't count, and go with what they are older than.
-        let mut others = list_checkpoints(run)?;
-        others.retain(|other| *other != path);
-        let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| seems_whole(other));
-        let surplus = (whole.len() + 1).saturating_sub(self.config.train.keep_checkpoints);
-        let useless = broken.iter().filter(|broken| **broken < path);
-        for old in whole.iter().take(surplus).chain(useless) {
-            remove_made(old, &FILES)?;
-        }
+        drop_surplus(run, &path, self.config.train.keep_checkpoints)?;
         Ok(path)
     }
 
@@ -189,6 +181,23 @@ impl Trainer {
         (self.step, self.samples) = (state.step, state.samples);
         Ok(())
     }
+}
+
+/// Drops the oldest checkpoints beyond the `kept` last ones, but never `latest`. Broken ones are worth nothing: they don't
+/// count, and go with what they are older than.
+///
+/// # Errors
+/// The system's refusal to remove.
+pub(super) fn drop_surplus(run: &Path, latest: &Path, kept: usize) -> Result<()> {
+    let mut others = list_checkpoints(run)?;
+    others.retain(|other| other != latest);
+    let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| seems_whole(other));
+    let surplus = (whole.len() + 1).saturating_sub(kept);
+    let useless = broken.iter().filter(|broken| broken.as_path() < latest);
+    for old in whole.iter().take(surplus).chain(useless) {
+        remove_made(old, &FILES)?;
+    }
+    Ok(())
 }
 
 /// Whether a checkpoint is whole: its files are as they were written.

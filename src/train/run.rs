@@ -1,7 +1,7 @@
 //! A whole run: from where it stands to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
-    Validation, best_score, check, keep_best, latest_checkpoint, list_checkpoints, recover,
+    Validation, best_score, check, drop_surplus, keep_best, latest_checkpoint, list_checkpoints, recover,
 };
 use super::is_due;
 use super::lock::RunLock;
@@ -149,6 +149,8 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             if validates && skipped_in_a_row == 0 && !self.metrics.has_validation(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 go_on = match self.validate(&checkpoint) {
+                    // What can't be written is no matter of what is held out.
+                    Err(e @ Error::Write { .. }) => return Err(e),
                     Err(e) => (self.observe)(Event::Notice(format!("a validation is left out: {e}"))),
                     go_on => go_on?,
                 };
@@ -186,9 +188,10 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
         self.trainer.take_back(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
+        // What a save couldn't remove is tried again.
+        drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
-                // What can't be written is no matter of what is held out.
                 Err(e @ Error::Write { .. }) => return Err(e),
                 Err(e) => {
                     (self.observe)(Event::Notice(format!("the last validation is left out: {e}")));

@@ -74,14 +74,22 @@ impl Pose {
 #[derive(Arbitrary)]
 struct Cameras {
     shape: Option<[Number; 2]>,
-    views: Vec<(Name, Option<Vec<Vec<Number>>>, Pose)>,
+    views: Vec<View>,
+}
+
+#[derive(Arbitrary)]
+struct View {
+    name: Name,
+    /// In place of those of a photo.
+    intrinsics: Option<Vec<Vec<Number>>>,
+    pose: Pose,
 }
 
 /// A `cameras.json`.
 pub fn cameras(bytes: &[u8]) {
     let Ok(made) = Cameras::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let side = f64::from(SIDE);
-    let view = |(name, intrinsics, pose): &(Name, Option<Vec<Vec<Number>>>, Pose)| {
+    let view = |View { name, intrinsics, pose }: &View| {
         let intrinsics = match intrinsics {
             None => json!([[side, 0, side / 2.], [0, side, side / 2.], [0, 0, 1]]),
             Some(rows) => Pose::Rows(rows.clone()).json(),

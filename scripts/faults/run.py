@@ -1,0 +1,572 @@
+#!/usr/bin/env python3
+"""Every system call that writes fails once, in every command that writes; then the files are the old ones or the new ones.
+
+    scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...] [--self-test]
+
+Each operation runs undisturbed first, under inject.c, which counts its calls. Then, for every call and everything that can
+happen to it, it runs again from the same state, in which older files lie where it writes, and afterwards
+  - it has ended by itself, without a signal or a panic: with all files new, or with one sentence that names the file;
+  - every file, and every folder that is one thing, is an old one or a new one;
+  - the same command, undisturbed, ends with what it would have ended with, to the bit, and nothing else is left lying about.
+Prints a table in Markdown and every failure with what repeats it. --short takes a fixed sample, in a minute.
+--self-test spoils right files instead, one by one, and fails unless every spoiled one is noticed.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+REPOSITORY = HERE.parents[1]
+# What can happen to a call of each group, and whether it stays so, as in inject.c. A disk that is gone ("any") leaves what a
+# crash leaves.
+REFUSED = [("ENOSPC", 0), ("ENOSPC", 1), ("EIO", 0), ("EIO", 1), ("EINTR", 0)]
+FAULTS = {
+    "write": REFUSED + [("short", 0), ("short", 1), ("torn", 0), ("torn", 1), ("torn-EIO", 0)],
+    "truncate": REFUSED,
+    "fsync": REFUSED,
+    "open": REFUSED,
+    "mkdir": REFUSED,
+    "rename": REFUSED + [("ENOSPC", 2)],
+    "link": REFUSED,
+    "remove": [("EIO", 0), ("EIO", 1)],
+    "any": [("EIO", 1)],
+}
+# Calls that are to be repeated when a signal interrupts them. Linux doesn't interrupt the others on a local disk.
+INTERRUPTIBLE = {"write", "truncate", "fsync", "open"}
+# With --short, of an operation that waits for room, and of another.
+SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
+# Seconds.
+PATIENCE = 30
+# What a run tells beside how it ended.
+NOTICE = re.compile(
+    "training pauses: .* when there is room$|there is room again: training goes on$|.*the checkpoint before it is taken$"
+    "|.*the best checkpoint is looked for anew$|left out: lpips_"
+)
+# Names of what is on its way.
+TEMPORARY = re.compile(r"(^|/)(\.[^/]+\.globalsplat-(partial|old)|\.globalsplat-probe)(/|$)")
+VOLATILE = {"seconds", "peak_memory_bytes", "samples_per_second", "forward_seconds"}
+
+
+def plain(text):
+    """With the names that files and folders get in the end."""
+    text = re.sub(r"/\.([^/ ]+?)\.globalsplat-(partial|old)(?=[/ :]|$)", r"/\1", text)
+    return re.sub(r"/\.globalsplat-probe", "", text)
+
+
+def steady(value):
+    """JSON without what differs from run to run."""
+    if isinstance(value, dict):
+        return {key: steady(of) for key, of in value.items() if key not in VOLATILE}
+    return [steady(of) for of in value] if isinstance(value, list) else value
+
+
+# What an operation leaves on disk.
+
+
+def crc32c(data, table=[]):
+    if not table:
+        for byte in range(256):
+            for _ in range(8):
+                byte = byte >> 1 ^ (0x82F63B78 if byte & 1 else 0)
+            table.append(byte)
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc = crc >> 8 ^ table[(crc ^ byte) & 255]
+    crc ^= 0xFFFFFFFF
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def events(data):
+    """The step and the contents of every event, without times; SessionLog.START is its step and None."""
+    while data:
+        if len(data) < 16:
+            raise ValueError("ends within a record")
+        (size,) = struct.unpack("<Q", data[:8])
+        record, data = data[: 16 + size], data[16 + size :]
+        message = record[12:-4]
+        sums = (struct.unpack("<I", record[8:12])[0], struct.unpack("<I", record[-4:])[0])
+        if len(record) < 16 + size or sums != (crc32c(record[:8]), crc32c(message)):
+            raise ValueError("ends within a record, or has a damaged one")
+        assert message[0] == 9 and message[9] == 16, "not how our events begin"
+        step, at = 0, 10
+        while True:
+            step |= (message[at] & 127) << 7 * (at - 10)
+            at += 1
+            if message[at - 1] < 128:
+                break
+        body = re.sub(rb"(train/samples_per_second\x15)....", rb"\1", message[at:], flags=re.DOTALL)
+        if body != b"\x1a\x0dbrain.Event:2":
+            yield step, None if body == b"\x3a\x02\x08\x01" else hashlib.sha1(body).hexdigest()
+
+
+class Tree:
+    """Files by their names: a hash, or the records of one that grows; those on their way apart."""
+
+    def __init__(self, folder):
+        self.files, self.temporary, self.broken = {}, {}, []
+        logged = []
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder).as_posix()
+            if TEMPORARY.search(name):
+                self.temporary[name] = path.is_file() and hashlib.sha1(path.read_bytes()).hexdigest()
+            elif path.is_dir() or path.name in (".lock", "stdout"):
+                continue
+            elif path.parent.name == "tensorboard":
+                try:
+                    logged.extend(events(path.read_bytes()))
+                except ValueError as e:
+                    self.broken.append(f"{name} {e}")
+            elif path.name == "metrics.jsonl":
+                lines = path.read_text().split("\n")
+                if lines.pop():
+                    self.broken.append(f"{name} ends within a line")
+                self.files[name] = tuple(json.dumps(steady(json.loads(line))) for line in lines)
+            else:
+                self.files[name] = hashlib.sha1(path.read_bytes()).hexdigest()
+        # As TensorBoard shows it: a start voids what was told of later steps, and what is told twice is shown once.
+        shown = {}
+        for step, event in logged:
+            if event is None:
+                shown = {of: None for of in shown if of[0] < step}
+            else:
+                shown[step, event] = None
+        if (folder / "tensorboard").is_dir() or (folder / "out/tensorboard").is_dir():
+            self.files["tensorboard"] = tuple(shown)
+
+    def digest(self):
+        return repr((sorted(self.files.items()), sorted(self.temporary.items()), self.broken))
+
+    def units(self, unit_of):
+        units = {}
+        for name, value in self.files.items():
+            units.setdefault(unit_of(name), {})[name] = value
+        return units
+
+    def differs(self, new):
+        """How it isn't what an undisturbed run leaves."""
+        names = [name for name in {**self.files, **new.files} if self.files.get(name) != new.files.get(name)]
+        wrong = self.broken + [f"{name} isn't the new one" for name in sorted(names)]
+        return wrong + [f"{name} is left" for name in sorted(self.temporary)]
+
+    def mixes(self, trees, unit_of, crashed=False):
+        """What is neither old nor new. `trees`: the old one, those between, the new one. After a crash, a folder may lie
+        where it was moved to make room for its successor."""
+        of = [tree.units(unit_of) for tree in trees]
+        wrong = list(self.broken)
+        units = self.units(unit_of)
+        for unit, files in units.items():
+            known = [tree[unit] for tree in of if unit in tree]
+            value, end = files.get(unit), of[-1].get(unit, {}).get(unit)
+            grows = isinstance(value, tuple) and isinstance(end, tuple) and end[: len(value)] == value
+            if files not in known and not grows:
+                wrong.append(f"{unit} is neither old nor new")
+        moved = {plain("/" + name)[1:]: value for name, value in self.temporary.items() if ".globalsplat-old/" in name and value}
+        for unit, files in of[0].items():
+            lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
+            if unit in of[-1] and unit not in units and not lies_beside:
+                wrong.append(f"{unit} is gone")
+        checkpoints = [any("checkpoints/" in unit for unit in tree) for tree in (of[0], units)]
+        return wrong + ["all checkpoints are gone"] * (checkpoints == [True, False])
+
+
+# The operations.
+
+
+def whole_room(name):
+    return name.split("/")[0]
+
+
+def whole_checkpoint(name):
+    return name.rsplit("/", 1)[0] if name.startswith(("checkpoints/", "best/")) else name
+
+
+class Operation:
+    """A command, the state it starts from, and the states it may leave."""
+
+    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None):
+        self.bench, self.name, self.unit_of, self.waits, self.into = bench, name, unit_of, waits, into
+        self.arguments = [str(argument) for argument in arguments]
+        self.old = bench.folder / "old" / name.replace(" ", "_").replace(",", "").replace("/", "_")
+        self.old.mkdir(parents=True)
+        self.between = []
+
+    def age(self, keep=(), drop=()):
+        """Other bytes where the command writes, as if from long ago."""
+        self.reset()
+        done = self.bench.run(self.arguments, into=self.into)
+        assert done.code == 0, done.said
+        for path in [path for path in self.bench.out.rglob("*") if path.is_file()]:
+            name = path.relative_to(self.bench.out).as_posix()
+            if name in drop:
+                path.unlink()
+            elif name not in keep:
+                path.write_bytes(b"old\n" + path.read_bytes())
+        self.take()
+        return self
+
+    def take(self):
+        """Begins with what lies there now."""
+        shutil.rmtree(self.old)
+        shutil.copytree(self.bench.out, self.old)
+        return self
+
+    def reset(self):
+        shutil.rmtree(self.bench.out, ignore_errors=True)
+        shutil.copytree(self.old, self.bench.out)
+
+    def undisturbed(self):
+        """Runs it, for what its calls are and what it leaves."""
+        self.reset()
+        old = Tree(self.bench.out)
+        done = self.bench.run(self.arguments, into=self.into)
+        assert done.code == 0 and not done.sentence, done.said
+        self.new, self.told, self.calls = Tree(self.bench.out), done.told, done.calls
+        self.trees = [old, *self.between, self.new]
+        assert not self.new.differs(self.new) and self.new.files != old.files, self.name
+        self.ends = {}
+
+    def names(self, done):
+        """Whether what is said names a file that a call failed on, or a folder that was to be removed with it."""
+        if self.into and re.search("stdout|standard output", done.sentence):
+            return True
+        hit = [(group, Path(file)) for failed, group, file in done.calls if failed]
+        names = [file for _, file in hit]
+        names += [of for group, file in hit if group == "remove" for of in file.parents if self.bench.out in of.parents]
+        return any(plain(str(name)) in plain(done.sentence) for name in names)
+
+    def faults(self, most=None):
+        """(group, n, kind, sticky) for every call, or for at most so many of a group, evenly."""
+        count = Counter(group for _, group, _ in self.calls)
+        count["any"] = len(self.calls)
+
+        def chosen(of):
+            return range(1, of + 1) if not most or of <= most else [1 + i * (of - 1) // (most - 1) for i in range(most)]
+
+        return [(group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults]
+
+    def again(self):
+        """What is wrong after the same command once more. States that were seen before end as before."""
+        state = Tree(self.bench.out).digest()
+        if state not in self.ends:
+            done = self.bench.run(self.arguments, into=self.into)
+            wrong = Tree(self.bench.out).differs(self.new)
+            if done.code != 0:
+                wrong.append(f"it ends with {done.code}: {done.said.strip()}")
+            self.ends[state] = wrong
+        return [f"second run: {what}" for what in self.ends[state]]
+
+
+class Done:
+    """How a run ended: exit code or None, what it told and said, and its calls as (whether it failed, group, file)."""
+
+    def __init__(self, code, told, said, calls):
+        self.code, self.said, self.calls = code, said, calls
+        lines = [line for line in said.splitlines() if not NOTICE.match(line)]
+        self.sentence = "\n".join(lines)
+        try:
+            self.told = steady(json.loads(told))
+        except ValueError:
+            self.told = told
+        self.hit = [file for failed, _, file in calls if failed]
+
+
+class Bench:
+    """A folder for everything: in/ is only read, out/ is where calls fail."""
+
+    def __init__(self, program, folder):
+        self.program, self.folder = program, folder
+        self.inputs, self.out, self.log = folder / "in", folder / "out", folder / "calls"
+        self.library = folder / "inject.so"
+        flags = ["-Wall", "-Wextra", "-O1", "-shared", "-fPIC"]
+        subprocess.run(["cc", *flags, "-o", self.library, HERE / "inject.c", "-ldl"], check=True)
+        for path in (self.inputs, self.out, folder / "bin"):
+            path.mkdir()
+        # An encoder for what we do around it; with the weights of LPIPS far away, scores are quick.
+        (folder / "bin/ffmpeg").write_text('#!/bin/sh\nfor out; do :; done\nexec cat > "$out"\n')
+        (folder / "bin/ffmpeg").chmod(0o755)
+        path = f"{folder / 'bin'}:{os.environ.get('PATH', '')}"
+        ours = {"PATH": path, "OMP_NUM_THREADS": "1", "GLOBALSPLAT_WEIGHTS": str(folder / "none")}
+        self.environment = {**os.environ, **ours}
+
+    def make(self, *arguments):
+        subprocess.run([self.program, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
+
+    def run(self, arguments, fault=None, stop_when_waiting=False, into=None):
+        """Runs the program in out/. `fault`: (group, n, kind, sticky). `into`: a file for what it tells."""
+        self.log.unlink(missing_ok=True)
+        ours = {"LD_PRELOAD": self.library, "FAULT_ROOT": self.out, "FAULT_LOG": self.log}
+        environment = {**self.environment, **{key: str(value) for key, value in ours.items()}}
+        if fault:
+            environment.update(zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], map(str, fault)))
+        told, said = self.folder / "told", self.folder / "said"
+        with open(into or told, "wb") as out, open(said, "wb") as err:
+            process = subprocess.Popen([self.program, *arguments], stdout=out, stderr=err, env=environment)
+            begun, code = time.monotonic(), None
+            while code is None and time.monotonic() - begun < PATIENCE:
+                if stop_when_waiting and b"training pauses" in said.read_bytes():
+                    process.send_signal(signal.SIGTERM)
+                    stop_when_waiting = False
+                try:
+                    code = process.wait(0.02 if stop_when_waiting else PATIENCE)
+                except subprocess.TimeoutExpired:
+                    pass
+            if code is None:
+                process.kill()
+                process.wait()
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        calls = [(line[0] == "!", *line[2:].split(" ", 1)) for line in lines]
+        return Done(code, "" if into else told.read_text(), said.read_text(), calls)
+
+
+def operations(bench, only):
+    """All of them, on rooms and weights that the program makes, by tests/common/program.rs's configuration."""
+    inputs, out = bench.inputs, bench.out
+    source = (REPOSITORY / "tests/common/program.rs").read_text()
+    config = re.search(r'TINY_CONFIG: &str = r#"(.*?)"#', source, re.DOTALL)[1]
+    rooms, room = inputs / "rooms", inputs / "rooms/room_000"
+    bench.make("synth", "--out", rooms, "--scenes", 2, "--frames", 9, "--size", 40)
+    tiny, weights = inputs / "tiny.toml", inputs / "tiny.safetensors"
+    config = config.replace("[data]", f"[data]\ncaptures = [{json.dumps(str(room))}]")
+    tiny.write_text(config + "validate_every = 2\n")
+    bench.make("export", "--config", tiny, "--out", weights)
+    splat = room / "truth.ply"
+    frames = {"context": [0, 2, 4], "target": [1, 3]}
+    index, splats = inputs / "index.json", inputs / "splats"
+    index.write_text(json.dumps({"room_000": frames, "room_001": frames}))
+    splats.mkdir()
+    for name in ("room_000", "room_001"):
+        shutil.copy(rooms / name / "truth.ply", splats / f"{name}.ply")
+    sweep = ["eval", "--splat", splats, "--data", rooms, "--index", index, "--json", "--out"]
+    bench.make(*sweep, inputs / "evaluation")
+
+    train = ["train", "--config", tiny, "--out", out, "--json"]
+    export = ["export", "--config", tiny, "--out", out / "model.safetensors", "--json"]
+    reconstruct = ["reconstruct", "--weights", weights, "--scene", room, "--out", out / "room.ply", "--json"]
+    score = ["eval", "--splat", splat, "--scene", room, "--json", "--sheet", out / "sheet.png"]
+    report = ["report", inputs / "evaluation", "--out", out / "report.html", "--json"]
+    orbit = ["render", "--splat", splat, "--size", "24x24", "--orbit", "--frames", 3, "--json", "--out"]
+
+    def training(name, stopped):
+        """Begun anew, or where an error ended it within the fourth step, with a checkpoint of the second one."""
+        op = Operation(bench, name, train, whole_checkpoint, waits=True)
+        told = [file.endswith("/metrics.jsonl") for _, group, file in bench.run(op.arguments).calls if group == "write"]
+        at = [n for n, ours in enumerate(told, 1) if ours]
+        for line in (5, 8):
+            op.reset()
+            assert bench.run(op.arguments, ("write", at[line - 1], "EIO", 0)).code == 1
+            op.between.append(Tree(out))
+            if stopped and line == 5:
+                first = bench.folder / "first"
+                shutil.copytree(out, first)
+        if stopped:
+            shutil.rmtree(op.old)
+            first.rename(op.old)
+        return op
+
+    def packed():
+        # Photos of more than a megabyte, for chunks of one each.
+        bench.make("synth", "--out", inputs / "large", "--scenes", 2, "--frames", 9, "--size", 256)
+        command = ["pack", inputs / "large", "--out", out, "--chunk-size", 1, "--json"]
+        # No chunk is replaced, so it begins where an earlier one was interrupted.
+        bench.make(*command)
+        (out / "000001.torch").unlink()
+        (out / "index.json").unlink()
+        return Operation(bench, "pack", command).take()
+
+    def synthesized():
+        bench.make("synth", "--out", out, "--frames", 4, "--size", 16, "--seed", 7)
+        command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--json"]
+        return Operation(bench, "synth", command, whole_room).take()
+
+    def aged(name, command, keep=(), **more):
+        return lambda: Operation(bench, name, command, **more).age(keep)
+
+    scored = ["evaluation.json", "scenes/room_000.json", "scenes/room_000.jpg"]
+    made = {
+        "train": lambda: training("train", False),
+        "train, resumed": lambda: training("train, resumed", True),
+        "export": aged("export", export),
+        "reconstruct": aged("reconstruct", reconstruct),
+        "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
+        "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
+        "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),
+        "eval --scene": aged("eval --scene", score),
+        "eval > file": aged("eval > file", score, into=out / "stdout"),
+        "eval --data": aged("eval --data", [*sweep, out], keep=scored),
+        "report": aged("report", report),
+        "pack": packed,
+        "synth": synthesized,
+    }
+    for name, make in made.items():
+        if not only or name in only:
+            shutil.rmtree(out)
+            out.mkdir()
+            op = make()
+            op.undisturbed()
+            yield op
+
+
+# The checks.
+
+
+def check(op, fault):
+    """Injects one fault. Returns what became of it ("right", "refused" or None where nothing was hit) and what was wrong."""
+    group, _, kind, sticky = fault
+    op.reset()
+    room_never_comes = op.waits and sticky and kind in ("ENOSPC", "torn")
+    done = op.bench.run(op.arguments, fault, stop_when_waiting=room_never_comes, into=op.into)
+    if not done.hit:
+        return None, [], done
+    tree, wrong = Tree(op.bench.out), []
+    if done.code is None:
+        wrong.append(f"it hasn't ended after {PATIENCE} s")
+    elif done.code not in (0, 1, 2) or "panicked" in done.said or "failed inside" in done.said:
+        wrong.append(f"it ended with {done.code}, by a signal or a panic")
+    elif done.code == 0:
+        wrong += tree.differs(op.new)
+        if done.sentence:
+            wrong.append("it complains, and says that it is done")
+        if done.told != op.told:
+            wrong.append("it tells something else")
+    else:
+        if not re.fullmatch(r"globalsplat: [^\n]+", done.sentence):
+            wrong.append("it doesn't say why in one sentence")
+        elif not op.names(done):
+            wrong.append(f"it doesn't name {plain(done.hit[0])}")
+        if done.told:
+            wrong.append("it tells a result, and fails")
+        if kind == "short" or kind == "EINTR" and group in INTERRUPTIBLE:
+            wrong.append("it doesn't go on")
+        # A full disk is waited for, but not by what looks whether the run's folder can be written and is nobody's.
+        looks = re.search(r"/out(/\.globalsplat-probe|/\.lock)?$", done.hit[0])
+        if op.waits and not sticky and kind in ("ENOSPC", "torn") and not looks:
+            wrong.append("it doesn't wait for room")
+        # Where renames fail for good, nobody can take one back.
+        wrong += tree.mixes(op.trees, op.unit_of, crashed=sticky == 1 and group in ("rename", "any"))
+    return "right" if done.code == 0 else "refused", wrong, done
+
+
+def told_of(op, fault, done, wrong):
+    """A failure, with what repeats it."""
+    how = " ".join(map(str, fault))
+    said = done.said.strip().replace("\n", "\n    ") or "nothing said"
+    return f"\n--only \"{op.name}\" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  " + "\n  ".join(wrong)
+
+
+def inject(operations, most, short, one):
+    """Injects everything and prints the table. Returns the failures."""
+    columns = ["operation", "calls", "faults injected", "ended right at once", "refused, with one sentence"]
+    columns += ["second run right", "failures"]
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+    failures, total = [], Counter()
+    for op in operations:
+        every, faults = op.faults(), op.faults(most)
+        if short:
+            sample = random.Random(0).sample(every, SHORT_OF_RUNS if op.waits else SHORT_OF_OTHERS)
+            faults = sorted(sample, key=every.index)
+        if one:
+            faults = [(one[0], int(one[1]), one[2], int(one[3]))]
+        count = Counter()
+        for fault in faults:
+            became, wrong, done = check(op, fault)
+            if became is None:
+                continue
+            count["injected"] += 1
+            count[became] += not wrong
+            # Chunks are never written over: a folder that has them all is refused.
+            again = [] if op.name == "pack" and done.code == 0 else op.again()
+            count["again"] += not again
+            if wrong or again:
+                count["failures"] += 1
+                failures.append((op, fault, done, wrong + again))
+                print(told_of(op, fault, done, wrong + again), file=sys.stderr, flush=True)
+        calls = Counter(group for _, group, _ in op.calls)
+        shown = ", ".join(f"{group} {calls[group]}" for group in FAULTS if calls[group])
+        part = "" if len(faults) == len(every) else f" of {len(every)}"
+        total.update(count)
+        total["calls"] += len(op.calls)
+        keys = ("right", "refused", "again", "failures")
+        print(f"| {op.name} | {shown} | {count['injected']}{part} | {' | '.join(str(count[key]) for key in keys)} |")
+        sys.stdout.flush()
+    print(f"| all | {total['calls']} | {total['injected']} | {' | '.join(str(total[key]) for key in keys)} |")
+    return failures
+
+
+def spoil(operations):
+    """Spoils what right runs left, file by file. Returns the number of those that nobody noticed."""
+    spoiled, unnoticed = 0, 0
+    for op in operations:
+        op.reset()
+        op.bench.run(op.arguments, into=op.into)
+        tree = Tree(op.bench.out)
+        assert not tree.differs(op.new) and not tree.mixes(op.trees, op.unit_of), op.name
+        units = tree.units(op.unit_of)
+        for path in [path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")]:
+            right = path.read_bytes()
+            middle = len(right) // 2
+            flipped = right[:middle] + bytes([right[middle] ^ 1]) + right[middle + 1 :]
+            ways = {"flipped": flipped, "cut": right[:-1], "gone": None}
+            name = path.relative_to(op.bench.out).as_posix()
+            older = op.old / name
+            if older.is_file() and older.read_bytes() != right:
+                ways["older"] = older.read_bytes()
+            for way, bytes_ in ways.items():
+                # A file of its own may be the old one, or not be there yet.
+                fits_none = way in ("flipped", "cut") or len(units.get(op.unit_of(name), "")) > 1
+                path.unlink() if bytes_ is None else path.write_bytes(bytes_)
+                try:
+                    tree = Tree(op.bench.out)
+                    noticed = tree.differs(op.new) and (not fits_none or tree.mixes(op.trees, op.unit_of))
+                except (ValueError, AssertionError):
+                    noticed = True
+                spoiled += 1
+                if not noticed:
+                    unnoticed += 1
+                    print(f"{op.name}: {name}, {way}, isn't noticed")
+                path.write_bytes(right)
+        left = op.bench.out / ".left.globalsplat-partial"
+        left.write_text("")
+        spoiled += 1
+        unnoticed += not Tree(op.bench.out).differs(op.new)
+        left.unlink()
+    print(f"{spoiled} spoiled, {spoiled - unnoticed} noticed")
+    return unnoticed
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--binary", type=Path, default=REPOSITORY / "target/release/globalsplat")
+    parser.add_argument("--short", action="store_true", help="a fixed sample, in about a minute")
+    most = "calls of a group and an operation that fail; of more, so many, evenly"
+    parser.add_argument("--most", type=int, default=60, metavar="N", help=most)
+    parser.add_argument("--only", nargs="+", metavar="OPERATION")
+    one = ("CALL", "N", "KIND", "STICKY")
+    parser.add_argument("--fault", nargs=4, metavar=one, help="this one alone, as a failure names it")
+    parser.add_argument("--self-test", action="store_true", help="spoil right files instead, and see that it is noticed")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        bench = Bench(arguments.binary.resolve(), Path(folder).resolve())
+        chosen = operations(bench, arguments.only)
+        if arguments.self_test:
+            return 1 if spoil(chosen) else 0
+        failures = inject(chosen, arguments.most, arguments.short, arguments.fault)
+        for failure in failures:
+            print(told_of(*failure))
+        return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
