@@ -78,7 +78,7 @@ pub fn main() -> ExitCode {
         }
     };
     if cli.command.computes() {
-        threads::sleep_while_waiting();
+        threads::sleep_soon();
     }
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));

@@ -3,15 +3,20 @@
 use std::env;
 use std::process::Command;
 
-/// What tells OpenMP, GCC's or LLVM's, how its threads wait. Whoever sets one knows why.
-const VARIABLES: [&str; 3] = ["OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"];
+/// How often one of GCC's OpenMP threads looks whether the others are done before it sleeps; by default 300,000 times, which
+/// takes milliseconds. Measured with `scripts/busy.py`: with fewer looks, threads that have a machine for themselves are woken
+/// more often than pays, and with more they take the time of those that don't.
+const SPINS: (&str, &str) = ("GOMP_SPINCOUNT", "500");
 
-/// Has them sleep. OpenMP's threads spin for milliseconds by default, each for the others: as soon as anything else takes a
-/// core, they spin away the time of the very thread that they wait for, at every one of thousands of operations, and training
-/// comes to a halt. OpenMP looks at its variables when it is loaded, before `main`, so the program starts itself anew.
-pub fn sleep_while_waiting() {
+/// Also tells OpenMP's threads how to wait. Whoever sets it knows why.
+const POLICY: &str = "OMP_WAIT_POLICY";
+
+/// Has them sleep soon. As soon as anything else takes a core, threads that spin for each other spin away the time of the very
+/// one that they wait for, at every one of thousands of operations, and training slows down to a quarter. OpenMP looks at its
+/// variables when it is loaded, before `main`, so the program starts itself anew.
+pub fn sleep_soon() {
     let alone = env::var("OMP_NUM_THREADS").is_ok_and(|threads| threads == "1");
-    if alone || VARIABLES.iter().any(|variable| env::var_os(variable).is_some()) {
+    if alone || [SPINS.0, POLICY].iter().any(|variable| env::var_os(variable).is_some()) {
         return;
     }
     #[cfg(unix)]
@@ -23,6 +28,6 @@ pub fn sleep_while_waiting() {
             again.arg0(name);
         }
         // Only returns where that can't be done, and then threads spin.
-        let _ = again.args(arguments).env(VARIABLES[0], "passive").exec();
+        let _ = again.args(arguments).env(SPINS.0, SPINS.1).exec();
     }
 }

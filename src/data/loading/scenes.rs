@@ -32,12 +32,14 @@ impl SceneGroups for Vec<Capture> {
     }
 
     fn decoded_bytes(&self) -> Option<u64> {
-        Some(self.iter().map(decoded_bytes).sum())
+        Some(self.iter().map(decoded_bytes).fold(0, u64::saturating_add))
     }
 }
 
 fn decoded_bytes(capture: &Capture) -> u64 {
-    capture.cameras().iter().map(|camera| 3 * u64::from(camera.width) * u64::from(camera.height)).sum()
+    let pixels =
+        capture.cameras().into_iter().map(|camera| u64::from(camera.width) * u64::from(camera.height));
+    pixels.fold(0, |sum, pixels| sum.saturating_add(pixels.saturating_mul(3)))
 }
 
 /// What a configuration names: captures, which are opened at once and kept, and chunks, which are read as they are needed.
@@ -92,6 +94,6 @@ impl SceneGroups for TrainingScenes {
     }
 
     fn decoded_bytes(&self) -> Option<u64> {
-        self.chunks.is_empty().then(|| self.captures.iter().map(decoded_bytes).sum())
+        self.chunks.is_empty().then(|| self.captures.decoded_bytes())?
     }
 }

@@ -21,7 +21,12 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
     let body = &bytes[header.length..];
     if body.len() / stride.max(1) < n {
         let found = format!("cut short: {} bytes of vertices", body.len());
-        return Err(Error::input(path, "the body", found, format!("{} bytes for {n} vertices", n * stride)));
+        return Err(Error::input(
+            path,
+            "the body",
+            found,
+            format!("{} bytes for {n} vertices", n as u128 * stride as u128),
+        ));
     }
 
     let rest = (0..).take_while(|k| header.offset_of(&format!("f_rest_{k}")).is_some()).count();

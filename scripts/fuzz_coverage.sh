@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Tells, in Markdown, how many lines of what reads files from elsewhere the seeds and corpora of fuzzing reach:
+#   scripts/fuzz_coverage.sh [CORPORA]        by default fuzz/corpus
+# Needs `rustup component add llvm-tools` and gcov. Builds in target/coverage.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+export FUZZ_CORPORA=${1:-$PWD/fuzz/corpus}
+export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target/coverage}
+mkdir -p "$CARGO_TARGET_DIR"
+out=$(cd "$CARGO_TARGET_DIR" && pwd)
+
+# Only our own Rust is instrumented. All C++ is, by its own compiler.
+printf '#!/bin/sh\nexec "$@" -C instrument-coverage -C link-arg=--coverage\n' >"$out/rustc"
+chmod +x "$out/rustc"
+export RUSTC_WORKSPACE_WRAPPER="$out/rustc" CXXFLAGS="--coverage" LLVM_PROFILE_FILE="$out/profile/%m.profraw"
+rm -rf "$out/profile"
+find "$out" -name '*.gcda' -delete
+test=$(cargo test --release --locked --no-default-features --test fuzz_seeds --no-run --message-format json |
+    sed -n 's/.*"executable":"\([^"]*fuzz_seeds[^"]*\)".*/\1/p' | tail -1)
+"$test" >/dev/null
+
+tools=$(rustc --print sysroot)/lib/rustlib/$(rustc -vV | sed -n 's/host: //p')/bin
+"$tools/llvm-profdata" merge -sparse "$out"/profile/*.profraw -o "$out/profile/all"
+echo "| file | lines | reached |"
+echo "|---|---|---|"
+"$tools/llvm-cov" export --summary-only --instr-profile "$out/profile/all" "$test" | python3 -c '
+import json, sys
+for file in json.load(sys.stdin)["data"][0]["files"]:
+    name = file["filename"].split("/src/", 1)[-1]
+    if "/csrc/" not in file["filename"] and name.startswith(("data/", "io/", "eval/index", "eval/scores_file", "config/", "reconstruct/model_file")):
+        lines = file["summary"]["lines"]
+        print("| src/%s | %d | %.0f %% |" % (name, lines["count"], lines["percent"]))
+'
+notes=$(find "$out" -name '*torch.gcda' -path '*globalsplat-csrc*' | head -1)
+gcov --no-output "$notes" | sed -n "/^File 'chunk.cpp'/{n;s/Lines executed:\([0-9]*\)\.[0-9]*% of \([0-9]*\)/| csrc\/chunk.cpp | \2 | \1 % |/p}"
