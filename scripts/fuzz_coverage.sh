@@ -25,11 +25,16 @@ echo "| file | lines | reached |"
 echo "|---|---|---|"
 "$tools/llvm-cov" export --summary-only --instr-profile "$out/profile/all" "$test" | python3 -c '
 import json, sys
+unreached = []
 for file in json.load(sys.stdin)["data"][0]["files"]:
     name = file["filename"].split("/src/", 1)[-1]
     if "/csrc/" not in file["filename"] and name.startswith(("data/", "io/", "eval/index", "eval/scores_file", "config/", "reconstruct/model_file")):
         lines = file["summary"]["lines"]
-        print("| src/%s | %d | %.0f %% |" % (name, lines["count"], lines["percent"]))
+        if lines["covered"]:
+            print("| src/%s | %d | %.0f %% |" % (name, lines["count"], lines["percent"]))
+        else:
+            unreached.append(name)
+print("Not reached: " + ", ".join(unreached) + ".", file=sys.stderr)
 '
 notes=$(find "$out" -name '*torch.gcda' -path '*globalsplat-csrc*' | head -1)
 gcov --no-output "$notes" | sed -n "/^File 'chunk.cpp'/{n;s/Lines executed:\([0-9]*\)\.[0-9]*% of \([0-9]*\)/| csrc\/chunk.cpp | \2 | \1 % |/p}"

@@ -19,7 +19,6 @@ mod reconstruct;
 mod render;
 mod report;
 mod synth;
-mod threads;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -60,13 +59,6 @@ enum Command {
     Parity(parity::Parity),
 }
 
-impl Command {
-    /// Whether it has work for all cores, for longer than a moment.
-    fn computes(&self) -> bool {
-        matches!(self, Command::Train(_) | Command::Eval(_) | Command::Reconstruct(_) | Command::Bench(_))
-    }
-}
-
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -77,9 +69,6 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    if cli.command.computes() {
-        threads::sleep_soon();
-    }
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| match cli.command {
