@@ -184,7 +184,8 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
-/// The context and target views of a held-out scene, always the same: as many as in training, at even distances along the camera's path, from the middle of a video that is longer than training's.
+/// The context and target views of a held-out scene, always the same: as many as in training, at even distances along the
+/// camera's path, from the middle of a video that is longer than training's.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
     if cameras.len() < 3 {
