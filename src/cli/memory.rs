@@ -40,6 +40,17 @@ fn or_end(memory: *mut u8, bytes: usize) -> *mut u8 {
     memory
 }
 
+/// Has the process end with exit code 1 where a library below aborts it, which it does for want of memory, glibc with a sentence
+/// of its own.
+pub fn end_instead_of_aborting() {
+    extern "C" fn end(_: libc::c_int) {
+        // SAFETY: ends the process, which is allowed in a signal's handler.
+        unsafe { libc::_exit(FAILED.into()) }
+    }
+    // SAFETY: the handler does nothing that a handler may not.
+    unsafe { libc::signal(libc::SIGABRT, end as extern "C" fn(libc::c_int) as libc::sighandler_t) };
+}
+
 /// Says so without taking memory for it.
 #[cold]
 fn end(bytes: usize) -> ! {

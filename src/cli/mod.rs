@@ -69,6 +69,7 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
+    memory::end_instead_of_aborting();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| match cli.command {
