@@ -78,7 +78,7 @@ def test_scalars_are_those_of_metrics_jsonl(trained):
     steps = [line for line in told if "validation" not in line]
     assert [line["step"] for line in steps] == list(range(12))
     tags = {f"train/{name}": name for name in PROGRESS} | {f"loss/{name}": name for name in TERMS + PARTS}
-    assert set(found.Tags()["scalars"]) == set(tags) | {"validation/psnr", "validation/ssim"}
+    assert set(found.Tags()["scalars"]) == set(tags) | {"validation/psnr", "validation/ssim", "validation/stage"}
     for tag, name in tags.items():
         events_of = found.Scalars(tag)
         assert [event.step for event in events_of] == [0, 3, 6, 9], tag
