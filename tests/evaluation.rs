@@ -3,7 +3,7 @@
 mod common;
 
 use common::has_lpips;
-use common::program::{arg, command, fail, refuse, succeed, tiny_weights};
+use common::program::{arg, command, fail, refuse, succeed, text, tiny_weights};
 use globalsplat::eval::read_evaluation;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -48,13 +48,9 @@ impl Set {
     }
 }
 
-fn strs(arguments: &[String]) -> Vec<&str> {
-    arguments.iter().map(String::as_str).collect()
-}
-
 /// Runs without LPIPS, which takes longer than all the rest.
 fn run(arguments: &[String], folder: &Path) -> (Option<i32>, String, String) {
-    let output = command(&strs(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
+    let output = command(&text(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (output.status.code(), text(&output.stdout), text(&output.stderr))
 }
@@ -111,11 +107,11 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
 
     // Another subject's scores don't go with these.
     let splats = set.path("splats");
-    let error = refuse(&strs(&set.arguments(&["--splat", arg(&splats)], "chunks")));
+    let error = refuse(&text(&set.arguments(&["--splat", arg(&splats)], "chunks")));
     assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
     // Nor do those of the same weights in another precision.
     let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
-    assert!(refuse(&strs(&half)).contains("evaluation.json: the evaluation is of tiny.safetensors"));
+    assert!(refuse(&text(&half)).contains("evaluation.json: the evaluation is of tiny.safetensors"));
     let elsewhere = set.path("half");
     let half: Vec<String> = half
         .into_iter()
@@ -129,7 +125,7 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
 
     let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
     set.write_index(&index);
-    let error = refuse(&strs(&arguments));
+    let error = refuse(&text(&arguments));
     assert!(error.contains("choose another --out"), "{error}");
 }
 
@@ -152,7 +148,7 @@ fn what_changed_since_is_scored_again() {
         return;
     }
     assert!(second.scenes.iter().all(|scene| scene.scores.lpips_alex.is_none()));
-    succeed(&strs(&arguments));
+    succeed(&text(&arguments));
     let third = read_evaluation(&set.path("out")).unwrap();
     assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
 }
@@ -217,7 +213,7 @@ fn several_indices_make_one_report() {
     std::fs::create_dir(set.path("other")).unwrap();
     std::fs::copy(&more, &twice).unwrap();
     arguments.extend(["--index".into(), arg(&twice).into()]);
-    assert!(refuse(&strs(&arguments)).contains("two of them would go to"));
+    assert!(refuse(&text(&arguments)).contains("two of them would go to"));
 }
 
 #[test]
@@ -234,7 +230,7 @@ fn what_data_sets_are_called_is_told_apart() {
     };
     // Two names, and none that the folder decides for.
     let mut ambiguous = named("chunks", "acid_from_re10k_3v.json");
-    let error = refuse(&strs(&ambiguous));
+    let error = refuse(&text(&ambiguous));
     assert!(error.contains("acid_from_re10k_3v.json: ") && error.contains("acid or re10k"), "{error}");
     assert!(error.contains("--dataset"), "{error}");
     assert!(!set.path("out").exists(), "nothing was begun");
@@ -259,11 +255,11 @@ fn what_data_sets_are_called_is_told_apart() {
         assert_eq!(code, Some(0), "{err}");
         assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, name);
     }
-    let error = refuse(&strs(&named("acid/test", "re10k_3v.json")));
+    let error = refuse(&text(&named("acid/test", "re10k_3v.json")));
     assert!(error.contains("acid") && error.contains("re10k") && error.contains("--dataset"), "{error}");
 
     // Another data set whose folder is called the same.
-    let error = refuse(&strs(&named("acid/test", "index_3v.json")));
+    let error = refuse(&text(&named("acid/test", "index_3v.json")));
     assert!(
         error.contains("evaluation.json: the evaluation is of ") && error.contains("placid/test"),
         "{error}"
@@ -276,22 +272,22 @@ fn what_an_index_gets_wrong_is_named() {
     let set = Set::new();
     let splats = set.path("splats");
     let one = splats.join("room_000.ply");
-    let error = refuse(&strs(&set.arguments(&["--splat", arg(&one)], "chunks")));
+    let error = refuse(&text(&set.arguments(&["--splat", arg(&one)], "chunks")));
     assert!(error.contains("room_000.ply: what is to be scored is no folder"), "{error}");
     let arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
     set.write_index(&json!({"room_000": {"context": [0, 7], "target": [1]}}));
-    let error = fail(&strs(&arguments), 1);
+    let error = fail(&text(&arguments), 1);
     let expected = "re10k_3v.json: a frame of scene room_000 is 7, expected one of the scene's 5, 0 to 4";
     assert!(error.contains(expected), "{error}");
     set.write_index(&json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
-    let error = refuse(&strs(&arguments));
+    let error = refuse(&text(&arguments));
     assert!(error.contains("none of the 3 in the data set chunks"), "{error}");
     std::fs::remove_file(set.path("splats/room_000.ply")).unwrap();
     set.write_index(&json!({"room_000": {"context": [0, 3], "target": [1]}}));
-    let error = fail(&strs(&arguments), 1);
+    let error = fail(&text(&arguments), 1);
     assert!(error.contains("room_000: ") && error.contains("room_000.ply can't be read"), "{error}");
     std::fs::remove_file(set.path("chunks/000000.torch")).unwrap();
-    let error = fail(&strs(&arguments), 1);
+    let error = fail(&text(&arguments), 1);
     assert!(error.contains("room_000: ") && error.contains("000000.torch can't be read"), "{error}");
 }
 

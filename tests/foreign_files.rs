@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::program::{arg, refuse, room, succeed, tiny_config};
+use common::program::{arg, refuse, room, succeed, text, tiny_config, train};
 use globalsplat::data::write_room;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -73,23 +73,10 @@ fn folders_of_other_names_than_ours_are_no_business_of_a_run() {
         "best/notes.txt",
     ];
     let mut files: Vec<PathBuf> = files.iter().map(|name| put(run.join(name))).collect();
-    let train = |steps: &str| {
-        let steps = format!("train.steps={steps}");
-        succeed(&[
-            "train",
-            "--config",
-            arg(&config),
-            "--out",
-            arg(&run),
-            "--set",
-            &steps,
-            "--resume",
-            "auto",
-        ]);
-    };
-    train("2");
+    let train_to = |steps: &str| succeed(&text(&train(&config, &run, &[&format!("train.steps={steps}")])));
+    train_to("2");
     files.push(put(run.join("checkpoints/step-00000002/notes.txt")));
-    train("8");
+    train_to("8");
     files.iter().for_each(|file| assert_kept(file));
     assert!(run.join("best/state.json").is_file());
     assert!(!run.join("checkpoints/step-00000002/state.json").exists(), "dropped but for the notes");
@@ -102,10 +89,7 @@ fn folders_of_other_names_than_ours_are_no_business_of_a_run() {
 fn a_broken_checkpoint_takes_no_good_ones_place() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    let train = |settings: &[&str]| {
-        let settings = settings.iter().flat_map(|setting| ["--set", setting]).collect::<Vec<_>>();
-        succeed(&[&["train", "--config", arg(&config), "--out", arg(&run)], &settings[..]].concat());
-    };
+    let train = |settings: &[&str]| succeed(&text(&train(&config, &run, settings)));
     train(&["train.steps=4", "train.keep_checkpoints=3"]);
     let at = |step: u64| run.join(format!("checkpoints/step-{step:08}"));
     // One with the latest number that no run has reached again yet, and one on the way.

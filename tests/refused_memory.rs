@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::program::{arg, room, succeed, tiny_config};
+use common::program::{arg, room, succeed, text, tiny_config, train};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -106,22 +106,15 @@ fn a_run_goes_on_where_memory_ended_it() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let whole = folder.path().join("whole");
-    let train = |out: &Path| ["train", "--config", arg(&config), "--out", arg(out)].map(String::from);
-    let strs = |arguments: &[String; 5]| arguments.each_ref().map(|argument| argument.to_owned());
-    let arguments = train(&whole);
-    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let (starts, enough) = range(&arguments);
+    let (starts, enough) = range(&text(&train(&config, &whole, &[])));
     let enough = enough.max(starts);
     for i in 0..8 {
-        let arguments = strs(&train(&run));
-        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-        let output = limited(starts + (enough - starts) * i / 8, &arguments);
+        let output = limited(starts + (enough - starts) * i / 8, &text(&train(&config, &run, &[])));
         let err = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}: {err}", output.status);
         assert!(!err.contains("panicked"), "{err}");
     }
-    let arguments = train(&run);
-    succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    succeed(&text(&train(&config, &run, &[])));
     let weights = |run: &Path| {
         let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
         globalsplat::io::read_weights(&checkpoint.join("model.safetensors")).unwrap().tensors

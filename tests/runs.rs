@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::program::{arg, command, fail, room, succeed, tiny_config};
+use common::program::{arg, command, fail, room, succeed, text, tiny_config, train};
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
 use globalsplat::error::Error;
@@ -207,17 +207,6 @@ fn a_run_that_waits_for_room_can_be_stopped() {
     let mut line = String::new();
     said.read_line(&mut line).unwrap();
     assert!(line.contains("can't be written"), "{line}");
-}
-
-/// The tiny model's training in `run`, with `settings`.
-fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
-    let mut arguments = vec!["train", "--config", arg(config), "--out", arg(run)];
-    arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
-    arguments.into_iter().map(String::from).collect()
-}
-
-fn text(arguments: &[String]) -> Vec<&str> {
-    arguments.iter().map(String::as_str).collect()
 }
 
 #[test]

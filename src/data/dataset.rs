@@ -159,8 +159,10 @@ fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
         return Err(Error::input(root, "the folder", found, "captures of the other part, too"));
     }
     let names: Vec<String> = folders.iter().map(|folder| folder_name(folder)).collect();
+    let mut counts: BTreeMap<&String, usize> = BTreeMap::new();
+    names.iter().for_each(|name| *counts.entry(name).or_default() += 1);
     // Of two folders of one name, the path below the root tells which.
-    let key = |folder: &Path, name: &String| match names.iter().filter(|other| *other == name).count() {
+    let key = |folder: &Path, name: &String| match counts[name] {
         1 => name.clone(),
         _ => folder.strip_prefix(root).unwrap_or(folder).to_string_lossy().into_owned(),
     };

@@ -119,3 +119,15 @@ pub fn tiny_weights(folder: &Path, capture: &Path) -> PathBuf {
     succeed(&["export", "--config", arg(&config), "--out", arg(&weights)]);
     weights
 }
+
+/// The arguments by which the model of `config` is trained in `run`, with `settings`.
+pub fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
+    let mut arguments = vec!["train", "--config", arg(config), "--out", arg(run)];
+    arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
+    arguments.into_iter().map(String::from).collect()
+}
+
+/// Arguments as the program is given them.
+pub fn text(arguments: &[String]) -> Vec<&str> {
+    arguments.iter().map(String::as_str).collect()
+}
