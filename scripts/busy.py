@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
 """Trains as `make demo` does, alone and beside other work, and tells what that costs.
 
-    scripts/busy.py [--steps 60] [--busy 0 1 2] [--wait default passive 500] [--binary target/release/globalsplat]
+    scripts/busy.py [--steps 60] [--busy 0 1 2] [--binary target/release/globalsplat …]
 
-Each busy process is a loop that never sleeps. --wait says how OpenMP's threads wait for each other: by `default` they spin for
-milliseconds, `passive` ones sleep at once, and with a number they look so often before they sleep. Prints Markdown: steps a
-second, and the share of the fastest.
+Each busy process is a loop that never sleeps. Several programs take turns. Prints Markdown: steps a second, and their share of
+the same program's alone.
 """
 
 import argparse
@@ -28,36 +27,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--busy", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--wait", nargs="+", default=["default"])
-    parser.add_argument("--binary", type=Path, default=Path("target/release/globalsplat"))
+    parser.add_argument("--binary", type=Path, nargs="+", default=[Path("target/release/globalsplat")])
     options = parser.parse_args()
-    rows = []
+    rates = {}
     with tempfile.TemporaryDirectory() as folder:
         synth = ["synth", "--out", folder, "--scenes", "2", "--frames", "12"]
-        subprocess.run([options.binary, *synth], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run([options.binary[0], *synth], check=True, stdout=subprocess.DEVNULL)
         bench = ["bench", "train", "--config", "configs/first_light.toml", "--batch", "2", "--json"]
         bench += ["--steps", str(options.steps), "--set", f'data.captures=["{folder}"]']
-        for wait in options.wait:
-            environment = dict(os.environ)
-            if wait.isdigit():
-                environment["GOMP_SPINCOUNT"] = wait
-            elif wait == "passive":
-                environment["OMP_WAIT_POLICY"] = wait
-            for count in options.busy:
+        for count in options.busy:
+            for binary in options.binary:
                 busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
                 try:
-                    done = subprocess.run([options.binary, *bench], env=environment, check=True, capture_output=True)
+                    done = subprocess.run([binary, *bench], check=True, capture_output=True)
                 finally:
                     for process in busy:
                         process.kill()
                         process.wait()
-                rows.append((wait, count, 1e3 / json.loads(done.stdout)["milliseconds"]["median"]))
-                print(f"{wait}, beside {count}: {rows[-1][2]:.2f} steps/s", file=sys.stderr, flush=True)
-    fastest = max(rate for _, _, rate in rows)
+                rates[binary, count] = 1e3 / json.loads(done.stdout)["milliseconds"]["median"]
+                print(f"{binary}, beside {count}: {rates[binary, count]:.2f} steps/s", file=sys.stderr, flush=True)
     print(f"{os.cpu_count()} cores, {processor()}\n")
-    print("| threads wait | busy processes | steps a second | of the fastest |\n|---|---|---|---|")
-    for wait, count, rate in rows:
-        print(f"| {wait} | {count} | {rate:.2f} | {100 * rate / fastest:.0f} % |")
+    print("| program | busy processes | steps a second | of its first |\n|---|---|---|---|")
+    for (binary, count), rate in rates.items():
+        print(f"| {binary} | {count} | {rate:.2f} | {100 * rate / rates[binary, options.busy[0]]:.0f} % |")
     return 0
 
 

@@ -12,6 +12,8 @@ mod export;
 mod inspect;
 mod memory;
 mod model;
+#[cfg(target_os = "linux")]
+mod neighbours;
 mod pack;
 mod parity;
 mod progress;
@@ -70,6 +72,8 @@ pub fn main() -> ExitCode {
         }
     };
     memory::end_instead_of_aborting();
+    #[cfg(target_os = "linux")]
+    neighbours::heed();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| match cli.command {

@@ -1,0 +1,177 @@
+//! Other processes on the same cores, and how OpenMP's threads wait for each other beside them.
+//!
+//! Between two operations a thread of libgomp, which libtorch computes with, spins for milliseconds until the next one. Alone
+//! that is the fastest way to wait. Where another process takes a core, threads spin for one that isn't running, and training
+//! slows several times over. libgomp itself spins next to never once it manages more threads than there are cores. So while
+//! others take cores it is given a team of threads that does nothing. The threads at work stay as many: on their number results
+//! depend.
+
+use std::fs::read_to_string;
+use std::sync::mpsc::{Sender, channel};
+use std::thread::{Builder, JoinHandle, sleep};
+use std::time::{Duration, Instant};
+use tch::{Device, Kind, Tensor};
+
+/// How often it is looked who computes: a few clock ticks, in which the system counts.
+const INTERVAL: Duration = Duration::from_millis(200);
+
+/// The part of a core that others may take until threads stop spinning, and the part below which they spin again.
+const CROWDED: f64 = 0.25;
+const QUIET: f64 = 0.1;
+
+/// Heeds other processes until this one ends. Where it can't be known what they do, threads go on waiting as they do.
+pub fn heed() {
+    let watch = || {
+        let mut crowds = Vec::new();
+        let mut before = Times::now();
+        loop {
+            sleep(INTERVAL);
+            let now = Times::now();
+            let (Some(then), Some(later)) = (&before, &now) else { return };
+            let threads = tch::get_num_threads() as usize;
+            let missing = threads as f64 + later.others_since(then) - later.cores as f64;
+            if threads < 2 || missing < QUIET {
+                crowds.clear();
+            } else if missing > CROWDED && crowds.is_empty() {
+                // Until there are more threads than cores: one team, but for who asked for fewer threads.
+                let teams = (later.cores + 1).saturating_sub(threads).div_ceil(threads - 1);
+                crowds.extend((0..teams).map_while(|_| Crowd::start()));
+            }
+            before = now;
+        }
+    };
+    // Refused, it is as if nobody else were there.
+    let _ = Builder::new().name("neighbours".into()).spawn(watch);
+}
+
+/// A team of threads more that libgomp manages, asleep, while this is held.
+struct Crowd {
+    /// Until it is dropped, the thread stays.
+    stay: Option<Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Crowd {
+    fn start() -> Option<Crowd> {
+        let (stay, stays) = channel::<()>();
+        let team = move || {
+            // Large enough that libtorch shares it among threads: one that isn't libgomp's gets a team of its own, and keeps it
+            // until it ends.
+            let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
+            let _ = stays.recv();
+        };
+        let thread = Builder::new().name("crowd".into()).spawn(team).ok()?;
+        Some(Crowd { stay: Some(stay), thread: Some(thread) })
+    }
+}
+
+impl Drop for Crowd {
+    fn drop(&mut self) {
+        self.stay = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Time computed until now, on the cores that this process may use.
+struct Times {
+    at: Instant,
+    cores: usize,
+    /// By all processes, in seconds.
+    all: f64,
+    /// By this one, in seconds.
+    own: f64,
+}
+
+impl Times {
+    fn now() -> Option<Times> {
+        // SAFETY: both are plain data, for which zero is a value, and the calls fill them.
+        let (set, usage, tick) = unsafe {
+            let mut set: libc::cpu_set_t = std::mem::zeroed();
+            let mut usage: libc::rusage = std::mem::zeroed();
+            let known = libc::sched_getaffinity(0, size_of_val(&set), &mut set) == 0
+                && libc::getrusage(libc::RUSAGE_SELF, &mut usage) == 0;
+            known.then(|| (set, usage, 1.0 / libc::sysconf(libc::_SC_CLK_TCK) as f64))
+        }?;
+        let seconds = |time: libc::timeval| time.tv_sec as f64 + 1e-6 * time.tv_usec as f64;
+        let own = seconds(usage.ru_utime) + seconds(usage.ru_stime);
+        // SAFETY: it is asked for bits that the set has.
+        let ours = |core: usize| core < libc::CPU_SETSIZE as usize && unsafe { libc::CPU_ISSET(core, &set) };
+        let table = read_to_string("/proc/stat").ok()?;
+        let busy: Vec<u64> = table.lines().filter_map(|line| busy_ticks(line, ours)).collect();
+        let all = tick * busy.iter().sum::<u64>() as f64;
+        Some(Times { at: Instant::now(), cores: busy.len(), all, own })
+    }
+
+    /// How many cores others took since then.
+    fn others_since(&self, then: &Times) -> f64 {
+        ((self.all - then.all) - (self.own - then.own)) / (self.at - then.at).as_secs_f64()
+    }
+}
+
+/// The clock ticks that one of our cores was busy for, of its line in `/proc/stat`: `cpuN user nice system idle iowait irq softirq
+/// steal …` (proc_stat(5)).
+fn busy_ticks(line: &str, ours: impl Fn(usize) -> bool) -> Option<u64> {
+    let mut words = line.strip_prefix("cpu")?.split(' ');
+    if !ours(words.next()?.parse().ok()?) {
+        return None;
+    }
+    let ticks: Vec<u64> = words.map_while(|word| word.parse().ok()).take(8).collect();
+    let [user, nice, system, _, _, irq, softirq, steal] = ticks.try_into().ok()?;
+    Some(user + nice + system + irq + softirq + steal)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_of_our_cores_and_leave_out_waiting() {
+        let ours = |core: usize| core != 1;
+        assert_eq!(
+            busy_ticks("cpu0 1 20 300 4000 50000 600000 7000000 80000000 5 5", ours),
+            Some(87_600_321)
+        );
+        for other in
+            ["cpu  1 2 3 4 5 6 7 8 9 10", "cpu1 1 2 3 4 5 6 7 8 9 10", "cpu2 1 2 3 4 5 6", "intr 5 0", ""]
+        {
+            assert_eq!(busy_ticks(other, ours), None, "{other}");
+        }
+    }
+
+    #[test]
+    fn others_take_what_this_process_does_not() {
+        let then = Times { at: Instant::now(), cores: 2, all: 10.0, own: 4.0 };
+        let later = Times { at: then.at + Duration::from_secs(2), cores: 2, all: 13.0, own: 6.0 };
+        assert_eq!(later.others_since(&then), 0.5);
+    }
+
+    #[test]
+    fn a_busy_process_is_seen() {
+        let mut busy = std::process::Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
+        let before = Times::now().unwrap();
+        sleep(Duration::from_millis(500));
+        let others = Times::now().unwrap().others_since(&before);
+        busy.kill().unwrap();
+        busy.wait().unwrap();
+        assert!(others > 0.2, "{others}");
+    }
+
+    #[test]
+    fn a_crowd_is_there_while_it_is_held() {
+        // A thread of a team has the name of the one that it was made for.
+        let there = || {
+            let tasks = std::fs::read_dir("/proc/self/task").unwrap();
+            let names = tasks.filter_map(|task| read_to_string(task.ok()?.path().join("comm")).ok());
+            names.filter(|name| name == "crowd\n").count()
+        };
+        let becomes =
+            |count: usize| (0..5000).any(|_| there() == count || (sleep(Duration::from_millis(1)), false).1);
+        tch::set_num_threads(3);
+        let crowd = Crowd::start().unwrap();
+        assert!(becomes(3), "{}", there());
+        drop(crowd);
+        assert!(becomes(0), "{}", there());
+    }
+}
