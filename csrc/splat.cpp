@@ -128,4 +128,9 @@ void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
 
 rust::String libtorch_version() { return TORCH_VERSION; }
 
+void leave_out_stack_traces() {
+  const auto nothing = std::make_shared<const c10::PrecomputedLazyValue<std::string>>(std::string());
+  c10::SetStackTraceFetcher([nothing]() -> c10::Backtrace { return nothing; });
+}
+
 }  // namespace globalsplat

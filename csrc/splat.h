@@ -28,4 +28,8 @@ void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out);
 // Of the libtorch whose headers this was compiled with.
 rust::String libtorch_version();
 
+// Has libtorch's errors, from now on, carry no stack trace. It takes memory without asking whether there is any, and is taken
+// and put in words for every error.
+void leave_out_stack_traces();
+
 }  // namespace globalsplat

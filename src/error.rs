@@ -13,6 +13,12 @@ pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     text.lines().next().unwrap_or(text)
 }
 
+/// Has libtorch's errors, from now on and in the whole process, carry no stack trace. It is taken for every error, and kills the
+/// process where memory is short.
+pub fn leave_out_stack_traces() {
+    globalsplat_csrc::render::leave_out_stack_traces();
+}
+
 /// Every failure of the library. [`Error::is_request`] tells a wrong request from work that failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

@@ -80,6 +80,9 @@ mod ffi {
         /// Of the libtorch whose headers this was compiled with.
         fn libtorch_version() -> String;
 
+        /// See `csrc/splat.h`.
+        fn leave_out_stack_traces();
+
         /// See `csrc/cpu/cpu.h`.
         ///
         /// # Safety

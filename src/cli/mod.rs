@@ -71,7 +71,7 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    memory::end_instead_of_aborting();
+    memory::end_as_failed();
     #[cfg(target_os = "linux")]
     neighbours::heed();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
