@@ -70,9 +70,8 @@ pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Resul
     let result = attempt();
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
-        if !path.exists() {
-            let _ = fs::rename(&retired, path);
-        }
+        // What refused one rename may refuse the next.
+        let _ = (0..3).any(|_| path.exists() || fs::rename(&retired, path).is_ok());
         return result;
     }
     sync_parent(path);
@@ -96,11 +95,26 @@ fn retire(retired: &Path, heir: &Path, made: &[&str]) -> Result<()> {
     remove_made(retired, made)
 }
 
-/// Removes `made` from `folder`, and the folder itself, if nothing else is in it.
+/// Removes the folder at `path`, of whose files `made` are the program's, as one: where it can't be removed, it is all there or
+/// under the name of what is half written. What else is in it stays, in a folder of its name.
 ///
 /// # Errors
-/// The system's refusal to write.
-pub fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
+/// The system's refusal to read or write.
+pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
+    for entry in fs::read_dir(path).map_err(Error::read(path))? {
+        let name = entry.map_err(Error::read(path))?.file_name();
+        if !made.iter().any(|made| name == *made) {
+            return remove_made(path, made);
+        }
+    }
+    let temporary = sibling(path, PARTIAL);
+    remove_dir_if_there(&temporary)?;
+    fs::rename(path, &temporary).map_err(Error::write(path))?;
+    remove_dir_if_there(&temporary)
+}
+
+/// Removes `made` from `folder`, and the folder itself, if nothing else is in it.
+fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
     for name in made {
         let path = folder.join(name);
         let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
@@ -208,5 +222,30 @@ fn sync_parent(path: &Path) {
 fn sync_dir(path: &Path) {
     if let Ok(dir) = File::open(path) {
         let _ = dir.sync_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_goes_as_one_and_foreign_files_stay() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("step");
+        let make = |names: &[&str]| {
+            fs::create_dir_all(&folder).unwrap();
+            names.iter().for_each(|name| fs::write(folder.join(name), name).unwrap());
+        };
+        make(&["model", "state"]);
+        // Of one that was removed by half before, nothing hinders.
+        fs::create_dir_all(sibling(&folder, PARTIAL).join("model")).unwrap();
+        remove_dir(&folder, &["model", "state"]).unwrap();
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+
+        make(&["model", "state", "notes"]);
+        remove_dir(&folder, &["model", "state"]).unwrap();
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        assert_eq!(fs::read(folder.join("notes")).unwrap(), b"notes");
     }
 }

@@ -20,7 +20,7 @@ pub use splat::{Splat, read_splat, write_splat};
 pub use weights::{Weights, read_weights, write_weights};
 
 pub(crate) use append::AppendFile;
-pub(crate) use atomic::{recover_dirs, remove_made, replace_dir, write_atomically, write_json};
+pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
 pub(crate) use images::{

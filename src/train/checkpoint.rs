@@ -7,7 +7,7 @@
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
-use crate::io::{read_weights, recover_dirs, remove_made, replace_dir, write_atomically, write_weights};
+use crate::io::{read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights};
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -195,7 +195,7 @@ pub(super) fn drop_surplus(run: &Path, latest: &Path, kept: usize) -> Result<()>
     let surplus = (whole.len() + 1).saturating_sub(kept);
     let useless = broken.iter().filter(|broken| broken.as_path() < latest);
     for old in whole.iter().take(surplus).chain(useless) {
-        remove_made(old, &FILES)?;
+        remove_dir(old, &FILES)?;
     }
     Ok(())
 }
