@@ -114,11 +114,56 @@ fn a_run_goes_on_where_memory_ended_it() {
         assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}: {err}", output.status);
         assert!(!err.contains("panicked"), "{err}");
     }
-    succeed(&text(&train(&config, &run, &[])));
+    goes_on_as(&config, &run, &whole);
+}
+
+/// The run ends, when nothing hinders it, as `whole` did.
+fn goes_on_as(config: &Path, run: &Path, whole: &Path) {
+    succeed(&text(&train(config, run, &[])));
     let weights = |run: &Path| {
         let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
         globalsplat::io::read_weights(&checkpoint.join("model.safetensors")).unwrap().tensors
     };
-    let (a, b) = (weights(&run), weights(&whole));
+    let (a, b) = (weights(run), weights(whole));
     assert!(!a.is_empty() && a.iter().zip(&b).all(|((_, x), (_, y))| x.equal(y)));
+}
+
+/// There, the system doesn't refuse memory but kills who uses more: a run loses no more than by any other end.
+#[test]
+#[ignore = "needs a memory cgroup that it may write to; run it as root, by `-- --ignored`"]
+fn a_run_goes_on_where_a_cgroup_killed_it() {
+    let root = Path::new("/sys/fs/cgroup");
+    let (parent, limit) = match root.join("memory").is_dir() {
+        true => (root.join("memory"), "memory.limit_in_bytes"),
+        false => (root.to_owned(), "memory.max"),
+    };
+    let group = parent.join(format!("globalsplat-{}", std::process::id()));
+    std::fs::create_dir(&group).expect("a cgroup");
+    let (folder, room) = room();
+    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
+    let whole = folder.path().join("whole");
+    succeed(&text(&train(&config, &whole, &[])));
+    let mut killed = 0;
+    for mebibytes in (48..=208).step_by(8) {
+        std::fs::write(group.join(limit), (mebibytes << 20_u64).to_string()).unwrap();
+        let output = Command::new("bash")
+            .args([
+                "-c",
+                "echo $$ > $0/cgroup.procs; exec \"$@\"",
+                arg(&group),
+                env!("CARGO_BIN_EXE_globalsplat"),
+            ])
+            .args(train(&config, &run, &[]))
+            .env("OMP_NUM_THREADS", "1")
+            .output()
+            .expect("a shell");
+        match output.status.code() {
+            Some(0) => {}
+            None => killed += 1,
+            code => panic!("exit code {code:?}: {}", String::from_utf8_lossy(&output.stderr)),
+        }
+    }
+    std::fs::remove_dir(&group).unwrap();
+    assert!(killed > 0);
+    goes_on_as(&config, &run, &whole);
 }
