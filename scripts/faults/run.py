@@ -454,8 +454,8 @@ def check(op, fault):
         looks = re.search(r"/out(/\.globalsplat-probe|/\.lock)?$", done.hit[0])
         if op.waits and not sticky and kind in ("ENOSPC", "torn") and not looks:
             wrong.append("it doesn't wait for room")
-        # Where renames fail for good, nobody can take one back.
-        wrong += tree.mixes(op.trees, op.unit_of, crashed=sticky == 1 and group in ("rename", "any"))
+        # Where renames fail for good, of anything or onto this one, nobody can take one back: the next run does.
+        wrong += tree.mixes(op.trees, op.unit_of, crashed=sticky and group in ("rename", "any"))
     return "right" if done.code == 0 else "refused", wrong, done
 
 

@@ -70,8 +70,9 @@ pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Resul
     let result = attempt();
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
-        // What refused one rename may refuse the next.
-        let _ = (0..3).any(|_| path.exists() || fs::rename(&retired, path).is_ok());
+        if !path.exists() {
+            let _ = fs::rename(&retired, path);
+        }
         return result;
     }
     sync_parent(path);
