@@ -73,7 +73,7 @@ pub fn main() -> ExitCode {
     };
     memory::end_as_failed();
     #[cfg(target_os = "linux")]
-    neighbours::heed();
+    let _heeding = neighbours::heed();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| match cli.command {

@@ -7,8 +7,8 @@
 //! depend.
 
 use std::fs::read_to_string;
-use std::sync::mpsc::{Sender, channel};
-use std::thread::{Builder, JoinHandle, sleep};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};
 
@@ -19,13 +19,13 @@ const INTERVAL: Duration = Duration::from_millis(200);
 const CROWDED: f64 = 0.25;
 const QUIET: f64 = 0.1;
 
-/// Heeds other processes until this one ends. Where it can't be known what they do, threads go on waiting as they do.
-pub fn heed() {
-    let watch = || {
+/// Heeds other processes while this is held. Where it can't be known what they do, threads go on waiting as they do.
+pub fn heed() -> Option<Background> {
+    // Refused, it is as if nobody else were there.
+    Background::start("neighbours", |until: Receiver<()>| {
         let mut crowds = Vec::new();
         let mut before = Times::now();
-        loop {
-            sleep(INTERVAL);
+        while until.recv_timeout(INTERVAL) == Err(RecvTimeoutError::Timeout) {
             let now = Times::now();
             let (Some(then), Some(later)) = (&before, &now) else { return };
             let threads = tch::get_num_threads() as usize;
@@ -35,39 +35,42 @@ pub fn heed() {
             } else if missing > CROWDED && crowds.is_empty() {
                 // Until there are more threads than cores: one team, but for who asked for fewer threads.
                 let teams = (later.cores + 1).saturating_sub(threads).div_ceil(threads - 1);
-                crowds.extend((0..teams).map_while(|_| Crowd::start()));
+                crowds.extend((0..teams).map_while(|_| crowd()));
             }
             before = now;
         }
-    };
-    // Refused, it is as if nobody else were there.
-    let _ = Builder::new().name("neighbours".into()).spawn(watch);
+    })
 }
 
 /// A team of threads more that libgomp manages, asleep, while this is held.
-struct Crowd {
-    /// Until it is dropped, the thread stays.
-    stay: Option<Sender<()>>,
+fn crowd() -> Option<Background> {
+    Background::start("crowd", |until: Receiver<()>| {
+        // Large enough that libtorch shares it among threads: one that isn't libgomp's gets a team of its own, and keeps it
+        // until it ends.
+        let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
+        let _ = until.recv();
+    })
+}
+
+/// A thread that is told to end, and waited for, when this is dropped: one that is left to itself may still be inside libtorch
+/// when the process takes that down.
+pub struct Background {
+    tell: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Crowd {
-    fn start() -> Option<Crowd> {
-        let (stay, stays) = channel::<()>();
-        let team = move || {
-            // Large enough that libtorch shares it among threads: one that isn't libgomp's gets a team of its own, and keeps it
-            // until it ends.
-            let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
-            let _ = stays.recv();
-        };
-        let thread = Builder::new().name("crowd".into()).spawn(team).ok()?;
-        Some(Crowd { stay: Some(stay), thread: Some(thread) })
+impl Background {
+    /// None where the system refuses a thread.
+    fn start(name: &str, work: impl FnOnce(Receiver<()>) + Send + 'static) -> Option<Background> {
+        let (tell, until) = channel();
+        let thread = Builder::new().name(name.into()).spawn(move || work(until)).ok()?;
+        Some(Background { tell: Some(tell), thread: Some(thread) })
     }
 }
 
-impl Drop for Crowd {
+impl Drop for Background {
     fn drop(&mut self) {
-        self.stay = None;
+        self.tell = None;
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -125,6 +128,7 @@ fn busy_ticks(line: &str, ours: impl Fn(usize) -> bool) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::thread::sleep;
 
     #[test]
     fn ticks_are_of_our_cores_and_leave_out_waiting() {
@@ -158,20 +162,31 @@ mod tests {
         assert!(others > 0.2, "{others}");
     }
 
+    /// Threads of this process that are called so. One of a team has the name of the thread that it was made for.
+    fn called(name: &str) -> usize {
+        let tasks = std::fs::read_dir("/proc/self/task").unwrap();
+        let names = tasks.filter_map(|task| read_to_string(task.ok()?.path().join("comm")).ok());
+        names.filter(|found| found.trim_end() == name).count()
+    }
+
+    fn becomes(name: &str, count: usize) -> bool {
+        (0..5000).any(|_| called(name) == count || (sleep(Duration::from_millis(1)), false).1)
+    }
+
     #[test]
     fn a_crowd_is_there_while_it_is_held() {
-        // A thread of a team has the name of the one that it was made for.
-        let there = || {
-            let tasks = std::fs::read_dir("/proc/self/task").unwrap();
-            let names = tasks.filter_map(|task| read_to_string(task.ok()?.path().join("comm")).ok());
-            names.filter(|name| name == "crowd\n").count()
-        };
-        let becomes =
-            |count: usize| (0..5000).any(|_| there() == count || (sleep(Duration::from_millis(1)), false).1);
         tch::set_num_threads(3);
-        let crowd = Crowd::start().unwrap();
-        assert!(becomes(3), "{}", there());
+        let crowd = crowd().unwrap();
+        assert!(becomes("crowd", 3), "{}", called("crowd"));
         drop(crowd);
-        assert!(becomes(0), "{}", there());
+        assert!(becomes("crowd", 0), "{}", called("crowd"));
+    }
+
+    #[test]
+    fn nobody_watches_once_the_program_ends() {
+        let heeding = heed();
+        assert!(becomes("neighbours", 1), "{}", called("neighbours"));
+        drop(heeding);
+        assert!(becomes("neighbours", 0), "{}", called("neighbours"));
     }
 }
