@@ -86,7 +86,7 @@ def main():
     kept.write_text(config)
     rooms = out / "rooms"
     if not rooms.is_dir():
-        command = [PROGRAM, "synth", "--out", rooms, "--scenes", "8", "--frames", "18", "--size", "64", "--seed", "5"]
+        command = [PROGRAM, "synth", "--gaussians", "--out", rooms, "--scenes", "8", "--frames", "18", "--size", "64", "--seed", "5"]
         subprocess.run(command, check=True, stdout=sys.stderr)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = {

@@ -28,7 +28,7 @@ if [ ${#scenes[@]} -eq 0 ]; then
     [ "$captures" = none ] || echo "demo: there is no capture in $captures" >&2
     echo "demo: rooms are made and photographed" >&2
     captures="$out/captures"
-    "$globalsplat" synth --out "$captures" --scenes 2 --frames 12
+    "$globalsplat" synth --gaussians --out "$captures" --scenes 2 --frames 12 --size 256
     find_scenes "$captures"
 fi
 list="$(printf ', "%s"' "${scenes[@]}")"

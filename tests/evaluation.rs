@@ -19,7 +19,18 @@ impl Set {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let captures = folder.path().join("captures");
-        succeed(&["synth", "--out", arg(&captures), "--scenes", "3", "--frames", "5"]);
+        succeed(&[
+            "synth",
+            "--gaussians",
+            "--out",
+            arg(&captures),
+            "--scenes",
+            "3",
+            "--frames",
+            "5",
+            "--size",
+            "256",
+        ]);
         succeed(&["pack", arg(&captures), "--out", arg(&folder.path().join("chunks"))]);
         std::fs::create_dir(folder.path().join("splats")).unwrap();
         for room in ["room_000", "room_001", "room_002"] {

@@ -41,7 +41,8 @@ fn synth_replaces_its_own_rooms_alone() {
         let (folder, room) = room();
         let file = put(room.join(name));
         let before = contents(&room);
-        let error = refuse(&["synth", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
+        let error =
+            refuse(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
         assert!(error.contains("room_000: the output is a folder with"), "{error}");
         assert_kept(&file);
         assert_eq!(contents(&room), before);
@@ -49,12 +50,13 @@ fn synth_replaces_its_own_rooms_alone() {
     let (folder, capture) = room();
     std::fs::remove_file(capture.join("truth.ply")).unwrap();
     let before = contents(&capture);
-    let error = refuse(&["synth", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
+    let error =
+        refuse(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
     assert!(error.contains("a capture without truth.ply"), "{error}");
     assert_eq!(contents(&capture), before);
 
     let (folder, room) = room();
-    succeed(&["synth", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
+    succeed(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
     assert_eq!(contents(&room).len(), 2 + 3);
 }
 

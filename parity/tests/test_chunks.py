@@ -20,7 +20,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("captures")
-    assert run("synth", "--out", folder, "--frames", 5, "--size", 24).returncode == 0
+    assert run("synth", "--gaussians", "--out", folder, "--frames", 5, "--size", 24).returncode == 0
     return folder / "room_000"
 
 

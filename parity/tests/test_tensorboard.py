@@ -42,7 +42,7 @@ def run(*arguments):
 def trained(tmp_path_factory):
     """A run that was killed after step 10, and then went on from the checkpoint before step 8."""
     folder = tmp_path_factory.mktemp("tensorboard")
-    run("synth", "--out", folder / "captures", "--frames", 9, "--size", 40)
+    run("synth", "--gaussians", "--out", folder / "captures", "--frames", 9, "--size", 40)
     (folder / "config.toml").write_text(CONFIG.replace("CAPTURES", str(folder / "captures")))
     train = ["train", "--config", folder / "config.toml", "--out", folder / "run"]
     run(*train, "--set", "train.steps=11", "--set", "train.checkpoint_every=4")

@@ -337,7 +337,7 @@ def operations(bench, only):
     source = (REPOSITORY / "tests/common/program.rs").read_text()
     config = re.search(r'TINY_CONFIG: &str = r#"(.*?)"#', source, re.DOTALL)[1]
     rooms, room = inputs / "rooms", inputs / "rooms/room_000"
-    bench.make("synth", "--out", rooms, "--scenes", 2, "--frames", 9, "--size", 40)
+    bench.make("synth", "--gaussians", "--out", rooms, "--scenes", 2, "--frames", 9, "--size", 40)
     tiny, weights = inputs / "tiny.toml", inputs / "tiny.safetensors"
     config = config.replace("[data]", f"[data]\ncaptures = [{json.dumps(str(room))}]")
     tiny.write_text(config + "validate_every = 2\n")
@@ -378,7 +378,7 @@ def operations(bench, only):
 
     def packed():
         # Photos of more than a megabyte, for chunks of one each.
-        bench.make("synth", "--out", inputs / "large", "--scenes", 2, "--frames", 9, "--size", 256)
+        bench.make("synth", "--gaussians", "--out", inputs / "large", "--scenes", 2, "--frames", 9, "--size", 256)
         command = ["pack", inputs / "large", "--out", out, "--chunk-size", 1, "--json"]
         # No chunk is replaced, so it begins where an earlier one was interrupted.
         bench.make(*command)
@@ -387,8 +387,8 @@ def operations(bench, only):
         return Operation(bench, "pack", command).take()
 
     def synthesized():
-        bench.make("synth", "--out", out, "--frames", 4, "--size", 16, "--seed", 7)
-        command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--json"]
+        bench.make("synth", "--gaussians", "--out", out, "--frames", 4, "--size", 16, "--seed", 7)
+        command = ["synth", "--gaussians", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--json"]
         return Operation(bench, "synth", command, whole_room).take()
 
     def aged(name, command, keep=(), **more):

@@ -2,11 +2,13 @@
 
 mod loader;
 mod raster;
+mod synth;
 mod train;
 mod video;
 
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use raster::{RasterReport, bench_raster, made_up_scene};
+pub use synth::{SynthReport, bench_synth};
 pub use train::{TrainReport, bench_train};
 
 use serde::Serialize;

@@ -2,7 +2,9 @@ use super::bench_train::Train;
 use super::{parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use globalsplat::bench::{RasterReport, Spread, bench_loader, bench_raster, made_up_scene, made_up_videos};
+use globalsplat::bench::{
+    RasterReport, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
+};
 use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
@@ -22,6 +24,7 @@ pub struct Bench {
 enum Part {
     Raster(Raster),
     Loader(Loader),
+    Synth(Synth),
     Train(Train),
 }
 
@@ -30,6 +33,7 @@ impl Bench {
         match self.part {
             Part::Raster(raster) => raster.run(),
             Part::Loader(loader) => loader.run(),
+            Part::Synth(synth) => synth.run(),
             Part::Train(train) => train.run(),
         }
     }
@@ -251,4 +255,45 @@ fn print_report(r: &RasterReport) {
         println!("  {name:<16} {:>6.2} Gpairs/s {:>6.1} %", rate.gpairs_per_second, 1e2 * rate.share_of_peak);
     }
     println!("working memory {:.0} MB", r.working_bytes as f64 * 1e-6);
+}
+
+/// Made-up videos: views a second of one core, four rays a pixel, with shadows.
+#[derive(Args)]
+#[command(after_help = "Example:\n  globalsplat bench synth --size 256")]
+pub struct Synth {
+    /// Worlds
+    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..))]
+    videos: u64,
+    /// Views of each
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    frames: u32,
+    /// Side of a view in pixels
+    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    size: u32,
+    /// Print the measurements as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Synth {
+    fn run(self) -> Result<()> {
+        let bar = progress::bar(self.videos, "worlds");
+        let report = bench_synth(self.videos, self.frames as usize, self.size, || bar.inc(1));
+        bar.finish_and_clear();
+        if self.json {
+            print_json(&serde_json::to_value(&report)?);
+            return Ok(());
+        }
+        let [height, width] = report.size;
+        println!(
+            "{} worlds of {} triangles, {} views of {width}x{height}, {} rays a pixel and their shadows",
+            report.videos, report.triangles, report.views, report.rays_per_pixel
+        );
+        println!(
+            "{:.1} views/s on one core, {:.2} 10^6 rays/s",
+            report.views_per_second, report.megarays_per_second
+        );
+        println!("{:.2} s until a world can be looked at, all cores", report.seconds_per_world);
+        Ok(())
+    }
 }

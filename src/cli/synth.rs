@@ -1,52 +1,134 @@
 use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::write_room;
-use globalsplat::error::Error;
-use globalsplat::io::check_writable_dir;
+use globalsplat::data::{ChunkWriter, MadeUp, read_pictures, write_room};
+use globalsplat::eval::{EvaluationIndex, SceneFrames};
+use globalsplat::io::{
+    check_writable_dir, check_writable_file, tile_horizontally, tile_vertically, write_png,
+};
 use globalsplat::scene::ImageSize;
+use globalsplat::synth::VideoSettings;
+use rayon::prelude::*;
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
+use tch::Tensor;
 
-/// Make captures of procedural rooms, for trying things without photos.
+/// Of photos in a chunk, about.
+const CHUNK_BYTES: usize = 20_000_000;
+
+/// Make videos of made-up worlds, with exact cameras, to train and to judge by.
+///
+/// Rooms and open scenes full of things of all shapes and surfaces, ray traced, in the chunks that RealEstate10K comes in, with
+/// an index.json and an evaluation_index.json. The same seed makes the same bytes. Training makes them as it goes where
+/// data.captures names "synth:seed=1,scenes=10000".
 #[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat synth --out captures --scenes 2 --seed 1")]
+#[command(after_help = "Examples:\n  \
+    globalsplat synth --out worlds/train --scenes 2000\n  \
+    globalsplat synth --out worlds/test --scenes 50 --first 2000 --sheet worlds.png")]
 pub struct Synth {
-    /// Folder for the captures: room_000, room_001, …
+    /// Folder for index.json, 000000.torch, …
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Number of rooms
+    /// Number of videos
     #[arg(long, value_name = "N", default_value_t = 1)]
     scenes: u64,
-    /// Other rooms for another seed
+    /// Other worlds for another seed
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
+    /// The number of the first video, to go on where others of the seed end
+    #[arg(long, value_name = "I", default_value_t = 0)]
+    first: u64,
     /// Photos of each
-    #[arg(long, value_name = "N", default_value_t = 24)]
-    frames: usize,
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    frames: u32,
     /// Side of a photo in pixels
-    #[arg(long, value_name = "PIXELS", default_value_t = 256)]
+    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u32).range(16..=8192))]
     size: u32,
+    /// PNG and JPEG files to be seen on walls and things
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<PathBuf>,
+    /// A picture of what came out, a video a row
+    #[arg(long, value_name = "FILE")]
+    sheet: Option<PathBuf>,
+    /// Captures of a small room made of Gaussians instead, its splat beside them
+    #[arg(long, conflicts_with_all = ["first", "pictures", "sheet"])]
+    gaussians: bool,
     /// Print what was written as one JSON object
     #[arg(long)]
     json: bool,
 }
 
+/// Videos on a sheet at most, and pictures of each.
+const SHEET: (usize, usize) = (16, 8);
+
 impl Synth {
     pub fn run(self) -> Result<()> {
-        if self.frames < 2 {
-            return Err(Error::Request(format!("--frames is {}, expected 2 or more", self.frames)).into());
-        }
-        if !(16..=8192).contains(&self.size) {
-            return Err(Error::Request(format!("--size is {}, expected 16 to 8192", self.size)).into());
-        }
         check_writable_dir(&self.out)?;
+        if let Some(sheet) = &self.sheet {
+            check_writable_file(sheet)?;
+        }
+        if self.gaussians { self.write_rooms() } else { self.write_videos() }
+    }
+
+    fn image_size(&self) -> ImageSize {
+        ImageSize { height: self.size, width: self.size }
+    }
+
+    fn write_videos(&self) -> Result<()> {
+        let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
+        let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
+        let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
+        let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
+        let bar = progress::bar(self.scenes, "videos");
+        let (mut index, mut rows) = (BTreeMap::new(), vec![]);
+        let numbers: Vec<usize> = (0..self.scenes as usize).collect();
+        // So many worlds at once: most of making one is work for a single thread.
+        let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
+            numbers.par_iter().map(|&number| videos.capture(number)).collect::<Result<Vec<_>, _>>()
+        });
+        for captures in made {
+            for capture in captures? {
+                writer.add(&capture)?;
+                index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
+                if self.sheet.is_some() && rows.len() < SHEET.0 {
+                    let shown: Vec<usize> =
+                        (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
+                    let pictures: Vec<Tensor> =
+                        capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();
+                    rows.push(tile_horizontally(&pictures));
+                }
+                bar.inc(1);
+            }
+        }
+        let chunks = writer.finish()?;
+        let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
+        index.write()?;
+        if let Some(sheet) = &self.sheet {
+            write_png(sheet, &tile_vertically(&rows))?;
+        }
+        bar.finish_and_clear();
+        let (out, scenes) = (self.out.display(), self.scenes);
+        if self.json {
+            print_json(
+                &json!({ "out": self.out, "scenes": scenes, "chunks": chunks, "index": index.file, "sheet": self.sheet }),
+            );
+        } else {
+            println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
+            if let Some(sheet) = &self.sheet {
+                println!("{}: the first of them", sheet.display());
+            }
+        }
+        Ok(())
+    }
+
+    fn write_rooms(&self) -> Result<()> {
         let bar = progress::bar(self.scenes, "scenes");
         let mut captures = vec![];
         for scene in 0..self.scenes {
             let path = self.out.join(format!("room_{scene:03}"));
-            let size = ImageSize { height: self.size, width: self.size };
-            write_room(&path, self.seed.wrapping_mul(1_000_003).wrapping_add(scene), self.frames, size)?;
+            let seed = self.seed.wrapping_mul(1_000_003).wrapping_add(scene);
+            write_room(&path, seed, self.frames as usize, self.image_size())?;
             captures.push(path);
             bar.inc(1);
         }

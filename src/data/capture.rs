@@ -4,6 +4,7 @@ use super::pixels::{Distortion, Planes, fit};
 use crate::error::{Error, Result};
 use crate::io;
 use crate::scene::{Camera, ImageSize, check_pose};
+use crate::synth::Video;
 use image::RgbImage;
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -36,6 +37,8 @@ pub(super) enum Photo {
         /// As errors call it.
         name: PathBuf,
     },
+    /// Not taken yet: picture `index` of a made-up video.
+    Made { video: Arc<Video>, index: usize },
 }
 
 impl Photo {
@@ -43,6 +46,7 @@ impl Photo {
     fn file(&self) -> &Path {
         match self {
             Photo::File(path) | Photo::Part { name: path, .. } => path,
+            Photo::Made { .. } => Path::new("a made-up video"),
         }
     }
 
@@ -50,6 +54,7 @@ impl Photo {
         match self {
             Photo::File(path) => Ok(std::fs::read(path).map_err(Error::read(path))?.into()),
             Photo::Part { file, bytes, .. } => Ok(file[bytes.clone()].into()),
+            Photo::Made { video, index } => Ok(io::encode_photo(&video.photo(*index), true)?.into()),
         }
     }
 }
@@ -123,7 +128,7 @@ impl Capture {
         path.is_file()
             && self.frames.iter().any(|frame| match &frame.photo {
                 Photo::File(photo) => photo.file_name() == name && is_same(photo),
-                Photo::Part { .. } => false,
+                Photo::Part { .. } | Photo::Made { .. } => false,
             })
     }
 
@@ -161,6 +166,9 @@ impl Capture {
     }
 
     fn read_photo(&self, frame: &Frame) -> Result<RgbImage> {
+        if let Photo::Made { video, index } = &frame.photo {
+            return Ok(video.photo(*index));
+        }
         let photo = self.decode(frame, &frame.photo.read()?)?;
         Ok(frame.distortion.remove(photo.pixels, &frame.camera.intrinsics))
     }

@@ -2,9 +2,11 @@
 
 use super::capture::Capture;
 use super::formats::{Chunk, INDEX_FILE, capture_folders, folder_name, open_capture};
+use super::made_up::MadeUp;
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The part of a data set that a model learns from, or the one it is judged by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,11 +36,22 @@ impl Split {
 /// Captures that are read from disk together, and their names.
 #[derive(Debug, Clone)]
 pub struct SceneGroup {
-    /// A chunk, or a capture's folder.
+    /// As [`SceneGroup::path`].
     path: PathBuf,
-    is_chunk: bool,
+    source: Source,
     /// Which of a chunk's scenes belong to the data set; a folder's own name, or its path where others have that name.
     pub keys: Vec<String>,
+}
+
+/// What scenes are read from.
+#[derive(Debug, Clone)]
+enum Source {
+    /// A file of one scene or more.
+    Chunk,
+    /// A capture of another format.
+    Folder,
+    /// The video of that number among those.
+    MadeUp(Arc<MadeUp>, usize),
 }
 
 /// The captures of one split, which are found now and read later.
@@ -59,7 +72,7 @@ pub enum OpenGroup {
 }
 
 impl Dataset {
-    /// The data set at `root`: a folder of chunks with an `index.json`, {key: chunk}, or one with such folders named `train`
+    /// The data set at `root`: made-up videos by their name; a folder of chunks with an `index.json`, {key: chunk}, or one with such folders named `train`
     /// and `test`, of which `split` is taken; else every capture in it, as by [`super::find_captures`], but for those in the
     /// folder of the other part.
     ///
@@ -67,6 +80,9 @@ impl Dataset {
     /// Nothing of that kind there, or an index that is no such object. Chunks that the index names are looked for when they
     /// are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
+        if let Some(videos) = MadeUp::named(root)? {
+            return Ok(Dataset { name: root.to_string_lossy().into_owned(), groups: made_up_groups(videos) });
+        }
         let name = folder_name(root);
         let indexed =
             [root.to_owned(), root.join(split.folder())].into_iter().find(|f| f.join(INDEX_FILE).is_file());
@@ -97,18 +113,19 @@ impl SceneGroup {
     /// # Errors
     /// A chunk or capture that is missing or broken.
     pub fn open(&self) -> Result<OpenGroup> {
-        match self.is_chunk {
-            true => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
-            false => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
+        match &self.source {
+            Source::Chunk => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
+            Source::Folder => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
+            Source::MadeUp(videos, index) => Ok(OpenGroup::Capture(Box::new(videos.capture(*index)?))),
         }
     }
 
-    /// Whether it is a chunk, of one scene or more, and no capture of another format.
-    pub fn is_chunk(&self) -> bool {
-        self.is_chunk
+    /// Whether it is a capture's folder, of which an open capture holds little more than the cameras.
+    pub fn is_folder(&self) -> bool {
+        matches!(self.source, Source::Folder)
     }
 
-    /// The chunk, or the capture's folder.
+    /// The chunk, or the capture's folder; of all made-up videos the same, as their keys tell them apart.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -146,8 +163,18 @@ fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
         }
         chunks.entry(chunk).or_default().push(key);
     }
-    let group = |(chunk, keys)| SceneGroup { path: folder.join(chunk), is_chunk: true, keys };
+    let group = |(chunk, keys)| SceneGroup { path: folder.join(chunk), source: Source::Chunk, keys };
     Ok(chunks.into_iter().map(group).collect())
+}
+
+fn made_up_groups(videos: MadeUp) -> Vec<SceneGroup> {
+    let videos = Arc::new(videos);
+    let group = |(index, key)| SceneGroup {
+        path: PathBuf::from(MadeUp::PREFIX),
+        source: Source::MadeUp(videos.clone(), index),
+        keys: vec![key],
+    };
+    videos.keys().into_iter().enumerate().map(group).collect()
 }
 
 /// Of the captures in `root` those that aren't in `except`.
@@ -167,6 +194,6 @@ fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
         _ => folder.strip_prefix(root).unwrap_or(folder).to_string_lossy().into_owned(),
     };
     let keys: Vec<String> = folders.iter().zip(&names).map(|(folder, name)| key(folder, name)).collect();
-    let group = |(path, key)| SceneGroup { path, is_chunk: false, keys: vec![key] };
+    let group = |(path, key)| SceneGroup { path, source: Source::Folder, keys: vec![key] };
     Ok(folders.into_iter().zip(keys).map(group).collect())
 }

@@ -7,6 +7,7 @@ mod dataset;
 mod formats;
 mod holdout;
 mod loading;
+mod made_up;
 mod pixels;
 mod room;
 
@@ -19,6 +20,7 @@ pub use formats::{
 };
 pub use holdout::Holdout;
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Sample, SceneGroups, TrainingScenes};
+pub use made_up::{MadeUp, read_pictures};
 pub use pixels::{Planes, fit};
 pub use room::write_room;
 

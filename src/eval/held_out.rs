@@ -53,8 +53,8 @@ impl HeldOut {
                 split_views(capture, config.holdout)?;
                 scenes.push(HeldOutScene::Views(capture.clone()));
             }
-            let in_chunks = spread(training.chunks(), config.validation_scenes);
-            scenes.extend(in_chunks.into_iter().map(|(group, key)| HeldOutScene::ViewsInChunk(group, key)));
+            let others = spread(training.others(), config.validation_scenes);
+            scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInChunk(group, key)));
         }
         let mut groups = vec![];
         for path in config.validation_paths()? {
@@ -64,9 +64,9 @@ impl HeldOut {
         for (group, key) in spread(&groups, config.validation_scenes) {
             let capture = group.open()?.capture(&key)?;
             split_scene(&capture, config)?;
-            let place = match group.is_chunk() {
-                true => place(group.path(), Some(&key)),
-                false => place(capture.file(), None),
+            let place = match group.is_folder() {
+                true => place(capture.file(), None),
+                false => place(group.path(), Some(&key)),
             };
             if trained.contains(&place) {
                 trained_on.push(capture.name.clone());
@@ -170,9 +170,9 @@ fn place(file: &Path, key: Option<&String>) -> Place {
 /// Of every scene of `training`.
 fn places(training: &TrainingScenes) -> BTreeSet<Place> {
     let captures = training.captures().iter().map(|capture| place(capture.file(), None));
-    let chunks = training.chunks().iter();
-    let in_chunks = chunks.flat_map(|group| group.keys.iter().map(|key| place(group.path(), Some(key))));
-    captures.chain(in_chunks).collect()
+    let others = training.others().iter();
+    let others = others.flat_map(|group| group.keys.iter().map(|key| place(group.path(), Some(key))));
+    captures.chain(others).collect()
 }
 
 /// At most so many scenes of `groups`, spread evenly over all of them.

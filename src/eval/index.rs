@@ -1,17 +1,25 @@
 //! Evaluation indices: which frames of which scenes are context, and which are targets.
 
 use crate::error::{Error, Result};
-use serde::Deserialize;
+use crate::io::write_json;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The frames of one scene.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFrames {
     /// Shown to the model.
     pub context: Vec<usize>,
     /// What has to be matched.
     pub target: Vec<usize>,
+}
+
+impl SceneFrames {
+    /// Of a video of `count` frames, two at least: every other one is shown, and every other one of the rest has to be matched.
+    pub fn alternating(count: usize) -> Self {
+        SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
+    }
 }
 
 /// The contents of an index file: `{scene: {"context": [frames], "target": [frames]}}`, where null stands for a scene that is
@@ -47,6 +55,14 @@ impl EvaluationIndex {
             }
         }
         Ok(EvaluationIndex { file: file.to_owned(), scenes })
+    }
+
+    /// Writes it where it says.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn write(&self) -> Result<()> {
+        write_json(&self.file, &self.scenes)
     }
 
     /// The file's name.

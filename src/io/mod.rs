@@ -13,7 +13,8 @@ mod weights;
 pub use atomic::{check_writable_dir, check_writable_file};
 pub use film::write_film;
 pub use images::{
-    Photo, colourize_depth, decode_photo, read_image, tensor_from_rgb, tile_horizontally, write_png,
+    Photo, colourize_depth, decode_photo, read_image, tensor_from_rgb, tile_horizontally, tile_vertically,
+    write_png,
 };
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use splat::{Splat, read_splat, write_splat};
@@ -23,7 +24,5 @@ pub(crate) use append::AppendFile;
 pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
-pub(crate) use images::{
-    encode_photo, encoded_image_size, enlarge, read_image_size, tile_vertically, write_jpeg,
-};
+pub(crate) use images::{encode_photo, encoded_image_size, enlarge, read_image_size, write_jpeg};
 pub(crate) use pretrained::pretrained_folders;

@@ -1,146 +1,25 @@
-//! Procedural scenes: a small room made of Gaussians, and a walk through it. They let everything run, and be tested, where no
-//! photos are at hand.
+//! Made-up worlds and videos taken in them: endless posed photos for where there are none, or too few.
+//!
+//! A world is made of plain shapes ([`shapes`]), which make things ([`things`]), which stand in rooms ([`room`]) and under the sky
+//! ([`open`]); textures of many families cover them. A [`Video`] looks at it along a path through its free space ([`walk`]), by
+//! rays through triangles ([`tracer`]), and a sensor makes bytes of that.
 
-use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics};
-use glam::{DMat4, DQuat, DVec3};
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use tch::{Kind, Tensor};
+mod gaussian_room;
+mod light;
+mod maker;
+mod material;
+mod mesh;
+mod noise;
+mod open;
+mod room;
+mod sensor;
+mod shapes;
+mod texture;
+mod things;
+mod tracer;
+mod video;
+mod walk;
 
-/// Y_0, by which a colour becomes an SH coefficient.
-const SH_C0: f64 = 0.28209479177387814;
-/// Distance between the Gaussians of a surface, in metres.
-const SPACING: f64 = 0.06;
-
-/// A room, and a walk through it.
-#[derive(Debug)]
-pub struct Room {
-    /// Its surfaces.
-    pub gaussians: Gaussians,
-    /// Where photos are taken from.
-    pub cameras: Vec<Camera>,
-}
-
-impl Room {
-    /// The room of `seed`, with so many cameras for pictures of `size`.
-    pub fn new(seed: u64, frames: usize, size: ImageSize) -> Self {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let gaussians = surfaces(&mut random);
-        Room { gaussians, cameras: walk(&mut random, frames, size) }
-    }
-}
-
-/// A step to the right with a slight turn, looking into the room.
-fn walk(random: &mut impl Rng, frames: usize, size: ImageSize) -> Vec<Camera> {
-    let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = 0.9 * width.max(height);
-    let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
-    let (sway, turn) = (random.random_range(0.05..0.15), random.random_range(0.1..0.25));
-    (0..frames)
-        .map(|i| {
-            let t = i as f64 / (frames.max(2) - 1) as f64 - 0.5;
-            let eye = DVec3::new(1.2 * t, sway * (6. * t).sin(), 0.4 * t);
-            let rotation = DQuat::from_rotation_y(-turn * 2. * t);
-            let c2w = DMat4::from_rotation_translation(rotation, eye);
-            Camera { intrinsics, c2w, width: size.width, height: size.height }
-        })
-        .collect()
-}
-
-/// A patch of the room's surface while it is built: a flat, opaque, coloured Gaussian.
-struct Patch {
-    mean: DVec3,
-    normal: DVec3,
-    colour: DVec3,
-}
-
-fn surfaces(random: &mut impl Rng) -> Gaussians {
-    let mut patches = vec![];
-    let mut colour = || {
-        DVec3::new(
-            random.random_range(0.2..0.9),
-            random.random_range(0.2..0.9),
-            random.random_range(0.2..0.9),
-        )
-    };
-    // Back wall, floor, ceiling and two side walls, each a checkerboard of two colours.
-    let walls = [
-        (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
-        (DVec3::new(-2., 1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),
-        (DVec3::new(-2., -1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),
-        (DVec3::new(-2., -1.2, 1.), DVec3::Y * 2.4, DVec3::Z * 3.),
-        (DVec3::new(2., -1.2, 1.), DVec3::Y * 2.4, DVec3::Z * 3.),
-    ];
-    for (corner, along, across) in walls {
-        let colours = [colour(), colour()];
-        checkerboard(&mut patches, corner, along, across, colours);
-    }
-    let spheres: Vec<(DVec3, f64, [DVec3; 2])> = (0..4)
-        .map(|i| {
-            let colours = [colour(), colour()];
-            let x = -1.2 + 0.8 * i as f64;
-            (
-                DVec3::new(x, 0.2 + 0.25 * (i as f64 * 1.7).sin(), 2.4 + 0.5 * (i as f64 * 2.3).cos()),
-                0.35,
-                colours,
-            )
-        })
-        .collect();
-    for (centre, radius, colours) in spheres {
-        striped_sphere(&mut patches, centre, radius, colours);
-    }
-    gaussians_of(&patches)
-}
-
-fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: DVec3, colours: [DVec3; 2]) {
-    const SQUARE: f64 = 0.4;
-    let (columns, rows) = ((along.length() / SPACING) as usize, (across.length() / SPACING) as usize);
-    for row in 0..rows {
-        for column in 0..columns {
-            let (s, t) = ((column as f64 + 0.5) * SPACING, (row as f64 + 0.5) * SPACING);
-            let square = (s / SQUARE) as usize + (t / SQUARE) as usize;
-            patches.push(Patch {
-                mean: corner + along.normalize() * s + across.normalize() * t,
-                normal: along.cross(across).normalize(),
-                colour: colours[square % 2],
-            });
-        }
-    }
-}
-
-fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colours: [DVec3; 2]) {
-    let rings = (std::f64::consts::PI * radius / SPACING) as usize;
-    for ring in 0..rings {
-        let polar = std::f64::consts::PI * (ring as f64 + 0.5) / rings as f64;
-        let around = (2. * std::f64::consts::PI * radius * polar.sin() / SPACING).max(3.) as usize;
-        for k in 0..around {
-            let azimuth = std::f64::consts::TAU * k as f64 / around as f64;
-            let normal = DVec3::new(polar.sin() * azimuth.cos(), polar.cos(), polar.sin() * azimuth.sin());
-            patches.push(Patch { mean: centre + radius * normal, normal, colour: colours[ring / 3 % 2] });
-        }
-    }
-}
-
-fn gaussians_of(patches: &[Patch]) -> Gaussians {
-    let count = patches.len() as i64;
-    let tensor = |values: Vec<f64>, width: i64| {
-        Tensor::from_slice(&values).view([1, count, width]).to_kind(Kind::Float)
-    };
-    let flatten =
-        |value: fn(&Patch) -> DVec3| patches.iter().flat_map(|p| value(p).to_array()).collect::<Vec<f64>>();
-    let quaternions = patches
-        .iter()
-        .flat_map(|p| {
-            let [x, y, z, w] = DQuat::from_rotation_arc(DVec3::Z, p.normal).to_array();
-            [w, x, y, z]
-        })
-        .collect();
-    let scale = [0.6 * SPACING, 0.6 * SPACING, 0.05 * SPACING];
-    Gaussians {
-        means: tensor(flatten(|p| p.mean), 3),
-        scales: tensor(scale.repeat(patches.len()), 3),
-        quaternions: tensor(quaternions, 4),
-        opacities: tensor(vec![0.95; patches.len()], 1).squeeze_dim(-1),
-        sh: tensor(flatten(|p| (p.colour - 0.5) / SH_C0), 3).unsqueeze(2),
-    }
-}
+pub use gaussian_room::Room;
+pub use texture::Texture;
+pub use video::{Video, VideoSettings};

@@ -84,7 +84,7 @@ pub fn room() -> (TempDir, PathBuf) {
     static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
     let original = ORIGINAL.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a folder");
-        succeed(&["synth", "--out", arg(folder.path()), "--frames", "9", "--size", "40"]);
+        succeed(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "9", "--size", "40"]);
         folder
     });
     let folder = tempfile::tempdir().expect("a folder");

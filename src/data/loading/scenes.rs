@@ -42,58 +42,59 @@ fn decoded_bytes(capture: &Capture) -> u64 {
     pixels.fold(0, |sum, pixels| sum.saturating_add(pixels.saturating_mul(3)))
 }
 
-/// What a configuration names: captures, which are opened at once and kept, and chunks, which are read as they are needed.
+/// What a configuration names: captures, which are opened at once and kept, and the others, chunks and made-up videos, which are
+/// opened as they are needed.
 #[derive(Debug)]
 pub struct TrainingScenes {
     captures: Vec<Capture>,
-    chunks: Vec<SceneGroup>,
+    others: Vec<SceneGroup>,
 }
 
 impl TrainingScenes {
     /// Finds them by [`Dataset::open`], where there are parts in the one that is to be learned from.
     ///
     /// # Errors
-    /// Nothing known at one of `paths`, or a capture that breaks its format's rules. Chunks aren't read yet.
+    /// Nothing known at one of `paths`, or a capture that breaks its format's rules. The others aren't opened yet.
     pub fn find(paths: &[PathBuf]) -> Result<Self> {
-        let mut found = TrainingScenes { captures: vec![], chunks: vec![] };
+        let mut found = TrainingScenes { captures: vec![], others: vec![] };
         for path in paths {
             for group in Dataset::open(path, Split::Train)?.groups() {
-                match group.is_chunk() {
-                    true => found.chunks.push(group.clone()),
-                    false => found.captures.push(group.open()?.capture(&group.keys[0])?),
+                match group.is_folder() {
+                    true => found.captures.push(group.open()?.capture(&group.keys[0])?),
+                    false => found.others.push(group.clone()),
                 }
             }
         }
         Ok(found)
     }
 
-    /// Those that don't lie in chunks.
+    /// Those that are kept.
     pub fn captures(&self) -> &[Capture] {
         &self.captures
     }
 
-    /// Chunks with the others.
-    pub fn chunks(&self) -> &[SceneGroup] {
-        &self.chunks
+    /// The others, in chunks or made up.
+    pub fn others(&self) -> &[SceneGroup] {
+        &self.others
     }
 }
 
 impl SceneGroups for TrainingScenes {
     fn sizes(&self) -> Vec<usize> {
-        let chunks = self.chunks.iter().map(|chunk| chunk.keys.len());
-        self.captures.iter().map(|_| 1).chain(chunks).collect()
+        let others = self.others.iter().map(|group| group.keys.len());
+        self.captures.iter().map(|_| 1).chain(others).collect()
     }
 
     fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
         if let Some(capture) = self.captures.get(group) {
             return Ok(vec![Ok(capture.clone())]);
         }
-        let chunk = &self.chunks[group - self.captures.len()];
-        let opened = chunk.open()?;
-        Ok(chunk.keys.iter().map(|key| opened.capture(key)).collect())
+        let group = &self.others[group - self.captures.len()];
+        let opened = group.open()?;
+        Ok(group.keys.iter().map(|key| opened.capture(key)).collect())
     }
 
     fn decoded_bytes(&self) -> Option<u64> {
-        self.chunks.is_empty().then(|| self.captures.decoded_bytes())?
+        self.others.is_empty().then(|| self.captures.decoded_bytes())?
     }
 }

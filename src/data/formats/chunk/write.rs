@@ -5,6 +5,7 @@ use crate::data::capture::Capture;
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
 use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -59,10 +60,8 @@ impl ChunkWriter {
             let found = format!("{:?}, which {chunk} holds already", capture.name);
             return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
         }
-        let mut images = vec![];
-        for index in 0..capture.len() {
-            images.push(EncodedImage { bytes: capture.encoded(index)? });
-        }
+        let image = |index| Ok(EncodedImage { bytes: capture.encoded(index)? });
+        let images = (0..capture.len()).into_par_iter().map(image).collect::<Result<Vec<_>>>()?;
         let bytes: usize = images.iter().map(|image| image.bytes.len()).sum();
         if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
             self.write_chunk()?;

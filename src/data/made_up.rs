@@ -1,0 +1,115 @@
+//! Made-up videos, named where a data set is named: `synth:seed=1,scenes=10000`.
+
+use super::capture::{Capture, Frame, Photo};
+use super::pixels::Distortion;
+use crate::error::{Error, Result};
+use crate::io::read_image;
+use crate::scene::ImageSize;
+use crate::synth::{Texture, Video, VideoSettings};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// As an error tells it.
+const EXPECTED: &str =
+    "synth:seed=S,scenes=N and, if need be, first=I, frames=F, size=PIXELS, pictures=FOLDER";
+
+/// Videos of one seed, each made when it is asked for.
+#[derive(Debug, Clone)]
+pub struct MadeUp {
+    /// As it was written.
+    name: String,
+    seed: u64,
+    /// The number of the first video: others of the same seed can be kept for validation.
+    first: u64,
+    scenes: u64,
+    settings: VideoSettings,
+}
+
+impl MadeUp {
+    /// What such a name begins with.
+    pub(super) const PREFIX: &str = "synth:";
+
+    /// `scenes` videos of `seed`, from number `first` on.
+    pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> MadeUp {
+        let name = format!("{}seed={seed},first={first},scenes={scenes}", Self::PREFIX);
+        MadeUp { name, seed, first, scenes, settings }
+    }
+
+    /// What `path` names, if it is no path but made-up videos.
+    ///
+    /// # Errors
+    /// A name that begins as theirs, with a field that is missing, unknown or no number in its range.
+    pub fn named(path: &Path) -> Result<Option<MadeUp>> {
+        let Some(fields) = path.to_str().and_then(|name| name.strip_prefix(Self::PREFIX)) else {
+            return Ok(None);
+        };
+        let refuse = |found: &str| Error::input(path, "the made-up videos", found, EXPECTED);
+        let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, None, 0, 24, 128);
+        let mut pictures = vec![];
+        for field in fields.split(',') {
+            let (name, value) = field.split_once('=').ok_or_else(|| refuse(field))?;
+            let number = || value.parse::<u64>().map_err(|_| refuse(field));
+            match name {
+                "seed" => seed = number()?,
+                "scenes" => scenes = Some(number()?).filter(|scenes| (1..=1 << 32).contains(scenes)),
+                "first" => {
+                    first = Some(number()?).filter(|first| *first <= 1 << 32).ok_or_else(|| refuse(field))?
+                }
+                "frames" => frames = number()?,
+                "size" => size = number()?,
+                "pictures" => pictures = read_pictures(Path::new(value))?,
+                _ => return Err(refuse(field)),
+            }
+        }
+        if !(2..=10_000).contains(&frames) || !(16..=8192).contains(&size) {
+            return Err(refuse(&format!("{frames} frames of {size} pixels")));
+        }
+        let scenes = scenes.ok_or_else(|| refuse(fields))?;
+        let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
+        let settings = VideoSettings { frames, size, pictures };
+        Ok(Some(MadeUp { name: path.to_string_lossy().into_owned(), seed, first, scenes, settings }))
+    }
+
+    /// Names of the scenes.
+    pub fn keys(&self) -> Vec<String> {
+        (self.first..self.first + self.scenes).map(|index| format!("{}_{index:06}", self.seed)).collect()
+    }
+
+    /// Makes video `index` of them, its pictures not yet.
+    ///
+    /// # Errors
+    /// None but what every capture is checked for.
+    pub fn capture(&self, index: usize) -> Result<Capture> {
+        let number = self.first + index as u64;
+        let video = Arc::new(Video::new(self.seed, number, &self.settings));
+        let frame = |(index, &camera)| Frame {
+            photo: Photo::Made { video: video.clone(), index },
+            name: format!("{index:06}"),
+            camera,
+            distortion: Distortion::default(),
+        };
+        let frames = video.cameras().iter().enumerate().map(frame).collect();
+        Capture::new(format!("{}_{number:06}", self.seed), PathBuf::from(&self.name), frames)
+    }
+}
+
+/// Pictures that are to be seen on things: all that lie in `folder`.
+///
+/// # Errors
+/// No folder, none in it, or one that can't be read.
+pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
+    let entries = std::fs::read_dir(folder).map_err(Error::read(folder))?;
+    let mut files = vec![];
+    for entry in entries {
+        let path = entry.map_err(Error::read(folder))?.path();
+        let extension = path.extension().map(|e| e.to_ascii_lowercase());
+        if extension.is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|known| e == *known)) {
+            files.push(path);
+        }
+    }
+    if files.is_empty() {
+        return Err(Error::input(folder, "the pictures", "none", "PNG or JPEG files"));
+    }
+    files.sort();
+    files.iter().map(|file| Ok(Arc::new(Texture::of_picture(&read_image(file)?)))).collect()
+}

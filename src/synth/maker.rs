@@ -1,0 +1,125 @@
+//! A world while it is made: what is in it so far, and the dice.
+
+use super::material::Material;
+use super::mesh::Mesh;
+use super::noise::Noise;
+use super::texture::{Purpose, Texture};
+use super::tracer::Parts;
+use glam::{Affine2, Affine3A, Quat, Vec2, Vec3};
+use rand::Rng;
+use rand::distr::uniform::{SampleRange, SampleUniform};
+use rand_chacha::ChaCha8Rng;
+use std::f32::consts::TAU;
+use std::sync::Arc;
+
+/// Textures of one purpose in a world; things share them, as they do in a home.
+const SHARED: usize = 6;
+
+/// Puts things into a world.
+pub(super) struct Maker {
+    pub random: ChaCha8Rng,
+    pub parts: Parts,
+    /// Pictures that a user wants to see on things.
+    pub pictures: Vec<Arc<Texture>>,
+    textures: Vec<(Purpose, Arc<Texture>)>,
+}
+
+impl Maker {
+    pub fn new(random: ChaCha8Rng, pictures: Vec<Arc<Texture>>) -> Self {
+        Maker { random, parts: Parts::default(), pictures, textures: vec![] }
+    }
+
+    pub fn within<T: SampleUniform>(&mut self, range: impl SampleRange<T>) -> T {
+        self.random.random_range(range)
+    }
+
+    /// Between `least` and `most`, small ones more often: each doubling is as likely as another.
+    pub fn scaled(&mut self, least: f32, most: f32) -> f32 {
+        least * (most / least).powf(self.within(0. ..1.))
+    }
+
+    pub fn chance(&mut self, probability: f64) -> bool {
+        self.random.random_bool(probability)
+    }
+
+    pub fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
+        choices[self.within(0..choices.len())]
+    }
+
+    pub fn turn(&mut self) -> f32 {
+        self.within(0. ..TAU)
+    }
+
+    /// A unit vector of any direction.
+    pub fn direction(&mut self) -> Vec3 {
+        let (y, angle) = (self.within(-1f32..1.), self.turn());
+        let ring = (1. - y * y).sqrt();
+        Vec3::new(ring * angle.cos(), y, ring * angle.sin())
+    }
+
+    pub fn noise(&mut self) -> Noise {
+        Noise::new(self.random.random())
+    }
+
+    pub fn texture(&mut self, purpose: Purpose) -> Arc<Texture> {
+        let is_picture = matches!(purpose, Purpose::Poster | Purpose::Thing);
+        if is_picture && !self.pictures.is_empty() && self.chance(0.5) {
+            let index = self.within(0..self.pictures.len());
+            return self.pictures[index].clone();
+        }
+        let there: Vec<&Arc<Texture>> =
+            self.textures.iter().filter(|(of, _)| *of == purpose).map(|(_, texture)| texture).collect();
+        let turn = self.random.random_range(0..SHARED);
+        if purpose != Purpose::Poster && turn < there.len() {
+            return there[turn].clone();
+        }
+        let texture = Arc::new(Texture::draw(&mut self.random, purpose));
+        self.textures.push((purpose, texture.clone()));
+        texture
+    }
+
+    /// Anything that covers `purpose`: its own size and direction, matte or not.
+    pub fn material(&mut self, purpose: Purpose) -> Material {
+        let texture = self.texture(purpose);
+        let mut material = Material::matte(texture);
+        let (scale, angle) = match purpose {
+            Purpose::Thing => (self.scaled(0.6, 3.), self.turn()),
+            _ => (self.scaled(0.7, 1.5), 0.),
+        };
+        let offset = Vec2::new(self.within(0. ..1.), self.within(0. ..1.));
+        let larger = Affine2::from_scale(Vec2::splat(scale / material.texture.repeat_metres));
+        material.repeats = Affine2::from_angle_translation(angle, offset) * larger;
+        if purpose == Purpose::Thing && self.chance(0.5) {
+            // The same cloth in another colour.
+            material.tint = Vec3::new(self.within(0.4..1.), self.within(0.4..1.), self.within(0.4..1.));
+        }
+        let glossy = match purpose {
+            Purpose::Floor | Purpose::Thing => 0.3,
+            _ => 0.05,
+        };
+        if self.chance(glossy) {
+            material.gloss = self.scaled(0.02, 0.3);
+            material.polish = self.scaled(8., 300.);
+            if self.chance(0.3) {
+                material.mirror = self.scaled(0.02, 0.12);
+            }
+        }
+        material
+    }
+
+    /// One whole picture on a surface of `size` metres.
+    pub fn picture(&mut self, size: Vec2) -> Material {
+        let mut material = Material::matte(self.texture(Purpose::Poster));
+        material.repeats = Affine2::from_scale(1. / size);
+        material
+    }
+
+    pub fn put(&mut self, mesh: Mesh, material: &Material, place: Affine3A) {
+        self.parts.meshes.push((mesh.moved(place), material.clone()));
+    }
+}
+
+/// Upright at `spot`, turned by `turn` about y.
+pub(super) fn standing(spot: Vec3, turn: f32) -> Affine3A {
+    Affine3A::from_rotation_translation(Quat::from_rotation_y(turn), spot)
+}

@@ -1,0 +1,176 @@
+//! Writing that says nothing, and scribbles.
+
+use glam::{Vec2, Vec3};
+use rand_chacha::ChaCha8Rng;
+
+use super::chance::Chance;
+use super::palette::{self, Palette, luminance};
+use super::shape;
+use super::{Canvas, Purpose, SIZE, Surface};
+
+/// Glyphs that look like one script: strokes between points of a grid in a box one high.
+pub(super) struct Script {
+    glyphs: Vec<Vec<(Vec2, Vec2)>>,
+    /// Width of a glyph's box.
+    aspect: f32,
+    /// Half a stroke's width.
+    weight: f32,
+}
+
+impl Script {
+    /// A script of its own.
+    pub fn draw(random: &mut ChaCha8Rng) -> Script {
+        let aspect = random.between(0.4, 0.8);
+        let rounded = random.happens(0.5);
+        let glyph = |random: &mut ChaCha8Rng| {
+            let mut strokes = Vec::new();
+            // Most letters stand on a stem.
+            if random.happens(0.7) {
+                strokes.push((Vec2::new(0., -0.5), Vec2::new(0., 0.5)));
+            }
+            for _ in 0..random.count(1, 3) {
+                let point = |random: &mut ChaCha8Rng| {
+                    Vec2::new(random.count(0, 2) as f32 / 2. * aspect, random.count(0, 2) as f32 / 2. - 0.5)
+                };
+                let (from, to) = (point(random), point(random));
+                let bow = if rounded { (to - from).perp() * random.between(-0.4, 0.4) } else { Vec2::ZERO };
+                let middle = 0.5 * (from + to) + bow;
+                strokes.extend([(from, middle), (middle, to)]);
+            }
+            strokes
+        };
+        let glyphs = (0..random.count(10, 26)).map(|_| glyph(random)).collect();
+        Script { glyphs, aspect, weight: random.between(0.05, 0.14) }
+    }
+
+    /// Writes words of `height` from `start`, the left end of a line's middle, over `length`; all in repeats.
+    pub fn write(
+        &self,
+        random: &mut ChaCha8Rng,
+        canvas: &mut Canvas,
+        start: Vec2,
+        length: f32,
+        height: f32,
+        colour: Vec3,
+    ) {
+        let pace = (self.aspect + 0.3) * height;
+        let weight = (self.weight * height).max(0.35 / canvas.size as f32);
+        let mut x = 0.;
+        let mut letters = random.count(2, 9);
+        while x + pace <= length {
+            if letters == 0 {
+                letters = random.count(1, 9);
+                x += 0.6 * pace;
+                continue;
+            }
+            letters -= 1;
+            let glyph = random.count(0, self.glyphs.len() - 1);
+            // Small letters are shorter.
+            let small = if glyph.is_multiple_of(3) { 1. } else { 0.65 };
+            for &(from, to) in &self.glyphs[glyph] {
+                let place = |point: Vec2| {
+                    Vec2::new(x, 0.)
+                        + (point * Vec2::new(1., small) + Vec2::new(0., 0.5 - 0.5 * small)) * height
+                };
+                let (from, to) = (place(from), place(to));
+                let middle = 0.5 * (from + to);
+                let reach = (to - from).abs() * 0.5 + weight + 1. / canvas.size as f32;
+                canvas.fill(start + middle, reach, colour, |offset| {
+                    shape::stroke(offset, from - middle, to - middle, weight)
+                });
+            }
+            x += pace;
+        }
+    }
+
+    /// Fills a rectangle with lines of so high letters.
+    pub fn paragraph(
+        &self,
+        random: &mut ChaCha8Rng,
+        canvas: &mut Canvas,
+        corner: Vec2,
+        extent: Vec2,
+        height: f32,
+        colour: Vec3,
+    ) {
+        let pace = height * random.between(1.5, 2.2);
+        let lines = (extent.y / pace) as usize;
+        for line in 0..lines {
+            let last = line + 1 == lines || random.happens(0.1);
+            let length = extent.x * if last { random.between(0.2, 0.9) } else { random.between(0.93, 1.) };
+            self.write(
+                random,
+                canvas,
+                corner + Vec2::new(0., (line as f32 + 0.5) * pace),
+                length,
+                height,
+                colour,
+            );
+        }
+    }
+}
+
+/// A colour to be read on another.
+pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
+    let theme = random.weighted(&[(palette::GREYS, 4.), (palette::VIVID, 1.), (palette::ACCENTS, 1.)]);
+    let ink = palette::colour_of(random, theme);
+    if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
+}
+
+/// Lines of writing all over, as of newspapers, labels and notices.
+pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let paper = if random.happens(0.6) {
+        palette::colour_of(random, palette::WHITES)
+    } else {
+        Palette::draw(random, purpose, 1).colour(0)
+    };
+    let mut canvas = Canvas::filled(SIZE, paper);
+    let ink = ink_for(random, paper);
+    let columns = random.count(1, 3);
+    let height = random.leaning_low(0.014, 0.1);
+    let script = Script::draw(random);
+    let margin = 0.03;
+    for column in 0..columns {
+        let wide = 1. / columns as f32;
+        let mut corner = Vec2::new(column as f32 * wide + margin, margin);
+        while corner.y < 0.9 {
+            let extent = Vec2::new(wide - 2. * margin, (0.97 - corner.y).min(random.between(0.15, 0.8)));
+            match random.count(0, 5) {
+                0 => script.write(random, &mut canvas, corner + Vec2::new(0., 0.05), extent.x, 0.05, ink),
+                1 => {
+                    let block = Palette::draw(random, Purpose::Poster, 1).colour(0);
+                    let half = Vec2::new(0.5 * extent.x, 0.45 * extent.y);
+                    let middle = corner + half;
+                    canvas.fill(middle, half, block, |offset| shape::rectangle(offset, half, 0.));
+                }
+                _ => script.paragraph(random, &mut canvas, corner, extent, height, ink),
+            }
+            corner.y += extent.y.max(0.1);
+        }
+    }
+    Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
+}
+
+/// Curly lines drawn by hand, as of chalk, crayons and graffiti.
+pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 5);
+    let palette = Palette::draw(random, purpose, count);
+    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    for _ in 0..random.count(1, 12) {
+        let colour = palette.any(random);
+        let width = random.leaning_low(0.8, 5.) / SIZE as f32;
+        let mut at = random.spot();
+        let (mut angle, mut curl) = (random.between(0., 6.), 0.);
+        let pace = random.between(0.01, 0.04);
+        for _ in 0..random.count(10, 120) {
+            curl = 0.8 * curl + 0.3 * random.bell();
+            angle += curl;
+            let step = Vec2::from_angle(angle) * pace;
+            canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, colour, |offset| {
+                shape::stroke(offset, -0.5 * step, 0.5 * step, width)
+            });
+            at += step;
+        }
+    }
+    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+}

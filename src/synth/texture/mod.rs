@@ -1,0 +1,315 @@
+//! Procedural reflectance: what made-up surfaces are covered with.
+//!
+//! A texture is drawn from a family (bricks, planks, wallpaper), by the chances that it has where it will be, and then weathered.
+
+mod canvas;
+mod chance;
+mod clouds;
+mod field;
+mod layout;
+mod marks;
+mod masonry;
+mod noise;
+mod palette;
+mod panels;
+mod patterns;
+mod pictures;
+mod plain;
+mod scatter;
+mod shape;
+mod stone;
+mod textile;
+mod voronoi;
+mod wear;
+mod wood;
+
+use glam::{Vec2, Vec3};
+use image::RgbImage;
+use rand_chacha::ChaCha8Rng;
+
+use canvas::Canvas;
+use chance::Chance;
+use field::Field;
+
+/// Pixels in a row of all but pictures.
+const SIZE: usize = 256;
+
+/// The least and the greatest reflectance: nothing is quite black, nothing quite white.
+const REFLECTANCE: (f32, f32) = (0.02, 0.95);
+
+/// Bits after the point of a place in repeats: as many as a float in [½, 1) has.
+const PLACE_BITS: u32 = 24;
+
+/// Reflectance that repeats in both directions: linear-light RGB of a square, a power of two wide, and its halvings.
+///
+/// u goes to the right and v down, as in an image; (0, 0) is the upper left corner.
+#[derive(Debug)]
+pub struct Texture {
+    /// Each half as wide as the one before, down to a single texel: roots of red, green and blue in bytes, and a fourth
+    /// that is 0.
+    levels: Vec<Vec<[u8; 4]>>,
+    /// How wide one repeat typically is, in metres.
+    pub repeat_metres: f32,
+}
+
+/// What a texture will cover. Families differ in how likely they are for each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// Indoors, underfoot.
+    Floor,
+    /// Indoors, upright.
+    Wall,
+    /// Indoors, overhead.
+    Ceiling,
+    /// Outdoors, underfoot: grass, gravel, earth, asphalt, paving.
+    Ground,
+    /// Outdoors, upright: walls of houses, fences, roofs.
+    Facade,
+    /// Furniture and whatever stands about.
+    Thing,
+    /// Leaves of trees and hedges.
+    Foliage,
+    /// Pictures, signs, screens: one repeat is the whole of it.
+    Poster,
+}
+
+impl Purpose {
+    /// All of them, pictures last.
+    pub const ALL: [Purpose; 8] = [
+        Purpose::Floor,
+        Purpose::Wall,
+        Purpose::Ceiling,
+        Purpose::Ground,
+        Purpose::Facade,
+        Purpose::Thing,
+        Purpose::Foliage,
+        Purpose::Poster,
+    ];
+}
+
+/// What a family paints, and how wide that is in metres.
+struct Surface {
+    canvas: Canvas,
+    repeat_metres: f32,
+}
+
+/// A way to paint surfaces.
+type Family = fn(&mut ChaCha8Rng, Purpose) -> Surface;
+
+/// Families, and their weights by purpose in the order of [`Purpose::ALL`], without pictures.
+#[rustfmt::skip]
+const FAMILIES: [(Family, [f32; 7]); 41] = [
+    //                            floor wall ceil grnd faca thing leaf
+    (plain::paint,               [1.0, 9.0, 9.0, 0.5, 2.0, 6.0, 0.3]),
+    (plain::gradient,            [0.2, 0.7, 0.5, 0.1, 0.3, 1.5, 0.2]),
+    (plain::brushed,             [0.2, 0.2, 0.2, 0.1, 1.0, 2.0, 0.0]),
+    (plain::glossy,              [0.3, 0.1, 0.1, 0.1, 0.3, 1.0, 0.1]),
+    (clouds::clouds,             [1.5, 1.5, 0.5, 1.5, 0.8, 2.0, 1.5]),
+    (patterns::stripes,          [0.7, 1.8, 0.3, 0.1, 0.5, 1.7, 0.0]),
+    (patterns::plaid,            [0.5, 0.6, 0.0, 0.0, 0.0, 1.5, 0.0]),
+    (patterns::pieces,           [1.5, 1.0, 0.2, 0.4, 0.3, 1.2, 0.0]),
+    (patterns::motifs,           [0.7, 1.5, 0.2, 0.0, 0.2, 1.3, 0.0]),
+    (patterns::ornament,         [0.5, 1.6, 0.2, 0.0, 0.1, 0.8, 0.0]),
+    (masonry::bricks,            [0.6, 1.5, 0.1, 1.2, 5.0, 0.4, 0.0]),
+    (masonry::tiles,             [4.0, 2.0, 0.4, 1.5, 1.0, 0.5, 0.0]),
+    (masonry::stones,            [0.8, 0.6, 0.0, 2.5, 2.0, 0.3, 0.0]),
+    (masonry::shingles,          [0.0, 0.1, 0.0, 0.1, 2.0, 0.2, 0.0]),
+    (masonry::mosaic,            [0.7, 0.6, 0.1, 0.3, 0.2, 0.5, 0.0]),
+    (wood::boards,               [7.0, 1.3, 1.2, 0.8, 1.8, 2.0, 0.0]),
+    (wood::veneer,               [0.3, 0.6, 0.3, 0.1, 0.3, 4.0, 0.2]),
+    (stone::marble,              [1.2, 0.5, 0.1, 0.2, 0.4, 1.2, 0.0]),
+    (stone::terrazzo,            [1.0, 0.3, 0.0, 0.4, 0.3, 0.5, 0.0]),
+    (stone::speckle,             [1.0, 0.3, 0.3, 1.0, 0.5, 1.2, 0.0]),
+    (stone::concrete,            [1.5, 1.0, 0.8, 2.0, 2.0, 0.6, 0.0]),
+    (stone::plaster,             [0.2, 3.0, 3.0, 0.2, 3.0, 0.5, 0.0]),
+    (stone::asphalt,             [0.2, 0.0, 0.0, 2.5, 0.1, 0.1, 0.0]),
+    (textile::weave,             [1.2, 0.6, 0.0, 0.0, 0.0, 3.0, 0.0]),
+    (textile::knit,              [0.2, 0.0, 0.0, 0.0, 0.0, 0.8, 0.0]),
+    (textile::pile,              [3.0, 0.1, 0.0, 0.2, 0.0, 1.5, 0.2]),
+    (textile::folds,             [0.0, 0.8, 0.0, 0.0, 0.0, 1.0, 0.0]),
+    (textile::quilted,           [0.1, 0.2, 0.1, 0.0, 0.0, 1.2, 0.0]),
+    (textile::carpet,            [2.5, 0.1, 0.0, 0.0, 0.0, 0.7, 0.0]),
+    (scatter::leaves,            [0.1, 0.1, 0.0, 2.0, 0.4, 0.2, 8.0]),
+    (scatter::grass,             [0.0, 0.0, 0.0, 5.0, 0.1, 0.1, 2.0]),
+    (scatter::gravel,            [0.1, 0.1, 0.0, 3.0, 0.4, 0.3, 0.1]),
+    (scatter::earth,             [0.0, 0.0, 0.0, 2.5, 0.1, 0.0, 0.1]),
+    (scatter::confetti,          [0.5, 0.6, 0.0, 0.2, 0.1, 1.2, 0.3]),
+    (marks::writing,             [0.0, 0.3, 0.0, 0.1, 0.2, 1.2, 0.0]),
+    (marks::scribbles,           [0.1, 0.3, 0.0, 0.1, 0.4, 0.5, 0.0]),
+    (panels::windows,            [0.0, 0.3, 0.0, 0.0, 4.0, 0.3, 0.0]),
+    (panels::shelves,            [0.0, 0.9, 0.0, 0.0, 0.0, 1.5, 0.0]),
+    (panels::cupboards,          [0.0, 0.8, 0.2, 0.0, 0.3, 2.5, 0.0]),
+    (panels::slats,              [0.2, 0.7, 0.6, 0.2, 1.5, 1.2, 0.0]),
+    (rows_of_things,             [0.1, 0.2, 2.0, 0.2, 0.7, 1.3, 0.0]),
+];
+
+/// Boards on ceilings; keys and grids elsewhere.
+fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let family: Family = match purpose {
+        Purpose::Ceiling => panels::ceiling_boards,
+        Purpose::Floor | Purpose::Wall | Purpose::Ground | Purpose::Facade => panels::grids,
+        _ => random.weighted(&[(panels::keys as Family, 2.), (panels::grids, 1.)]),
+    };
+    family(random, purpose)
+}
+
+/// A house's wall, for what is set into one.
+fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
+    let family: Family = random.one_of(&[
+        masonry::bricks as Family,
+        stone::plaster,
+        stone::concrete,
+        plain::paint,
+        panels::slats,
+    ]);
+    family(random, Purpose::Facade)
+}
+
+/// One surface of one family.
+fn surface(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let family = random.weighted(&FAMILIES.map(|(family, weights)| (family, weights[purpose as usize])));
+    family(random, purpose)
+}
+
+/// Two surfaces: one shows where the other has worn off, or tints it.
+fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let Surface { mut canvas, repeat_metres } = surface(random, purpose);
+    let other = surface(random, purpose).canvas;
+    let cells = random.count(1, 4);
+    let gain = random.between(0.3, 0.8);
+    let mask = noise::fractal(random, SIZE, [cells; 2], 6, gain);
+    let (level, soft) = (random.between(-0.6, 0.8), random.leaning_low(0.03, 1.));
+    let tints = random.happens(0.35);
+    let mean = other.pixels.iter().sum::<Vec3>() / other.pixels.len() as f32;
+    for ((pixel, other), value) in canvas.pixels.iter_mut().zip(&other.pixels).zip(&mask.values) {
+        *pixel = if tints {
+            *pixel * (0.5 + 0.5 * (*other / mean.max(Vec3::splat(0.02))).min(Vec3::splat(2.)))
+        } else {
+            pixel.lerp(*other, shape::smoothstep(level, level + soft, *value))
+        };
+    }
+    Surface { canvas, repeat_metres }
+}
+
+impl Texture {
+    /// Draws one of all families. The state of `random` alone decides.
+    pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
+        if purpose == Purpose::Poster {
+            return Texture::of_surface(pictures::picture(random));
+        }
+        let mut surface =
+            if random.happens(0.12) { combined(random, purpose) } else { surface(random, purpose) };
+        wear::weather(random, &mut surface.canvas, purpose);
+        Texture::of_surface(surface)
+    }
+
+    /// Of a photo or picture in sRGB: the largest square of its middle, and its mirror images to the right and below, so
+    /// that it repeats.
+    pub fn of_picture(picture: &RgbImage) -> Texture {
+        let side = picture.width().min(picture.height());
+        let corner = Vec2::new((picture.width() - side) as f32, (picture.height() - side) as f32) * 0.5;
+        let step = side as f32 / SIZE as f32;
+        let linear: Vec<f32> = (0..=255).map(palette::linear_of_byte).collect();
+        let quarter = Canvas::of(SIZE, |uv| {
+            // The mean of the photo's pixels that a texel covers, at least of one.
+            let middle = corner + uv * side as f32;
+            let [low, high] = [-0.5, 0.5].map(|half| (middle + half * step).max(Vec2::ZERO).as_uvec2());
+            let mut sum = Vec3::ZERO;
+            let mut count = 0.;
+            for y in low.y..high.y.max(low.y + 1) {
+                for x in low.x..high.x.max(low.x + 1) {
+                    let pixel = picture.get_pixel(x.min(picture.width() - 1), y.min(picture.height() - 1));
+                    sum += Vec3::from(pixel.0.map(|byte| linear[byte as usize]));
+                    count += 1.;
+                }
+            }
+            sum / count
+        });
+        let canvas = Canvas::of(2 * SIZE, |uv| {
+            let folded = 1. - (2. * uv - 1.).abs();
+            let at = (folded * SIZE as f32).as_uvec2().min(glam::UVec2::splat(SIZE as u32 - 1));
+            quarter.pixels[at.y as usize * SIZE + at.x as usize]
+        });
+        Texture::of_surface(Surface { canvas, repeat_metres: 2. })
+    }
+
+    /// Trilinear, at `uv` in repeats, for a footprint so many repeats wide.
+    pub fn sample(&self, uv: Vec2, footprint: f32) -> Vec3 {
+        let last = self.levels.len() - 1;
+        let texels = (footprint * (1u32 << last) as f32).clamp(1., (1u32 << last) as f32);
+        // The logarithm, straight between powers of two: the exponent, and the mantissa as what follows the point.
+        let level = (texels.to_bits() - 1f32.to_bits()) as f32 * (1. / (1 << 23) as f32);
+        let finer = (level as usize).min(last);
+        let part = level - finer as f32;
+        let place = |repeats: f32| (repeats * (1 << PLACE_BITS) as f32) as i64 as u32;
+        let (x, y) = (place(uv.x), place(uv.y));
+        let fine = self.bilinear(finer, x, y);
+        if part == 0. { fine } else { fine.lerp(self.bilinear(finer + 1, x, y), part) }
+    }
+
+    /// Mean reflectance.
+    pub fn mean(&self) -> Vec3 {
+        self.bilinear(self.levels.len() - 1, 0, 0)
+    }
+
+    /// Between four texels of a level, at a place in 2⁻²⁴ repeats.
+    #[inline]
+    fn bilinear(&self, level: usize, x: u32, y: u32) -> Vec3 {
+        let shift = (self.levels.len() - 1 - level) as u32;
+        let texels = self.levels[level].as_slice();
+        let mask = (1usize << shift) - 1;
+        let texel_bits = PLACE_BITS - shift;
+        // From the middle of a texel to that of the next.
+        let half = 1 << (texel_bits - 1);
+        let (x, y) = (x.wrapping_sub(half), y.wrapping_sub(half));
+        // 2^-texel_bits by its exponent, since a division would take as long as all the rest.
+        let texels_per_place = f32::from_bits((127 - texel_bits) << 23);
+        let within = (1 << texel_bits) - 1;
+        let right = (x & within) as i32 as f32 * texels_per_place;
+        let down = (y & within) as i32 as f32 * texels_per_place;
+        let (column, row) = ((x >> texel_bits) as usize, (y >> texel_bits) as usize);
+        let (next_column, column) = ((column + 1) & mask, column & mask);
+        let (next_row, row) = (((row + 1) & mask) << shift, (row & mask) << shift);
+        let between = |row: usize| {
+            let left = linear_of_texel(texels[row | column]);
+            left + (linear_of_texel(texels[row | next_column]) - left) * right
+        };
+        let above = between(row);
+        (above + (between(next_row) - above) * down).truncate()
+    }
+
+    fn of_surface(Surface { canvas, repeat_metres }: Surface) -> Texture {
+        let (low, high) = REFLECTANCE;
+        let mut size = canvas.size;
+        let mut texels: Vec<Vec3> =
+            canvas.pixels.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
+        let mut levels = Vec::new();
+        loop {
+            levels.push(texels.iter().map(|&colour| texel_of(colour)).collect());
+            if size == 1 {
+                return Texture { levels, repeat_metres };
+            }
+            let halved = texels.chunks_exact(2 * size).flat_map(|rows| {
+                let (above, below) = rows.split_at(size);
+                let pairs = above.chunks_exact(2).zip(below.chunks_exact(2));
+                pairs.map(|(above, below)| 0.25 * (above[0] + above[1] + below[0] + below[1]))
+            });
+            texels = halved.collect();
+            size /= 2;
+        }
+    }
+}
+
+/// Roots, since eyes and cameras tell dark colours apart more finely.
+fn texel_of(colour: Vec3) -> [u8; 4] {
+    let root = (colour.map(f32::sqrt) * 255. + 0.5).as_u8vec3();
+    [root.x, root.y, root.z, 0]
+}
+
+fn linear_of_texel(texel: [u8; 4]) -> glam::Vec4 {
+    let root = glam::Vec4::from(texel.map(f32::from));
+    root * root * (1. / (255. * 255.))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,242 @@
+//! Wallpaper, fabric and print: flat colours in figures that come again.
+
+use glam::{Vec2, Vec3};
+use rand_chacha::ChaCha8Rng;
+
+use super::chance::{Chance, unit_of};
+use super::layout::Layout;
+use super::palette::Palette;
+use super::shape;
+use super::voronoi::Voronoi;
+use super::{Canvas, Purpose, SIZE, Surface};
+
+/// Stripes of different widths, level, upright or oblique.
+pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 5);
+    let palette = Palette::draw(random, purpose, count);
+    let bands = bands(random, &palette);
+    let (across, along) = random.one_of(&[(1., 0.), (1., 0.), (0., 1.), (1., 1.), (1., -1.), (2., 1.)]);
+    let times = random.leaning_low(1., 12.).floor();
+    let (wave, waves) =
+        (if random.happens(0.2) { random.between(0.02, 0.3) } else { 0. }, random.count(1, 6) as f32);
+    let zigzag = random.happens(0.5);
+    let canvas = Canvas::of(SIZE, |uv| {
+        let phase = (uv.x * along + uv.y * across) * waves;
+        let swing = if zigzag {
+            4. * (phase - (phase + 0.5).floor()).abs()
+        } else {
+            (phase * std::f32::consts::TAU).sin()
+        };
+        let at = (uv.x * across + uv.y * along) * times + wave * swing;
+        band_at(&bands, at, times * across.abs().max(along.abs()))
+    });
+    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+}
+
+/// Stripes both ways, woven into each other.
+pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 4);
+    let palette = Palette::draw(random, purpose, count);
+    let bands_across = bands(random, &palette);
+    let bands_along = if random.happens(0.7) { bands_across.clone() } else { bands(random, &palette) };
+    let times = random.leaning_low(1., 8.).floor();
+    let threads = random.one_of(&[32., 64., 128.]);
+    let twill = random.between(0., 0.5);
+    let canvas = Canvas::of(SIZE, |uv| {
+        let warp = band_at(&bands_across, uv.x * times, times);
+        let weft = band_at(&bands_along, uv.y * times, times);
+        let over = ((uv.x + uv.y) * threads).fract() < 0.5;
+        warp.lerp(weft, if over { 0.5 + twill } else { 0.5 - twill })
+    });
+    Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
+}
+
+/// Stripes in a row: where each ends, in [0, 1], and its colour.
+type Bands = Vec<(f32, Vec3)>;
+
+fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
+    let widths: Vec<f32> = (0..random.count(2, 7)).map(|_| random.leaning_low(0.05, 1.)).collect();
+    let sum: f32 = widths.iter().sum();
+    let mut end = 0.;
+    let band = |(index, width): (usize, &f32)| {
+        end += width / sum;
+        (end, palette.colour(index))
+    };
+    widths.iter().enumerate().map(band).collect()
+}
+
+/// The colour at a place, softened by a pixel where `times` of the bands make a repeat.
+fn band_at(bands: &Bands, at: f32, times: f32) -> Vec3 {
+    let at = at.rem_euclid(1.);
+    let index = bands.partition_point(|(end, _)| *end <= at).min(bands.len() - 1);
+    let next = bands[(index + 1) % bands.len()].1;
+    let soft = times / SIZE as f32;
+    bands[index].1.lerp(next, (1. - (bands[index].0 - at) / soft).clamp(0., 1.))
+}
+
+/// Flat pieces: checks, hexagons, diamonds, zigzags, patchwork.
+pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 5);
+    let palette = Palette::draw(random, purpose, count);
+    let fine = random.count(1, 6);
+    let checks = random.happens(0.35);
+    let layout = if checks {
+        Layout::courses(2 * fine, 2 * fine, 0., false)
+    } else {
+        match random.count(0, 4) {
+            0 => Layout::Cells(Voronoi::new(random, 3 * fine, 4 * fine, 0., true)),
+            1 => Layout::Diamonds { across: fine + 1 },
+            2 => Layout::Herringbone { across: 6 * fine, long: 3 },
+            3 => Layout::quilt(random, 4 * fine, 3),
+            _ => Layout::Basket { squares: 2 * fine, long: 2 },
+        }
+    };
+    let seed = random.seed();
+    let line = if random.happens(0.4) { random.leaning_low(0.001, 0.012) } else { 0. };
+    let ink = palette.any(random) * random.between(0.3, 1.);
+    let halved = random.happens(0.25);
+    let inset = if random.happens(0.3) { random.between(0.1, 0.4) } else { 1. };
+    let canvas = Canvas::of(SIZE, |uv| {
+        let piece = layout.piece(uv);
+        let mut number = (unit_of(seed, piece.id) * count as f32) as usize;
+        if checks {
+            number = ((piece.id / 64 + piece.id % 64) % 2) as usize;
+        }
+        // Half a piece in another colour makes triangles of squares.
+        if halved && piece.at.x * piece.extent.y > piece.at.y * piece.extent.x {
+            number += 1;
+        }
+        if piece.edge > inset * piece.extent.y {
+            number += 1;
+        }
+        let on_line = if line > 0. { ((line - piece.edge) * SIZE as f32 + 0.5).clamp(0., 1.) } else { 0. };
+        palette.colour(number).lerp(ink, on_line)
+    });
+    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+}
+
+/// Dots, rings, stars, flowers and polygons on a grid, straight, staggered or loose.
+pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 5);
+    let palette = Palette::draw(random, purpose, count);
+    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let rows = 2 * random.leaning_low(1., 8.) as usize;
+    let cell = 1. / rows as f32;
+    let staggered = random.happens(0.6);
+    let loose = if random.happens(0.3) { random.between(0.1, 0.8) } else { 0. };
+    let kinds: Vec<Motif> = (0..random.count(1, 2)).map(|_| Motif::draw(random, &palette)).collect();
+    for row in 0..rows {
+        for column in 0..rows {
+            let shift = if staggered && row % 2 == 1 { 0.5 } else { 0. };
+            let off = (random.spot() - 0.5) * loose;
+            let centre = (Vec2::new(column as f32 + 0.5 + shift, row as f32 + 0.5) + off) * cell;
+            let turn = if loose > 0. { random.direction() } else { Vec2::X };
+            kinds[(row + column) % kinds.len()].paint(&mut canvas, centre, cell, turn);
+        }
+    }
+    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+}
+
+/// Nested figures, the outermost first.
+pub(super) struct Motif {
+    layers: Vec<(Figure, f32, Vec3)>,
+}
+
+#[derive(Clone, Copy)]
+enum Figure {
+    Disk,
+    Polygon(usize),
+    Flower(usize, f32),
+    Leaf(f32),
+    Box(f32),
+}
+
+impl Motif {
+    /// One to four figures; the radius is a share of the cell's width.
+    pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
+        let mut radius = random.between(0.15, 0.5);
+        let mut layers = Vec::new();
+        for index in 0..random.count(1, 4) {
+            let figure = match random.count(0, 4) {
+                0 => Figure::Disk,
+                1 => Figure::Polygon(random.count(3, 8)),
+                2 => Figure::Flower(random.count(3, 12), random.between(0.2, 0.8)),
+                3 => Figure::Leaf(random.between(0.2, 0.8)),
+                _ => Figure::Box(random.between(0.3, 1.)),
+            };
+            layers.push((figure, radius, palette.colour(index + 1)));
+            radius *= random.between(0.4, 0.85);
+        }
+        Motif { layers }
+    }
+
+    /// Paints it into a cell so wide, turned.
+    pub fn paint(&self, canvas: &mut Canvas, centre: Vec2, cell: f32, turn: Vec2) {
+        for &(figure, share, colour) in &self.layers {
+            let radius = share * cell;
+            // A triangle's tips are twice its inner radius away.
+            canvas.fill(centre, Vec2::splat(2. * radius), colour, |offset| {
+                let offset = turn.rotate(offset);
+                match figure {
+                    Figure::Disk => shape::disk(offset, radius),
+                    Figure::Polygon(corners) => shape::polygon(offset, 0.8 * radius, corners),
+                    Figure::Flower(petals, depth) => shape::flower(offset, radius, petals, depth),
+                    Figure::Leaf(width) => shape::leaf(offset, 2. * radius, width * radius),
+                    Figure::Box(aspect) => shape::rectangle(offset, Vec2::new(radius, aspect * radius), 0.),
+                }
+            });
+        }
+    }
+}
+
+/// Ornaments mirrored left and right, as of old wallpaper: tendrils, leaves and flowers.
+pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(2, 4);
+    let palette = Palette::draw(random, purpose, count);
+    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
+    let cell = 1. / columns as f32;
+    let flower = Motif::draw(random, &palette);
+    let width = random.between(0.01, 0.03) * cell;
+    let leaf = Vec2::new(random.between(0.1, 0.25), random.between(0.3, 0.7));
+    let steps = random.count(6, 14);
+    let mut tendrils = Vec::new();
+    for _ in 0..random.count(1, 3) {
+        let (mut at, mut angle, curl) = (Vec2::ZERO, random.between(-1.5, 1.5), random.between(-0.6, 0.6));
+        for step in 0..steps {
+            let next = at + Vec2::from_angle(angle) * 0.5 / steps as f32;
+            tendrils.push((at, next, angle, step));
+            angle += curl + 0.3 * random.bell();
+            at = next;
+        }
+    }
+    let every = random.count(2, 4);
+    for index in 0..2 * columns * columns {
+        // The second half sits between the first.
+        let half = if index >= columns * columns { 0.5 } else { 0. };
+        let place = Vec2::new((index % columns) as f32, (index / columns % columns) as f32) + half + 0.25;
+        let centre = place * cell;
+        for &(from, to, angle, step) in &tendrils {
+            for side in [1., -1.] {
+                let mirror = Vec2::new(side, 1.);
+                let (from, to) = (from * mirror * cell, to * mirror * cell);
+                let middle = 0.5 * (from + to);
+                let reach = (to - from).abs() * 0.5 + width;
+                canvas.fill(centre + middle, reach, palette.colour(1), |offset| {
+                    shape::stroke(offset, from - middle, to - middle, width)
+                });
+                if step % every == 1 {
+                    let length = leaf.x * cell;
+                    let turn = Vec2::from_angle(-angle - 0.8) * mirror;
+                    let tip = centre + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
+                    canvas.fill(tip, Vec2::splat(length), palette.colour(2), |offset| {
+                        let offset = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
+                        shape::leaf(offset, length, length * leaf.y)
+                    });
+                }
+            }
+        }
+        flower.paint(&mut canvas, centre, 0.5 * cell, Vec2::X);
+    }
+    Surface { canvas, repeat_metres: random.between(0.4, 1.6) * columns as f32 * 0.5 }
+}

@@ -1,0 +1,426 @@
+//! What hangs on walls and stands on sills: paintings, prints, photos, signs. One repeat is the whole picture.
+
+use glam::{Vec2, Vec3};
+use rand_chacha::ChaCha8Rng;
+
+use super::chance::Chance;
+use super::marks::{Script, ink_for};
+use super::noise::{fractal, smooth};
+use super::palette::{self, Palette};
+use super::shape::{self, smoothstep};
+use super::{Canvas, Purpose, Surface};
+
+/// Pixels in a row: finer than other textures, since none repeats over a picture.
+const SIZE: usize = 512;
+
+/// A picture of any kind, often in a mat or a frame.
+pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
+    let kind: fn(&mut ChaCha8Rng) -> Canvas = random.weighted(&[
+        (landscape as _, 3.),
+        (portrait as _, 1.5),
+        (window as _, 2.),
+        (shapes as _, 2.),
+        (print as _, 2.),
+        (painting as _, 2.),
+        (dead_leaves as _, 2.),
+        (flowers as _, 1.),
+        (screen as _, 1.),
+    ]);
+    let mut canvas = kind(random);
+    if random.happens(0.55) {
+        frame(random, &mut canvas);
+    }
+    Surface { canvas, repeat_metres: random.leaning_low(0.25, 1.4) }
+}
+
+/// Sky over hills, water or roofs.
+fn landscape(random: &mut ChaCha8Rng) -> Canvas {
+    let skies = [
+        [0x5f93c9, 0xd6e4ee],
+        [0x8fa5b5, 0xe3e0d8],
+        [0x2e3f66, 0xe0946a],
+        [0xb9a58a, 0xeee2c8],
+        [0x22304a, 0x6d87a0],
+    ];
+    let [zenith, haze] =
+        random.one_of(&skies).map(palette::linear_of).map(|colour| palette::shade(random, colour, 0.2));
+    let clouds = fractal(random, SIZE, [2, 5], 7, 0.6);
+    let (level, cover) = (random.between(-0.5, 1.), random.between(0., 0.9));
+    let horizon = random.between(0.35, 0.75);
+    let mut index = 0;
+    let mut canvas = Canvas::of(SIZE, |uv| {
+        let sky = zenith.lerp(haze, (uv.y / horizon).min(1.));
+        let cloud = cover * smoothstep(level, level + 0.8, clouds.values[index]);
+        index += 1;
+        sky.lerp(Vec3::splat(0.85).lerp(haze, 0.3), cloud)
+    });
+    canvas.repeats = false;
+    if random.happens(0.4) {
+        let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.between(0.02, 0.09));
+        canvas.fill(sun, Vec2::splat(2. * radius), haze.lerp(Vec3::ONE, 0.7), |offset| {
+            shape::disk(offset, radius)
+        });
+    }
+    let theme = random.weighted(&[
+        (palette::GREENS, 4.),
+        (palette::AUTUMN, 2.),
+        (palette::ACCENTS, 1.),
+        (palette::STONES, 1.),
+    ]);
+    let ranges = random.count(2, 6);
+    for range in 0..ranges {
+        let near = (range + 1) as f32 / ranges as f32;
+        let (hills, jagged) = (random.count(1, 4), random.between(0.3, 0.65));
+        let profile = fractal(random, SIZE, [hills, 1], 6, jagged);
+        let ground = palette::colour_of(random, theme).lerp(haze, 0.75 * (1. - near));
+        let water = random.happens(0.12);
+        let texture = fractal(random, SIZE, [4, 16], 5, 0.8);
+        let base = horizon + (1. - horizon) * (near - 0.5 / ranges as f32) * 0.8;
+        let height = if water { 0. } else { random.between(0.03, 0.18) };
+        let mut index = 0;
+        canvas.change(|uv, below| {
+            let top = base - height * (1. + profile.values[(uv.x * SIZE as f32) as usize]);
+            let value = texture.values[index];
+            index += 1;
+            let colour = if water {
+                zenith.lerp(haze, 0.5 + 0.3 * value)
+            } else {
+                ground * (1. + 0.35 * near * value)
+            };
+            below.lerp(colour, (0.5 + (uv.y - top) * SIZE as f32).clamp(0., 1.))
+        });
+        if !water && random.happens(0.5) {
+            for _ in 0..random.count(2, 40) {
+                let x = random.unit();
+                let size = near * random.between(0.01, 0.07);
+                let top = base - height * (1. + profile.values[((x * SIZE as f32) as usize).min(SIZE - 1)]);
+                let colour = ground * random.between(0.3, 0.9);
+                let slim = random.between(0.4, 1.);
+                let lobes = random.count(3, 9);
+                canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), colour, |offset| {
+                    shape::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
+                });
+            }
+        }
+    }
+    canvas
+}
+
+/// Somebody: shoulders, neck, head, hair, a face.
+fn portrait(random: &mut ChaCha8Rng) -> Canvas {
+    let backdrop = Palette::draw(random, Purpose::Poster, 2);
+    let drift = smooth(random, SIZE, [2, 2]);
+    let mut index = 0;
+    let mut canvas = Canvas::bounded(SIZE, Vec3::ZERO);
+    canvas.change(|uv, _| {
+        index += 1;
+        backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.values[index - 1]) * 0.7
+    });
+    let skin = palette::linear_of(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
+    let skin = palette::shade(random, skin, 0.1);
+    let hair = palette::colour_of(random, palette::BROWNS) * random.between(0.2, 1.);
+    let theme = random.weighted(&[(palette::ACCENTS, 3.), (palette::GREYS, 2.), (palette::VIVID, 1.)]);
+    let cloth = palette::colour_of(random, theme);
+    for _ in 0..random.one_of(&[1, 1, 1, 2, 3]) {
+        let head = Vec2::new(random.between(0.3, 0.7), random.between(0.3, 0.5));
+        let size = random.between(0.1, 0.24);
+        let light = Vec2::new(random.between(-1., 1.), -0.4);
+        let mut blob = |place: Vec2, radii: Vec2, colour: Vec3, shading: f32| {
+            let (place, radii) = (place * size, radii * size);
+            canvas.stamp(head + place, radii + 0.004, |offset| {
+                let lit = 1. + shading * (offset / radii).dot(light);
+                (colour * lit.max(0.2), (0.5 - shape::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
+            });
+        };
+        let long = random.between(0., 1.);
+        blob(Vec2::new(0., 0.25 * long - 0.15), Vec2::new(1., 1.2 + 0.5 * long), hair, 0.3);
+        blob(Vec2::new(0., 3.1), Vec2::new(2.2, 1.8), cloth, 0.35);
+        blob(Vec2::new(0., 1.2), Vec2::new(0.38, 0.7), skin * 0.8, 0.3);
+        blob(Vec2::ZERO, Vec2::new(0.78, 1.), skin, 0.35);
+        blob(Vec2::new(0., -0.8), Vec2::new(0.75, 0.4), hair, 0.3);
+        for side in [-1., 1.] {
+            blob(Vec2::new(0.32 * side, -0.1), Vec2::new(0.14, 0.07), Vec3::splat(0.7), 0.);
+            blob(Vec2::new(0.32 * side, -0.1), Vec2::splat(0.06), Vec3::splat(0.03), 0.);
+            blob(Vec2::new(0.33 * side, -0.27), Vec2::new(0.18, 0.04), hair * 0.7, 0.);
+        }
+        blob(Vec2::new(0.05, 0.18), Vec2::new(0.08, 0.2), skin * 0.85, 0.4);
+        blob(Vec2::new(0., 0.52), Vec2::new(0.25, 0.07), skin * Vec3::new(0.8, 0.4, 0.4), 0.1);
+    }
+    canvas
+}
+
+/// Abstract: big flat shapes.
+fn shapes(random: &mut ChaCha8Rng) -> Canvas {
+    let count = random.count(3, 5);
+    let palette = Palette::draw(random, Purpose::Poster, count);
+    let mut canvas = Canvas::bounded(SIZE, palette.colour(0));
+    let straight = random.happens(0.4);
+    let line = if random.happens(0.4) { random.between(0.003, 0.015) } else { 0. };
+    for _ in 0..random.count(3, 40) {
+        let size = random.leaning_low(0.03, 0.45);
+        let half = Vec2::new(1., random.between(0.1, 1.)) * size;
+        let turn = if straight { random.one_of(&[Vec2::X, Vec2::Y]) } else { random.direction() };
+        let (kind, corners, depth) = (random.count(0, 4), random.count(3, 6), random.between(0., 0.7));
+        let distance = |offset: Vec2| {
+            let local = turn.rotate(offset);
+            match kind {
+                0 => shape::disk(local, size),
+                1 => shape::polygon(local, 0.6 * size, corners),
+                2 => shape::flower(local, size, corners, depth),
+                3 => shape::disk(local, size).max(local.y),
+                _ => shape::rectangle(local, half, 0.),
+            }
+        };
+        let centre = random.spot();
+        let reach = Vec2::splat(1.42 * size);
+        canvas.fill(centre, reach, palette.any(random), distance);
+        if line > 0. {
+            canvas.fill(centre, reach, Vec3::splat(0.02), |offset| distance(offset).abs() - line);
+        }
+    }
+    canvas
+}
+
+/// A poster or a sign: a heading, a picture, paragraphs.
+fn print(random: &mut ChaCha8Rng) -> Canvas {
+    let paper = if random.happens(0.5) {
+        palette::colour_of(random, palette::WHITES)
+    } else {
+        Palette::draw(random, Purpose::Poster, 1).colour(0)
+    };
+    let mut canvas = Canvas::bounded(SIZE, paper);
+    let ink = ink_for(random, paper);
+    let script = Script::draw(random);
+    let mut top = 0.06;
+    while top < 0.9 {
+        let left = 0.94 - top;
+        match random.count(0, 3) {
+            0 => {
+                let height = random.leaning_low(0.05, 0.3).min(left);
+                script.write(
+                    random,
+                    &mut canvas,
+                    Vec2::new(0.07, top + 0.5 * height),
+                    0.88,
+                    0.8 * height,
+                    ink,
+                );
+                top += height;
+            }
+            1 => {
+                let height = random.between(0.15, 0.6).min(left);
+                let inner = random.one_of(&[landscape, shapes, portrait, dead_leaves])(random);
+                let (low, extent) = (Vec2::new(0.06, top), Vec2::new(0.88, height));
+                canvas.change(|uv, below| {
+                    let at = (uv - low) / extent;
+                    let inside = at.cmpge(Vec2::ZERO).all() && at.cmplt(Vec2::ONE).all();
+                    // Cropped, not squeezed: as wide a part of it as is high.
+                    if inside { inner.sample(Vec2::new(at.x, (at.y - 0.5) * height + 0.5)) } else { below }
+                });
+                top += height + 0.03;
+            }
+            2 => {
+                let height = random.between(0.1, 0.4).min(left);
+                let letters = random.leaning_low(0.014, 0.05);
+                script.paragraph(
+                    random,
+                    &mut canvas,
+                    Vec2::new(0.07, top),
+                    Vec2::new(0.86, height),
+                    letters,
+                    ink,
+                );
+                top += height + 0.02;
+            }
+            _ => {
+                let height = random.between(0.03, 0.2).min(left);
+                let colour = Palette::draw(random, Purpose::Poster, 1).colour(0);
+                let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
+                canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, colour, |offset| {
+                    shape::rectangle(offset, half, 0.)
+                });
+                top += height + 0.02;
+            }
+        }
+    }
+    canvas
+}
+
+/// Brush strokes that follow a field, over a picture whose colours they take.
+fn painting(random: &mut ChaCha8Rng) -> Canvas {
+    let model = random.one_of(&[landscape, portrait, dead_leaves, flowers, shapes])(random);
+    let flow = smooth(random, SIZE, [3; 2]);
+    let mut canvas = model.clone();
+    canvas.repeats = false;
+    let length = random.between(0.015, 0.06);
+    let width = length * random.between(0.15, 0.4);
+    let count = (0.8 / (length * width)) as usize;
+    let turns = random.between(0.5, 3.);
+    let spread = random.between(0.1, 0.6);
+    for _ in 0..count.min(3000) {
+        let spot = random.spot();
+        let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
+        let colour = model.sample(spot) * (1. + spread * random.bell()).max(0.2);
+        canvas.fill(spot, along.abs() + width, colour, |offset| {
+            shape::stroke(offset, -along, along, 0.5 * width)
+        });
+    }
+    canvas
+}
+
+/// Shapes of all sizes over each other, as things lie in photos: the smaller the more.
+fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
+    let count = random.count(3, 5);
+    let palette = Palette::draw(random, Purpose::Thing, count);
+    let other = Palette::draw(random, Purpose::Poster, 3);
+    let mut canvas = Canvas::bounded(SIZE, palette.colour(0));
+    let light = random.direction();
+    let decline = random.leaning_low(0.02, 0.3);
+    for step in 0..random.count(40, 250) {
+        // Large ones first, lest they hide everything.
+        let size = 0.4 / (1. + decline * step as f32) * random.between(0.6, 1.5);
+        let own = if random.happens(0.8) { palette.ramp(random.unit()) } else { other.any(random) };
+        let colour = own * random.between(0.5, 1.3);
+        let (turn, kind) = (random.direction(), random.count(0, 2));
+        let half = Vec2::new(1., random.between(0.3, 1.)) * size;
+        let shading = random.between(0., 0.5);
+        canvas.stamp(random.spot(), Vec2::splat(1.42 * size), |offset| {
+            let local = turn.rotate(offset);
+            let distance = match kind {
+                0 => shape::ellipse(local, half),
+                1 => shape::rectangle(local, half, 0.2 * half.y),
+                _ => shape::polygon(local, 0.7 * size, 3),
+            };
+            let lit = 1. + shading * offset.dot(light) / size;
+            (colour * lit.max(0.1), (0.5 - distance * SIZE as f32).clamp(0., 1.))
+        });
+    }
+    canvas
+}
+
+/// Flowers with stems and leaves before a plain ground.
+fn flowers(random: &mut ChaCha8Rng) -> Canvas {
+    let ground = Palette::draw(random, Purpose::Wall, 1).colour(0);
+    let mut canvas = Canvas::bounded(SIZE, ground);
+    let foot = Vec2::new(random.between(0.4, 0.6), random.between(0.8, 1.1));
+    let green = Palette::of_theme(random, palette::GREENS, 3);
+    for _ in 0..random.count(3, 16) {
+        let head = Vec2::new(random.between(0.12, 0.88), random.between(0.1, 0.6));
+        let stem = palette_shade(random, &green);
+        let half = 0.5 * (foot - head);
+        canvas.fill(head + half, half.abs() + 0.01, stem, |offset| shape::stroke(offset, -half, half, 0.005));
+        for _ in 0..random.count(0, 3) {
+            let (place, turn) = (head.lerp(foot, random.between(0.2, 0.9)), random.direction());
+            let (length, leaf) = (random.between(0.08, 0.2), palette_shade(random, &green));
+            canvas.fill(place, Vec2::splat(0.6 * length), leaf, |offset| {
+                shape::leaf(turn.rotate(offset), length, 0.35 * length)
+            });
+        }
+        let theme = random.weighted(&[(palette::VIVID, 2.), (palette::ACCENTS, 3.), (palette::WHITES, 1.)]);
+        let petals = palette::colour_of(random, theme);
+        let (count, depth) = (random.count(4, 14), random.between(0.2, 0.7));
+        let mut radius = random.between(0.04, 0.14);
+        for layer in 0..random.count(2, 4) {
+            let colour = petals * (1. - 0.2 * layer as f32);
+            let turn = random.direction();
+            canvas.fill(head, Vec2::splat(radius + 0.01), colour, |offset| {
+                shape::flower(turn.rotate(offset), radius, count, depth)
+            });
+            radius *= 0.65;
+        }
+        let heart = palette::colour_of(random, palette::AUTUMN);
+        canvas.fill(head, Vec2::splat(radius), heart, |offset| shape::disk(offset, 0.6 * radius));
+    }
+    canvas
+}
+
+fn palette_shade(random: &mut ChaCha8Rng, palette: &Palette) -> Vec3 {
+    palette.ramp(random.unit()) * random.between(0.5, 1.1)
+}
+
+/// A window, and what is to be seen through it, in bright light.
+fn window(random: &mut ChaCha8Rng) -> Canvas {
+    let mut canvas = landscape(random);
+    let light = random.between(1., 1.8);
+    canvas.pixels.iter_mut().for_each(|pixel| *pixel = (*pixel * light).min(Vec3::ONE));
+    let theme = random.weighted(&[(palette::WHITES, 5.), (palette::WOODS, 2.), (palette::GREYS, 2.)]);
+    let frame = palette::colour_of(random, theme);
+    let panes = Vec2::new(random.count(1, 4) as f32, random.count(1, 4) as f32);
+    let (bar, edge) = (random.between(0.005, 0.02), random.between(0.02, 0.06));
+    let [left, right] = [(); 2].map(|()| if random.happens(0.3) { random.between(0.1, 0.35) } else { 0. });
+    let cloth = palette::colour_of(random, palette::WHITES);
+    let folds = random.between(60., 160.);
+    canvas.change(|uv, outside| {
+        let part = (uv * panes - (uv * panes).round()).abs() / panes;
+        let near = (part - bar).min_element().min((uv.min(1. - uv) - edge).min_element());
+        let seen = outside
+            .lerp(frame * (0.75 + 10. * near.clamp(-0.025, 0.)), (0.5 - near * SIZE as f32).clamp(0., 1.));
+        let curtain = uv.x < left || uv.x > 1. - right;
+        if curtain { cloth * (0.75 + 0.2 * (uv.x * folds).sin()) } else { seen }
+    });
+    canvas
+}
+
+/// What a television or a monitor shows: windows, or nothing but a glimmer.
+fn screen(random: &mut ChaCha8Rng) -> Canvas {
+    if random.happens(0.35) {
+        let glimmer = random.between(0.02, 0.12);
+        let slant = random.between(-1., 1.);
+        let mut canvas = Canvas::of(SIZE, |uv| {
+            Vec3::splat(0.02 + glimmer * smoothstep(0.3, -0.3, uv.y - 0.5 + slant * (uv.x - 0.5)))
+        });
+        canvas.repeats = false;
+        return canvas;
+    }
+    let ground = random.one_of(&[landscape, shapes])(random);
+    let mut canvas = Canvas { repeats: false, ..ground };
+    let script = Script::draw(random);
+    for _ in 0..random.count(0, 4) {
+        let paper = if random.happens(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
+        let half = Vec2::new(random.between(0.12, 0.45), random.between(0.12, 0.45));
+        let middle = Vec2::new(random.between(0.2, 0.8), random.between(0.2, 0.8));
+        canvas.fill(middle, half, paper, |offset| shape::rectangle(offset, half, 0.01));
+        let bar = Palette::draw(random, Purpose::Poster, 1).colour(0);
+        let half_bar = Vec2::new(half.x, 0.02);
+        canvas.fill(middle - Vec2::new(0., half.y - 0.02), half_bar, bar, |offset| {
+            shape::rectangle(offset, half_bar, 0.)
+        });
+        let ink = ink_for(random, paper);
+        let corner = middle - half + Vec2::new(0.02, 0.06);
+        script.paragraph(random, &mut canvas, corner, 2. * half - Vec2::new(0.04, 0.08), 0.018, ink);
+    }
+    canvas
+}
+
+/// Puts a mat and a frame around.
+fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
+    let wood = random.weighted(&[
+        (palette::WOODS, 3.),
+        (palette::GREYS, 2.),
+        (palette::WHITES, 2.),
+        (palette::AUTUMN, 1.),
+    ]);
+    let wood = palette::colour_of(random, wood) * random.between(0.3, 1.);
+    let mat = random.weighted(&[(palette::WHITES, 4.), (palette::ACCENTS, 1.)]);
+    let mat = palette::colour_of(random, mat);
+    let bar = random.between(0.015, 0.07);
+    let margin = if random.happens(0.6) { random.between(0.03, 0.2) } else { 0. };
+    let relief = random.between(0.1, 0.5);
+    let inner = canvas.clone();
+    let all = bar + margin;
+    canvas.change(|uv, _| {
+        let from_edge = uv.min(1. - uv);
+        let near = from_edge.min_element();
+        if near >= all {
+            return inner.sample((uv - all) / (1. - 2. * all));
+        }
+        if near >= bar {
+            // The frame's shadow, and the cut of the mat.
+            let cut = smoothstep(all - 0.004, all, near);
+            return mat * (0.7 + 0.3 * smoothstep(bar, bar + 0.015, near)) * (1. - 0.25 * cut);
+        }
+        let lit = if from_edge.x < from_edge.y { uv.x < 0.5 } else { uv.y < 0.5 };
+        let profile = (near / bar * std::f32::consts::PI).sin();
+        wood * (0.7 + 0.3 * profile + if lit { relief } else { -relief } * (near / bar - 0.5))
+    });
+}

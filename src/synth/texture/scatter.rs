@@ -1,0 +1,196 @@
+//! What lies or grows about in numbers: leaves, grass, gravel, chips, flowers.
+
+use glam::{Vec2, Vec3};
+use rand_chacha::ChaCha8Rng;
+
+use super::chance::Chance;
+use super::noise::fractal;
+use super::palette::{self, Palette};
+use super::shape;
+use super::{Canvas, Purpose, SIZE, Surface};
+
+/// Ground of one theme, dark enough to lie below something.
+fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
+    let palette = Palette::of_theme(random, theme, 2);
+    let cells = random.count(2, 12);
+    let field = fractal(random, SIZE, [cells; 2], 6, 0.75);
+    let dark = random.between(0.35, 1.);
+    let mut canvas = Canvas::of_field(&field, |value| palette.ramp(0.5 + 0.5 * value) * dark);
+    canvas.shade(&field, 0.15);
+    canvas
+}
+
+/// Leaves over each other, the upper ones brighter.
+pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let fallen = !matches!(purpose, Purpose::Foliage) && random.happens(0.5);
+    let theme = if fallen {
+        palette::AUTUMN
+    } else {
+        random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.)])
+    };
+    let mut canvas = ground(random, if fallen { palette::EARTHS } else { theme });
+    if !fallen {
+        canvas.pixels.iter_mut().for_each(|pixel| *pixel *= 0.35);
+    }
+    let palette = Palette::of_theme(random, theme, 4);
+    let length = random.leaning_low(0.025, 0.16);
+    let slim = random.between(0.25, 0.9);
+    let cover = if fallen { random.between(0.2, 1.6) } else { random.between(1.2, 2.6) };
+    let count = (cover / (length * length * slim * 0.5)) as usize;
+    let count = count.min(2600);
+    let veined = random.between(0., 0.35);
+    let lit = random.between(0.3, 0.9);
+    for index in 0..count {
+        let height = index as f32 / count as f32;
+        let light =
+            if fallen { random.between(0.7, 1.2) } else { 1.15 - lit * (1. - height) + 0.2 * random.bell() };
+        let colour = palette.ramp(random.unit()) * light.max(0.1);
+        let turn = random.direction();
+        let size = length * random.between(0.6, 1.3);
+        let width = size * slim * random.between(0.6, 1.1);
+        let tilt = random.between(-0.35, 0.35);
+        let pixels = SIZE as f32;
+        canvas.stamp(random.spot(), Vec2::splat(0.55 * size), |offset| {
+            let local = turn.rotate(offset);
+            let cover = (0.5 - shape::leaf(local, size, width) * pixels).clamp(0., 1.);
+            let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
+            let side = 1. + tilt * local.y.signum() * (local.y.abs() * pixels).min(1.) + 0.3 * local.x / size;
+            (colour * vein * side, cover)
+        });
+    }
+    Surface { canvas, repeat_metres: random.between(0.06, 0.15) / length * 0.6 }
+}
+
+/// Blades of grass, needles, straw.
+pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let theme = random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.5), (palette::EARTHS, 0.5)]);
+    let below = random.one_of(&[palette::EARTHS, theme]);
+    let mut canvas = ground(random, below);
+    let palette = Palette::of_theme(random, theme, 4);
+    let patches = fractal(random, SIZE, [3; 2], 4, 0.6);
+    let bare = random.between(-1.5, 0.3);
+    let length = random.leaning_low(0.025, 0.11);
+    let width = random.between(0.4, 1.2) / SIZE as f32;
+    let upright = random.between(0., 0.9);
+    let count = (random.between(50., 110.) / length) as usize;
+    let dry = palette::colour_of(random, palette::AUTUMN);
+    let dryness = random.leaning_low(0., 0.4);
+    for _ in 0..count {
+        let root = random.spot();
+        let patch = patches.sample(root);
+        let lean = random.direction() * (1. - upright) - Vec2::Y * upright;
+        let half = lean * 0.5 * length * random.between(0.4, 1.2);
+        let light = random.between(0.45, 1.25) * (1. + 0.2 * patch);
+        let green = if random.happens(dryness) { dry } else { palette.ramp(random.unit()) };
+        if patch < bare {
+            continue;
+        }
+        canvas.fill(root, half.abs() + width + 1. / SIZE as f32, green * light, |offset| {
+            shape::stroke(offset, -half, half, width)
+        });
+    }
+    if random.happens(0.2) {
+        let petals = [palette::VIVID, palette::WHITES, palette::ACCENTS]
+            .map(|theme| palette::colour_of(random, theme));
+        for _ in 0..random.count(10, 150) {
+            let radius = random.between(1., 3.) / SIZE as f32;
+            let colour = random.one_of(&petals);
+            canvas
+                .fill(random.spot(), Vec2::splat(2. * radius), colour, |offset| shape::disk(offset, radius));
+        }
+    }
+    Surface { canvas, repeat_metres: random.between(0.8, 3.) }
+}
+
+/// Pebbles, gravel, bark, rubble: rounded bits with a lit side and a shadow.
+pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let theme = random.weighted(&[
+        (palette::STONES, 5.),
+        (palette::EARTHS, 2.),
+        (palette::GREYS, 2.),
+        (palette::BROWNS, 1.),
+        (palette::WHITES, 0.5),
+    ]);
+    let below = random.one_of(&[palette::EARTHS, theme]);
+    let mut canvas = ground(random, below);
+    let palette = Palette::of_theme(random, theme, 4);
+    let radius = random.leaning_low(0.008, 0.06);
+    let cover = random.between(0.4, 1.4);
+    let count = ((cover / (3. * radius * radius)) as usize).min(3000);
+    let angular = random.happens(0.4);
+    let (light, strength) = (random.direction(), random.between(0.15, 0.7));
+    let shadow = random.between(0., 0.7);
+    let flat = random.between(0.5, 1.);
+    let spread = random.between(0.1, 0.6);
+    for _ in 0..count {
+        let centre = random.spot();
+        let size = radius * random.leaning_low(0.35, 1.5);
+        let radii = Vec2::new(size, size * random.between(flat, 1.));
+        let turn = random.direction();
+        let tone = palette.ramp(random.unit()) * (1. + spread * random.bell()).max(0.2);
+        let corners = random.count(3, 6);
+        let distance = |offset: Vec2| {
+            let local = turn.rotate(offset) * size / radii;
+            if angular { shape::polygon(local, 0.75 * size, corners) } else { shape::disk(local, size) }
+        };
+        let reach = Vec2::splat(1.5 * size);
+        let pixels = SIZE as f32;
+        canvas.stamp(centre - light * 0.35 * size, reach, |offset| {
+            (Vec3::splat(0.01), shadow * (0.5 - distance(offset) * pixels * 0.5).clamp(0., 1.))
+        });
+        canvas.stamp(centre, reach, |offset| {
+            let lit = 1. + strength * offset.dot(light) / size;
+            (tone * lit.max(0.1), (0.5 - distance(offset) * pixels).clamp(0., 1.))
+        });
+    }
+    Surface { canvas, repeat_metres: random.between(0.008, 0.05) / radius }
+}
+
+/// Earth and sand, with tracks, clods and a bit of green.
+pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let theme = random.weighted(&[(palette::EARTHS, 5.), (palette::BEIGES, 1.5), (palette::BROWNS, 1.)]);
+    let mut canvas = ground(random, theme);
+    let cells = random.leaning_low(4., 32.) as usize;
+    let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3]]);
+    let clods = fractal(random, SIZE, stretch.map(|factor| cells * factor), 5, 0.8);
+    canvas.shade(&clods.slope(random.direction()), random.between(0.2, 1.2));
+    if random.happens(0.5) {
+        let green = Palette::of_theme(random, palette::GREENS, 2);
+        let patches = fractal(random, SIZE, [3; 2], 6, 0.75);
+        let level = random.between(-0.4, 1.);
+        for (pixel, value) in canvas.pixels.iter_mut().zip(&patches.values) {
+            let share = shape::smoothstep(level, level + 0.5, *value);
+            *pixel = pixel.lerp(green.ramp(0.5 + 0.5 * value), 0.9 * share);
+        }
+    }
+    Surface { canvas, repeat_metres: random.between(1., 4.) }
+}
+
+/// Confetti, splashes, brush strokes: bits of any shape in several colours.
+pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let count = random.count(3, 5);
+    let palette = Palette::draw(random, purpose, count);
+    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let length = random.leaning_low(0.02, 0.3);
+    let bits = (random.between(0.2, 2.) / (length * length)).min(800.) as usize;
+    let kind = random.count(0, 3);
+    let slim = random.between(0.05, 0.6);
+    let clear = random.between(0.4, 1.);
+    for _ in 0..bits {
+        let colour = palette.any(random);
+        let turn = random.direction();
+        let size = length * random.between(0.3, 1.2);
+        let pixels = SIZE as f32;
+        canvas.stamp(random.spot(), Vec2::splat(0.8 * size), |offset| {
+            let local = turn.rotate(offset);
+            let distance = match kind {
+                0 => shape::ellipse(local, Vec2::new(0.5, 0.5 * slim + 0.1) * size),
+                1 => shape::rectangle(local, Vec2::new(0.5, 0.5 * slim) * size, 0.),
+                2 => shape::polygon(local, 0.3 * size, 3),
+                _ => shape::flower(local, 0.5 * size, 5, slim),
+            };
+            (colour, clear * (0.5 - distance * pixels).clamp(0., 1.))
+        });
+    }
+    Surface { canvas, repeat_metres: random.leaning_low(0.4, 3.) }
+}

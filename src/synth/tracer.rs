@@ -1,0 +1,376 @@
+//! Rays through triangles.
+
+use super::light::{Lamp, Sky};
+use super::material::Material;
+use super::mesh::Mesh;
+use glam::{Vec2, Vec3, Vec3A};
+use obvhs::BvhBuildParams;
+use obvhs::cwbvh::CwBvh;
+use obvhs::cwbvh::builder::build_cwbvh_from_tris;
+use obvhs::ray::{Ray, RayHit};
+use obvhs::triangle::Triangle;
+use rayon::prelude::*;
+use std::f32::consts::{PI, TAU};
+use std::time::Duration;
+
+/// Directions in which a vertex looks for the light that other surfaces send it.
+const GATHERED: usize = 24;
+/// How far rays begin from the surface that they leave, in metres.
+const LIFT: f32 = 1e-3;
+/// Mirrors in mirrors that are followed.
+const DEPTH: u32 = 3;
+
+/// Surfaces with their materials, and what lights them.
+#[derive(Default)]
+pub(super) struct Parts {
+    pub meshes: Vec<(Mesh, Material)>,
+    pub lamps: Vec<Lamp>,
+}
+
+/// A world that can be looked at.
+pub(super) struct Tracer {
+    bvh: CwBvh,
+    triangles: Vec<Triangle>,
+    /// Of each triangle: its vertices and its material.
+    corners: Vec<([u32; 3], u32)>,
+    normals: Vec<Vec3>,
+    uvs: Vec<Vec2>,
+    /// Indirect irradiance at each vertex, over π: what reaches it by way of one other surface, or from the sky.
+    indirect: Vec<Vec3>,
+    materials: Vec<Material>,
+    lamps: Vec<Lamp>,
+    sky: Sky,
+}
+
+/// What a ray finds.
+#[derive(Debug, Clone, Copy)]
+struct Hit {
+    triangle: usize,
+    distance: f32,
+}
+
+/// Where a ray arrived.
+struct Surface<'a> {
+    point: Vec3,
+    /// Against the ray.
+    normal: Vec3,
+    /// Of the triangle, against the ray.
+    flat: Vec3,
+    reflectance: Vec3,
+    indirect: Vec3,
+    material: &'a Material,
+}
+
+/// What one sample of a pixel may depend on besides its ray.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SampleChoice {
+    /// Which of the lamps is asked; a pixel's four samples take turns.
+    pub turn: usize,
+    /// Where on it, in [0, 1)².
+    pub on_lamp: Vec2,
+}
+
+impl Tracer {
+    /// Gathers indirect light, which takes most of the time, on all threads.
+    pub fn new(parts: Parts, sky: Sky) -> Tracer {
+        let mut whole = Mesh::default();
+        let (mut corners, mut materials, mut normals) = (vec![], vec![], vec![]);
+        for (mesh, material) in parts.meshes {
+            let (first, number) = (whole.positions.len() as u32, materials.len() as u32);
+            corners.extend(mesh.triangles.iter().map(|c| (c.map(|vertex| first + vertex), number)));
+            normals.extend(mesh.normals());
+            whole.join(mesh);
+            materials.push(material);
+        }
+        let position = |vertex: u32| Vec3A::from(whole.positions[vertex as usize]);
+        let triangle = |(c, _): &([u32; 3], u32)| Triangle {
+            v0: position(c[0]),
+            v1: position(c[1]),
+            v2: position(c[2]),
+        };
+        let triangles: Vec<Triangle> = corners.iter().map(triangle).collect();
+        let bvh = build_cwbvh_from_tris(&triangles, BvhBuildParams::fast_build(), &mut Duration::default());
+        // In the tree's order: neighbours in space are neighbours in memory.
+        let order = || bvh.primitive_indices.iter().map(|&index| index as usize);
+        let triangles = order().map(|index| triangles[index]).collect();
+        let corners = order().map(|index| corners[index]).collect();
+        let insides = whole.insides();
+        let uvs = whole.uvs;
+        let (lamps, indirect) = (taking_turns(parts.lamps), vec![]);
+        let mut tracer = Tracer { bvh, triangles, corners, normals, uvs, indirect, materials, lamps, sky };
+        tracer.indirect = tracer.gathered(&insides);
+        tracer
+    }
+
+    /// Radiance from `towards` (unit), at `origin`, seen by a pixel `spread` radians wide, and the distance to what is there,
+    /// infinite where nothing is.
+    pub fn look(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> (Vec3, f32) {
+        let hit = self.nearest(origin, towards, f32::INFINITY);
+        let distance = hit.map_or(f32::INFINITY, |hit| hit.distance);
+        (self.radiance(origin, towards, hit, spread, choice, DEPTH), distance)
+    }
+
+    /// The distance to what is towards there, at most `limit`.
+    pub fn free(&self, origin: Vec3, towards: Vec3, limit: f32) -> f32 {
+        self.nearest(origin, towards, limit).map_or(limit, |hit| hit.distance)
+    }
+
+    pub fn triangles(&self) -> usize {
+        self.triangles.len()
+    }
+
+    fn radiance(
+        &self,
+        origin: Vec3,
+        towards: Vec3,
+        hit: Option<Hit>,
+        spread: f32,
+        choice: SampleChoice,
+        depth: u32,
+    ) -> Vec3 {
+        let Some(hit) = hit else { return self.sky.seen(towards) };
+        let surface = self.surface(origin, towards, hit, spread);
+        let material = surface.material;
+        let (direct, highlight) = self.direct(&surface, towards, choice);
+        let mut radiance = surface.reflectance * (surface.indirect + direct + material.glow) + highlight;
+        // Schlick: surfaces mirror more at a flat angle.
+        let flatness = 1. + towards.dot(surface.normal);
+        let mirror = material.mirror + (1. - material.mirror) * material.mirror.sqrt() * flatness.powi(5);
+        if mirror > 0.02 && depth > 0 {
+            let away = towards - 2. * towards.dot(surface.normal) * surface.normal;
+            let start = surface.point + LIFT * surface.flat;
+            let next = self.nearest(start, away, f32::INFINITY);
+            let mirrored = self.radiance(start, away, next, 2. * spread, choice, depth - 1);
+            radiance = radiance.lerp(mirrored, mirror);
+        }
+        radiance
+    }
+
+    /// Irradiance over π from the lamp whose turn it is, times the number of lamps, and its highlight.
+    fn direct(&self, surface: &Surface, towards: Vec3, choice: SampleChoice) -> (Vec3, Vec3) {
+        if self.lamps.is_empty() {
+            return (Vec3::ZERO, Vec3::ZERO);
+        }
+        let lamp = choice.turn % self.lamps.len();
+        let light = self.lamps[lamp].arriving(surface.point, choice.on_lamp);
+        let facing = light.towards.dot(surface.normal);
+        if facing <= 0. || light.towards.dot(surface.flat) <= 0. || light.colour.max_element() < 1e-4 {
+            return (Vec3::ZERO, Vec3::ZERO);
+        }
+        let start = surface.point + LIFT * surface.flat;
+        if self.is_blocked(start, light.towards, light.distance - 2. * LIFT) {
+            return (Vec3::ZERO, Vec3::ZERO);
+        }
+        let colour = self.lamps.len() as f32 * light.colour;
+        let Material { gloss, polish, .. } = *surface.material;
+        let highlight = if gloss > 0. {
+            // Blinn and Phong, normalized.
+            let half = (light.towards - towards).normalize_or(surface.normal);
+            let lobe = (polish + 8.) / (8. * PI) * half.dot(surface.normal).max(0.).powf(polish);
+            gloss * lobe * facing * colour
+        } else {
+            Vec3::ZERO
+        };
+        (colour * facing / PI, highlight)
+    }
+
+    fn surface(&self, origin: Vec3, towards: Vec3, hit: Hit, spread: f32) -> Surface<'_> {
+        let (corners, material) = self.corners[hit.triangle];
+        let [a, b, c] = corners.map(|vertex| vertex as usize);
+        let Triangle { v0, v1, v2 } = self.triangles[hit.triangle];
+        let point = origin + hit.distance * towards;
+        let cross = Vec3::from((v1 - v0).cross(v2 - v0));
+        let area = cross.length_squared();
+        // Barycentric coordinates of b and c.
+        let from_a = Vec3A::from(point) - v0;
+        let s = Vec3::from(from_a.cross(v2 - v0)).dot(cross) / area;
+        let t = Vec3::from((v1 - v0).cross(from_a)).dot(cross) / area;
+        let mut flat = cross / area.sqrt();
+        if flat.dot(towards) > 0. {
+            flat = -flat;
+        }
+        let mean = |[x, y, z]: [Vec3; 3]| x + s * (y - x) + t * (z - x);
+        let mut normal = mean([self.normals[a], self.normals[b], self.normals[c]]).normalize_or(flat);
+        if normal.dot(flat) < 0. {
+            normal = -normal;
+        }
+        let uv = self.uvs[a] + s * (self.uvs[b] - self.uvs[a]) + t * (self.uvs[c] - self.uvs[a]);
+        let material = &self.materials[material as usize];
+        let slant = (-towards.dot(flat)).max(0.1);
+        let reflectance = material.reflectance(uv, hit.distance * spread / slant.sqrt());
+        let indirect = if self.indirect.is_empty() {
+            Vec3::ZERO
+        } else {
+            mean([self.indirect[a], self.indirect[b], self.indirect[c]])
+        };
+        Surface { point, normal, flat, reflectance, indirect, material }
+    }
+
+    /// Light by way of one other surface, or from the sky, at every vertex, for which `insides` stand. The same directions about each normal make errors
+    /// smooth.
+    fn gathered(&self, insides: &[Vec3]) -> Vec<Vec3> {
+        let directions: Vec<Vec3> = (0..GATHERED)
+            .map(|i| {
+                // Cosine-weighted, on a spiral.
+                let height = (1. - (i as f32 + 0.5) / GATHERED as f32).sqrt();
+                let angle = TAU * 0.618_034 * i as f32;
+                let ring = (1. - height * height).sqrt();
+                Vec3::new(ring * angle.cos(), ring * angle.sin(), height)
+            })
+            .collect();
+        let gather = |(&inside, &normal): (&Vec3, &Vec3)| {
+            let (right, up) = normal.any_orthonormal_pair();
+            let start = inside + 5. * LIFT * normal;
+            let arriving = |(i, d): (usize, &Vec3)| {
+                let towards = d.x * right + d.y * up + d.z * normal;
+                let Some(hit) = self.nearest(start, towards, f32::INFINITY) else {
+                    return self.sky.around(towards);
+                };
+                let surface = self.surface(start, towards, hit, 0.3);
+                let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
+                let (direct, _) = self.direct(&surface, towards, choice);
+                // What surfaces send each other over and over is taken for a part of the sky's light.
+                let rest = 0.12 * self.sky.around(surface.normal);
+                surface.reflectance * (direct + surface.material.glow + rest)
+            };
+            directions.iter().enumerate().map(arriving).sum::<Vec3>() / GATHERED as f32
+        };
+        insides.par_iter().zip(&self.normals).map(gather).collect()
+    }
+
+    fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
+        let ray = Ray::new(origin.into(), towards.into(), 0., limit);
+        let mut hit = RayHit::none();
+        let is_hit = self.bvh.ray_traverse(ray, &mut hit, |ray, at| distance(&self.triangles[at], ray));
+        is_hit.then_some(Hit { triangle: hit.primitive_id as usize, distance: hit.t })
+    }
+
+    fn is_blocked(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
+        let ray = Ray::new(origin.into(), towards.into(), 0., limit);
+        let mut state = self.bvh.new_ray_traversal(ray);
+        let mut hit = RayHit::none();
+        self.bvh.ray_traverse_dynamic(&mut state, &mut hit, |ray, at| distance(&self.triangles[at], ray))
+    }
+}
+
+/// Along the ray to the triangle, infinite beside it (Möller and Trumbore, 1997). Edges belong to it, so that there is no gap
+/// between two.
+#[inline]
+fn distance(&Triangle { v0, v1, v2 }: &Triangle, ray: &Ray) -> f32 {
+    let (right, up) = (v1 - v0, v2 - v0);
+    let normal = right.cross(up);
+    let scale = 1. / normal.dot(ray.direction);
+    let way = v0 - ray.origin;
+    let across = way.cross(ray.direction);
+    let (u, v) = (scale * up.dot(across), -scale * right.dot(across));
+    let t = scale * normal.dot(way);
+    // False, too, where nothing is a number: the ray runs along the triangle.
+    let is_hit = u >= 0. && v >= 0. && u + v <= 1. && t >= ray.tmin;
+    if is_hit { t } else { f32::INFINITY }
+}
+
+/// One, two or four lamps, which a pixel's four samples ask equally often: one of three becomes two of half its light, and more
+/// than four are too many.
+fn taking_turns(mut lamps: Vec<Lamp>) -> Vec<Lamp> {
+    lamps.truncate(4);
+    if lamps.len() == 3 {
+        let half = lamps[2].dimmed(0.5);
+        lamps[2] = half;
+        lamps.push(half);
+    }
+    lamps
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synth::noise::Noise;
+    use crate::synth::shapes::superellipsoid;
+    use crate::synth::texture::Texture;
+    use std::sync::Arc;
+
+    const DARK: Sky =
+        Sky { zenith: Vec3::ZERO, horizon: Vec3::ZERO, ground: Vec3::ZERO, clouds: 0., noise: Noise::new(0) };
+
+    /// A floor of reflectance `grey`, five metres each way, and whatever `more` adds.
+    fn world(grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
+        let texture =
+            Arc::new(Texture::of_picture(&image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]))));
+        let material = Material::matte(texture);
+        let mut parts = Parts::default();
+        let floor = Mesh::rectangle(Vec3::new(-5., 0., 5.), Vec3::X * 10., Vec3::Z * -10., 1.);
+        parts.meshes.push((floor, material.clone()));
+        more(&mut parts, &material);
+        Tracer::new(parts, DARK)
+    }
+
+    fn seen(tracer: &Tracer, at: Vec3) -> f32 {
+        let choice = |turn| SampleChoice { turn, on_lamp: Vec2::splat(0.5) };
+        let eye = at + Vec3::new(0.5, 3., 0.5);
+        let look = |turn| tracer.look(eye, (at - eye).normalize(), 1e-3, choice(turn)).0.x;
+        (0..4).map(look).sum::<f32>() / 4.
+    }
+
+    /// Lambert: radiance is reflectance · irradiance · cos / π, whatever the number of lamps.
+    #[test]
+    fn matte_floors_are_as_bright_as_light_and_angle_say() {
+        let reflectance = ((186. / 255. + 0.055f32) / 1.055).powf(2.4);
+        for lamps in 1..=4 {
+            let tracer = world(186, |parts, _| {
+                for i in 0..lamps {
+                    let towards = Vec3::new(0.1 * i as f32, 1., 0.).normalize();
+                    parts.lamps.push(Lamp::Sun { towards, spread: 0., colour: Vec3::splat(2.) });
+                }
+            });
+            let cosines: f32 = (0..lamps).map(|i| Vec3::new(0.1 * i as f32, 1., 0.).normalize().y).sum();
+            let expected = reflectance * 2. * cosines / PI;
+            let found = seen(&tracer, Vec3::new(0.3, 0., 0.2));
+            assert!((found / expected - 1.).abs() < 0.02, "{lamps} lamps: {found}, expected {expected}");
+        }
+    }
+
+    #[test]
+    fn light_of_a_ball_falls_with_the_square_of_the_distance() {
+        let tracer = world(255, |parts, _| {
+            parts.lamps.push(Lamp::Ball { at: Vec3::new(0., 2., 0.), radius: 0., colour: Vec3::ONE });
+        });
+        let (below, aside) =
+            (seen(&tracer, Vec3::new(0.02, 0., 0.01)), seen(&tracer, Vec3::new(2., 0., 0.01)));
+        // Twice the squared distance, and the angle's cosine.
+        assert!((below / aside - 2. * 2f32.sqrt()).abs() < 0.05, "{below} {aside}");
+    }
+
+    #[test]
+    fn what_is_in_between_casts_a_shadow_and_sends_light_on() {
+        let sun = Lamp::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(3.) };
+        let tracer = world(186, |parts, material| {
+            parts.lamps.push(sun);
+            let ball = superellipsoid(Vec3::ONE, [1., 1.], 16).warped(|p| p + 1.5 * Vec3::Y);
+            parts.meshes.push((ball, material.clone()));
+        });
+        let (shadow, lit) = (seen(&tracer, Vec3::new(0.1, 0., 0.1)), seen(&tracer, Vec3::new(2., 0., 2.)));
+        assert!(shadow < 0.3 * lit, "{shadow} {lit}");
+        // From below, the ball is lit by the floor alone.
+        let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
+        let below = tracer.look(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).0.x;
+        assert!(below > 0.1 * lit && below < lit, "{below} {lit}");
+    }
+
+    #[test]
+    fn triangles_have_no_gaps_between_them() {
+        let tracer = world(128, |_, _| {});
+        for i in 0..19 * 19 {
+            let (a, b) = ((i % 19) as f32 / 2. - 4.5, (i / 19) as f32 / 2. - 4.5);
+            let found = tracer.free(Vec3::new(a, 1., b), Vec3::NEG_Y, 9.);
+            assert!((found - 1.).abs() < 1e-5, "a gap at {a}, {b}");
+        }
+    }
+
+    #[test]
+    fn distances_are_those_of_the_surfaces() {
+        let tracer = world(128, |_, _| {});
+        assert!((tracer.free(Vec3::new(0.2, 3., 0.1), Vec3::NEG_Y, 10.) - 3.).abs() < 1e-5);
+        assert_eq!(tracer.free(Vec3::Y, Vec3::Y, 7.), 7.);
+        assert_eq!(tracer.free(Vec3::Y, Vec3::Y, f32::INFINITY), f32::INFINITY);
+    }
+}

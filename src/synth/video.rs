@@ -1,0 +1,175 @@
+//! A made-up world, and a video taken in it.
+
+use super::light::Sky;
+use super::maker::Maker;
+use super::sensor::{Hash, Sensor};
+use super::texture::Texture;
+use super::tracer::{SampleChoice, Tracer};
+use super::walk::{Place, walk};
+use super::{open, room};
+use crate::scene::{Camera, ImageSize, Intrinsics};
+use glam::{DMat4, Vec2, Vec3, vec2};
+use image::RgbImage;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use std::fmt;
+use std::sync::Arc;
+
+/// Rays a pixel, along a side.
+const RAYS: u32 = 2;
+/// Worlds that are made until there is a way through one.
+const WORLDS: u64 = 20;
+
+/// What every video of a data set has in common.
+#[derive(Debug, Clone)]
+pub struct VideoSettings {
+    /// Pictures of each.
+    pub frames: usize,
+    /// Of a picture.
+    pub size: ImageSize,
+    /// Pictures of the user's, seen on some of the things.
+    pub pictures: Vec<Arc<Texture>>,
+}
+
+/// A world and the cameras in it. Pictures are made when they are asked for.
+pub struct Video {
+    tracer: Tracer,
+    sensor: Sensor,
+    cameras: Vec<Camera>,
+    seed: u32,
+}
+
+impl Video {
+    /// From the eye; each of them asks a lamp by a ray of its own.
+    pub const RAYS_PER_PIXEL: u32 = RAYS * RAYS;
+
+    /// Video number `index` of those of `seed`: the same on every machine and for any number of threads.
+    pub fn new(seed: u64, index: u64, settings: &VideoSettings) -> Video {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        (0..WORLDS)
+            .find_map(|attempt| {
+                random.set_stream(index.wrapping_mul(WORLDS).wrapping_add(attempt));
+                random.set_word_pos(0);
+                Video::attempt(random.clone(), settings)
+            })
+            .expect("a way through one of many worlds")
+    }
+
+    fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
+        let mut make = Maker::new(random, settings.pictures.clone());
+        let (place, sky) = world(&mut make);
+        let tracer = Tracer::new(std::mem::take(&mut make.parts), sky);
+        let poses = walk(&mut make, &tracer, place, settings.frames)?;
+        let cameras = cameras(&mut make, poses, settings.size);
+        let seen = mean_light(&tracer, &cameras);
+        let sensor = Sensor::draw(&mut make, seen);
+        let seed = make.within(0..u32::MAX);
+        Some(Video { tracer, sensor, cameras, seed })
+    }
+
+    /// Of the pictures.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// Triangles of the world.
+    pub fn triangles(&self) -> usize {
+        self.tracer.triangles()
+    }
+
+    /// Picture `index`.
+    pub fn photo(&self, index: usize) -> RgbImage {
+        let camera = &self.cameras[index];
+        let time = index as f32 / self.cameras.len() as f32;
+        let half = 0.5 * vec2(camera.width as f32, camera.height as f32);
+        let spread = 1. / (camera.intrinsics.fx as f32 * RAYS as f32);
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        RgbImage::from_fn(camera.width, camera.height, |x, y| {
+            let pixel = y * camera.width + x;
+            let mut random = Hash::new(self.seed, index as u32, pixel);
+            let mut light = Vec3::ZERO;
+            for sample in 0..Self::RAYS_PER_PIXEL {
+                let cell = vec2((sample % RAYS) as f32, (sample / RAYS) as f32);
+                let jitter = vec2(random.uniform(), random.uniform());
+                let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
+                let on_lamp = vec2(random.uniform(), random.uniform());
+                let choice = SampleChoice { turn: sample as usize, on_lamp };
+                let (radiance, _) = self.tracer.look(eye, towards(camera, at), spread, choice);
+                // One ray that meets a lamp doesn't outshine all others of its pixel.
+                light += radiance.min(Vec3::splat(8.));
+            }
+            let place = (vec2(x as f32, y as f32) - half) / half;
+            let mean = light / Self::RAYS_PER_PIXEL as f32;
+            image::Rgb(self.sensor.bytes(mean, index as u32, time, place, pixel))
+        })
+    }
+
+    /// Depths along the camera's axis at the centres of picture `index`'s pixels, row by row, in metres; infinite where the sky
+    /// is.
+    pub fn depth(&self, index: usize) -> Vec<f32> {
+        let camera = &self.cameras[index];
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        let axis = camera.c2w.z_axis.truncate().as_vec3();
+        let rows = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+        rows.map(|(x, y)| {
+            let ray = towards(camera, vec2(x as f32 + 0.5, y as f32 + 0.5));
+            self.tracer.free(eye, ray, f32::INFINITY) * ray.dot(axis)
+        })
+        .collect()
+    }
+}
+
+/// Of triangles nobody wants to read.
+impl fmt::Debug for Video {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "a video of {} frames, number {}", self.cameras.len(), self.seed)
+    }
+}
+
+/// Rooms for the most part: what people photograph, and what is hardest to get right.
+fn world(make: &mut Maker) -> (Place, Sky) {
+    let mut sky = open::sky(make);
+    let place = match make.within(0..100) {
+        0..55 => room::room(make, &mut sky),
+        55..75 => room::box_of_shapes(make, &mut sky),
+        _ => open::landscape(make, &sky),
+    };
+    (place, sky)
+}
+
+fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
+    let (width, height) = (f64::from(size.width), f64::from(size.height));
+    let focal = f64::from(make.scaled(0.55, 1.3)) * width.min(height);
+    let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
+    let camera = |c2w| Camera { intrinsics, c2w, width: size.width, height: size.height };
+    poses.into_iter().map(camera).collect()
+}
+
+/// The unit direction from the camera through `at`, in pixels.
+fn towards(camera: &Camera, at: Vec2) -> Vec3 {
+    let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+    let x = (at.x - cx as f32) / fx as f32;
+    let y = (at.y - cy as f32) / fy as f32;
+    let [right, down, forward] =
+        [camera.c2w.x_axis, camera.c2w.y_axis, camera.c2w.z_axis].map(|axis| axis.truncate().as_vec3());
+    (x * right + y * down + forward).normalize()
+}
+
+/// The geometric mean of the radiance of a few rays of a few pictures: a lamp or a window in the picture doesn't leave all else
+/// dark.
+fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
+    const SIDE: usize = 8;
+    let mut sum = Vec3::ZERO;
+    let picked = [0, cameras.len() / 2, cameras.len() - 1];
+    for camera in picked.map(|index| &cameras[index]) {
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        for i in 0..SIDE * SIDE {
+            let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
+            let at = cell * vec2(camera.width as f32, camera.height as f32);
+            let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
+            let (radiance, _) = tracer.look(eye, towards(camera, at), 0.05, choice);
+            sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
+        }
+    }
+    (sum / (picked.len() * SIDE * SIDE) as f32).map(f32::exp)
+}

@@ -1,0 +1,198 @@
+//! Where videos are taken from: walks, dollies, orbits and flights through free space, by hand.
+
+use super::maker::Maker;
+use super::noise::Noise;
+use super::tracer::Tracer;
+use glam::{DMat4, DVec3, DVec4, Vec3, vec3};
+
+/// Paths that are tried before a world is given up.
+const TRIES: usize = 80;
+/// Places of a path that have to be free.
+const CHECKED: usize = 12;
+
+/// Where cameras may be.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    /// A corner of the box around it, and the other one.
+    pub least: Vec3,
+    pub most: Vec3,
+    /// Usual heights of an eye above the ground, in metres.
+    pub eye: (f32, f32),
+    /// Free space that a camera needs around it, in metres.
+    pub roomy: f32,
+}
+
+/// How a camera moves as time goes from 0 to 1.
+#[derive(Debug, Clone, Copy)]
+struct Path {
+    start: Vec3,
+    /// What is looked at, at the start, and how it moves.
+    target: Vec3,
+    target_motion: Vec3,
+    motion: Vec3,
+    /// Part of a circle about the target, in radians.
+    orbit: f32,
+    /// Sideways swing in metres, and its waves.
+    swing: (Vec3, f32),
+    /// A hand's: metres, and how fast.
+    shake: (f32, f32),
+    /// Tilt of the horizon at the start and at the end.
+    roll: (f32, f32),
+    noise: Noise,
+}
+
+impl Path {
+    /// Position, direction of view, and roll.
+    fn at(&self, time: f32) -> (Vec3, Vec3, f32) {
+        // Nobody starts at full speed.
+        let eased = 0.7 * time + 0.3 * time * time * (3. - 2. * time);
+        let target = self.target + eased * self.target_motion;
+        let (sin, cos) = (self.orbit * eased).sin_cos();
+        let away = self.start - self.target;
+        let turned = vec3(cos * away.x + sin * away.z, away.y, cos * away.z - sin * away.x);
+        let (swing, waves) = self.swing;
+        let hand = |offset: f32| self.noise.fractal(vec3(self.shake.1 * time + offset, offset, 0.), 3);
+        let shaken = self.shake.0 * vec3(hand(0.), hand(40.), hand(80.));
+        let position = self.target + turned + eased * self.motion + (waves * eased).sin() * swing + shaken;
+        let aim = 0.3 * self.shake.0 * vec3(hand(120.), hand(160.), hand(200.));
+        let roll = self.roll.0 + eased * (self.roll.1 - self.roll.0);
+        (position, (target - position).normalize_or(Vec3::Z) + aim, roll)
+    }
+}
+
+/// Camera-to-world poses of `frames` pictures, x right, y down, z forward; none where there is no way through.
+pub(super) fn walk(make: &mut Maker, tracer: &Tracer, place: Place, frames: usize) -> Option<Vec<DMat4>> {
+    for attempt in 0..TRIES {
+        // The longer it takes, the shorter paths get.
+        let patience = 1. - attempt as f32 / TRIES as f32;
+        let path = draw(make, tracer, place, patience);
+        if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
+            let last = frames.max(2) - 1;
+            return path.map(|path| (0..frames).map(|i| pose(path.at(i as f32 / last as f32))).collect());
+        }
+    }
+    None
+}
+
+fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Option<Path> {
+    // Of several standpoints the one with the widest view, as photographers choose.
+    let views: Vec<(Vec3, Vec3)> = (0..make.within(1..6)).map(|_| standpoint(make, tracer, place)).collect();
+    let width = |&(start, towards): &(Vec3, Vec3)| {
+        let (right, up) =
+            (towards.cross(Vec3::Y).normalize(), towards.cross(Vec3::Y).cross(towards).normalize());
+        let rays = [(0., 0.), (0.3, 0.), (-0.3, 0.), (0., -0.3), (0.3, -0.3), (-0.3, -0.3)];
+        let depth =
+            |(x, y): (f32, f32)| tracer.free(start, (towards + x * right + y * up).normalize(), 20.).ln();
+        rays.map(depth).iter().sum::<f32>() / rays.len() as f32
+    };
+    let widths = views.iter().map(|view| (width(view), *view));
+    let (widest, (start, towards)) = widths.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    let depth = widest.exp();
+    if depth < 1.2 * patience {
+        return None;
+    }
+    let (right, up) = (towards.cross(Vec3::Y).normalize(), Vec3::Y);
+    let length = patience * depth.min(6.) * make.scaled(0.12, 0.8);
+    let sign = make.one_of(&[-1., 1.]);
+    let mut path = Path {
+        start,
+        target: start + depth * make.within(0.6..1.2) * towards,
+        target_motion: Vec3::ZERO,
+        motion: Vec3::ZERO,
+        orbit: 0.,
+        swing: (
+            right * length * make.within(0. ..0.12) + up * length * make.within(0. ..0.05),
+            make.within(2. ..9.),
+        ),
+        shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
+        roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
+        noise: make.noise(),
+    };
+    match make.within(0..10) {
+        // Forwards or back, the way people walk and real-estate videos go.
+        0..4 => {
+            let way = if make.chance(0.8) { towards } else { -towards };
+            path.motion = length * (way.with_y(0.2 * way.y) + make.within(-0.5..0.5) * right);
+            path.target_motion = path.motion * make.within(0.3..1.) + right * make.within(-0.3..0.3) * length;
+        }
+        // Sideways on rails.
+        4..7 => {
+            path.motion = length * (sign * right + make.within(-0.3..0.3) * towards);
+            path.target_motion = path.motion * make.within(0.2..1.1);
+        }
+        // About something.
+        7 | 8 => path.orbit = sign * patience * make.within(0.2..1.1),
+        // Up and over.
+        _ => {
+            path.motion = length
+                * (make.within(-0.5..0.5) * up
+                    + make.within(-0.7..0.7) * right
+                    + make.within(-0.5..0.5) * towards);
+            path.target_motion = make.within(0. ..0.6) * path.motion;
+        }
+    }
+    // Turning on the way.
+    if make.chance(0.35) {
+        path.target_motion += sign * right * depth * patience * make.within(0.1..0.7);
+    }
+    Some(path)
+}
+
+/// Where somebody might stand, or fly, and where they look.
+fn standpoint(make: &mut Maker, tracer: &Tracer, place: Place) -> (Vec3, Vec3) {
+    let Place { least, most, eye, .. } = place;
+    let start = least + (most - least) * vec3(make.within(0. ..1.), 0., make.within(0. ..1.));
+    let below = tracer.free(start.with_y(most.y), Vec3::NEG_Y, 40.);
+    let is_flight = make.chance(0.12);
+    let height =
+        if is_flight { make.within(eye.1..most.y.max(eye.1 + 0.1)) } else { make.within(eye.0..eye.1) };
+    let start = start.with_y(((most.y - below).max(0.) + height).min(most.y));
+    // Mostly into the scene, level or somewhat down.
+    let middle = (0.5 * (least + most) - start).with_y(0.).normalize_or(Vec3::X);
+    let turn = make.within(-1f32..1.) * make.one_of(&[0.6, 1.2, 3.1]);
+    let pitch = if is_flight { make.within(-0.8..-0.05) } else { make.within(-0.35..0.15) };
+    let level = vec3(
+        turn.cos() * middle.x + turn.sin() * middle.z,
+        0.,
+        turn.cos() * middle.z - turn.sin() * middle.x,
+    );
+    (start, (level + pitch * Vec3::Y).normalize())
+}
+
+/// Whether nothing is in the way, and something is seen.
+fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
+    let margin = place.roomy * (0.3 + 0.7 * patience);
+    let mut before: Option<Vec3> = None;
+    (0..=CHECKED).all(|i| {
+        let (at, towards, _) = path.at(i as f32 / CHECKED as f32);
+        let towards = towards.normalize();
+        let inside = at.cmpge(place.least).all() && at.cmple(place.most).all();
+        let sides = [Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z];
+        let is_roomy = || sides.iter().all(|&side| tracer.free(at, side, margin) >= margin);
+        let right = towards.cross(Vec3::Y).normalize_or(Vec3::X);
+        let up = right.cross(towards);
+        let sees = || {
+            [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].iter().all(|&(x, y)| {
+                let ray = (towards + x * right + y * up).normalize();
+                tracer.free(at, ray, 1.) > 1.6 * margin
+            })
+        };
+        let is_open = before.is_none_or(|from| {
+            let way = at - from;
+            let length = way.length();
+            length < 1e-6 || tracer.free(from, way / length, length) >= length
+        });
+        before = Some(at);
+        inside && is_open && is_roomy() && sees()
+    })
+}
+
+fn pose((position, towards, roll): (Vec3, Vec3, f32)) -> DMat4 {
+    let forward = towards.as_dvec3().normalize();
+    let level = forward.cross(DVec3::Y).normalize();
+    let below = forward.cross(level);
+    let (sin, cos) = f64::from(roll).sin_cos();
+    let (right, down) = (cos * level + sin * below, cos * below - sin * level);
+    let column = |v: DVec3| DVec4::from((v, 0.));
+    DMat4::from_cols(column(right), column(down), column(forward), position.as_dvec3().extend(1.))
+}

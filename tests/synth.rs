@@ -1,0 +1,198 @@
+//! Made-up videos: the same for everyone, true to their cameras, and data like any other.
+
+mod common;
+
+use common::program::{arg, succeed, tiny_config};
+use glam::DVec3;
+use globalsplat::data::{Dataset, MadeUp, Split};
+use globalsplat::scene::{Camera, ImageSize};
+use globalsplat::synth::{Video, VideoSettings};
+use std::path::Path;
+
+fn settings(frames: usize, side: u32) -> VideoSettings {
+    VideoSettings { frames, size: ImageSize { height: side, width: side }, pictures: vec![] }
+}
+
+/// The same seed, the same bytes, whatever the threads, and other ones for another seed.
+#[test]
+fn a_seed_makes_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = |name: &str, threads: &str, seed: &str| {
+        let out = folder.path().join(name);
+        let done = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+            .args([
+                "synth",
+                "--out",
+                arg(&out),
+                "--scenes",
+                "3",
+                "--frames",
+                "3",
+                "--size",
+                "24",
+                "--seed",
+                seed,
+            ])
+            .env("RAYON_NUM_THREADS", threads)
+            .output()
+            .unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        std::fs::read(out.join("000000.torch")).unwrap()
+    };
+    let one = bytes("one", "1", "5");
+    assert!(one == bytes("three", "3", "5"), "threads change the bytes");
+    assert!(one != bytes("other", "1", "6"), "another seed is another world");
+}
+
+/// Where a pixel of `from` that is `depth` metres away is seen by `to`, in pixels, and how far it is from there.
+fn seen(from: &Camera, to: &Camera, x: f64, y: f64, depth: f64) -> (f64, f64, f64) {
+    let k = from.intrinsics;
+    let point = from.c2w.transform_point3(depth * DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.));
+    let there = to.c2w.inverse().transform_point3(point);
+    let k = to.intrinsics;
+    (k.fx * there.x / there.z + k.cx, k.fy * there.y / there.z + k.cy, there.z)
+}
+
+/// A view that is carried into the next one by its depths and both poses agrees with it, where both see the same.
+#[test]
+fn depths_and_poses_carry_one_view_into_the_next() {
+    const SIDE: u32 = 96;
+    let mut compared = 0;
+    for index in 0..6 {
+        let video = Video::new(11, index, &settings(24, SIDE));
+        let frames = [6, 16];
+        let [from, to] = frames.map(|i| &video.cameras()[i]);
+        let (photos, depths) = (frames.map(|i| video.photo(i)), frames.map(|i| video.depth(i)));
+        let (mut differences, mut unmoved, mut apart) = (vec![], vec![], vec![]);
+        for (i, &depth) in depths[0].iter().enumerate().filter(|(_, depth)| depth.is_finite()) {
+            let (column, row) = (i as u32 % SIDE, i as u32 / SIDE);
+            let (x, y, far) = seen(from, to, f64::from(column) + 0.5, f64::from(row) + 0.5, f64::from(depth));
+            if !(0. ..f64::from(SIDE)).contains(&x) || !(0. ..f64::from(SIDE)).contains(&y) || far <= 0. {
+                continue;
+            }
+            let there = (y as u32 * SIDE + x as u32) as usize;
+            apart.push((f64::from(depths[1][there]) / far - 1.).abs());
+            // Another depth there: something is in front.
+            if *apart.last().unwrap() > 0.05 {
+                continue;
+            }
+            let difference = |a: [u8; 3], b: [u8; 3]| {
+                a.iter().zip(b).map(|(&a, b)| (i32::from(a) - i32::from(b)).abs()).max().unwrap()
+            };
+            let here = photos[0].get_pixel(column, row).0;
+            differences.push(difference(here, photos[1].get_pixel(x as u32, y as u32).0));
+            unmoved.push(difference(here, photos[1].get_pixel(column, row).0));
+        }
+        if apart.len() < 1000 {
+            continue;
+        }
+        compared += 1;
+        apart.sort_by(f64::total_cmp);
+        let (half, most) = (apart[apart.len() / 2], apart[apart.len() * 7 / 10]);
+        assert!(half < 0.008 && most < 0.05, "video {index}: depths are {half} apart for half of the pixels");
+        let mean = |of: &[i32]| of.iter().map(|&x| f64::from(x)).sum::<f64>() / of.len() as f64;
+        let (moved, unmoved) = (mean(&differences), mean(&unmoved));
+        assert!(
+            moved < 30. && moved < 1.1 * unmoved,
+            "video {index}: {moved} of 255 apart, {unmoved} if not carried"
+        );
+    }
+    assert!(compared >= 4, "{compared} videos");
+}
+
+#[test]
+fn cameras_are_in_free_space_and_move() {
+    for index in 0..8 {
+        let video = Video::new(2, index, &settings(12, 16));
+        let near = video.depth(6).into_iter().fold(f32::INFINITY, f32::min);
+        assert!(near > 0.02, "video {index}: something {near} m before the camera");
+        let centres = [0, 11].map(|i| video.cameras()[i].c2w.w_axis.truncate());
+        assert!(centres[0].distance(centres[1]) > 0.01, "video {index} doesn't move");
+        assert!(centres[0].distance(centres[1]) < 12., "video {index} leaves");
+    }
+}
+
+/// What is written is a data set, with an index to judge by; and one that isn't written has the same scenes.
+#[test]
+fn videos_are_data_like_any_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, sheet) = (folder.path().join("worlds"), folder.path().join("sheet.png"));
+    succeed(&[
+        "synth",
+        "--out",
+        arg(&out),
+        "--scenes",
+        "2",
+        "--first",
+        "7",
+        "--seed",
+        "3",
+        "--frames",
+        "9",
+        "--size",
+        "24",
+        "--sheet",
+        arg(&sheet),
+    ]);
+    assert!(image::open(&sheet).unwrap().width() > 8 * 24);
+    let told = succeed(&["inspect", arg(&out), "--json"]);
+    assert!(told.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{told}");
+    let (weights, scores) = (folder.path().join("weights.safetensors"), folder.path().join("scores"));
+    succeed(&["export", "--config", arg(&tiny_config(folder.path(), &out)), "--out", arg(&weights)]);
+    let index = out.join("evaluation_index.json");
+    succeed(&[
+        "eval",
+        "--weights",
+        arg(&weights),
+        "--data",
+        arg(&out),
+        "--index",
+        arg(&index),
+        "--out",
+        arg(&scores),
+    ]);
+    assert_eq!(
+        std::fs::read_dir(scores.join("scenes")).unwrap().count(),
+        4,
+        "scores and a picture of each scene"
+    );
+
+    let written = Dataset::open(&out, Split::Test).unwrap();
+    let named =
+        Dataset::open(Path::new("synth:seed=3,first=7,scenes=2,frames=9,size=24"), Split::Train).unwrap();
+    assert_eq!(written.scenes(), 2);
+    let keys = |data: &Dataset| data.groups().iter().flat_map(|g| g.keys.clone()).collect::<Vec<_>>();
+    assert_eq!(keys(&written), keys(&named));
+    let views = |data: &Dataset| {
+        let key = &keys(data)[1];
+        let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
+        group.open().unwrap().capture(key).unwrap().load_all(None).unwrap()
+    };
+    for (a, b) in views(&written).iter().zip(&views(&named)) {
+        assert!((a.camera.c2w - b.camera.c2w).abs_diff_eq(glam::DMat4::ZERO, 1e-5));
+        // A JPEG of high quality on one side.
+        let apart = (&a.image - &b.image).abs().mean(tch::Kind::Double).double_value(&[]);
+        assert!(apart < 0.02, "{apart}");
+    }
+}
+
+#[test]
+fn names_of_made_up_videos_are_checked() {
+    let named = |name: &str| MadeUp::named(Path::new(name));
+    assert!(named("captures/synth").unwrap().is_none());
+    assert_eq!(named("synth:scenes=3").unwrap().unwrap().keys(), ["0_000000", "0_000001", "0_000002"]);
+    assert_eq!(named("synth:seed=4,scenes=1,first=9").unwrap().unwrap().keys(), ["4_000009"]);
+    for (name, found) in [
+        ("synth:", "is , expected"),
+        ("synth:seed=1", "seed=1, expected"),
+        ("synth:scenes=0", "scenes=0"),
+        ("synth:scenes=some", "scenes=some"),
+        ("synth:scenes=1,colour=red", "colour=red"),
+        ("synth:scenes=1,size=8", "24 frames of 8 pixels"),
+        ("synth:scenes=1,frames=1", "1 frames"),
+        ("synth:scenes=1,pictures=nowhere", "nowhere"),
+    ] {
+        let error = named(name).unwrap_err().to_string();
+        assert!(error.contains(found), "{name}: {error}");
+    }
+}
