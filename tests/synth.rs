@@ -184,12 +184,12 @@ fn names_of_made_up_videos_are_checked() {
     assert_eq!(named("synth:seed=4,scenes=1,first=9").unwrap().unwrap().keys(), ["4_000009"]);
     for (name, found) in [
         ("synth:", "is , expected"),
-        ("synth:seed=1", "seed=1, expected"),
-        ("synth:scenes=0", "scenes=0"),
+        ("synth:seed=1", "one with scenes=0"),
+        ("synth:scenes=9000000", "scenes of 1 to 1000000"),
         ("synth:scenes=some", "scenes=some"),
         ("synth:scenes=1,colour=red", "colour=red"),
-        ("synth:scenes=1,size=8", "24 frames of 8 pixels"),
-        ("synth:scenes=1,frames=1", "1 frames"),
+        ("synth:scenes=1,size=8", "size of 16 to 8192"),
+        ("synth:scenes=1,frames=2", "frames of 3 to 10000"),
         ("synth:scenes=1,pictures=nowhere", "nowhere"),
     ] {
         let error = named(name).unwrap_err().to_string();

@@ -31,16 +31,16 @@ pub struct Synth {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Number of videos
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     scenes: u64,
     /// Other worlds for another seed
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
     /// The number of the first video, to go on where others of the seed end
-    #[arg(long, value_name = "I", default_value_t = 0)]
+    #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 32))]
     first: u64,
     /// Photos of each
-    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u32).range(3..=10_000))]
     frames: u32,
     /// Side of a photo in pixels
     #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u32).range(16..=8192))]

@@ -44,27 +44,33 @@ impl MadeUp {
             return Ok(None);
         };
         let refuse = |found: &str| Error::input(path, "the made-up videos", found, EXPECTED);
-        let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, None, 0, 24, 128);
+        let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, 0, 0, 24, 128);
         let mut pictures = vec![];
         for field in fields.split(',') {
             let (name, value) = field.split_once('=').ok_or_else(|| refuse(field))?;
             let number = || value.parse::<u64>().map_err(|_| refuse(field));
             match name {
                 "seed" => seed = number()?,
-                "scenes" => scenes = Some(number()?).filter(|scenes| (1..=1 << 32).contains(scenes)),
-                "first" => {
-                    first = Some(number()?).filter(|first| *first <= 1 << 32).ok_or_else(|| refuse(field))?
-                }
+                "scenes" => scenes = number()?,
+                "first" => first = number()?,
                 "frames" => frames = number()?,
                 "size" => size = number()?,
                 "pictures" => pictures = read_pictures(Path::new(value))?,
                 _ => return Err(refuse(field)),
             }
         }
-        if !(2..=10_000).contains(&frames) || !(16..=8192).contains(&size) {
-            return Err(refuse(&format!("{frames} frames of {size} pixels")));
+        for (name, value, range) in [
+            ("scenes", scenes, 1..=1_000_000),
+            ("first", first, 0..=1 << 32),
+            ("frames", frames, 3..=10_000),
+            ("size", size, 16..=8192),
+        ] {
+            if !range.contains(&value) {
+                let found = format!("one with {name}={value}");
+                let expected = format!("{EXPECTED}; {name} of {} to {}", range.start(), range.end());
+                return Err(Error::input(path, "the made-up videos", found, expected));
+            }
         }
-        let scenes = scenes.ok_or_else(|| refuse(fields))?;
         let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
         let settings = VideoSettings { frames, size, pictures };
         Ok(Some(MadeUp { name: path.to_string_lossy().into_owned(), seed, first, scenes, settings }))

@@ -111,6 +111,10 @@ impl Maker {
     pub fn picture(&mut self, size: Vec2) -> Material {
         let mut material = Material::matte(self.texture(Purpose::Poster));
         material.repeats = Affine2::from_scale(1. / size);
+        if self.pictures.iter().any(|picture| Arc::ptr_eq(picture, &material.texture)) {
+            // A user's is the upper left quarter of its texture.
+            material.repeats = Affine2::from_scale_angle_translation(0.5 / size, 0., Vec2::new(0., 0.5));
+        }
         material
     }
 
@@ -122,4 +126,29 @@ impl Maker {
 /// Upright at `spot`, turned by `turn` about y.
 pub(super) fn standing(spot: Vec3, turn: f32) -> Affine3A {
     Affine3A::from_rotation_translation(Quat::from_rotation_y(turn), spot)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{Rgb, RgbImage};
+    use rand::SeedableRng;
+
+    #[test]
+    fn a_users_picture_hangs_upright_and_whole() {
+        let corners = RgbImage::from_fn(64, 64, |x, y| {
+            Rgb([if x < 32 { 255 } else { 0 }, if y < 32 { 255 } else { 0 }, 0])
+        });
+        let picture = Arc::new(Texture::of_picture(&corners));
+        let mut make = Maker::new(ChaCha8Rng::seed_from_u64(1), vec![picture.clone()]);
+        let size = Vec2::new(2., 3.);
+        let hung =
+            (0..32).map(|_| make.picture(size)).find(|material| Arc::ptr_eq(&material.texture, &picture));
+        let seen = |x: f32, y: f32| hung.as_ref().unwrap().reflectance(Vec2::new(x, y) * size, 0.01).round();
+        // From below to above, as surfaces are measured.
+        assert_eq!(seen(0.2, 0.9), Vec3::new(1., 1., 0.));
+        assert_eq!(seen(0.8, 0.9), Vec3::new(0., 1., 0.));
+        assert_eq!(seen(0.2, 0.1), Vec3::new(1., 0., 0.));
+        assert_eq!(seen(0.8, 0.1), Vec3::ZERO);
+    }
 }
