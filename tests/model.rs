@@ -139,7 +139,8 @@ fn bf16_is_float32_but_for_its_rounding() {
     for streams in [Streams::Dual, Streams::Single] {
         let (vs, mut model) = build(&ModelConfig { streams, ..small() });
         let mut random = common::Random::new(3);
-        for (name, variable) in &mut vs.variables() {
+        // By their names: a map's own order is another one in every process, and with it every weight.
+        for (name, variable) in &mut vs.variables().into_iter().collect::<BTreeMap<_, _>>() {
             // So that every layer matters: LayerScale begins at a thousandth.
             let is_norm = name.ends_with(".weight") && variable.dim() == 1;
             let value = random.symmetric(&variable.size()) * 0.3 + if is_norm { 1. } else { 0. };
