@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::program::{arg, command, fail, globalsplat, room, succeed, tiny_config, tiny_weights};
+use common::program::{arg, command, fail, globalsplat, room, rooms, succeed, tiny_config, tiny_weights};
 use common::{has_lpips, skip};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -227,7 +227,7 @@ fn lpips_is_left_out_where_views_are_too_small_for_it() {
     }
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("captures");
-    succeed(&["synth", "--gaussians", "--out", arg(&out), "--frames", "3", "--size", "24"]);
+    rooms(&out, 1, 3, 24);
     let room = out.join("room_000");
     let splat = room.join("truth.ply");
     let output = globalsplat(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"]);
@@ -444,18 +444,7 @@ fn wrong_usage_is_exit_code_2() {
 fn a_data_set_of_chunks_is_learned_from_and_told_of() {
     let folder = tempfile::tempdir().unwrap();
     let (captures, set) = (folder.path().join("captures"), folder.path().join("set/train"));
-    succeed(&[
-        "synth",
-        "--gaussians",
-        "--out",
-        arg(&captures),
-        "--scenes",
-        "3",
-        "--frames",
-        "6",
-        "--size",
-        "40",
-    ]);
+    rooms(&captures, 3, 6, 40);
     // The smallest chunks that there are: two of the rooms share one.
     let rooms: Vec<PathBuf> = (0..3).map(|room| captures.join(format!("room_{room:03}"))).collect();
     succeed(&["pack", arg(&rooms[0]), arg(&rooms[1]), "--out", arg(&set)]);

@@ -3,7 +3,7 @@
 mod common;
 
 use common::has_lpips;
-use common::program::{arg, command, fail, refuse, succeed, text, tiny_weights};
+use common::program::{arg, command, fail, refuse, rooms, succeed, text, tiny_weights};
 use globalsplat::eval::read_evaluation;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -19,18 +19,7 @@ impl Set {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let captures = folder.path().join("captures");
-        succeed(&[
-            "synth",
-            "--gaussians",
-            "--out",
-            arg(&captures),
-            "--scenes",
-            "3",
-            "--frames",
-            "5",
-            "--size",
-            "256",
-        ]);
+        rooms(&captures, 3, 5, 256);
         succeed(&["pack", arg(&captures), "--out", arg(&folder.path().join("chunks"))]);
         std::fs::create_dir(folder.path().join("splats")).unwrap();
         for room in ["room_000", "room_001", "room_002"] {

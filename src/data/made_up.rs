@@ -3,7 +3,7 @@
 use super::capture::{Capture, Frame, Photo};
 use super::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::read_image;
+use crate::io::{PHOTO_EXTENSIONS, read_image};
 use crate::scene::ImageSize;
 use crate::synth::{Texture, Video, VideoSettings};
 use std::path::{Path, PathBuf};
@@ -109,7 +109,7 @@ pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
     for entry in entries {
         let path = entry.map_err(Error::read(folder))?.path();
         let extension = path.extension().map(|e| e.to_ascii_lowercase());
-        if extension.is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|known| e == *known)) {
+        if extension.is_some_and(|e| PHOTO_EXTENSIONS.iter().any(|known| e == *known)) {
             files.push(path);
         }
     }

@@ -24,8 +24,9 @@ pub struct HeldOut {
 enum HeldOutScene {
     /// The views that are held out of a capture.
     Views(Capture),
-    /// The views that are held out of a scene in a chunk. It is opened when it is needed: a chunk is large.
-    ViewsInChunk(SceneGroup, String),
+    /// The views that are held out of a scene in a chunk, or of a made-up one. It is opened when it is needed: chunks and worlds
+    /// are large.
+    ViewsInGroup(SceneGroup, String),
     /// A scene that is held out as a whole.
     Whole(SceneGroup, String),
 }
@@ -54,7 +55,7 @@ impl HeldOut {
                 scenes.push(HeldOutScene::Views(capture.clone()));
             }
             let others = spread(training.others(), config.validation_scenes);
-            scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInChunk(group, key)));
+            scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInGroup(group, key)));
         }
         let mut groups = vec![];
         for path in config.validation_paths()? {
@@ -103,7 +104,7 @@ impl HeldOutScene {
                 let (shown, held_out) = split_views(capture, config.holdout)?;
                 (capture.clone(), (spread_over_path(&capture.cameras(), &shown, context_views), held_out))
             }
-            HeldOutScene::ViewsInChunk(group, key) => {
+            HeldOutScene::ViewsInGroup(group, key) => {
                 let capture = group.open()?.capture(key)?;
                 let (shown, held_out) = split_views(&capture, config.holdout)?;
                 let cameras = capture.cameras();

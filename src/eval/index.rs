@@ -16,7 +16,7 @@ pub struct SceneFrames {
 }
 
 impl SceneFrames {
-    /// Of a video of `count` frames, two at least: every other one is shown, and every other one of the rest has to be matched.
+    /// Of a video of `count` frames, three at least: every other one is shown, and every other one of the rest has to be matched.
     pub fn alternating(count: usize) -> Self {
         SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
     }

@@ -6,7 +6,7 @@ use super::scene::EvalScene;
 use super::scores::{CaptureScores, score};
 use crate::data::View;
 use crate::error::{Error, Result};
-use crate::io::{Splat, read_image, read_splat, tensor_from_rgb};
+use crate::io::{PHOTO_EXTENSIONS, Splat, read_image, read_splat, tensor_from_rgb};
 use crate::reconstruct::{LoadedModel, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
 use crate::scene::Camera;
@@ -173,7 +173,7 @@ pub(super) fn colours(rendered: &[Rendered]) -> Vec<Tensor> {
 
 /// The picture `name` in `folder`, whatever its ending, [3, H, W].
 fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
-    let candidates = ["png", "jpg", "jpeg"].map(|ending| folder.join(format!("{name}.{ending}")));
+    let candidates = PHOTO_EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
     match candidates.iter().find(|path| path.is_file()) {
         Some(path) => Ok(tensor_from_rgb(&read_image(path)?)),
         None => {

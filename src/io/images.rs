@@ -9,6 +9,9 @@ use std::io::{BufReader, Cursor};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
+/// Of the names of photos.
+pub const PHOTO_EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+
 /// Reads any image as 8-bit RGB, pixels as they are stored: grey is repeated, what is transparent lies over black, 16 bits
 /// are rounded to 8.
 ///

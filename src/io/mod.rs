@@ -24,5 +24,7 @@ pub(crate) use append::AppendFile;
 pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
-pub(crate) use images::{encode_photo, encoded_image_size, enlarge, read_image_size, write_jpeg};
+pub(crate) use images::{
+    PHOTO_EXTENSIONS, encode_photo, encoded_image_size, enlarge, read_image_size, write_jpeg,
+};
 pub(crate) use pretrained::pretrained_folders;

@@ -75,7 +75,7 @@ pub(super) fn room(make: &mut Maker, sky: &mut Sky) -> Place {
     }
     furnish(make, size, &walls);
     light(make, size, sky, has_openings);
-    Place { least: vec3(0.25, 0.5, 0.25), most: size - vec3(0.25, 0.25, 0.25), eye: (1., 1.75), roomy: 0.3 }
+    Place { least: vec3(0.25, 0.5, 0.25), most: size - 0.25, eye: (1., 1.75), roomy: 0.3 }
 }
 
 /// Windows and doors.

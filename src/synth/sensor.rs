@@ -47,9 +47,13 @@ impl Sensor {
         }
     }
 
-    /// sRGB bytes of radiance in frame `frame`, at `time` in [0, 1] and at `place` in [-1, 1]² of the picture.
-    pub fn bytes(&self, radiance: Vec3, frame: u32, time: f32, place: Vec2, pixel: u32) -> [u8; 3] {
-        let exposure = (self.wandering * self.wander.at(vec3(4. * time, 0.5, 0.5))).exp2();
+    /// The factor on light that a picture taken at `time` in [0, 1] of the video has.
+    pub fn exposure(&self, time: f32) -> f32 {
+        (self.wandering * self.wander.at(vec3(4. * time, 0.5, 0.5))).exp2()
+    }
+
+    /// sRGB bytes of radiance at `place` in [-1, 1]² of a picture of that `exposure`: of its pixel `pixel`, in frame `frame`.
+    pub fn bytes(&self, radiance: Vec3, exposure: f32, place: Vec2, frame: u32, pixel: u32) -> [u8; 3] {
         let corner = 1. - self.vignette * place.length_squared() / 2.;
         let light = radiance * self.gain * exposure * corner;
         let grey = light.dot(vec3(0.2126, 0.7152, 0.0722));

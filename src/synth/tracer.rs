@@ -102,12 +102,9 @@ impl Tracer {
         tracer
     }
 
-    /// Radiance from `towards` (unit), at `origin`, seen by a pixel `spread` radians wide, and the distance to what is there,
-    /// infinite where nothing is.
-    pub fn look(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> (Vec3, f32) {
-        let hit = self.nearest(origin, towards, f32::INFINITY);
-        let distance = hit.map_or(f32::INFINITY, |hit| hit.distance);
-        (self.radiance(origin, towards, hit, spread, choice, DEPTH), distance)
+    /// Radiance from `towards` (unit), at `origin`, seen by a pixel `spread` radians wide.
+    pub fn look(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> Vec3 {
+        self.radiance(origin, towards, spread, choice, DEPTH)
     }
 
     /// The distance to what is towards there, at most `limit`.
@@ -119,16 +116,8 @@ impl Tracer {
         self.triangles.len()
     }
 
-    fn radiance(
-        &self,
-        origin: Vec3,
-        towards: Vec3,
-        hit: Option<Hit>,
-        spread: f32,
-        choice: SampleChoice,
-        depth: u32,
-    ) -> Vec3 {
-        let Some(hit) = hit else { return self.sky.seen(towards) };
+    fn radiance(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice, depth: u32) -> Vec3 {
+        let Some(hit) = self.nearest(origin, towards, f32::INFINITY) else { return self.sky.seen(towards) };
         let surface = self.surface(origin, towards, hit, spread);
         let material = surface.material;
         let (direct, highlight) = self.direct(&surface, towards, choice);
@@ -139,8 +128,7 @@ impl Tracer {
         if mirror > 0.02 && depth > 0 {
             let away = towards - 2. * towards.dot(surface.normal) * surface.normal;
             let start = surface.point + LIFT * surface.flat;
-            let next = self.nearest(start, away, f32::INFINITY);
-            let mirrored = self.radiance(start, away, next, 2. * spread, choice, depth - 1);
+            let mirrored = self.radiance(start, away, 2. * spread, choice, depth - 1);
             radiance = radiance.lerp(mirrored, mirror);
         }
         radiance
@@ -151,8 +139,7 @@ impl Tracer {
         if self.lamps.is_empty() {
             return (Vec3::ZERO, Vec3::ZERO);
         }
-        let lamp = choice.turn % self.lamps.len();
-        let light = self.lamps[lamp].arriving(surface.point, choice.on_lamp);
+        let light = self.lamps[choice.turn % self.lamps.len()].arriving(surface.point, choice.on_lamp);
         let facing = light.towards.dot(surface.normal);
         if facing <= 0. || light.towards.dot(surface.flat) <= 0. || light.colour.max_element() < 1e-4 {
             return (Vec3::ZERO, Vec3::ZERO);
@@ -307,7 +294,7 @@ mod tests {
     fn seen(tracer: &Tracer, at: Vec3) -> f32 {
         let choice = |turn| SampleChoice { turn, on_lamp: Vec2::splat(0.5) };
         let eye = at + Vec3::new(0.5, 3., 0.5);
-        let look = |turn| tracer.look(eye, (at - eye).normalize(), 1e-3, choice(turn)).0.x;
+        let look = |turn| tracer.look(eye, (at - eye).normalize(), 1e-3, choice(turn)).x;
         (0..4).map(look).sum::<f32>() / 4.
     }
 
@@ -352,7 +339,7 @@ mod tests {
         assert!(shadow < 0.3 * lit, "{shadow} {lit}");
         // From below, the ball is lit by the floor alone.
         let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
-        let below = tracer.look(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).0.x;
+        let below = tracer.look(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).x;
         assert!(below > 0.1 * lit && below < lit, "{below} {lit}");
     }
 

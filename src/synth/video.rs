@@ -80,7 +80,7 @@ impl Video {
     /// Picture `index`.
     pub fn photo(&self, index: usize) -> RgbImage {
         let camera = &self.cameras[index];
-        let time = index as f32 / self.cameras.len() as f32;
+        let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
         let half = 0.5 * vec2(camera.width as f32, camera.height as f32);
         let spread = 1. / (camera.intrinsics.fx as f32 * RAYS as f32);
         let eye = camera.c2w.w_axis.truncate().as_vec3();
@@ -94,13 +94,13 @@ impl Video {
                 let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
                 let on_lamp = vec2(random.uniform(), random.uniform());
                 let choice = SampleChoice { turn: sample as usize, on_lamp };
-                let (radiance, _) = self.tracer.look(eye, towards(camera, at), spread, choice);
+                let radiance = self.tracer.look(eye, towards(camera, at), spread, choice);
                 // One ray that meets a lamp doesn't outshine all others of its pixel.
                 light += radiance.min(Vec3::splat(8.));
             }
             let place = (vec2(x as f32, y as f32) - half) / half;
             let mean = light / Self::RAYS_PER_PIXEL as f32;
-            image::Rgb(self.sensor.bytes(mean, index as u32, time, place, pixel))
+            image::Rgb(self.sensor.bytes(mean, exposure, place, index as u32, pixel))
         })
     }
 
@@ -167,7 +167,7 @@ fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
             let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
             let at = cell * vec2(camera.width as f32, camera.height as f32);
             let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
-            let (radiance, _) = tracer.look(eye, towards(camera, at), 0.05, choice);
+            let radiance = tracer.look(eye, towards(camera, at), 0.05, choice);
             sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
         }
     }

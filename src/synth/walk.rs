@@ -47,9 +47,7 @@ impl Path {
         // Nobody starts at full speed.
         let eased = 0.7 * time + 0.3 * time * time * (3. - 2. * time);
         let target = self.target + eased * self.target_motion;
-        let (sin, cos) = (self.orbit * eased).sin_cos();
-        let away = self.start - self.target;
-        let turned = vec3(cos * away.x + sin * away.z, away.y, cos * away.z - sin * away.x);
+        let turned = turned(self.start - self.target, self.orbit * eased);
         let (swing, waves) = self.swing;
         let hand = |offset: f32| self.noise.fractal(vec3(self.shake.1 * time + offset, offset, 0.), 3);
         let shaken = self.shake.0 * vec3(hand(0.), hand(40.), hand(80.));
@@ -151,12 +149,13 @@ fn standpoint(make: &mut Maker, tracer: &Tracer, place: Place) -> (Vec3, Vec3) {
     let middle = (0.5 * (least + most) - start).with_y(0.).normalize_or(Vec3::X);
     let turn = make.within(-1f32..1.) * make.one_of(&[0.6, 1.2, 3.1]);
     let pitch = if is_flight { make.within(-0.8..-0.05) } else { make.within(-0.35..0.15) };
-    let level = vec3(
-        turn.cos() * middle.x + turn.sin() * middle.z,
-        0.,
-        turn.cos() * middle.z - turn.sin() * middle.x,
-    );
-    (start, (level + pitch * Vec3::Y).normalize())
+    (start, (turned(middle, turn) + pitch * Vec3::Y).normalize())
+}
+
+/// About y, by `angle`.
+fn turned(v: Vec3, angle: f32) -> Vec3 {
+    let (sin, cos) = angle.sin_cos();
+    vec3(cos * v.x + sin * v.z, v.y, cos * v.z - sin * v.x)
 }
 
 /// Whether nothing is in the way, and something is seen.

@@ -79,12 +79,19 @@ pub fn arg(path: &Path) -> &str {
     path.to_str().expect("an UTF-8 path")
 }
 
+/// Makes the rooms `room_000`, … in `folder`, each with so many photos of `size` × `size`.
+pub fn rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
+    let [scenes, frames, size] = [scenes, frames, size].map(|number| number.to_string());
+    let numbers = ["--scenes", &scenes, "--frames", &frames, "--size", &size];
+    succeed(&[&["synth", "--gaussians", "--out", arg(folder)][..], &numbers].concat());
+}
+
 /// A capture of nine 40×40 photos of a procedural room, `truth.ply` beside them; every caller has a copy of its own.
 pub fn room() -> (TempDir, PathBuf) {
     static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
     let original = ORIGINAL.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a folder");
-        succeed(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "9", "--size", "40"]);
+        rooms(folder.path(), 1, 9, 40);
         folder
     });
     let folder = tempfile::tempdir().expect("a folder");

@@ -8,7 +8,7 @@ use super::{Found, file_in, folder_name};
 use crate::data::capture::{Capture, Frame, Photo};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::read_image_size;
+use crate::io::{PHOTO_EXTENSIONS, read_image_size};
 use crate::scene::{Camera, Intrinsics, nearest_rigid};
 use glam::{DMat4, DVec4};
 use serde_json::Value;
@@ -17,9 +17,6 @@ use std::path::{Path, PathBuf};
 
 /// By which a capture of this format is recognized.
 const FILE_NAME: &str = "transforms.json";
-
-/// What is tried behind a `file_path` that names no file.
-const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Lenses that [`Distortion`] describes.
 const CAMERA_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
@@ -62,7 +59,8 @@ fn read(file: &Path) -> Result<Capture> {
 }
 
 fn image_at(root: &Path, name: &str) -> Option<PathBuf> {
-    let with_extension = EXTENSIONS.iter().map(|extension| root.join(format!("{name}.{extension}")));
+    // What is tried behind a `file_path` that names no file.
+    let with_extension = PHOTO_EXTENSIONS.iter().map(|extension| root.join(format!("{name}.{extension}")));
     std::iter::once(root.join(name)).chain(with_extension).find(|path| path.is_file())
 }
 
