@@ -9,6 +9,8 @@ use glam::{DMat4, DVec3, DVec4, Vec3, vec3};
 const TRIES: usize = 80;
 /// Places of a path that have to be free.
 const CHECKED: usize = 12;
+/// Mean depth of what every picture shows at least, in metres, where paths are easy to find.
+const WIDE: f32 = 1.8;
 
 /// Where cameras may be.
 #[derive(Debug, Clone, Copy)]
@@ -90,7 +92,7 @@ fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Optio
         return None;
     }
     let (right, up) = (towards.cross(Vec3::Y).normalize(), Vec3::Y);
-    let length = patience * depth.min(6.) * make.scaled(0.12, 0.8);
+    let length = patience * depth.min(8.) * make.scaled(0.25, 1.6);
     let sign = make.one_of(&[-1., 1.]);
     let mut path = Path {
         start,
@@ -119,7 +121,7 @@ fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Optio
             path.target_motion = path.motion * make.within(0.2..1.1);
         }
         // About something.
-        7 | 8 => path.orbit = sign * patience * make.within(0.2..1.1),
+        7 | 8 => path.orbit = sign * patience * make.within(0.3..2.),
         // Up and over.
         _ => {
             path.motion = length
@@ -131,7 +133,7 @@ fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Optio
     }
     // Turning on the way.
     if make.chance(0.35) {
-        path.target_motion += sign * right * depth * patience * make.within(0.1..0.7);
+        path.target_motion += sign * right * depth * patience * make.within(0.2..1.2);
     }
     Some(path)
 }
@@ -170,11 +172,14 @@ fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
         let is_roomy = || sides.iter().all(|&side| tracer.free(at, side, margin) >= margin);
         let right = towards.cross(Vec3::Y).normalize_or(Vec3::X);
         let up = right.cross(towards);
+        // Neither a nose against a wall nor a picture of nothing else.
         let sees = || {
-            [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].iter().all(|&(x, y)| {
+            let depths = [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].map(|(x, y)| {
                 let ray = (towards + x * right + y * up).normalize();
-                tracer.free(at, ray, 1.) > 1.6 * margin
-            })
+                tracer.free(at, ray, 2. * WIDE)
+            });
+            let least = depths.into_iter().fold(f32::INFINITY, f32::min);
+            least > 1.6 * margin && depths.iter().sum::<f32>() > depths.len() as f32 * patience * WIDE
         };
         let is_open = before.is_none_or(|from| {
             let way = at - from;
