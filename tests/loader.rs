@@ -8,6 +8,7 @@ use globalsplat::data::{
 use globalsplat::error::{Error, Result};
 use globalsplat::scene::{Camera, Intrinsics};
 use image::{Rgb, RgbImage};
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 use tch::Device;
@@ -102,7 +103,7 @@ fn samples_depend_on_seed_and_number_alone() {
     let data = Arc::new(groups(folder.path(), &[2, 3, 2]));
     let load = |seed: u64, threads: usize, first: u64, count: usize| {
         let config = DataConfig { threads, ..config() };
-        scenes(&mut Loader::start(&config, seed, data.clone(), first).unwrap(), count)
+        scenes(&mut Loader::start(&config, seed, data.clone(), 1, first).unwrap(), count)
     };
     let all = load(3, 1, 0, 17);
     assert_same(&load(3, 3, 0, 17), &all);
@@ -122,16 +123,32 @@ fn decoded_photos_that_are_kept_change_nothing() {
     let data = Arc::new(captures);
     let load = |photo_megabytes: u64| {
         let config = DataConfig { photo_megabytes, ..config() };
-        scenes(&mut Loader::start(&config, 0, data.clone(), 0).unwrap(), 9)
+        scenes(&mut Loader::start(&config, 0, data.clone(), 1, 0).unwrap(), 9)
     };
     assert_same(&load(0), &load(1));
+}
+
+#[test]
+fn the_scenes_of_a_step_show_equally_many_views() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(groups(folder.path(), &[4]));
+    let config = DataConfig { fewest_context_views: 2, ..config() };
+    let counts = |first: u64| -> Vec<usize> {
+        let mut loader = Loader::start(&config, 0, data.clone(), 3, first).unwrap();
+        let batches = (0..12).map(|_| loader.next_batch(3, Device::Cpu).unwrap());
+        batches.map(|batch| batch.context_views()).collect()
+    };
+    let all = counts(0);
+    assert_eq!(all.iter().copied().collect::<BTreeSet<_>>(), BTreeSet::from([2, 3, 4]));
+    // A run that goes on draws on.
+    assert_eq!(counts(6)[..10], all[2..]);
 }
 
 #[test]
 fn batches_are_what_the_scenes_are() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(groups(folder.path(), &[4]));
-    let loader = || Loader::start(&config(), 0, data.clone(), 0).unwrap();
+    let loader = || Loader::start(&config(), 0, data.clone(), 1, 0).unwrap();
     let batch = loader().next_batch(3, Device::Cpu).unwrap();
     assert_eq!(batch.context.images.size(), [3, 4, 3, 16, 24]);
     assert_eq!(batch.target.w2c.size(), [3, 2, 4, 4]);
@@ -159,7 +176,7 @@ fn without_augmentation_every_view_is_the_same_in_every_sample() {
         flip: false,
         ..config()
     };
-    let shown = scenes(&mut Loader::start(&config, 0, data, 0).unwrap(), 4);
+    let shown = scenes(&mut Loader::start(&config, 0, data, 1, 0).unwrap(), 4);
     assert!(shown.iter().all(|scene| scene.images == shown[0].images && scene.context == [0, 1, 2, 3, 4, 5]));
 }
 
@@ -185,7 +202,7 @@ fn bad_data_are_counted_and_skipped() {
     let data = Arc::new(with_bad_data(folder.path()));
     let load = |threads: usize, first: u64, count: usize| {
         let config = DataConfig { max_bad_share: 0.5, threads, ..config() };
-        let mut loader = Loader::start(&config, 0, data.clone(), first).unwrap();
+        let mut loader = Loader::start(&config, 0, data.clone(), 1, first).unwrap();
         (scenes(&mut loader, count), loader.bad_data())
     };
     let (all, bad) = load(1, 0, 24);
@@ -222,7 +239,7 @@ impl SceneGroups for Panics {
 
 #[test]
 fn what_goes_wrong_inside_is_told() {
-    let mut loader = Loader::start(&config(), 0, Arc::new(Panics), 0).unwrap();
+    let mut loader = Loader::start(&config(), 0, Arc::new(Panics), 1, 0).unwrap();
     let error = loader.next_scene().unwrap_err().to_string();
     assert_eq!(error, "loading sample 0 failed inside: group 0 must not be opened");
 }
@@ -232,7 +249,7 @@ fn too_much_bad_data_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(with_bad_data(folder.path()));
     let config = DataConfig { max_bad_share: 0.2, threads: 2, ..config() };
-    let mut loader = Loader::start(&config, 0, data, 0).unwrap();
+    let mut loader = Loader::start(&config, 0, data, 1, 0).unwrap();
     let error = (0..24).find_map(|_| loader.next_scene().err()).expect("3 of 12 are too many").to_string();
     assert!(
         error.contains("of 12 scenes were skipped") && error.contains("data.max_bad_share allows 0.2"),
@@ -245,8 +262,8 @@ fn nothing_but_bad_data_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(vec![write_capture(folder.path(), 0, 5)]);
     let config = DataConfig { max_bad_share: 1., ..config() };
-    let error = Loader::start(&config, 0, data, 0).unwrap().next_scene().unwrap_err().to_string();
+    let error = Loader::start(&config, 0, data, 1, 0).unwrap().next_scene().unwrap_err().to_string();
     assert!(error.contains("no scene can be trained on: 1 of 1 scenes were skipped: 1 too short"), "{error}");
     let none = Arc::new(Vec::<Capture>::new());
-    assert!(Loader::start(&config, 0, none, 0).unwrap_err().to_string().contains("no scenes"));
+    assert!(Loader::start(&config, 0, none, 1, 0).unwrap_err().to_string().contains("no scenes"));
 }

@@ -71,7 +71,7 @@ pub fn made_up_videos(root: &Path) -> Result<()> {
 /// # Errors
 /// What [`Loader`] fails with.
 pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: u64) -> Result<LoaderReport> {
-    let mut loader = Loader::start(config, 0, scenes, 0)?;
+    let mut loader = Loader::start(config, 0, scenes, 1, 0)?;
     let next = |loader: &mut Loader| -> Result<(u64, u64, LoadTimes, f64)> {
         let scene = loader.next_scene()?;
         let start = Instant::now();

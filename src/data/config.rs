@@ -50,8 +50,10 @@ pub struct DataConfig {
     pub captures: Vec<String>,
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,
-    /// Views the model sees of a scene in a training step.
+    /// Views the model sees of a scene in a training step, at most.
     pub context_views: usize,
+    /// Where it isn't 0, every step draws how many views the model sees of its scenes: from this to `context_views`.
+    pub fewest_context_views: usize,
     /// Views of a scene that its pictures are compared with in a training step.
     pub target_views: usize,
     /// [shortest, longest] part of a video, in frames, that the views of a training step are from, at most the whole of it. A
@@ -87,6 +89,7 @@ impl Default for DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
             context_views: 24,
+            fewest_context_views: 0,
             target_views: 12,
             window: [40, 220],
             sampling: Sampling::Uniform,
@@ -148,6 +151,10 @@ impl DataConfig {
                 let expected = format!("1 to the {shortest} frames of the shortest window, data.window");
                 return Err(Error::setting(field, views, expected));
             }
+        }
+        if self.fewest_context_views > self.context_views {
+            let expected = format!("0 to the {} of data.context_views", self.context_views);
+            return Err(Error::setting("data.fewest_context_views", self.fewest_context_views, expected));
         }
         let JitterConfig { brightness, contrast, saturation, hue } = self.jitter;
         for (field, value, largest) in [

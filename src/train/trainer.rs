@@ -146,7 +146,13 @@ impl Trainer {
         let first = self.samples;
         let loader = match self.loader.take() {
             Some(loader) if loader.position() == first => loader,
-            _ => Loader::start(&self.config.data, self.config.train.seed, self.scenes.clone(), first)?,
+            _ => Loader::start(
+                &self.config.data,
+                self.config.train.seed,
+                self.scenes.clone(),
+                self.config.train.batch,
+                first,
+            )?,
         };
         Ok(self.loader.insert(loader))
     }

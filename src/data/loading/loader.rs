@@ -5,7 +5,7 @@ use super::bad_data::{BadData, Fault, Ledger};
 use super::open_groups::{OpenGroups, Opened};
 use super::order::{Order, Place};
 use super::sample::Sample;
-use super::sampler::choose_views;
+use super::sampler::{choose_views, context_views};
 use super::scene::{LoadTimes, LoadedScene};
 use super::scenes::SceneGroups;
 use crate::data::capture::Capture;
@@ -47,6 +47,8 @@ type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
 struct Shared {
     config: DataConfig,
     seed: u64,
+    /// Samples of a step.
+    batch: u64,
     order: Order,
     groups: OpenGroups,
     ledger: Ledger,
@@ -64,11 +66,17 @@ struct Tools {
 }
 
 impl Loader {
-    /// Begins to load `scenes`, sample `first` before all others.
+    /// Begins to load `scenes` for steps of `batch` samples, sample `first` before all others.
     ///
     /// # Errors
     /// No scenes, or threads that can't be had.
-    pub fn start(config: &DataConfig, seed: u64, scenes: Arc<dyn SceneGroups>, first: u64) -> Result<Self> {
+    pub fn start(
+        config: &DataConfig,
+        seed: u64,
+        scenes: Arc<dyn SceneGroups>,
+        batch: usize,
+        first: u64,
+    ) -> Result<Self> {
         let sizes = scenes.sizes();
         if sizes.iter().all(|&size| size == 0) {
             return Err(Error::Request("there are no scenes to train on".into()));
@@ -80,6 +88,7 @@ impl Loader {
         let shared = Arc::new(Shared {
             config: config.clone(),
             seed,
+            batch: batch as u64,
             ledger: Ledger::new(order.scenes(), config.max_bad_share),
             order,
             groups: OpenGroups::new(scenes),
@@ -180,6 +189,7 @@ impl Shared {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
         tools.times = LoadTimes::default();
+        let views = context_views(&self.config, self.seed, sample / self.batch);
         let (first, groups) = self.order.turn(sample);
         for group in groups {
             let start = Instant::now();
@@ -206,7 +216,7 @@ impl Shared {
                     shuffled = usize::MAX;
                 }
                 let place = Place { group, scene: turns[turn] };
-                match self.load_scene(place, scenes.get(place.scene), &mut random, tools) {
+                match self.load_scene(place, scenes.get(place.scene), views, &mut random, tools) {
                     Ok(scene) => return Ok(scene),
                     Err((fault, why)) => self.ledger.add(fault, std::iter::once(place), why)?,
                 }
@@ -219,6 +229,7 @@ impl Shared {
         &self,
         place: Place,
         capture: Option<&Result<Capture>>,
+        context: usize,
         random: &mut impl Rng,
         tools: &mut Tools,
     ) -> std::result::Result<LoadedScene, (Fault, String)> {
@@ -233,7 +244,7 @@ impl Shared {
         let cameras = capture.cameras();
         let (shown, _) = config.holdout.split(cameras.len());
         let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
-        let views = choose_views(config, &centres, random).ok_or_else(|| {
+        let views = choose_views(config, context, &centres, random).ok_or_else(|| {
             let why = format!("{} views to show, expected {} or more", shown.len(), config.window[0]);
             (Fault::Short, format!("{}: {why} (data.window)", capture.file().display()))
         })?;

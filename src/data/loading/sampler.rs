@@ -2,8 +2,12 @@
 
 use crate::data::config::{DataConfig, Sampling};
 use glam::DVec3;
-use rand::Rng;
 use rand::seq::index;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Sets the numbers of views apart from what else is drawn.
+const COUNT_KEY: u64 = 0x7669_6577_5f63_6e74;
 
 /// Positions in a video, ascending.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -14,9 +18,24 @@ pub struct ChosenViews {
     pub target: Vec<usize>,
 }
 
-/// Views of a random window of a video whose cameras stand at `centres`; none where the video is shorter than the shortest
-/// window. The configuration's numbers of views are at most that window's length.
-pub fn choose_views(config: &DataConfig, centres: &[DVec3], random: &mut impl Rng) -> Option<ChosenViews> {
+/// How many views the model sees of every scene of step `step`.
+pub fn context_views(config: &DataConfig, seed: u64, step: u64) -> usize {
+    if config.fewest_context_views == 0 {
+        return config.context_views;
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(seed ^ COUNT_KEY);
+    random.set_stream(step);
+    random.random_range(config.fewest_context_views..=config.context_views)
+}
+
+/// `context` views and the targets of a random window of a video whose cameras stand at `centres`; none where the video is shorter than the shortest
+/// window. The numbers of views are at most that window's length.
+pub fn choose_views(
+    config: &DataConfig,
+    context: usize,
+    centres: &[DVec3],
+    random: &mut impl Rng,
+) -> Option<ChosenViews> {
     let [shortest, longest] = config.window;
     if centres.len() < shortest {
         return None;
@@ -24,8 +43,8 @@ pub fn choose_views(config: &DataConfig, centres: &[DVec3], random: &mut impl Rn
     let length = random.random_range(shortest..=longest).min(centres.len());
     let start = random.random_range(0..=centres.len() - length);
     let context = match config.sampling {
-        Sampling::Uniform => uniform(length, config.context_views, random),
-        Sampling::Farthest => farthest(&centres[start..][..length], config.context_views, random),
+        Sampling::Uniform => uniform(length, context, random),
+        Sampling::Farthest => farthest(&centres[start..][..length], context, random),
     };
     let target = uniform(length, config.target_views, random);
     let in_video = |mut positions: Vec<usize>| {
@@ -64,7 +83,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     fn config(sampling: Sampling) -> DataConfig {
-        DataConfig { window: [40, 220], context_views: 24, target_views: 12, sampling, ..Default::default() }
+        DataConfig { window: [40, 220], target_views: 12, sampling, ..Default::default() }
     }
 
     fn line(count: usize) -> Vec<DVec3> {
@@ -81,7 +100,7 @@ mod tests {
         for sampling in [Sampling::Uniform, Sampling::Farthest] {
             let (mut shortest, mut longest, mut last) = (usize::MAX, 0, 0);
             for _ in 0..2000 {
-                let views = choose_views(&config(sampling), &line(300), &mut random).unwrap();
+                let views = choose_views(&config(sampling), 24, &line(300), &mut random).unwrap();
                 assert_eq!((views.context.len(), views.target.len()), (24, 12));
                 assert!(is_ascending(&views.context) && is_ascending(&views.target));
                 let all = || views.context.iter().chain(&views.target);
@@ -97,10 +116,23 @@ mod tests {
     }
 
     #[test]
+    fn steps_draw_how_many_views_are_seen() {
+        let config = DataConfig { context_views: 12, fewest_context_views: 4, ..Default::default() };
+        let counts: Vec<usize> = (0..2000).map(|step| context_views(&config, 0, step)).collect();
+        for count in 4..=12 {
+            let share = counts.iter().filter(|&&drawn| drawn == count).count();
+            assert!((160..=290).contains(&share), "{count}: {share}");
+        }
+        assert!(counts.iter().all(|count| (4..=12).contains(count)));
+        let always = DataConfig { fewest_context_views: 0, ..config };
+        assert!((0..20).all(|step| context_views(&always, 0, step) == 12));
+    }
+
+    #[test]
     fn a_short_clip_is_its_own_window_and_a_shorter_one_is_skipped() {
         let mut random = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(choose_views(&config(Sampling::Uniform), &line(39), &mut random), None);
-        let views = choose_views(&config(Sampling::Uniform), &line(40), &mut random).unwrap();
+        assert_eq!(choose_views(&config(Sampling::Uniform), 24, &line(39), &mut random), None);
+        let views = choose_views(&config(Sampling::Uniform), 24, &line(40), &mut random).unwrap();
         assert!(views.context.iter().all(|&view| view < 40));
     }
 
@@ -109,19 +141,18 @@ mod tests {
         let mut random = ChaCha8Rng::seed_from_u64(0);
         let config = DataConfig {
             window: [64, 64],
-            context_views: 9,
             target_views: 1,
             sampling: Sampling::Farthest,
             ..Default::default()
         };
         for _ in 0..50 {
-            let context = choose_views(&config, &line(64), &mut random).unwrap().context;
+            let context = choose_views(&config, 9, &line(64), &mut random).unwrap().context;
             assert!(context[0] <= 10 && context[8] >= 53, "{context:?}");
             let widest = context.windows(2).map(|pair| pair[1] - pair[0]).max();
             assert!(widest <= Some(16), "{context:?}");
         }
         // Cameras in one place are told apart all the same.
-        let still = choose_views(&config, &[DVec3::ONE; 64], &mut random).unwrap();
+        let still = choose_views(&config, 9, &[DVec3::ONE; 64], &mut random).unwrap();
         assert!(is_ascending(&still.context));
     }
 }
