@@ -518,3 +518,36 @@ fn scenes_of_training_among_those_held_out_are_told() {
     globalsplat::data::write_room(&other, 9, 5, [40, 40].into()).unwrap();
     assert_eq!(said(&other).matches("trained on").count(), 0);
 }
+
+#[test]
+fn a_run_begins_with_the_weights_that_are_named() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let (first, second) = (folder.path().join("first"), folder.path().join("second"));
+    let weights = folder.path().join("model.safetensors");
+    succeed(&text(&train(&config, &first, &["train.seed=3"])));
+    succeed(&["export", "--run", arg(&first), "--out", arg(&weights)]);
+    let from = |run: &Path, settings: &[&str]| {
+        let mut arguments = train(&config, run, settings);
+        arguments.extend(["--from".into(), arg(&weights).into()]);
+        arguments
+    };
+    // At a learning rate that moves nothing.
+    succeed(&text(&from(&second, &["train.steps=1", "train.learning_rate=1e-30"])));
+    let of_model = |run: &Path| -> Vec<_> {
+        tensors(run).into_iter().filter(|(name, _)| name.starts_with("model")).collect()
+    };
+    for ((name, x), (_, y)) in of_model(&first).iter().zip(of_model(&second)) {
+        assert!(x.equal(&y), "{name}");
+    }
+    let stage = metrics(&second)[0]["stage"].as_u64();
+    assert_eq!(stage, Some(2), "all Gaussians are shown from the first step on");
+
+    let other = folder.path().join("other");
+    let err = fail(&text(&from(&other, &["model.width=64", "model.latents=32"])), 2);
+    assert!(
+        err.contains("model.safetensors: the model is model.latents 16 → 32, model.width 32 → 64, expected"),
+        "{err}"
+    );
+    assert!(!other.join("checkpoints").exists(), "nothing was begun");
+}

@@ -21,7 +21,8 @@ use std::time::Instant;
 /// the checkpoint that did best. TensorBoard shows RUN/tensorboard.
 #[derive(Args)]
 #[command(
-    after_help = "Example:\n  globalsplat train --config configs/first_light.toml --out runs/first_light"
+    after_help = "Examples:\n  globalsplat train --config configs/first_light.toml --out runs/first_light\n  \
+    globalsplat train --config configs/tiny.toml --from models/tiny.safetensors --out runs/tuned --set 'data.captures=[\"mine\"]'"
 )]
 pub struct Train {
     /// Configuration file; see configs/
@@ -36,6 +37,9 @@ pub struct Train {
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
     resume: String,
+    /// Weights to begin with instead of fresh ones, of a model of the same shape; all Gaussians are shown from the first step on
+    #[arg(long, value_name = "FILE")]
+    from: Option<PathBuf>,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -46,7 +50,10 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        let config = Config::read(&self.config, &self.set)?;
+        let mut config = Config::read(&self.config, &self.set)?;
+        // Weights that were trained to the last stage know nothing of the first any more.
+        config.curriculum.full_capacity |= self.from.is_some();
+        let config = config;
         let device = device::parse(&self.device)?;
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,
@@ -72,6 +79,9 @@ impl Train {
             );
         }
         let mut trainer = Trainer::new(&config, scenes, device)?;
+        if let Some(weights) = &self.from {
+            trainer.begin_with(weights)?;
+        }
 
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;

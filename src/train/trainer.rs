@@ -9,13 +9,15 @@ use super::schedule::learning_rate;
 use super::step_report::StepReport;
 use super::stopwatch::Stopwatch;
 use super::subsets::subsets;
-use crate::config::Config;
+use crate::config::{Config, changed_keys};
 use crate::data::{BadData, Loader, Sample, SceneGroups};
-use crate::error::Result;
+use crate::error::{Error, Result};
+use crate::io::read_weights;
 use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
 use crate::optim::AdamW;
-use crate::reconstruct::Model;
+use crate::reconstruct::{CONFIG_KEY, Model};
+use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -50,6 +52,24 @@ impl Trainer {
         let optimizer = AdamW::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
+    }
+
+    /// Takes the weights that [`crate::reconstruct::save_model`] wrote in place of the fresh ones.
+    ///
+    /// # Errors
+    /// A file that can't be read, or whose model has another shape: its keys are named.
+    pub fn begin_with(&mut self, path: &Path) -> Result<()> {
+        let weights = read_weights(path)?;
+        if let Some(text) = weights.metadata.get(CONFIG_KEY) {
+            let ours = Config { model: self.config.model.clone(), ..Default::default() };
+            let theirs = Config { model: Config::parse(text, &[], path)?.model, ..Default::default() };
+            let changed = changed_keys(&theirs.to_toml(), &ours.to_toml());
+            if !changed.is_empty() {
+                let expected = "the model that the configuration describes";
+                return Err(Error::input(path, "the model", changed.join(", "), expected));
+            }
+        }
+        weights.load_into(&self.vs, path)
     }
 
     /// Draws a sample and follows its gradient.
