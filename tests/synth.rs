@@ -7,6 +7,8 @@ use glam::DVec3;
 use globalsplat::data::{Dataset, MadeUp, Split};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
+use npyz::NpyFile;
+use std::fs::File;
 use std::path::Path;
 
 fn settings(frames: usize, side: u32) -> VideoSettings {
@@ -131,10 +133,16 @@ fn videos_are_data_like_any_other() {
         "9",
         "--size",
         "24",
+        "--depth",
         "--sheet",
         arg(&sheet),
     ]);
     assert!(image::open(&sheet).unwrap().width() > 8 * 24);
+    let depths = NpyFile::new(File::open(out.join("depth/3_000008.npy")).unwrap()).unwrap();
+    assert_eq!(depths.shape(), [9, 24, 24]);
+    let video = Video::new(3, 8, &settings(9, 24));
+    let expected: Vec<f32> = (0..9).flat_map(|view| video.depth(view)).collect();
+    assert_eq!(depths.into_vec::<f32>().unwrap(), expected);
     let told = succeed(&["inspect", arg(&out), "--json"]);
     assert!(told.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{told}");
     let (weights, scores) = (folder.path().join("weights.safetensors"), folder.path().join("scores"));

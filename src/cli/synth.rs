@@ -1,17 +1,17 @@
 use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{ChunkWriter, MadeUp, read_pictures, write_room};
+use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    check_writable_dir, check_writable_file, tile_horizontally, tile_vertically, write_png,
+    check_writable_dir, check_writable_file, tile_horizontally, tile_vertically, write_npy, write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use tch::Tensor;
 
 /// Of photos in a chunk, about.
@@ -48,11 +48,14 @@ pub struct Synth {
     /// PNG and JPEG files to be seen on walls and things
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
+    /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite where the sky is
+    #[arg(long)]
+    depth: bool,
     /// A picture of what came out, a video a row
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
     /// Captures of a small room made of Gaussians instead, its splat beside them
-    #[arg(long, conflicts_with_all = ["first", "pictures", "sheet"])]
+    #[arg(long, conflicts_with_all = ["first", "pictures", "depth", "sheet"])]
     gaussians: bool,
     /// Print what was written as one JSON object
     #[arg(long)]
@@ -80,23 +83,30 @@ impl Synth {
         let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
         let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
+        let depths = self.out.join("depth");
+        if self.depth {
+            check_writable_dir(&depths)?;
+        }
         let bar = progress::bar(self.scenes, "videos");
         let (mut index, mut rows) = (BTreeMap::new(), vec![]);
         let numbers: Vec<usize> = (0..self.scenes as usize).collect();
         // So many worlds at once: most of making one is work for a single thread.
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
-            numbers.par_iter().map(|&number| videos.capture(number)).collect::<Result<Vec<_>, _>>()
+            let make = |&number| {
+                let capture = videos.capture(number)?;
+                if self.depth {
+                    self.write_depths(&depths, &capture)?;
+                }
+                Ok(capture)
+            };
+            numbers.par_iter().map(make).collect::<Result<Vec<_>>>()
         });
         for captures in made {
             for capture in captures? {
                 writer.add(&capture)?;
                 index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
                 if self.sheet.is_some() && rows.len() < SHEET.0 {
-                    let shown: Vec<usize> =
-                        (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
-                    let pictures: Vec<Tensor> =
-                        capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();
-                    rows.push(tile_horizontally(&pictures));
+                    rows.push(sheet_row(&capture)?);
                 }
                 bar.inc(1);
             }
@@ -111,7 +121,7 @@ impl Synth {
         let (out, scenes) = (self.out.display(), self.scenes);
         if self.json {
             print_json(
-                &json!({ "out": self.out, "scenes": scenes, "chunks": chunks, "index": index.file, "sheet": self.sheet }),
+                &json!({ "out": self.out, "scenes": scenes, "chunks": chunks, "index": index.file, "depth": self.depth.then_some(depths), "sheet": self.sheet }),
             );
         } else {
             println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
@@ -120,6 +130,12 @@ impl Synth {
             }
         }
         Ok(())
+    }
+
+    fn write_depths(&self, folder: &Path, capture: &Capture) -> Result<()> {
+        let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
+        let shape = [u64::from(self.frames), u64::from(self.size), u64::from(self.size)];
+        Ok(write_npy(&folder.join(&capture.name).with_extension("npy"), &shape, &depths)?)
     }
 
     fn write_rooms(&self) -> Result<()> {
@@ -140,4 +156,11 @@ impl Synth {
         }
         Ok(())
     }
+}
+
+/// Pictures of a video side by side, from the first to the last.
+fn sheet_row(capture: &Capture) -> Result<Tensor> {
+    let shown: Vec<usize> = (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
+    let pictures: Vec<Tensor> = capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();
+    Ok(tile_horizontally(&pictures))
 }

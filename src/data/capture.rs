@@ -157,6 +157,15 @@ impl Capture {
         Ok(View { name: frame.name.clone(), image: planes.to_tensor(), camera })
     }
 
+    /// Depths of view `index` along its camera's axis at its pixels' centres, row by row, in the capture's unit and infinite where
+    /// the sky is: made-up captures alone know them.
+    pub fn depth(&self, index: usize) -> Option<Vec<f32>> {
+        match &self.frames[index].photo {
+            Photo::Made { video, index } => Some(video.depth(*index)),
+            Photo::File(_) | Photo::Part { .. } => None,
+        }
+    }
+
     /// The photo of view `index` at its camera's size, lens distortion removed.
     ///
     /// # Errors

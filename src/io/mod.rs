@@ -1,4 +1,4 @@
-//! Files: splats (PLY), weights (safetensors), images, films and TensorBoard's events. Writing never leaves half a file.
+//! Files: splats (PLY), weights (safetensors), images, films, arrays (NPY) and TensorBoard's events. Writing never leaves half a file.
 
 mod append;
 mod atomic;
@@ -6,6 +6,7 @@ mod environment;
 mod event_file;
 mod film;
 mod images;
+mod npy;
 mod pretrained;
 mod splat;
 mod weights;
@@ -16,6 +17,7 @@ pub use images::{
     Photo, colourize_depth, decode_photo, read_image, tensor_from_rgb, tile_horizontally, tile_vertically,
     write_png,
 };
+pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use splat::{Splat, read_splat, write_splat};
 pub use weights::{Weights, read_weights, write_weights};
