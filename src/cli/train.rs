@@ -4,7 +4,7 @@ use clap::Args;
 use globalsplat::config::Config;
 use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
-use globalsplat::eval::{HeldOut, HeldOutScores};
+use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
 use globalsplat::io::check_writable_dir;
 use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
@@ -18,7 +18,7 @@ use std::time::Instant;
 ///
 /// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command goes on from there. Now and then, and at the end, views
 /// and scenes that are held out are rendered and scored, beside the answer "the nearest photo that was shown"; RUN/best is
-/// the checkpoint that did best. TensorBoard shows RUN/tensorboard.
+/// the checkpoint that did best. RUN/curves.svg shows how it went, and TensorBoard RUN/tensorboard.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  globalsplat train --config configs/first_light.toml --out runs/first_light\n  \
@@ -101,8 +101,7 @@ impl Train {
             };
             anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
         }
-        self.report(&outcome, seconds, held_out.scores(), &bad_data);
-        Ok(())
+        self.report(&outcome, seconds, held_out.scores(), &bad_data)
     }
 
     fn train(
@@ -156,13 +155,22 @@ impl Train {
         Ok(outcome)
     }
 
-    fn report(&self, outcome: &Outcome, seconds: f64, validation: &[HeldOutScores], bad_data: &BadData) {
+    fn report(
+        &self,
+        outcome: &Outcome,
+        seconds: f64,
+        validation: &[HeldOutScores],
+        bad_data: &BadData,
+    ) -> Result<()> {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
+        let curves = self.out.join("curves.svg");
+        write_curves(&curves, &self.out, (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr)))?;
         if self.json {
             let mut object = json!({
                 "checkpoint": outcome.checkpoint,
+                "curves": curves,
                 "seconds": seconds,
                 "skipped_steps": outcome.skipped,
                 "skipped_scenes": bad_data,
@@ -177,9 +185,10 @@ impl Train {
                 });
             }
             print_json(&object);
-            return;
+            return Ok(());
         }
         println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
+        println!("{}: how it went", curves.display());
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
             for v in validation {
@@ -196,5 +205,6 @@ impl Train {
                 psnr - nearest
             );
         }
+        Ok(())
     }
 }

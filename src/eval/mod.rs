@@ -32,7 +32,7 @@ pub use published::{
     Published, PublishedAblation, PublishedCompactness, PublishedEfficiency, PublishedMethod,
     PublishedScores, published,
 };
-pub use report::write_report;
+pub use report::{write_curves, write_report};
 pub use scene::EvalScene;
 pub use scores::{CaptureScores, ViewScore, score};
 pub use scores_file::{comparison_path, read_evaluation, write_csv, write_evaluation};

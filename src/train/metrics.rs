@@ -9,6 +9,9 @@ use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::Path;
 
+/// A line for every step and every validation.
+pub(super) const METRICS_FILE: &str = "metrics.jsonl";
+
 /// How a step went, by name: not what it minimized.
 pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
     [
@@ -91,5 +94,43 @@ impl Metrics {
 
     fn append(&mut self, line: &Value) -> Result<()> {
         self.file.append(format!("{line}\n").as_bytes())
+    }
+}
+
+/// How a run went, by what it wrote down.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curves {
+    /// Of views in training, in dB: the last step of some in a row, and the mean over them.
+    pub training: Vec<(u64, f64)>,
+    /// Of held-out views, in dB: the last step before each validation, and its score.
+    pub held_out: Vec<(u64, f64)>,
+}
+
+impl Curves {
+    /// Reads those of the folder `run`, steps in `parts` parts.
+    ///
+    /// # Errors
+    /// Metrics that can't be read, or tell of no step.
+    pub fn read(run: &Path, parts: u64) -> Result<Self> {
+        let path = run.join(METRICS_FILE);
+        let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
+        let lines = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let (mut steps, mut held_out) = (vec![], vec![]);
+        for line in lines {
+            let Some(step) = line["step"].as_u64() else { continue };
+            match (line["validation"]["psnr"].as_f64(), line["psnr"].as_f64()) {
+                (Some(psnr), _) => held_out.push((step, psnr)),
+                (None, Some(psnr)) => steps.push((step, psnr)),
+                (None, None) => {}
+            }
+        }
+        if steps.is_empty() {
+            return Err(Error::input(&path, "the metrics", "no step", "one step or more"));
+        }
+        let mean = |part: &[(u64, f64)]| {
+            (part[part.len() - 1].0, part.iter().map(|step| step.1).sum::<f64>() / part.len() as f64)
+        };
+        let training = steps.chunks(steps.len().div_ceil(parts as usize)).map(mean).collect();
+        Ok(Curves { training, held_out })
     }
 }

@@ -19,6 +19,7 @@ mod trainer;
 mod validator;
 
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use metrics::Curves;
 pub use run::{Event, Outcome, Resume, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;

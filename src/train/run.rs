@@ -5,7 +5,7 @@ use super::checkpoint::{
 };
 use super::is_due;
 use super::lock::RunLock;
-use super::metrics::Metrics;
+use super::metrics::{METRICS_FILE, Metrics};
 use super::step_report::StepReport;
 use super::tensorboard::TensorBoard;
 use super::trainer::Trainer;
@@ -18,8 +18,6 @@ use std::time::{Duration, Instant};
 
 /// The run's configuration, every key written out.
 const CONFIG_FILE: &str = "config.toml";
-/// A line for every step and every validation.
-const METRICS_FILE: &str = "metrics.jsonl";
 
 /// Where a run begins.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -9,6 +9,8 @@ mod plot;
 mod scenes;
 mod table;
 
+pub use plot::write_curves;
+
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;

@@ -1,11 +1,13 @@
 //! Plots as inline SVG. Colours come from the page's style sheet, so that they follow light and dark.
 
 mod axes;
+mod curves;
 mod distribution;
 mod labels;
 mod quality_by_size;
 mod quality_by_views;
 
+pub use curves::write_curves;
 pub use distribution::distributions;
 pub use quality_by_size::quality_by_size;
 pub use quality_by_views::quality_by_views;
