@@ -4,8 +4,8 @@ use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep, contact_sheet, judge,
-    machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
+    Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
+    contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
 use globalsplat::io::{check_writable_dir, check_writable_file, write_png};
 use globalsplat::reconstruct::LoadedModel;
@@ -98,6 +98,9 @@ impl Eval {
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
         let scores = judge(&scene, &made, &perceptual)?;
+        // Beside a model, what answering without one would score.
+        let baselines =
+            loaded.as_ref().map(|_| Baselines::of(&scene.name, &scene.context, &scene.target)).transpose()?;
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &contact_sheet(&scene.target, &made.rendered))?;
         }
@@ -107,9 +110,21 @@ impl Eval {
         if self.json {
             let mut object = serde_json::to_value(&scores)?;
             object["peak_memory_bytes"] = peak_memory.into();
+            if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
+                let means = |scores: &CaptureScores| json!({ "psnr": scores.psnr, "ssim": scores.ssim });
+                object["baselines"] =
+                    json!({ "nearest_photo": means(nearest_photo), "mean_photo": means(mean_photo) });
+            }
             print_json(&object);
         } else {
             print_table(&scores);
+            if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
+                for (name, scores) in
+                    [("the nearest photo shown", nearest_photo), ("the mean photo shown", mean_photo)]
+                {
+                    println!("{name:<24} {:>8.2} {:>8.4}", scores.psnr, scores.ssim);
+                }
+            }
         }
         Ok(())
     }
@@ -126,7 +141,7 @@ impl Eval {
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
-        let load = |path: &PathBuf| model::load(path, &self.precision, device);
+        let load = |path: &PathBuf| model::load(Some(path), &self.precision, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 

@@ -34,6 +34,6 @@ pub use published::{
 };
 pub use report::{write_curves, write_report};
 pub use scene::EvalScene;
-pub use scores::{CaptureScores, ViewScore, score};
+pub use scores::{Baselines, CaptureScores, ViewScore, score};
 pub use scores_file::{comparison_path, read_evaluation, write_csv, write_evaluation};
 pub use sweep::Sweep;

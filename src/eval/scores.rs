@@ -79,6 +79,31 @@ pub fn score(
     })
 }
 
+/// What answering without looking would score for the target views of a scene.
+#[derive(Debug, Clone)]
+pub struct Baselines {
+    /// With the context photo that was taken nearest.
+    pub nearest_photo: CaptureScores,
+    /// With the mean of all context photos.
+    pub mean_photo: CaptureScores,
+}
+
+impl Baselines {
+    /// Of a scene's views, all of one size, a context view at least.
+    ///
+    /// # Errors
+    /// Views of different sizes.
+    pub fn of(scene: &str, context: &[View], target: &[View]) -> Result<Self> {
+        let images: Vec<&Tensor> = context.iter().map(|view| &view.image).collect();
+        let mean = Tensor::stack(&images, 0).mean_dim(0, false, None);
+        let means: Vec<Tensor> = target.iter().map(|_| mean.shallow_clone()).collect();
+        Ok(Baselines {
+            nearest_photo: nearest_context_baseline(scene, context, target)?,
+            mean_photo: score(scene, &means, target, None)?,
+        })
+    }
+}
+
 /// What answering with the context photo taken nearest (by camera centre) would score for the target views.
 pub(super) fn nearest_context_baseline(
     scene: &str,
@@ -92,4 +117,25 @@ pub(super) fn nearest_context_baseline(
         view.image.shallow_clone()
     };
     score(scene, &target.iter().map(nearest).collect::<Vec<_>>(), target, None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::{DMat4, DVec3};
+    use tch::{Device, Kind};
+
+    #[test]
+    fn baselines_are_the_nearest_photo_and_the_mean() {
+        let intrinsics = Intrinsics { fx: 16., fy: 16., cx: 8., cy: 8. };
+        let view = |at: f64, grey: f64| View {
+            name: String::new(),
+            image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)),
+            camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
+        };
+        let baselines = Baselines::of("", &[view(0., 0.2), view(1., 0.6)], &[view(0.7, 0.7)]).unwrap();
+        assert!((baselines.nearest_photo.psnr - 20.).abs() < 1e-4, "0.1 apart");
+        assert!((baselines.mean_photo.psnr - 20. * (1f64 / 0.3).log10()).abs() < 1e-4, "0.3 apart");
+    }
 }

@@ -134,3 +134,23 @@ impl Curves {
         Ok(Curves { training, held_out })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_are_read_from_what_a_run_wrote() {
+        let run = tempfile::tempdir().unwrap();
+        let step = |step: u64| format!("{{\"step\": {step}, \"psnr\": {}.0}}\n", 10 + step);
+        let mut text: String = (0..5).map(step).collect();
+        // A step that was skipped has no number, and a line may be cut off.
+        text += "{\"step\": 5, \"psnr\": null}\n{\"step\": 4, \"validation\": {\"psnr\": 8.5}}\n{\"step\": 6, \"ps";
+        std::fs::write(run.path().join(METRICS_FILE), text).unwrap();
+        let curves = Curves::read(run.path(), 2).unwrap();
+        assert_eq!(curves.training, [(2, 11.), (4, 13.5)]);
+        assert_eq!(curves.held_out, [(4, 8.5)]);
+        std::fs::write(run.path().join(METRICS_FILE), "").unwrap();
+        assert!(Curves::read(run.path(), 2).unwrap_err().to_string().contains("no step"));
+    }
+}
