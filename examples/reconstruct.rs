@@ -9,9 +9,6 @@ use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
 
-/// Photos that the model sees, at most.
-const VIEWS: usize = 24;
-
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().collect();
     let [_, weights, scene, out] = arguments.as_slice() else {
@@ -19,8 +16,9 @@ fn main() -> Result<()> {
     };
     let model = load_model(Path::new(weights), Device::Cpu)?;
     let capture = open_capture(Path::new(scene))?;
-    // Spread over the path of the camera, cut and resized to what the model takes.
-    let views = load_context(&capture, Holdout::None, Some(VIEWS), model.config.data.image_size)?;
+    let data = &model.config.data;
+    // As many as the model saw in training, spread over the path of the camera, cut and resized to what it takes.
+    let views = load_context(&capture, Holdout::None, Some(data.context_views), data.image_size)?;
 
     let reconstruction = reconstruct(&model, &views, &[])?;
     // The model works in a world in which all scenes are alike; this is the way back to the capture's own.

@@ -17,8 +17,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-PROGRAM = REPOSITORY / "target/release/globalsplat"
+from core_runs import PROGRAM, REPOSITORY, row, train
+
 VARIANTS = {
     "full model": [],
     "Plücker only": ["model.camera_code=false"],
@@ -36,26 +36,6 @@ def run_folder(out, name, seed):
     return out / f"{name.replace(' ', '_').replace(',', '')}_{seed}"
 
 
-def trained(out, name, seed, settings, rooms):
-    """What a run on one core told at its end, which OUT keeps, and the seconds for which its process kept the core busy."""
-    run = run_folder(out, name, seed)
-    result = run / "result.json"
-    if not result.is_file():
-        command = [PROGRAM, "train", "--config", REPOSITORY / "configs/small.toml", "--out", run, "--json"]
-        for setting in [*settings, f"train.seed={seed}"]:
-            command += ["--set", setting]
-        environment = dict(os.environ, GLOBALSPLAT_ROOMS=str(rooms), OMP_NUM_THREADS="1")
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-        told = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        if status != 0 or "held_out" not in (told := json.loads(told)):
-            raise RuntimeError(f"{run}: training failed")
-        partial = result.with_suffix(".partial")
-        partial.write_text(json.dumps(told | {"core_seconds": usage.ru_utime + usage.ru_stime}))
-        partial.rename(result)
-    return json.loads(result.read_text())
-
-
 def curve(out, name, seeds):
     """PSNR in training over equal parts of the runs, each the mean over a part's steps and the seeds, in dB."""
     parts = [[] for _ in range(PARTS)]
@@ -65,10 +45,6 @@ def curve(out, name, seeds):
         for line in steps:
             parts[line["step"] * PARTS // (steps[-1]["step"] + 1)].append(line["psnr"])
     return steps[-1]["step"] + 1, [statistics.mean(part) for part in parts]
-
-
-def row(*cells):
-    print("|", " | ".join(cells), "|", flush=True)
 
 
 def main():
@@ -89,10 +65,12 @@ def main():
         command = [PROGRAM, "synth", "--gaussians", "--out", rooms, "--scenes", "8", "--frames", "18", "--size", "64", "--seed", "5"]
         subprocess.run(command, check=True, stdout=sys.stderr)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = {
-            name: [pool.submit(trained, out, name, seed, VARIANTS[name], rooms) for seed in range(seeds)]
-            for name in arguments.only
-        }
+
+        def run(name, seed):
+            settings = [*VARIANTS[name], f"train.seed={seed}"]
+            return train(run_folder(out, name, seed), kept, settings, GLOBALSPLAT_ROOMS=str(rooms))
+
+        results = {name: [pool.submit(run, name, seed) for seed in range(seeds)] for name in arguments.only}
         row("variant", "held-out PSNR, dB", "SSIM", "seconds of a core")
         row(*["---"] * 4)
         for name in arguments.only:

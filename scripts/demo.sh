@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# The whole way in minutes on two CPU cores: trains a small model on the captures at hand (or on rooms it makes itself),
-# then writes a splat, a side-by-side picture of views that training never showed, and an orbit.
-#   CAPTURES  a capture, or a folder with captures up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else none
+# Photos to a splat by the weights that come with the program, then a few minutes of training on these scenes, on two CPU cores.
+#   CAPTURES  a capture, or a folder with captures up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else made-up worlds
 #   OUT       where everything goes; by default runs/demo
 set -euo pipefail
 cd "$(dirname "$0")/.."
 globalsplat="target/release/globalsplat"
 out="${OUT:-runs/demo}"
 captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-none}}"
+captures="${captures%/}"
+mkdir -p "$out"
 
 # Folders in $1 that are captures; what lies inside of one isn't another.
 find_scenes() {
@@ -22,27 +23,48 @@ find_scenes() {
     done < <(find -L "$1" -maxdepth 2 -type d | sort)
 }
 
+# What a scene's files are called.
+name_of() {
+    local name="${1#"$captures"/}"
+    [ "$1" != "$captures" ] || name="$(basename "$1")"
+    name="${name##*#}"
+    echo "${name//\//_}"
+}
+
+# Splat, views never shown and orbit of every scene, by the weights $1, in the folder $2.
+show() {
+    local scene name
+    mkdir -p "$2"
+    for scene in "${scenes[@]}"; do
+        name="$(name_of "$scene")"
+        "$globalsplat" reconstruct --weights "$1" --scene "$scene" --holdout every:3+1 --out "$2/$name.ply"
+        "$globalsplat" eval --weights "$1" --scene "$scene" --holdout every:3+1 --views 12 --sheet "$2/${name}_held_out.png" >/dev/null
+        "$globalsplat" render --splat "$2/$name.ply" --scene "$scene" --orbit --depth --size 256x256 --out "$2/${name}_orbit.gif" >/dev/null
+    done
+}
+
 scenes=()
-[ "$captures" = none ] || find_scenes "${captures%/}"
+[ "$captures" = none ] || find_scenes "$captures"
+train_on=("${scenes[@]}")
 if [ ${#scenes[@]} -eq 0 ]; then
     [ "$captures" = none ] || echo "demo: there is no capture in $captures" >&2
-    echo "demo: rooms are made and photographed" >&2
-    captures="$out/captures"
-    "$globalsplat" synth --gaussians --out "$captures" --scenes 2 --frames 12 --size 256
-    find_scenes "$captures"
+    echo "demo: worlds are made up and filmed" >&2
+    captures="$out/worlds"
+    "$globalsplat" synth --out "$captures" --seed 7 --scenes 4 --frames 32 --size 192
+    for number in 0 1 2 3; do scenes+=("$captures/000000.torch#7_00000$number"); done
+    train_on=("$captures")
+    # Judged over all of them, on one page.
+    "$globalsplat" eval --weights models/tiny.safetensors --data "$captures" --index "$captures/evaluation_index.json" \
+        --name "weights that come with it" --out "$out/evaluation"
 fi
-list="$(printf ', "%s"' "${scenes[@]}")"
-"$globalsplat" train --config configs/first_light.toml --set "data.captures=[${list#, }]" --out "$out"
-"$globalsplat" export --run "$out" --out "$out/model.safetensors"
+show models/tiny.safetensors "$out/shipped"
+first="$(name_of "${scenes[0]}")"
+echo "LOOK: $out/shipped/${first}_held_out.png has views never shown (photo, ours, depth), ${first}_orbit.gif a look around," \
+    "${first}.ply the splat for any 3DGS viewer"
 
-for scene in "${scenes[@]}"; do
-    name="${scene#"${captures%/}"/}"
-    [ "$scene" != "${captures%/}" ] || name="$(basename "$scene")"
-    name="${name//\//_}"
-    "$globalsplat" reconstruct --weights "$out/model.safetensors" --scene "$scene" --holdout every:3+1 --out "$out/$name.ply"
-    "$globalsplat" eval --weights "$out/model.safetensors" --scene "$scene" --sheet "$out/${name}_held_out.png" >/dev/null
-    "$globalsplat" render --splat "$out/$name.ply" --scene "$scene" --orbit --depth --size 256x256 --out "$out/${name}_orbit.gif" >/dev/null
-    echo "$out/$name.ply                 the splat; any 3DGS viewer opens it"
-    echo "$out/${name}_held_out.png      views never shown: photo, ours, depth"
-    echo "$out/${name}_orbit.gif         a look around"
-done
+echo "demo: the weights are trained on for some minutes, on two thirds of these photos" >&2
+list="$(printf ', "%s"' "${train_on[@]}")"
+"$globalsplat" train --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" --out "$out/training"
+"$globalsplat" export --run "$out/training" --out "$out/model.safetensors"
+show "$out/model.safetensors" "$out/trained"
+echo "LOOK: $out/training/curves.svg has both curves, in training and held out; $out/trained the same views as $out/shipped, after training"

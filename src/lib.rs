@@ -3,13 +3,13 @@
 //! ```no_run
 //! use globalsplat::data::{Holdout, open_capture};
 //! use globalsplat::io::{Splat, write_splat};
-//! use globalsplat::reconstruct::{load_context, load_model, reconstruct};
+//! use globalsplat::reconstruct::{load_context, reconstruct, shipped_model};
 //!
 //! # fn main() -> globalsplat::Result<()> {
-//! let model = load_model("model.safetensors".as_ref(), tch::Device::Cpu)?;
+//! let model = shipped_model(tch::Device::Cpu)?;
 //! let capture = open_capture("captures/room".as_ref())?;
-//! // 24 photos, spread over the path of the camera and fitted to the model.
-//! let views = load_context(&capture, Holdout::None, Some(24), model.config.data.image_size)?;
+//! // Twelve photos, spread over the path of the camera and fitted to the model.
+//! let views = load_context(&capture, Holdout::None, Some(12), model.config.data.image_size)?;
 //! let reconstruction = reconstruct(&model, &views, &[])?;
 //! write_splat("room.ply".as_ref(), &Splat::of(&reconstruction.in_world())?)?;
 //! # Ok(())

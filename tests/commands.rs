@@ -346,15 +346,41 @@ fn a_run_goes_from_photos_to_a_splat() {
             "--json",
         ]);
         assert_eq!(report["gaussians"], 16 * 4);
-        assert_eq!(report["views"], 9);
+        assert_eq!(report["views"], 3, "as many as in training");
         assert!(
             report["seconds"].as_f64().unwrap() > 0.
                 && report["peak_memory_bytes"].as_u64().unwrap() > 1 << 20
         );
     }
+    let curves = std::fs::read_to_string(run.join("curves.svg")).unwrap();
+    assert!(curves.matches("<polyline").count() == 3 && curves.contains("held out"), "{curves}");
+    // By the weights that come with the program, and what was done to the photos in one line.
+    let output =
+        globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
+    let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!((&report["weights"], &report["views"]), (&json!("models/tiny.safetensors"), &json!(5)));
+    let told = String::from_utf8_lossy(&output.stderr);
+    let expected = "room_000: 5 of 9 photos are shown, spread over the camera's path; 40×40 pixels are cut and resized to ";
+    assert!(told.starts_with(expected) && told.lines().count() == 1, "{told}");
+    let [doctor, as_json] = [succeed(&["doctor"]), succeed(&["doctor", "--json"])];
+    assert!(doctor.contains("models/tiny.safetensors") && as_json.contains("models/tiny.safetensors"));
+
+    succeed(&[
+        "reconstruct",
+        "--weights",
+        arg(&weights),
+        "--scene",
+        arg(&room),
+        "--views",
+        "9",
+        "--out",
+        arg(&splat),
+    ]);
     // In the capture's world: the capture's cameras see what the model's own rendering shows.
     let by_model = json(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--json"]);
     assert_eq!(by_model["views"].as_array().unwrap().len(), 3);
+    assert!(by_model["baselines"]["nearest_photo"]["psnr"].is_f64());
+    assert!(by_model["baselines"]["mean_photo"]["ssim"].is_f64());
     let by_splat = json(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"]);
     assert!(by_splat["psnr"].is_f64());
 }

@@ -3,12 +3,14 @@
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
 use globalsplat::data::write_room;
+use globalsplat::io::read_weights;
 use globalsplat::loss::Term;
 use globalsplat::model::{GlobalSplat, Streams};
+use globalsplat::reconstruct::{SHIPPED_MODEL, shipped_model};
 use globalsplat::train::Trainer;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use tch::{Device, nn};
+use tch::{Device, Kind, nn};
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs")
@@ -32,6 +34,30 @@ fn every_configuration_builds_its_model() {
         count += 1;
     }
     assert!(count >= 11);
+}
+
+#[test]
+fn the_weights_that_come_with_the_program_are_those_of_tiny() {
+    let shipped = shipped_model(Device::Cpu).expect("a model");
+    let tiny = read("tiny");
+    assert_eq!(shipped.config.model, tiny.model);
+    assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
+    assert_eq!(shipped.stage, tiny.curriculum.final_stage());
+    assert_eq!(read("fine_tune").model, tiny.model, "what goes on from them");
+    let folder = folder().with_file_name("models");
+    let files = std::fs::read_dir(&folder).expect("models/").map(|entry| entry.expect("an entry").path());
+    let weights: Vec<PathBuf> =
+        files.filter(|file| file.extension().is_some_and(|e| e == "safetensors")).collect();
+    assert!(weights.contains(&folder.with_file_name(SHIPPED_MODEL)));
+    let sizes: Vec<u64> = weights.iter().map(|file| file.metadata().expect("a file").len()).collect();
+    assert!(
+        sizes.iter().all(|&size| size <= 16_000_000) && sizes.iter().sum::<u64>() <= 48_000_000,
+        "{sizes:?}"
+    );
+    for file in weights {
+        let tensors = read_weights(&file).expect("weights").tensors;
+        assert!(tensors.values().all(|tensor| tensor.kind() == Kind::BFloat16), "{}", file.display());
+    }
 }
 
 /// Of a configuration, everything but what makes it one of its kind made small.

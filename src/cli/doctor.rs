@@ -3,6 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
+use globalsplat::reconstruct::SHIPPED_MODEL;
 use globalsplat::render::cpu::simd_level;
 use serde_json::json;
 
@@ -37,6 +38,7 @@ impl Doctor {
                 "simd": simd,
                 "threads": threads,
                 "cores": cores,
+                "model": SHIPPED_MODEL,
                 "weights": found,
             }));
         } else {
@@ -45,6 +47,9 @@ impl Doctor {
             println!("devices      {}", devices.join(", "));
             println!("rasterizer   {simd} (GLOBALSPLAT_SIMD forces another)");
             println!("threads      {threads} on {cores} cores (OMP_NUM_THREADS sets them)");
+            println!(
+                "model        {SHIPPED_MODEL}, inside the program (reconstruct --weights takes another)"
+            );
             for (metric, path) in weights {
                 let found = match path {
                     Some(path) => path.display().to_string(),

@@ -2,20 +2,28 @@
 
 use globalsplat::config::Config;
 use globalsplat::model::Stage;
-use globalsplat::reconstruct::{LoadedModel, load_model};
+use globalsplat::reconstruct::{LoadedModel, SHIPPED_MODEL, load_model, shipped_model};
 use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
 
-/// Reads the model in `weights`, which computes in `precision` from then on.
-pub fn load(weights: &Path, precision: &str, device: Device) -> Result<LoadedModel> {
+/// Reads the model in `weights`, or the one that comes with this program, which computes in `precision` from then on.
+pub fn load(weights: Option<&Path>, precision: &str, device: Device) -> Result<LoadedModel> {
     let precision = precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
-    let mut loaded = load_model(weights, device)?;
+    let mut loaded = match weights {
+        Some(weights) => load_model(weights, device)?,
+        None => shipped_model(device)?,
+    };
     loaded.model.set_precision(precision);
     if let Some(early) = early_stage(loaded.stage, &loaded.config) {
-        eprintln!("{}: {early}, and are used so", weights.display());
+        eprintln!("{}: {early}, and are used so", name(weights).display());
     }
     Ok(loaded)
+}
+
+/// What errors and reports call the weights.
+pub fn name(weights: Option<&Path>) -> &Path {
+    weights.unwrap_or(Path::new(SHIPPED_MODEL))
 }
 
 /// What is to be told of weights whose training was stopped on the way.

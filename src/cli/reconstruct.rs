@@ -1,34 +1,35 @@
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Holdout, open_capture};
+use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::peak_memory_bytes;
 use globalsplat::io::{Splat, check_writable_file, write_splat};
 use globalsplat::reconstruct::{load_context, reconstruct};
+use globalsplat::scene::ImageSize;
 use serde_json::json;
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 /// Make a splat from posed photos.
 ///
 /// The splat is in the capture's own world, so the capture's cameras see it where the photos show it.
 #[derive(Args)]
-#[command(
-    after_help = "Example:\n  globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply"
-)]
+#[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
+    globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply")]
 pub struct Reconstruct {
-    /// Weights that `globalsplat export` wrote
+    /// Weights that `globalsplat export` wrote; by default those that come with this program
     #[arg(long, value_name = "FILE")]
-    weights: PathBuf,
+    weights: Option<PathBuf>,
     /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
     /// The splat to write
     #[arg(long, value_name = "FILE.ply")]
     out: PathBuf,
-    /// Use this many views, spread over the path of the camera
-    #[arg(long, value_name = "N", default_value_t = 24)]
-    views: usize,
+    /// Use this many views at most, spread over the path of the camera; by default as many as the model saw in training
+    #[arg(long, value_name = "N")]
+    views: Option<usize>,
     /// Views not to use: every:N, every:N+K or none
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
@@ -48,9 +49,14 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_file(&self.out)?;
-        let loaded = model::load(&self.weights, &self.precision, device)?;
+        let loaded = model::load(self.weights.as_deref(), &self.precision, device)?;
         let capture = open_capture(&self.scene)?;
-        let views = load_context(&capture, holdout, Some(self.views), loaded.config.data.image_size)?;
+        let data = &loaded.config.data;
+        let count = self.views.unwrap_or(data.context_views);
+        let views = load_context(&capture, holdout, Some(count), data.image_size)?;
+        if let Some(line) = fitting(&capture, views.len(), data.image_size) {
+            eprintln!("{line}");
+        }
         let reconstruction = reconstruct(&loaded, &views, &[])?;
         write_splat(&self.out, &Splat::of(&reconstruction.in_world())?)?;
 
@@ -59,6 +65,7 @@ impl Reconstruct {
         if self.json {
             print_json(&json!({
                 "splat": self.out,
+                "weights": model::name(self.weights.as_deref()),
                 "views": views.len(),
                 "gaussians": count,
                 "seconds": seconds,
@@ -76,4 +83,19 @@ impl Reconstruct {
         }
         Ok(())
     }
+}
+
+/// What is done to a capture's photos before `shown` of them are seen at `size`, if anything.
+fn fitting(capture: &Capture, shown: usize, size: ImageSize) -> Option<String> {
+    let sizes: BTreeSet<(u32, u32)> = capture.cameras().iter().map(|c| (c.width, c.height)).collect();
+    let chosen = (shown < capture.len())
+        .then(|| format!("{shown} of {} photos are shown, spread over the camera's path", capture.len()));
+    let model = format!("the {}×{} pixels that the model sees", size.width, size.height);
+    let fitted = match sizes.first() {
+        Some((width, height)) if sizes.len() == 1 => ((*width, *height) != (size.width, size.height))
+            .then(|| format!("{width}×{height} pixels are cut and resized to {model}")),
+        _ => Some(format!("photos of {} sizes are cut and resized to {model}", sizes.len())),
+    };
+    let parts: Vec<String> = chosen.into_iter().chain(fitted).collect();
+    (!parts.is_empty()).then(|| format!("{}: {}", capture.name, parts.join("; ")))
 }

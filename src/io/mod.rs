@@ -22,6 +22,8 @@ pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use splat::{Splat, read_splat, write_splat};
 pub use weights::{Weights, read_weights, write_weights};
 
+pub(crate) use weights::weights_from;
+
 pub(crate) use append::AppendFile;
 pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
 pub(crate) use environment::expand_path;

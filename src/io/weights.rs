@@ -21,13 +21,17 @@ pub struct Weights {
 /// # Errors
 /// A file that can't be read, isn't safetensors, or holds another type.
 pub fn read_weights(path: &Path) -> Result<Weights> {
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    weights_from(&std::fs::read(path).map_err(Error::read(path))?, path)
+}
+
+/// As [`read_weights`], of a file's bytes; `path` is what errors call it.
+pub(crate) fn weights_from(bytes: &[u8], path: &Path) -> Result<Weights> {
     let broken = |e: safetensors::SafeTensorError| {
         Error::input(path, "the file", format!("broken ({e})"), "safetensors")
     };
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(broken)?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
     let metadata = header.metadata().clone().unwrap_or_default();
-    let file = SafeTensors::deserialize(&bytes).map_err(broken)?;
+    let file = SafeTensors::deserialize(bytes).map_err(broken)?;
     let mut tensors = BTreeMap::new();
     for (name, view) in file.iter() {
         let kind = match view.dtype() {

@@ -6,7 +6,9 @@ mod model_file;
 mod spread;
 
 pub use context::load_context;
-pub use model_file::{CONFIG_KEY, LoadedModel, ModelDtype, STAGE_KEY, load_model, save_model};
+pub use model_file::{
+    CONFIG_KEY, LoadedModel, ModelDtype, SHIPPED_MODEL, STAGE_KEY, load_model, save_model, shipped_model,
+};
 
 pub(crate) use spread::spread_over_path;
 

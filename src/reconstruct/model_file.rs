@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::io::{read_weights, write_weights};
+use crate::io::{Weights, read_weights, weights_from, write_weights};
 use crate::model::{GlobalSplat, Stage};
 use std::collections::HashMap;
 use std::path::Path;
@@ -58,12 +58,29 @@ pub fn save_model(
     write_weights(path, &tensors, metadata)
 }
 
+/// The weights that come with this program, which it carries inside: the model of `configs/tiny.toml`, trained on made-up worlds
+/// alone. Their card is `models/README.md`.
+pub const SHIPPED_MODEL: &str = "models/tiny.safetensors";
+const SHIPPED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
+
+/// The model that comes with this program, [`SHIPPED_MODEL`].
+///
+/// # Errors
+/// The device's refusal.
+pub fn shipped_model(device: Device) -> Result<LoadedModel> {
+    let name = Path::new(SHIPPED_MODEL);
+    rebuild(&weights_from(SHIPPED_BYTES, name)?, name, device)
+}
+
 /// Rebuilds the model that [`save_model`] wrote, in float32.
 ///
 /// # Errors
 /// A file that can't be read, has no configuration, or whose weights don't fit it.
 pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
-    let weights = read_weights(path)?;
+    rebuild(&read_weights(path)?, path, device)
+}
+
+fn rebuild(weights: &Weights, path: &Path, device: Device) -> Result<LoadedModel> {
     let config = weights.metadata.get(CONFIG_KEY).ok_or_else(|| {
         Error::input(
             path,

@@ -1,0 +1,37 @@
+"""Training runs of one core each, as many side by side as there are cores: what scripts that compare variants share."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PROGRAM = REPOSITORY / "target/release/globalsplat"
+
+
+def environment(**more):
+    """For a process that keeps to one core."""
+    return dict(os.environ, OMP_NUM_THREADS="1", **more)
+
+
+def train(run, config, settings, **variables):
+    """What a run told at its end, which its folder keeps, and the seconds for which its process kept the core busy."""
+    result = run / "result.json"
+    if not result.is_file():
+        command = [PROGRAM, "train", "--config", config, "--out", run, "--json"]
+        for setting in settings:
+            command += ["--set", setting]
+        process = subprocess.Popen(command, env=environment(**variables), stdout=subprocess.PIPE, text=True)
+        told = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        if status != 0 or "held_out" not in (told := json.loads(told)):
+            raise RuntimeError(f"{run}: training failed")
+        partial = result.with_suffix(".partial")
+        partial.write_text(json.dumps(told | {"core_seconds": usage.ru_utime + usage.ru_stime}))
+        partial.rename(result)
+    return json.loads(result.read_text())
+
+
+def row(*cells):
+    """Of a Markdown table."""
+    print("|", " | ".join(cells), "|", flush=True)

@@ -1,0 +1,118 @@
+#!/usr/bin/env python3
+"""Which shape and recipe of configs/tiny.toml learns most in equal time: short runs on one core, one thing changed in each.
+
+    .venv/bin/python scripts/tune.py --worlds DIR --test DIR [--out OUT] [--seconds 300] [--captures DIR] [--only VARIANT ...]
+
+DIR hold videos that `globalsplat synth` made, 96 pixels wide. Every variant gets as many steps as fit in the seconds by its own
+time for a step, the curriculum's stages at the same shares of them. Prints a Markdown table: PSNR on worlds never seen, and, where
+captures are named, on the held-out views of each, mean over them. What is done stays done.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from core_runs import PROGRAM, REPOSITORY, environment, row, train
+
+# Parts of the run at which stages begin, and the length of a transition.
+STAGES = [0.1, 0.2, 0.35, 0.5]
+TRANSITION = 0.05
+
+VARIANTS = {
+    "tiny": [],
+    "4 target views": ["data.target_views=4"],
+    "12 target views": ["data.target_views=12"],
+    "width 96": ["model.width=96", "model.rgb_width=96", "model.ray_width=48", "model.heads=3"],
+    "width 192": ["model.width=192", "model.rgb_width=192", "model.ray_width=96", "model.heads=6"],
+    "128 latents": ["model.latents=128"],
+    "384 latents": ["model.latents=384"],
+    "384 latents, 8 candidates": ["model.latents=384", "model.candidates=8", "curriculum.final_stage=3"],
+    "8 candidates": ["model.candidates=8", "curriculum.final_stage=3"],
+    "patch 8": ["model.patch_size=8"],
+    "patch 12": ["model.patch_size=12"],
+    "1 round": ["model.rounds=1"],
+    "3 rounds": ["model.rounds=3"],
+    "batch 1": ["train.batch=1"],
+    "batch 4": ["train.batch=4"],
+    "learning rate 2e-3": ["train.learning_rate=2e-3"],
+    "learning rate 4e-3": ["train.learning_rate=4e-3"],
+    "longer curriculum": ["stages=2"],
+    "shorter curriculum": ["stages=0.5"],
+    "no curriculum": ["curriculum.full_capacity=true"],
+    "with consistency": ["loss.consistency_alpha=1e-3", "loss.consistency_depth=1e-2"],
+    "bf16": ["train.precision=bf16"],
+    "flat colours": ["model.sh_degree=0"],
+}
+
+
+def steps_in(seconds, config, settings, batch):
+    """Steps that fit, by the quickest of a few."""
+    command = [PROGRAM, "bench", "train", "--config", config, "--steps", "5", "--batch", str(batch), "--json"]
+    # As many views as a step has in the mean.
+    for setting in [*settings, "data.context_views=8"]:
+        if not setting.startswith("train.batch="):
+            command += ["--set", setting]
+    told = subprocess.run(command, env=environment(), stdout=subprocess.PIPE, text=True, check=True).stdout
+    return int(seconds / (1e-3 * json.loads(told)["milliseconds"]["least"]))
+
+
+def run(out, name, seconds, config, worlds, test, captures):
+    """Steps, parameters, and PSNR of a variant: on made-up worlds and on captures."""
+    settings = [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
+    longer = next((float(setting.split("=")[1]) for setting in VARIANTS[name] if setting.startswith("stages=")), 1.0)
+    batch = next((int(setting.split("=")[1]) for setting in settings if setting.startswith("train.batch=")), 2)
+    folder = out / name.replace(" ", "_").replace(",", "")
+    folder.mkdir(parents=True, exist_ok=True)
+    planned = folder / "steps"
+    if not planned.is_file():
+        planned.write_text(str(steps_in(seconds, config, settings, batch)))
+    steps = int(planned.read_text())
+    settings += [
+        f"train.steps={steps}",
+        "train.validate_every=0",
+        f"data.validation=[\"{test}\"]",
+        "data.threads=1",
+        f"curriculum.boundaries={[int(longer * share * steps) for share in STAGES]}",
+        f"curriculum.transition={int(longer * TRANSITION * steps)}",
+    ]
+    told = train(folder / "run", config, settings, GLOBALSPLAT_WORLDS=str(worlds))
+    weights = folder / "model.safetensors"
+    if not weights.is_file():
+        subprocess.run([PROGRAM, "export", "--run", folder / "run", "--out", weights], check=True, stdout=subprocess.DEVNULL)
+    scores = []
+    for capture in captures:
+        command = [PROGRAM, "eval", "--weights", weights, "--scene", capture, "--views", "8", "--holdout", "every:3+1", "--json"]
+        text = subprocess.run(command, env=environment(), capture_output=True, text=True, check=True).stdout
+        scores.append(json.loads(text)["psnr"])
+    held_out = told["held_out"]
+    return steps * batch, weights.stat().st_size / 4e6, told["core_seconds"], held_out["psnr"], held_out["ssim"], scores
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=Path, required=True)
+    parser.add_argument("--test", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("runs/tune"))
+    parser.add_argument("--seconds", type=float, default=300, help="of a core, for each variant")
+    parser.add_argument("--captures", type=Path, nargs="*", default=[])
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
+    arguments = parser.parse_args()
+    out = arguments.out.absolute()
+    config = REPOSITORY / "configs/tiny.toml"
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        several = (arguments.seconds, config, arguments.worlds.absolute(), arguments.test.absolute(), arguments.captures)
+        results = {name: pool.submit(run, out, name, *several) for name in arguments.only}
+        row("variant", "10⁶ parameters", "scenes shown", "seconds of a core", "PSNR, made-up", "SSIM", "PSNR, photos")
+        row(*["---"] * 7)
+        for name in arguments.only:
+            scenes, parameters, seconds, psnr, ssim, photos = results[name].result()
+            shown = f"{statistics.mean(photos):.2f}" if photos else ""
+            row(name, f"{parameters:.2f}", str(scenes), f"{seconds:.0f}", f"{psnr:.2f}", f"{ssim:.4f}", shown)
+
+
+if __name__ == "__main__":
+    main()
