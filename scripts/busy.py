@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Trains as `make demo` does, alone and beside other work, and tells what that costs.
+"""Trains configs/first_light.toml, alone and beside other work, and tells what that costs.
 
     scripts/busy.py [--steps 60] [--busy 0 1 2] [--binary target/release/globalsplat …]
 
