@@ -53,7 +53,7 @@ PATIENCE = 30
 # What a run tells beside how it ended.
 NOTICE = re.compile(
     "training pauses: .* when there is room$|there is room again: training goes on$|.*the checkpoint before it is taken$"
-    "|.*the best checkpoint is looked for anew$|left out: lpips_"
+    "|.*the best checkpoint is looked for anew$|left out: lpips_|.* pixels that the model sees$"
 )
 # Names of what is on its way.
 TEMPORARY = re.compile(r"(^|/)(\.[^/]+\.globalsplat-(partial|old)|\.globalsplat-probe)(/|$)")
