@@ -24,6 +24,7 @@ TRANSITION = 0.05
 
 VARIANTS = {
     "tiny": [],
+    "4 to 8 context views": ["data.context_views=8"],
     "4 target views": ["data.target_views=4"],
     "12 target views": ["data.target_views=12"],
     "width 96": ["model.width=96", "model.rgb_width=96", "model.ray_width=48", "model.heads=3"],
@@ -49,11 +50,17 @@ VARIANTS = {
 }
 
 
+def value_of(name, settings, otherwise):
+    """What the settings, each `NAME=VALUE`, say of a number."""
+    return next((float(setting.removeprefix(f"{name}=")) for setting in settings if setting.startswith(f"{name}=")), otherwise)
+
+
 def steps_in(seconds, config, settings, batch):
     """Steps that fit, by the quickest of a few."""
     command = [PROGRAM, "bench", "train", "--config", config, "--steps", "5", "--batch", str(batch), "--json"]
-    # As many views as a step has in the mean.
-    for setting in [*settings, "data.context_views=8"]:
+    # As many views as a step has in the mean: of 4 to 12, where the variant does not say otherwise.
+    views = (4 + int(value_of("data.context_views", settings, 12))) // 2
+    for setting in [*settings, f"data.context_views={views}"]:
         if not setting.startswith("train.batch="):
             command += ["--set", setting]
     told = subprocess.run(command, env=environment(), stdout=subprocess.PIPE, text=True, check=True).stdout
@@ -63,8 +70,8 @@ def steps_in(seconds, config, settings, batch):
 def run(out, name, seconds, config, worlds, test, captures):
     """Steps, parameters, and PSNR of a variant: on made-up worlds and on captures."""
     settings = [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
-    longer = next((float(setting.split("=")[1]) for setting in VARIANTS[name] if setting.startswith("stages=")), 1.0)
-    batch = next((int(setting.split("=")[1]) for setting in settings if setting.startswith("train.batch=")), 2)
+    longer = value_of("stages", VARIANTS[name], 1.0)
+    batch = int(value_of("train.batch", settings, 2))
     folder = out / name.replace(" ", "_").replace(",", "")
     folder.mkdir(parents=True, exist_ok=True)
     planned = folder / "steps"

@@ -31,20 +31,20 @@ pub struct Synth {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Number of videos
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(MadeUp::SCENES))]
     scenes: u64,
     /// Other worlds for another seed
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
     /// The number of the first video, to go on where others of the seed end
-    #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 32))]
+    #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(MadeUp::FIRST))]
     first: u64,
     /// Photos of each
-    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u32).range(3..=10_000))]
-    frames: u32,
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u64).range(MadeUp::FRAMES))]
+    frames: u64,
     /// Side of a photo in pixels
-    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u32).range(16..=8192))]
-    size: u32,
+    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(MadeUp::SIZE))]
+    size: u64,
     /// PNG and JPEG files to be seen on walls and things
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
@@ -75,7 +75,7 @@ impl Synth {
     }
 
     fn image_size(&self) -> ImageSize {
-        ImageSize { height: self.size, width: self.size }
+        ImageSize { height: self.size as u32, width: self.size as u32 }
     }
 
     fn write_videos(&self) -> Result<()> {
@@ -134,7 +134,7 @@ impl Synth {
 
     fn write_depths(&self, folder: &Path, capture: &Capture) -> Result<()> {
         let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
-        let shape = [u64::from(self.frames), u64::from(self.size), u64::from(self.size)];
+        let shape = [self.frames, self.size, self.size];
         Ok(write_npy(&folder.join(&capture.name).with_extension("npy"), &shape, &depths)?)
     }
 

@@ -50,10 +50,7 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        let mut config = Config::read(&self.config, &self.set)?;
-        // Weights that were trained to the last stage know nothing of the first any more.
-        config.curriculum.full_capacity |= self.from.is_some();
-        let config = config;
+        let config = Config::read(&self.config, &self.set)?;
         let device = device::parse(&self.device)?;
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,

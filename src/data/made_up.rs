@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, read_image};
 use crate::scene::ImageSize;
 use crate::synth::{Texture, Video, VideoSettings};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -28,6 +29,15 @@ pub struct MadeUp {
 impl MadeUp {
     /// What such a name begins with.
     pub(super) const PREFIX: &str = "synth:";
+
+    /// How many videos there can be.
+    pub const SCENES: RangeInclusive<u64> = 1..=1_000_000;
+    /// The number that the first can have.
+    pub const FIRST: RangeInclusive<u64> = 0..=1 << 32;
+    /// Photos of each.
+    pub const FRAMES: RangeInclusive<u64> = 3..=10_000;
+    /// Side of a photo in pixels.
+    pub const SIZE: RangeInclusive<u64> = 16..=8192;
 
     /// `scenes` videos of `seed`, from number `first` on.
     pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> MadeUp {
@@ -60,10 +70,10 @@ impl MadeUp {
             }
         }
         for (name, value, range) in [
-            ("scenes", scenes, 1..=1_000_000),
-            ("first", first, 0..=1 << 32),
-            ("frames", frames, 3..=10_000),
-            ("size", size, 16..=8192),
+            ("scenes", scenes, Self::SCENES),
+            ("first", first, Self::FIRST),
+            ("frames", frames, Self::FRAMES),
+            ("size", size, Self::SIZE),
         ] {
             if !range.contains(&value) {
                 let found = format!("one with {name}={value}");
@@ -78,7 +88,12 @@ impl MadeUp {
 
     /// Names of the scenes.
     pub fn keys(&self) -> Vec<String> {
-        (self.first..self.first + self.scenes).map(|index| format!("{}_{index:06}", self.seed)).collect()
+        (self.first..self.first + self.scenes).map(|number| self.key(number)).collect()
+    }
+
+    /// Name of the scene of a number: of all that are of the seed, not of these.
+    fn key(&self, number: u64) -> String {
+        format!("{}_{number:06}", self.seed)
     }
 
     /// Makes video `index` of them, its pictures not yet.
@@ -95,7 +110,7 @@ impl MadeUp {
             distortion: Distortion::default(),
         };
         let frames = video.cameras().iter().enumerate().map(frame).collect();
-        Capture::new(format!("{}_{number:06}", self.seed), PathBuf::from(&self.name), frames)
+        Capture::new(self.key(number), PathBuf::from(&self.name), frames)
     }
 }
 

@@ -54,7 +54,8 @@ impl Trainer {
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
     }
 
-    /// Takes the weights that [`crate::reconstruct::save_model`] wrote in place of the fresh ones.
+    /// Takes the weights that [`crate::reconstruct::save_model`] wrote in place of the fresh ones. All Gaussians are shown from
+    /// the first step on: weights that were trained to the last stage know nothing of the first any more.
     ///
     /// # Errors
     /// A file that can't be read, or whose model has another shape: its keys are named.
@@ -69,6 +70,7 @@ impl Trainer {
                 return Err(Error::input(path, "the model", changed.join(", "), expected));
             }
         }
+        self.config.curriculum.full_capacity = true;
         weights.load_into(&self.vs, path)
     }
 

@@ -13,6 +13,12 @@ pub struct Margins {
     pub bottom: f64,
 }
 
+impl Margins {
+    pub const NARROW: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
+    /// With room for names on the right.
+    pub const NAMED: Margins = Margins { right: 138., ..Margins::NARROW };
+}
+
 /// Of a linear axis, in dB or scenes: a smaller difference is none to look at.
 const LEAST_SPAN: f64 = 1.;
 
@@ -64,6 +70,18 @@ fn round_step(least: f64) -> f64 {
         .into_iter()
         .find(|step| *step >= least * 0.999)
         .unwrap_or(power)
+}
+
+/// The least and the most of them.
+pub fn bounds(values: impl IntoIterator<Item = f64>) -> (f64, f64) {
+    let widen = |(least, most): (f64, f64), value: f64| (least.min(value), most.max(value));
+    values.into_iter().fold((f64::INFINITY, f64::NEG_INFINITY), widen)
+}
+
+/// The corners of a polyline through `points`.
+pub fn polyline(points: impl Iterator<Item = (f64, f64)>, x: &Axis, y: &Axis) -> String {
+    let corners: Vec<_> = points.map(|(u, v)| format!("{},{}", px(x.pixel(u)), px(y.pixel(v)))).collect();
+    corners.join(" ")
 }
 
 /// Grid lines across, ticks of both axes, and what they measure.

@@ -2,7 +2,7 @@
 
 use super::super::STYLE;
 use super::super::numbers::decimal;
-use super::axes::{Axis, Margins, frame};
+use super::axes::{Axis, Margins, bounds, frame, polyline};
 use super::labels::spread;
 use super::{HEIGHT, WIDTH, px};
 use crate::error::{Error, Result};
@@ -11,8 +11,7 @@ use crate::train::Curves;
 use maud::{PreEscaped, html};
 use std::path::Path;
 
-/// On the right there is room for names.
-const MARGINS: Margins = Margins { left: 46., top: 34., right: 138., bottom: 48. };
+const MARGINS: Margins = Margins::NAMED;
 /// Parts of a run over which training's scores are averaged.
 const PARTS: u64 = 60;
 
@@ -24,8 +23,7 @@ const PARTS: u64 = 60;
 pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()> {
     let Curves { training, held_out } = Curves::read(run, PARTS)?;
     let last = training.iter().chain(&held_out).map(|point| point.0).fold(0, u64::max) as f64;
-    let values = || training.iter().chain(&held_out).map(|point| point.1).chain(nearest);
-    let (worst, best) = values().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    let (worst, best) = bounds(training.iter().chain(&held_out).map(|point| point.1).chain(nearest));
     let x = Axis::linear(0., last, MARGINS.left, WIDTH - MARGINS.right);
     let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
     let lines = [("held out", "colour-2", held_out), ("in training", "colour-1", training)];
@@ -39,8 +37,7 @@ pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()>
             rect width="100%" height="100%" style="fill: var(--surface)" {}
             (frame(&x, &y, "Steps", "PSNR (dB)", |step| decimal(step, 0)))
             @for ((name, class, points), height) in lines.iter().zip(&heights) {
-                @let place = |&(step, psnr): &(u64, f64)| format!("{},{}", px(x.pixel(step as f64)), px(y.pixel(psnr)));
-                polyline.line.(class) points=(points.iter().map(place).collect::<Vec<_>>().join(" ")) {}
+                polyline.line.(class) points=(polyline(points.iter().map(|&(step, psnr)| (step as f64, psnr)), &x, &y)) {}
                 text.name x=(px(WIDTH - MARGINS.right + 8.)) y=(px(height + 4.)) {
                     (name) " " (decimal(points[points.len() - 1].1, 2))
                 }

@@ -3,11 +3,11 @@
 use super::super::entry::Entry;
 use super::super::numbers::{count, decimal, short};
 use super::super::table::swatch;
-use super::axes::{Axis, Margins, frame};
+use super::axes::{Axis, Margins, bounds, frame};
 use super::{HEIGHT, WIDTH, figure, px};
 use maud::{Markup, html};
 
-const MARGINS: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
+const MARGINS: Margins = Margins::NARROW;
 /// Widths of a bar in dB, and how many bars there are at most.
 const BIN_WIDTHS: [f64; 5] = [0.2, 0.5, 1., 2., 5.];
 const MOST_BINS: f64 = 28.;
@@ -15,8 +15,8 @@ const MOST_BINS: f64 = 28.;
 /// One histogram for each evaluation on `dataset`.
 pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
     let entries = entries.iter().filter(|entry| entry.dataset == dataset && entry.scored() > 0);
-    let values = entries.clone().flat_map(|s| s.evaluation.scenes.iter().map(|scene| scene.scores.psnr));
-    let (worst, best) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    let scenes = entries.clone().flat_map(|entry| &entry.evaluation.scenes);
+    let (worst, best) = bounds(scenes.map(|scene| scene.scores.psnr));
     let width = BIN_WIDTHS.into_iter().find(|width| (best - worst) / width <= MOST_BINS).unwrap_or(10.);
     let first = (worst / width).floor();
     html! {

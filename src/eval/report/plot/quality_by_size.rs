@@ -2,12 +2,12 @@
 
 use super::super::comparison::Row;
 use super::super::numbers::{decimal, short};
-use super::axes::{Axis, Margins, frame};
+use super::axes::{Axis, Margins, bounds, frame};
 use super::labels::{Area, beside_points, shortened};
 use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
-const MARGINS: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
+const MARGINS: Margins = Margins::NARROW;
 /// Longer names are cut.
 const LONGEST_NAME: usize = 24;
 
@@ -20,12 +20,8 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
     if shown.len() < 2 || shown[0].0.measured.is_none() {
         return html! {};
     }
-    let range = |values: &dyn Fn(&(f64, f64)) -> f64| {
-        let values = shown.iter().map(|(_, point)| values(point));
-        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), v| (least.min(v), most.max(v)))
-    };
-    let (fewest, most) = range(&|point| point.0.max(1.));
-    let (worst, best) = range(&|point| point.1);
+    let (fewest, most) = bounds(shown.iter().map(|(_, point)| point.0.max(1.)));
+    let (worst, best) = bounds(shown.iter().map(|(_, point)| point.1));
     let x = Axis::logarithmic(fewest, most, MARGINS.left, WIDTH - MARGINS.right);
     let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
     let points: Vec<(f64, f64)> =

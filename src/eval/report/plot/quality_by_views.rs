@@ -3,13 +3,12 @@
 use super::super::comparison::{rows, view_counts};
 use super::super::entry::{Entry, dataset_name};
 use super::super::numbers::decimal;
-use super::axes::{Axis, Margins, frame};
+use super::axes::{Axis, Margins, bounds, frame, polyline};
 use super::labels::{shortened, spread};
 use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
-/// On the right there is room for names.
-const MARGINS: Margins = Margins { left: 46., top: 34., right: 138., bottom: 48. };
+const MARGINS: Margins = Margins::NAMED;
 /// Names longer than the room for them are cut; the legend and the tooltips have them whole.
 const LONGEST_NAME: usize = 14;
 
@@ -49,8 +48,7 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
     }
     // What was measured is drawn last, above the others.
     lines.sort_by_key(|line| line.measured.is_some());
-    let values = lines.iter().flat_map(|line| line.points.iter().map(|point| point.1));
-    let (worst, best) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    let (worst, best) = bounds(lines.iter().flat_map(|line| line.points.iter().map(|point| point.1)));
     let ticks = counts.iter().map(|&views| views as f64).collect();
     let x = Axis::at(ticks, MARGINS.left, WIDTH - MARGINS.right);
     let y = Axis::linear(worst, best, HEIGHT - MARGINS.bottom, MARGINS.top);
@@ -67,7 +65,9 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
             text.name.emphasis[line.class != "published"] x=(px(names_at)) y=(px(height + 4.)) { (shortened(line.name, LONGEST_NAME)) }
         }
         @for line in &lines {
-            @if line.points.len() > 1 { polyline.line.(line.class) points=(path(line, &x, &y)) {} }
+            @if line.points.len() > 1 {
+                polyline.line.(line.class) points=(polyline(line.points.iter().map(|&(views, psnr)| (views as f64, psnr)), &x, &y)) {}
+            }
             @for &(views, psnr) in &line.points {
                 circle.point.(line.class) cx=(px(x.pixel(views as f64))) cy=(px(y.pixel(psnr)))
                     r=(if line.measured.is_some() { "6" } else { "4" }) {
@@ -84,12 +84,4 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
         "PSNR against the number of context views on {dataset}; the numbers are in the tables below."
     );
     figure(&format!("Quality by context views: {dataset}"), &about, drawing, legend)
-}
-
-fn path(line: &Line, x: &Axis, y: &Axis) -> String {
-    let points = line.points.iter();
-    points
-        .map(|&(views, psnr)| format!("{},{}", px(x.pixel(views as f64)), px(y.pixel(psnr))))
-        .collect::<Vec<_>>()
-        .join(" ")
 }
