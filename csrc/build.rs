@@ -44,7 +44,7 @@ fn libtorch() -> PathBuf {
 fn main() {
     let libtorch = libtorch();
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
-    cxx_build::bridges(["src/chunk.rs", "src/render.rs"])
+    cxx_build::bridges(["src/chunk.rs", "src/fit.rs", "src/render.rs"])
         .std("c++17")
         // The work is done in raster/ and in libtorch.
         .opt_level(1)
@@ -57,7 +57,7 @@ fn main() {
         .compile("globalsplat_torch");
 
     cpp()
-        .files(["raster/raster.cpp", "raster/parallel.cpp", "raster/kernels.cpp"])
+        .files(["raster/raster.cpp", "raster/fit.cpp", "raster/parallel.cpp", "raster/kernels.cpp"])
         .compile("globalsplat_raster");
     match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
         Ok("x86_64") => {

@@ -3,4 +3,6 @@
 #include "chunk.cpp"
 #include "cpu/projection.cpp"
 #include "cpu/splat.cpp"
+#include "fit.cpp"
 #include "splat.cpp"
+#include "threads.cpp"

@@ -37,13 +37,13 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in raster/{raster,parallel,kernels}.cpp checks/{checks,refusals}.cpp; do
+    for source in raster/{raster,fit,parallel,kernels}.cpp checks/{checks,refusals}.cpp; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}"
     done
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster parallel kernels checks refusals; do objects+=("$out/$sanitizer-$part.o"); done
+    for part in $isas raster fit parallel kernels checks refusals; do objects+=("$out/$sanitizer-$part.o"); done
     # shellcheck disable=SC2086
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done

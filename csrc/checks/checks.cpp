@@ -7,6 +7,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <array>
 #include <atomic>
 #include <cstdio>
 #include <cstdlib>
@@ -17,6 +18,7 @@
 #include <string>
 #include <thread>
 
+#include "../raster/fit.h"
 #include "../raster/kernels.h"
 #include "../raster/parallel.h"
 #include "refusals.h"
@@ -166,12 +168,60 @@ int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) 
   return 1 + int64_t(thread_counts.size());
 }
 
+// What pictures are off by, its gradient, and a step of Adam. Arrays end where they end: reading beyond is noticed.
+template <class T>
+int64_t fits(const std::vector<int>& thread_counts) {
+  Random random(11);
+  const auto numbers = [&](size_t count) {
+    std::vector<T> values;
+    for (const double value : random.uniform(count, 0, 1)) values.push_back(T(value));
+    return values;
+  };
+  const auto same = [](const std::vector<T>& a, const std::vector<T>& b) {
+    return std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0;
+  };
+  int64_t count = 0;
+  for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
+    const size_t all = size_t(planes * height * width);
+    const std::vector<T> pictures = numbers(all), photos = numbers(all);
+    const raster::FitJob<T> job{pictures.data(), photos.data(), planes, width, height};
+    for (const double similar : {0.0, -0.2}) {
+      std::vector<T> one(all);
+      begin("a fit, " + type_name<T>());
+      const double value = raster::photometric<T>(job, 0.8, similar, one.data(), 1);
+      expect(raster::photometric<T>(job, 0.8, similar, nullptr, 1) == value, "the gradient changes the value");
+      for (const int threads : thread_counts) {
+        std::vector<T> gradient(all, T(threads));
+        const double again = raster::photometric<T>(job, 0.8, similar, gradient.data(), threads);
+        expect(again == value && same(gradient, one), "threads change a fit");
+        ++count;
+      }
+    }
+  }
+  const size_t many = 40'000;
+  const std::vector<T> gradient = numbers(many), start = numbers(many);
+  const auto stepped = [&](int threads) {
+    begin("a step of Adam, " + type_name<T>());
+    std::vector<T> value = start, first = start, second = start;
+    raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {value.data(), gradient.data(), first.data(), second.data()}, int64_t(many), threads);
+    value.insert(value.end(), first.begin(), first.end());
+    value.insert(value.end(), second.begin(), second.end());
+    return value;
+  };
+  const std::vector<T> one = stepped(1);
+  for (const int threads : thread_counts) {
+    expect(same(stepped(threads), one), "threads change a step of Adam");
+    ++count;
+  }
+  return count;
+}
+
 // Every scene's pictures and gradients on any number of threads.
 int64_t bits(bool is_short) {
   std::vector<int> thread_counts = {2, 3, 16};
   if (!is_short)
     for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
-  int64_t count = 0;
+  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts);
   size_t turn = 0;  // the short form has one degree for each scene, and all degrees for all of them
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);

@@ -1,4 +1,3 @@
-#include <ATen/Parallel.h>
 #include <ATen/ops/empty.h>
 
 #include <memory>
@@ -11,6 +10,7 @@
 #include "cpu.h"
 #include "globalsplat-csrc/src/render.rs.h"
 #include "memory.h"
+#include "../threads.h"
 
 namespace globalsplat {
 namespace cpu {
@@ -43,7 +43,7 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, Pictures& out, raster::
   out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   out.depth = at::empty_like(out.alpha);
-  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, at::get_num_threads()};
+  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, threads()};
   return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
 }
 
@@ -88,7 +88,7 @@ PairCounts count_pairs(const SplatArguments& of) {
   return {counts.tile_entries, counts.evaluated, counts.contributing};
 }
 
-double multiply_add_peak(double seconds) { return raster::multiply_add_peak(at::get_num_threads(), seconds); }
+double multiply_add_peak(double seconds) { return raster::multiply_add_peak(threads(), seconds); }
 
 rust::String simd_level() { return raster::kernels().name; }
 

@@ -1,8 +1,10 @@
 // Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
+#include "adam.h"
 #include "blend.h"
 #include "cover.h"
 #include "kernels.h"
 #include "project.h"
+#include "ssim.h"
 
 namespace globalsplat::raster::GS_ISA {
 
@@ -12,8 +14,10 @@ namespace globalsplat::raster::GS_ISA {
 extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
-    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>, project_backward<float>},
-    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>},
+    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>, project_backward<float>,
+     ssim<float>, fit_gradient<float>, adam<float>},
+    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>,
+     ssim<double>, fit_gradient<double>, adam<double>},
     multiply_adds,
 };
 

@@ -140,4 +140,38 @@ struct TileJob {
   int width, height;         // of the picture
 };
 
+// SSIM: its window's side in pixels, (0.01 L)² and (0.03 L)² for the data range L = 1, and what makes sample variances.
+inline constexpr int kWindow = 11;
+inline constexpr double kSsimC1 = 1e-4, kSsimC2 = 9e-4;
+inline constexpr double kSsimSample = 121.0 / 120.0;
+
+// One channel of a picture, the photo's, and what its gradient is made of. Row-major.
+template <class T>
+struct FitPlane {
+  const T* picture;  // [H, W]
+  const T* photo;    // [H, W]
+  T* slopes;         // [3, H − 10, W − 10] of every window's SSIM to its means of x, x² and xy; null: not asked for
+  T* gradient;       // [H, W]
+  const T* weights;  // [11] of the window, in each direction
+  int width, height;
+};
+
+// Numbers that a kernel for rows of this width works with.
+inline constexpr int fit_room(int width) { return 5 * (width + 32); }
+
+// What all numbers of one step of Adam share; see adam.h.
+struct AdamStep {
+  double rate, root, decay;
+  double beta1, beta2, epsilon;
+};
+
+// The numbers, their gradients and their moments.
+template <class T>
+struct AdamNumbers {
+  T* value;
+  const T* gradient;
+  T* first;
+  T* second;
+};
+
 }  // namespace globalsplat::raster

@@ -61,6 +61,7 @@ mod ffi {
     unsafe extern "C++" {
         include!("cpu/cpu.h");
         include!("splat.h");
+        include!("threads.h");
 
         /// See `csrc/splat.h`.
         ///
@@ -97,5 +98,11 @@ mod ffi {
 
         /// See `csrc/cpu/cpu.h`.
         fn simd_level() -> Result<String>;
+
+        /// See `csrc/threads.h`.
+        fn threads() -> i32;
+
+        /// See `csrc/threads.h`.
+        fn set_threads(count: i32);
     }
 }

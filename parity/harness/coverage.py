@@ -20,7 +20,7 @@ CASES_OF = {
     "src/loss/lpips.rs": ["lpips_vgg", "lpips_alex"],
     "src/loss/mse.rs": ["mse"],
     "src/loss/perceptual.rs": ["perceptual"],
-    "src/loss/ssim.rs": ["ssim"],
+    "src/loss/photometric.rs": ["photometric", "ssim"],
     "src/loss/vgg19.rs": ["vgg19"],
     "src/scene/normalize.rs": ["scene_normalization"],
     "src/scene/rays.rs": ["rays"],

@@ -7,7 +7,7 @@ mod frustum;
 mod lpips;
 mod mse;
 mod perceptual;
-mod ssim;
+mod photometric;
 mod terms;
 mod vgg19;
 
@@ -17,7 +17,7 @@ pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
 pub use mse::{mse, psnr_of_mse};
 pub use perceptual::PerceptualLoss;
-pub use ssim::ssim;
+pub use photometric::{photometric, ssim};
 pub use terms::{Losses, Term};
 pub use vgg19::Vgg19;
 

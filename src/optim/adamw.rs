@@ -1,8 +1,9 @@
 //! AdamW (Loshchilov & Hutter 2019), with a state that can be saved (spec 8.5).
 
 use crate::error::{Error, Result};
+use globalsplat_csrc::fit::{AdamArguments, adam};
 use std::collections::BTreeMap;
-use tch::Tensor;
+use tch::{Device, Tensor};
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -31,6 +32,28 @@ struct Parameter {
     group: usize,
 }
 
+impl Parameter {
+    /// One update on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, `root2` √(1 − β₂ᵗ).
+    fn update(&mut self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
+        let address = |t: &Tensor| t.as_ptr() as usize;
+        let arguments = AdamArguments {
+            value: address(&self.value),
+            gradient: address(gradient),
+            first: address(&self.first),
+            second: address(&self.second),
+            rate,
+            root: root2,
+            decay,
+            beta1: BETA1,
+            beta2: BETA2,
+            epsilon,
+        };
+        // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
+        let done = unsafe { adam(&arguments) };
+        done.expect("a parameter, its gradient and its moments are alike");
+    }
+}
+
 /// What a group's parameters have in common.
 #[derive(Debug)]
 struct Settings {
@@ -43,6 +66,7 @@ struct Settings {
 pub struct AdamW {
     parameters: Vec<Parameter>,
     groups: Vec<Settings>,
+    epsilon: f64,
     steps: i64,
 }
 
@@ -61,7 +85,24 @@ impl AdamW {
             }
             settings.push(Settings { learning_rate: of.learning_rate, weight_decay: of.weight_decay });
         }
-        AdamW { parameters: parameters.into_values().collect(), groups: settings, steps: 0 }
+        AdamW { parameters: parameters.into_values().collect(), groups: settings, epsilon: EPS, steps: 0 }
+    }
+
+    /// With `epsilon` in place of 1e-8 added to the root of the second moments.
+    pub fn with_epsilon(self, epsilon: f64) -> Self {
+        AdamW { epsilon, ..self }
+    }
+
+    /// Of the groups, in their order, from the next step on.
+    pub fn set_learning_rates(&mut self, learning_rates: &[f64]) {
+        for (group, &learning_rate) in self.groups.iter_mut().zip(learning_rates) {
+            group.learning_rate = learning_rate;
+        }
+    }
+
+    /// Running means of the gradients and of their squares, to be changed in place.
+    pub fn moments(&self) -> impl Iterator<Item = &Tensor> {
+        self.parameters.iter().flat_map(|p| [&p.first, &p.second])
     }
 
     /// Of every group, from the next step on.
@@ -95,11 +136,11 @@ impl AdamW {
         norm
     }
 
-    /// One update from the gradients that are there, by the groups' learning rates.
+    /// One update from the gradients that are there, by the groups' learning rates; on the CPU in one pass over memory.
     pub fn step(&mut self) {
         self.steps += 1;
         let correction1 = 1. - BETA1.powi(self.steps as i32);
-        let correction2 = 1. - BETA2.powi(self.steps as i32);
+        let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
         tch::no_grad(|| {
             for p in &mut self.parameters {
                 let gradient = p.value.grad();
@@ -107,13 +148,18 @@ impl AdamW {
                     continue;
                 }
                 let Settings { learning_rate, weight_decay } = self.groups[p.group];
-                if weight_decay > 0. {
-                    let _ = p.value.g_mul_scalar_(1. - learning_rate * weight_decay);
+                let (rate, decay) = (learning_rate / correction1, learning_rate * weight_decay);
+                if p.value.device() == Device::Cpu {
+                    p.update(&gradient.contiguous(), rate, root2, decay, self.epsilon);
+                    continue;
+                }
+                if decay > 0. {
+                    let _ = p.value.g_mul_scalar_(1. - decay);
                 }
                 let _ = p.first.lerp_(&gradient, 1. - BETA1);
                 let _ = p.second.g_mul_scalar_(BETA2).addcmul_(&(&gradient * (1. - BETA2)), &gradient);
-                let denominator = p.second.sqrt().divide_scalar(correction2.sqrt()) + EPS;
-                let _ = p.value.addcdiv_(&(&p.first * (-learning_rate / correction1)), &denominator);
+                let denominator = p.second.sqrt().divide_scalar(root2) + self.epsilon;
+                let _ = p.value.addcdiv_(&(&p.first * -rate), &denominator);
             }
         });
     }

@@ -43,6 +43,12 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "ssim" => {
             outputs([("ssim", loss::ssim(request.input("picture")?, request.input("truth")?).view([1]))])
         }
+        "photometric" => loss_of(loss::photometric(
+            request.input("picture")?,
+            request.input("truth")?,
+            request.number("absolute")?,
+            request.number("similar")?,
+        )),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),

@@ -33,3 +33,29 @@ pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Resu
 pub fn multiply_add_peak(seconds: f64) -> f64 {
     ffi::multiply_add_peak(seconds)
 }
+
+/// While it lives, libtorch works on one thread, and the kernels of this program on as many as libtorch did before. Where kernels and
+/// small tensor operations take turns this is much faster: libtorch's threads don't sleep after an operation, but wait for the next
+/// one, and take the cores that the kernels need.
+#[derive(Debug)]
+pub struct KernelThreads {
+    libtorch: i32,
+    own: i32,
+}
+
+impl KernelThreads {
+    /// Begins.
+    pub fn take() -> Self {
+        let (libtorch, own) = (tch::get_num_threads(), ffi::threads());
+        ffi::set_threads(own);
+        tch::set_num_threads(1);
+        KernelThreads { libtorch, own }
+    }
+}
+
+impl Drop for KernelThreads {
+    fn drop(&mut self) {
+        tch::set_num_threads(self.libtorch);
+        ffi::set_threads(if self.own == self.libtorch { 0 } else { self.own });
+    }
+}

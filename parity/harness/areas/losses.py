@@ -143,10 +143,34 @@ def ssim(rng):
     picture[1] = truth[1]
     pairs["2×3×12×16, one pair identical"] = picture, truth
     for label, (picture, truth) in pairs.items():
-        yield Draw(label, {"picture": picture, "truth": truth}, differentiate=("picture", "truth"))
+        yield Draw(label, {"picture": picture, "truth": truth}, differentiate=("picture",))
     yield Draw("2×3×12×16, identical", {"picture": truth, "truth": truth})
 
 
 @twin("ssim")
 def ssim_twin(config, params, inputs):
     return {"ssim": reference.loss.ssim.ssim(inputs["picture"], inputs["truth"])}
+
+
+@case
+def photometric(rng):
+    """Absolute differences and SSIM in one pass, by themselves and together. Rows are taken sixteen at a time, and columns a vector
+    at a time: sizes lie around both."""
+    for shape, absolute, similar in [
+        ((1, 3, 11, 40), 1.0, 0.0),
+        ((2, 3, 26, 27), 0.8, -0.2),
+        ((1, 3, 33, 16), 0.5, -0.5),
+        ((1, 2, 3, 17, 43), 0.8, -0.2),
+    ]:
+        truth = uniform(rng, 0.0, 1.0, *shape)
+        picture = 0.5 * truth + uniform(rng, 0.0, 0.5, *shape)
+        config = {"absolute": absolute, "similar": similar}
+        label = f"{by(*shape)}, {absolute:g} and {similar:g}"
+        yield Draw(label, {"picture": picture, "truth": truth}, config=config, differentiate=("picture",))
+
+
+@twin("photometric")
+def photometric_twin(config, params, inputs):
+    picture, truth = (inputs[name].flatten(0, -4) for name in ("picture", "truth"))
+    difference = (picture - truth).abs().mean()
+    return {"loss": config["absolute"] * difference + config["similar"] * reference.loss.ssim.ssim(picture, truth)}

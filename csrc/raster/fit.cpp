@@ -1,0 +1,95 @@
+#include "fit.h"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "bins.h"
+#include "kernels.h"
+#include "parallel.h"
+
+namespace globalsplat::raster {
+namespace {
+
+constexpr int kRows = 16;                   // that are one task
+constexpr int64_t kNumbers = int64_t(1) << 14;  // of Adam, likewise
+constexpr double kSigma = 1.5;              // of SSIM's window, pixels
+
+template <class T>
+const T* window() {
+  static const std::vector<T> weights = [] {
+    std::vector<double> exact(kWindow);
+    double sum = 0;
+    for (int k = 0; k < kWindow; ++k) {
+      const double offset = k - (kWindow - 1) / 2;
+      sum += exact[size_t(k)] = std::exp(-offset * offset / (2 * kSigma * kSigma));
+    }
+    std::vector<T> rounded;
+    for (const double weight : exact) rounded.push_back(T(weight / sum));
+    return rounded;
+  }();
+  return weights.data();
+}
+
+// Σ of body(plane, begin, end, room) over planes and parts of their rows, added in order.
+template <class T, class Body>
+double sum_over_rows(int threads, int64_t planes, int rows, int width, const Body& body) {
+  const int64_t parts = (rows + kRows - 1) / kRows;
+  std::vector<double> sums(size_t(planes * parts));
+  parallel_for(threads, planes * parts, [&](int64_t task) {
+    const int begin = int(task % parts) * kRows;
+    thread_local std::vector<T> room;
+    room.resize(std::max(room.size(), size_t(fit_room(width))));
+    sums[size_t(task)] = body(task / parts, begin, std::min(begin + kRows, rows), room.data());
+  });
+  double total = 0;
+  for (const double sum : sums) total += sum;
+  return total;
+}
+
+}  // namespace
+
+template <class T>
+double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads) {
+  const int64_t pixels = int64_t(job.width) * job.height;
+  const int64_t windows = int64_t(job.width - kWindow + 1) * (job.height - kWindow + 1);
+  const Buffer<T> slopes(similar != 0 && gradient != nullptr ? size_t(3 * windows * job.planes) : 0);
+  const auto plane_of = [&](int64_t plane) {
+    return FitPlane<T>{job.pictures + plane * pixels,
+                       job.photos + plane * pixels,
+                       slopes.size > 0 ? slopes.data.get() + 3 * windows * plane : nullptr,
+                       gradient != nullptr ? gradient + plane * pixels : nullptr,
+                       window<T>(),
+                       job.width,
+                       job.height};
+  };
+  const double each_pixel = 1 / double(pixels * job.planes), each_window = 1 / double(windows * job.planes);
+  double value = 0;
+  if (similar != 0)
+    value += similar * each_window *
+             sum_over_rows<T>(threads, job.planes, job.height - kWindow + 1, job.width,
+                              [&](int64_t plane, int begin, int end, T* room) {
+                                return kernels().of<T>().ssim(plane_of(plane), begin, end, room);
+                              });
+  if (absolute != 0 || gradient != nullptr)
+    value += absolute * each_pixel *
+             sum_over_rows<T>(threads, job.planes, job.height, job.width, [&](int64_t plane, int begin, int end, T* room) {
+               return kernels().of<T>().fit_gradient(plane_of(plane), T(absolute * each_pixel),
+                                                             T(slopes.size > 0 ? similar * each_window : 0), begin, end, room);
+             });
+  return value;
+}
+
+template <class T>
+void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads) {
+  parallel_for(threads, (count + kNumbers - 1) / kNumbers, [&](int64_t task) {
+    kernels().of<T>().adam(step, numbers, task * kNumbers, std::min((task + 1) * kNumbers, count));
+  });
+}
+
+template double photometric(const FitJob<float>&, double, double, float*, int);
+template double photometric(const FitJob<double>&, double, double, double*, int);
+template void adam(const AdamStep&, const AdamNumbers<float>&, int64_t, int);
+template void adam(const AdamStep&, const AdamNumbers<double>&, int64_t, int);
+
+}  // namespace globalsplat::raster

@@ -1,0 +1,29 @@
+// What fitting pictures to photos needs beside drawing them: how far they are apart, with the gradient, and a step of Adam.
+// Shared among threads; the bits don't depend on their number.
+#pragma once
+
+#include <cstdint>
+
+#include "types.h"
+
+namespace globalsplat::raster {
+
+// Pictures and photos: planes [H, W], both sides at least 11.
+template <class T>
+struct FitJob {
+  const T* pictures;
+  const T* photos;
+  int64_t planes;
+  int width, height;
+};
+
+// `absolute` · mean |x − y| + `similar` · mean SSIM, means over all planes and pixels, or windows that lie inside (spec 9.4).
+// Writes the gradient with respect to the pictures, [planes, H, W], if it isn't null.
+template <class T>
+double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads);
+
+// Updates `count` numbers and their moments.
+template <class T>
+void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads);
+
+}  // namespace globalsplat::raster
