@@ -16,7 +16,8 @@ pub use capture::{Capture, View};
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use formats::{
-    Chunk, ChunkWriter, INDEX_FILE, find_captures, open_capture, read_camera_path, write_cameras_json,
+    Chunk, ChunkWriter, INDEX_FILE, Point, find_captures, open_capture, points_of, read_camera_path,
+    write_cameras_json,
 };
 pub use holdout::Holdout;
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Sample, SceneGroups, TrainingScenes};

@@ -151,3 +151,26 @@ pub fn rewrite(folder: &Path, format: Format) {
     }
     std::fs::remove_file(folder.join("cameras.json")).unwrap();
 }
+
+/// Adds points to a model of COLMAP: x, y and z of one after the other, all of the colour (255, 0, 51).
+pub fn write_points(model: &Path, format: Format, positions: &[f64]) {
+    if let Format::ColmapText = format {
+        let lines = positions.chunks(3).enumerate().map(|(i, p)| {
+            let views = if i % 2 == 0 { "" } else { " 1 17 2 4" };
+            format!("{} {} {} {} 255 0 51 0.75{views}\n", i + 1, p[0], p[1], p[2])
+        });
+        let text: String = ["# 3D point list\n".to_string()].into_iter().chain(lines).collect();
+        return std::fs::write(model.join("points3D.txt"), text).unwrap();
+    }
+    let mut bytes = vec![];
+    bytes.extend((positions.len() as u64 / 3).to_le_bytes());
+    for (i, p) in positions.chunks(3).enumerate() {
+        bytes.extend((i as u64 + 1).to_le_bytes());
+        bytes.extend(p.iter().flat_map(|v| v.to_le_bytes()));
+        bytes.extend([255, 0, 51]);
+        bytes.extend(0.75f64.to_le_bytes());
+        bytes.extend((i as u64 % 3).to_le_bytes());
+        bytes.extend(vec![7u8; i % 3 * 8]);
+    }
+    std::fs::write(model.join("points3D.bin"), bytes).unwrap();
+}

@@ -9,6 +9,7 @@ mod transforms_json;
 
 pub use cameras_json::write_cameras_json;
 pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
+pub use colmap::{Point, points_of};
 
 use super::capture::Capture;
 use crate::error::{Error, Result};

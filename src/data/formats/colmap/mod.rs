@@ -1,5 +1,11 @@
 //! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. Pixel
-//! (0, 0) has its centre at (½, ½), as everywhere here. The points are not needed (spec 10.4).
+//! (0, 0) has its centre at (½, ½), as everywhere here. The points are read where they are asked for
+//! (spec 10.4).
+
+mod fields;
+mod points;
+
+pub use points::{Point, points_of};
 
 use super::natural::natural_order;
 use super::{Found, folder_name};
@@ -7,10 +13,10 @@ use crate::data::capture::{Capture, Frame, Photo};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::scene::{Camera, Intrinsics};
+use fields::{Bytes, Words, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 /// Where a model is looked for below a capture's folder, and where its photos are.
 const PLACES: [(&str, &str); 4] = [
@@ -225,29 +231,6 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
     Ok(images)
 }
 
-fn is_comment(line: &str) -> bool {
-    line.trim().is_empty() || line.trim_start().starts_with('#')
-}
-
-/// A line, word by word.
-struct Words<'a> {
-    file: &'a Path,
-    /// From 1.
-    number: usize,
-    rest: &'a str,
-}
-
-impl Words<'_> {
-    fn parse<T: FromStr>(&mut self, name: &str, expected: &str) -> Result<T> {
-        let trimmed = self.rest.trim_start();
-        let (word, rest) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
-        self.rest = rest;
-        let found = if word.is_empty() { "absent".to_string() } else { format!("{word:?}") };
-        let refused = |_| Error::input(self.file, format!("{name} in line {}", self.number), found, expected);
-        if word.is_empty() { Err(()) } else { word.parse().map_err(drop) }.map_err(refused)
-    }
-}
-
 /// The number of cameras (u64), then of each: id (u32), model (i32), width and height (u64), parameters (f64).
 fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
     const SMALLEST: usize = 4 + 4 + 8 + 8 + 3 * 8;
@@ -302,71 +285,4 @@ fn images_of_bytes(file: &Path) -> Result<Vec<ImageEntry>> {
     }
     bytes.end()?;
     Ok(images)
-}
-
-/// A file's contents, value by value.
-struct Bytes<'a> {
-    file: &'a Path,
-    contents: &'a [u8],
-    at: usize,
-}
-
-impl Bytes<'_> {
-    fn left(&self) -> usize {
-        self.contents.len() - self.at
-    }
-
-    fn take<const N: usize>(&mut self, field: impl FnOnce() -> String) -> Result<[u8; N]> {
-        match self.contents[self.at..].first_chunk() {
-            Some(chunk) => {
-                self.at += N;
-                Ok(*chunk)
-            }
-            None => {
-                let found = format!("cut short by the end of the file after {} bytes", self.contents.len());
-                Err(Error::input(self.file, field(), found, format!("{N} bytes")))
-            }
-        }
-    }
-
-    fn number(&mut self, field: impl FnOnce() -> String) -> Result<f64> {
-        self.take(field).map(f64::from_le_bytes)
-    }
-
-    /// A number of entries of `smallest` bytes or more, for which there is room in the file.
-    fn count(&mut self, field: &str, smallest: usize) -> Result<usize> {
-        let count = u64::from_le_bytes(self.take(|| field.to_string())?);
-        let room = self.left() / smallest;
-        usize::try_from(count).ok().filter(|&count| count <= room).ok_or_else(|| {
-            let expected = format!("{room} at most, for which the file has bytes");
-            Error::input(self.file, field, count, expected)
-        })
-    }
-
-    fn name(&mut self, field: impl FnOnce() -> String) -> Result<String> {
-        let rest = &self.contents[self.at..];
-        let end = rest.iter().position(|&byte| byte == 0);
-        match end.and_then(|end| std::str::from_utf8(&rest[..end]).ok()) {
-            Some(name) if !name.contains(char::is_control) => {
-                self.at += name.len() + 1;
-                Ok(name.to_string())
-            }
-            _ => Err(Error::input(self.file, field(), "no text", "UTF-8 ended by a 0")),
-        }
-    }
-
-    fn end(&self) -> Result<()> {
-        match self.left() {
-            0 => Ok(()),
-            left => {
-                let expected = format!("{} as its counts say", self.at);
-                Err(Error::input(
-                    self.file,
-                    "the length",
-                    format!("{} bytes, {left} too many", self.contents.len()),
-                    expected,
-                ))
-            }
-        }
-    }
 }
