@@ -14,6 +14,16 @@ def environment(**more):
     return dict(os.environ, OMP_NUM_THREADS="1", **more)
 
 
+def core_seconds(command, **variables):
+    """What a command of the program told, and the seconds for which it kept the core busy."""
+    process = subprocess.Popen(command, env=environment(**variables), stdout=subprocess.PIPE, text=True)
+    told = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    if status != 0:
+        raise RuntimeError(f"{' '.join(map(str, command))} failed")
+    return told, usage.ru_utime + usage.ru_stime
+
+
 def train(run, config, settings, **variables):
     """What a run told at its end, which its folder keeps, and the seconds for which its process kept the core busy."""
     result = run / "result.json"
@@ -21,13 +31,12 @@ def train(run, config, settings, **variables):
         command = [PROGRAM, "train", "--config", config, "--out", run, "--json"]
         for setting in settings:
             command += ["--set", setting]
-        process = subprocess.Popen(command, env=environment(**variables), stdout=subprocess.PIPE, text=True)
-        told = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        if status != 0 or "held_out" not in (told := json.loads(told)):
-            raise RuntimeError(f"{run}: training failed")
+        told, seconds = core_seconds(command, **variables)
+        told = json.loads(told)
+        if "held_out" not in told:
+            raise RuntimeError(f"{run}: nothing was held out")
         partial = result.with_suffix(".partial")
-        partial.write_text(json.dumps(told | {"core_seconds": usage.ru_utime + usage.ru_stime}))
+        partial.write_text(json.dumps(told | {"core_seconds": seconds}))
         partial.rename(result)
     return json.loads(result.read_text())
 

@@ -16,7 +16,7 @@ import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from core_runs import PROGRAM, REPOSITORY, environment, row, train
+from core_runs import PROGRAM, REPOSITORY, core_seconds, environment, row, train
 
 # Parts of the run at which stages begin, and the length of a transition.
 STAGES = [0.1, 0.2, 0.35, 0.5]
@@ -44,9 +44,6 @@ VARIANTS = {
     "longer curriculum": ["stages=2"],
     "shorter curriculum": ["stages=0.5"],
     "no curriculum": ["curriculum.full_capacity=true"],
-    "with consistency": ["loss.consistency_alpha=1e-3", "loss.consistency_depth=1e-2"],
-    "bf16": ["train.precision=bf16"],
-    "flat colours": ["model.sh_degree=0"],
 }
 
 
@@ -56,15 +53,15 @@ def value_of(name, settings, otherwise):
 
 
 def steps_in(seconds, config, settings, batch):
-    """Steps that fit, by the quickest of a few."""
-    command = [PROGRAM, "bench", "train", "--config", config, "--steps", "5", "--batch", str(batch), "--json"]
+    """Steps that fit, by what a core is busy with for ten of them."""
     # As many views as a step has in the mean: of 4 to 12, where the variant does not say otherwise.
     views = (4 + int(value_of("data.context_views", settings, 12))) // 2
+    command = [PROGRAM, "bench", "train", "--config", config, "--batch", str(batch), "--json"]
     for setting in [*settings, f"data.context_views={views}"]:
         if not setting.startswith("train.batch="):
             command += ["--set", setting]
-    told = subprocess.run(command, env=environment(), stdout=subprocess.PIPE, text=True, check=True).stdout
-    return int(seconds / (1e-3 * json.loads(told)["milliseconds"]["least"]))
+    few, more = (core_seconds([*command, "--steps", str(steps)])[1] for steps in (5, 15))
+    return int(10 * seconds / (more - few))
 
 
 def run(out, name, seconds, config, worlds, test, captures):

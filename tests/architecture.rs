@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// From what a person touches down to the ground: a module uses those after it, and those on the ground.
-const FLOORS: [&str; 14] = [
+const FLOORS: [&str; 15] = [
     "parity",
     "bench",
     "eval",
     "train",
+    "refine",
     "reconstruct",
     "config",
     "optim",

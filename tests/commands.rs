@@ -15,9 +15,19 @@ fn json(arguments: &[&str]) -> Value {
 
 #[test]
 fn every_command_helps_with_an_example() {
-    for command in
-        ["train", "eval", "report", "reconstruct", "render", "export", "synth", "pack", "inspect", "doctor"]
-    {
+    for command in [
+        "train",
+        "eval",
+        "report",
+        "reconstruct",
+        "refine",
+        "render",
+        "export",
+        "synth",
+        "pack",
+        "inspect",
+        "doctor",
+    ] {
         let help = succeed(&[command, "--help"]);
         assert!(help.contains("Example"), "{command}");
         assert!(help.contains("--json"), "{command}");

@@ -2,12 +2,14 @@
 
 mod loader;
 mod raster;
+mod refine;
 mod synth;
 mod train;
 mod video;
 
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use raster::{RasterReport, bench_raster, made_up_scene};
+pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
 pub use train::{TrainReport, bench_train};
 

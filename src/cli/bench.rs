@@ -1,3 +1,4 @@
+use super::bench_refine::Refine;
 use super::bench_train::Train;
 use super::{parse_size, print_json, progress};
 use anyhow::Result;
@@ -24,6 +25,7 @@ pub struct Bench {
 enum Part {
     Raster(Raster),
     Loader(Loader),
+    Refine(Refine),
     Synth(Synth),
     Train(Train),
 }
@@ -33,6 +35,7 @@ impl Bench {
         match self.part {
             Part::Raster(raster) => raster.run(),
             Part::Loader(loader) => loader.run(),
+            Part::Refine(refine) => refine.run(),
             Part::Synth(synth) => synth.run(),
             Part::Train(train) => train.run(),
         }

@@ -4,6 +4,7 @@
 //! object), everything else to standard error.
 
 mod bench;
+mod bench_refine;
 mod bench_train;
 mod device;
 mod doctor;
@@ -18,6 +19,7 @@ mod pack;
 mod parity;
 mod progress;
 mod reconstruct;
+mod refine;
 mod render;
 mod report;
 mod synth;
@@ -50,6 +52,7 @@ enum Command {
     Eval(eval::Eval),
     Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
+    Refine(refine::Refine),
     Render(render::Render),
     Export(export::Export),
     Synth(synth::Synth),
@@ -81,6 +84,7 @@ pub fn main() -> ExitCode {
         Command::Eval(command) => command.run(),
         Command::Report(command) => command.run(),
         Command::Reconstruct(command) => command.run(),
+        Command::Refine(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Synth(command) => command.run(),

@@ -1,3 +1,4 @@
+use super::refine::{From, Refine, SpaceName};
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
@@ -33,6 +34,9 @@ pub struct Reconstruct {
     /// Views not to use: every:N, every:N+K or none
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
+    /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
+    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device"])]
+    refine: Option<f64>,
     /// f32, or bf16 for matrix products: faster on machines with instructions for it
     #[arg(long, default_value = "f32")]
     precision: String,
@@ -45,7 +49,32 @@ pub struct Reconstruct {
 }
 
 impl Reconstruct {
+    /// The same, and then some time for the Gaussians.
+    fn refined(self, seconds: f64) -> Refine {
+        Refine {
+            splat: None,
+            from: Some(From::Weights),
+            weights: self.weights,
+            space: SpaceName::Gaussians,
+            scene: self.scene,
+            out: self.out,
+            gaussians: 0,
+            seconds,
+            steps: None,
+            seed: 0,
+            holdout: self.holdout,
+            views: self.views,
+            size: None,
+            sheet: None,
+            set: vec![],
+            json: self.json,
+        }
+    }
+
     pub fn run(self) -> Result<()> {
+        if let Some(seconds) = self.refine {
+            return self.refined(seconds).run();
+        }
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_file(&self.out)?;
@@ -83,6 +112,16 @@ impl Reconstruct {
         }
         Ok(())
     }
+}
+
+/// `60`, `60s` or `2m`, in seconds.
+fn parse_seconds(text: &str) -> Result<f64, String> {
+    let (number, unit) = match text.strip_suffix('m') {
+        Some(minutes) => (minutes, 60.),
+        None => (text.strip_suffix('s').unwrap_or(text), 1.),
+    };
+    let seconds = number.parse::<f64>().ok().map(|number| number * unit);
+    seconds.filter(|s| *s > 0. && s.is_finite()).ok_or_else(|| "expected a time, as in 60s or 2m".into())
 }
 
 /// What is done to a capture's photos before `shown` of them are seen at `size`, if anything.

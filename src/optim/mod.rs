@@ -1,5 +1,10 @@
-//! Optimizers over named tensors in groups: for a network's weights as for Gaussians. tch's own can't save their state.
+//! Optimizers over named tensors in groups: for a network's weights as for Gaussians (tch's own can't save their state); and where
+//! their time goes.
 
 mod adamw;
+mod stopwatch;
 
 pub use adamw::{AdamW, ParameterGroup};
+
+// For benchmarks.
+pub(crate) use stopwatch::Stopwatch;

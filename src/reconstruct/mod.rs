@@ -10,12 +10,12 @@ pub use model_file::{
     CONFIG_KEY, LoadedModel, ModelDtype, SHIPPED_MODEL, STAGE_KEY, load_model, save_model, shipped_model,
 };
 
-pub(crate) use spread::spread_over_path;
+pub use spread::spread_over_path;
 
 use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
-use crate::model::{GlobalSplat, Stage};
+use crate::model::{Encoded, GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Similarity, normalize};
 use glam::DMat4;
@@ -45,6 +45,8 @@ impl<'a> From<&'a LoadedModel> for Model<'a> {
 /// A splat in the normalized world, and the way to the capture's own.
 #[derive(Debug)]
 pub struct Reconstruction {
+    /// What the Gaussians were decoded from.
+    pub tokens: Encoded,
     /// One scene, in the normalized world.
     pub gaussians: Gaussians,
     /// Normalized world to the capture's.
@@ -87,10 +89,15 @@ pub fn reconstruct<'a>(
     config.model.check_image(images.size()[3], images.size()[4])?;
 
     let start = Instant::now();
-    let decoded = tch::no_grad(|| network.forward(&images, &c2w, &intrinsics, stage));
+    let (encoded, decoded) = tch::no_grad(|| {
+        let encoded = network.encode(&network.tokens(&images, &c2w, &intrinsics));
+        let decoded = network.decode(&encoded, stage);
+        (encoded, decoded)
+    });
     // Bringing the Gaussians to the host also waits for a GPU.
     let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);
     Ok(Reconstruction {
+        tokens: encoded,
         gaussians,
         world_from_normalized: normalization.world_from_normalized,
         target_poses: target_poses.to_vec(),

@@ -4,6 +4,9 @@ use tch::{Device, Kind, Tensor};
 
 /// Opacities are kept this far from 0 and 1, whose logits are infinite.
 const OPACITY_MARGIN: f64 = 1e-6;
+/// Y_0, by which a colour becomes an SH coefficient.
+pub(crate) const SH_C0: f64 = 0.28209479177387814;
+
 /// Scales are at least this, whose logarithm is finite.
 const MIN_SCALE: f64 = 1e-30;
 
@@ -80,6 +83,17 @@ impl RawGaussians {
             scales: self.log_scales.exp(),
             quaternions: self.quaternions.shallow_clone(),
             opacities: self.opacity_logits.sigmoid(),
+            sh: self.sh.shallow_clone(),
+        }
+    }
+
+    /// The same tensors.
+    pub fn shallow_clone(&self) -> Self {
+        RawGaussians {
+            means: self.means.shallow_clone(),
+            log_scales: self.log_scales.shallow_clone(),
+            quaternions: self.quaternions.shallow_clone(),
+            opacity_logits: self.opacity_logits.shallow_clone(),
             sh: self.sh.shallow_clone(),
         }
     }

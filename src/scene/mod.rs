@@ -10,6 +10,7 @@ mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
 pub(crate) use camera::{check_pose, nearest_rigid};
+pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
 pub use normalize::{Normalization, Similarity, normalize};
 pub(crate) use rays::plucker_rays;

@@ -20,6 +20,21 @@ pub struct Similarity {
     pub scale: f64,
 }
 
+impl Similarity {
+    /// The pose, camera-to-world, that becomes `c2w` when the similarity moves the world: its camera sees there what `c2w` sees here.
+    pub fn pose_before(&self, c2w: &DMat4) -> DMat4 {
+        let rotation = self.rotation.transpose();
+        let centre = rotation * (c2w.w_axis.truncate() - self.translation) / self.scale;
+        let axes = rotation * DMat3::from_mat4(*c2w);
+        DMat4::from_cols(
+            axes.x_axis.extend(0.),
+            axes.y_axis.extend(0.),
+            axes.z_axis.extend(0.),
+            centre.extend(1.),
+        )
+    }
+}
+
 /// What [`normalize`] finds.
 #[derive(Debug, Clone)]
 pub struct Normalization {

@@ -1,14 +1,12 @@
 //! A small room made of Gaussians, and a walk through it: a scene whose splat is known. It lets everything be tested where no
 //! photos are at hand.
 
-use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics};
+use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics, SH_C0};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
-/// Y_0, by which a colour becomes an SH coefficient.
-const SH_C0: f64 = 0.28209479177387814;
 /// Distance between the Gaussians of a surface, in metres.
 const SPACING: f64 = 0.06;
 

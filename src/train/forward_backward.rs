@@ -4,12 +4,12 @@
 //! leaves got. So what one part kept is freed before the backward pass of the one before it begins, the encoder may choose
 //! to keep nothing and compute its rounds again, and one can tell how long each part takes.
 
-use super::stopwatch::Stopwatch;
 use crate::config::Config;
 use crate::data::Sample;
 use crate::error::Result;
 use crate::loss::{Losses, PerceptualLoss, Share, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, leaf, pull_back};
+use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, Pictures, render};
 use tch::{Tensor, no_grad};
 

@@ -12,7 +12,6 @@ mod schedule;
 mod step_report;
 #[cfg(test)]
 mod step_tests;
-mod stopwatch;
 mod subsets;
 mod tensorboard;
 mod trainer;
@@ -24,9 +23,6 @@ pub use run::{Event, Outcome, Resume, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};
-
-// For benchmarks.
-pub(crate) use stopwatch::Stopwatch;
 
 // For the parity checks, which run every part by itself.
 pub(crate) use curriculum::stage_at;

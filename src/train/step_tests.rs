@@ -1,10 +1,11 @@
 //! A step's gradient, however it is computed.
 
-use super::{Stopwatch, Trainer, subsets};
+use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Stage, Streams};
+use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};

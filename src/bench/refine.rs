@@ -1,0 +1,93 @@
+//! A step of refining a splat: how much of it is rendering.
+
+use super::{Spread, made_up_scene};
+use crate::data::ViewBatch;
+use crate::error::Result;
+use crate::optim::Stopwatch;
+use crate::refine::{Budget, GaussianSpace, Photos, RefineConfig, Task, refine_timed};
+use crate::render::cpu::stage_times;
+use crate::render::{DEFAULT_EPS2D, render};
+use crate::scene::{ImageSize, RawGaussians};
+use serde::Serialize;
+use std::time::Duration;
+
+/// Photos of the made-up scene.
+const PHOTOS: usize = 8;
+/// Before those that are measured.
+const WARM_UP: u64 = 5;
+
+/// What [`bench_refine`] measured.
+#[derive(Debug, Serialize)]
+pub struct RefineReport {
+    /// Of the splat.
+    pub gaussians: i64,
+    /// Pictures in a step.
+    pub views: usize,
+    /// [height, width] of them.
+    pub size: [u32; 2],
+    /// Threads that shared the work.
+    pub threads: i32,
+    /// Steps that were measured.
+    pub steps: u64,
+    /// Of a whole step.
+    pub milliseconds: Spread,
+    /// The mean time of its parts, in the order of the work.
+    pub sections: Vec<(&'static str, f64)>,
+    /// Of the time, what isn't rendering, forward or backward.
+    pub other_share: f64,
+}
+
+/// Times `steps` steps on photos of `size` of a made-up scene with `count` Gaussians, which are begun with.
+///
+/// # Errors
+/// What the rasterizer refuses.
+pub fn bench_refine(
+    count: usize,
+    size: ImageSize,
+    config: &RefineConfig,
+    steps: u64,
+) -> Result<RefineReport> {
+    let (gaussians, cameras) = made_up_scene(count, PHOTOS, size);
+    let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
+    let c2w = cameras.w2c.inverse();
+    let photos =
+        Photos::of(ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c, intrinsics: cameras.intrinsics });
+    let mut space = GaussianSpace::new(&RawGaussians::of(&gaussians), 1., config);
+    let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
+    refine_timed(&mut space, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
+
+    let mut stopwatch = Stopwatch::default();
+    let (mut whole, mut before, mut backward) = (vec![], Duration::ZERO, 0.);
+    refine_timed(&mut space, &task(steps), &mut stopwatch, |at| {
+        whole.push(1e3 * (at.elapsed - before).as_secs_f64());
+        before = at.elapsed;
+        let stages = stage_times();
+        backward += stages.blend_backward + stages.project_backward;
+        true
+    })?;
+    let mean = |seconds: f64| 1e3 * seconds / steps as f64;
+    let mut sections = vec![];
+    for &(name, time) in stopwatch.sections() {
+        let time = time.as_secs_f64();
+        match name {
+            "backward" => {
+                sections.push(("render backward", mean(backward)));
+                sections.push(("rest of the backward pass", mean(time - backward)));
+            }
+            name => sections.push((name, mean(time))),
+        }
+    }
+    let of_render = |(name, _): &&(&str, f64)| name.starts_with("render");
+    let rendering: f64 = sections.iter().filter(of_render).map(|section| section.1).sum();
+    let all: f64 = whole.iter().sum::<f64>() / steps as f64;
+    Ok(RefineReport {
+        gaussians: gaussians.count(),
+        views: config.views,
+        size: size.into(),
+        threads: tch::get_num_threads(),
+        steps,
+        milliseconds: Spread::of(whole),
+        sections,
+        other_share: 1. - rendering / all,
+    })
+}

@@ -1,0 +1,369 @@
+use super::progress::{self, Progress};
+use super::{model, parse_size, print_json, stop_flag};
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use glam::DMat4;
+use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
+use globalsplat::error::Error;
+use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, score};
+use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
+use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, spread_over_path};
+use globalsplat::refine::{
+    Budget, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace, gaussians_from_photos, load_photos,
+    refine, scene_depth,
+};
+use globalsplat::render::{Rendered, render_views, transform};
+use globalsplat::scene::{Gaussians, RawGaussians, Similarity};
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use tch::Device;
+
+/// Of the time or the steps, what goes to tokens where Gaussians follow.
+const TOKENS_SHARE: f64 = 0.2;
+/// For the optimization, however long the beginning took.
+const LEAST_SECONDS: f64 = 1.;
+/// Parts of a phase at which views held out are scored.
+const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+
+/// Make a splat sharp on the photos of its scene, or make one of the photos alone.
+///
+/// Its Gaussians, as many as there are, are optimized until they show what the photos show. Without --splat they begin where the
+/// photos agree on what is seen; no weights are needed, and no GPU. Ctrl-C ends the work early and keeps what there is.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
+    globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
+    globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
+pub struct Refine {
+    /// The splat to begin with, in the capture's world
+    #[arg(long, value_name = "FILE.ply", conflicts_with = "gaussians")]
+    pub splat: Option<PathBuf>,
+    /// What to begin with where there is no splat: the photos alone, or what a model makes of them
+    #[arg(long, value_enum, conflicts_with = "splat")]
+    pub from: Option<From>,
+    /// Weights that `globalsplat export` wrote, to begin with; by default those that come with this program
+    #[arg(long, value_name = "FILE", conflicts_with = "splat")]
+    pub weights: Option<PathBuf>,
+    /// What is optimized: Gaussians, the tokens that a model decodes them from, or these first and then those
+    #[arg(long, value_enum, default_value_t = SpaceName::Gaussians, conflicts_with = "splat")]
+    pub space: SpaceName,
+    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// The splat to write
+    #[arg(long, value_name = "FILE.ply")]
+    pub out: PathBuf,
+    /// How many Gaussians, from nothing
+    #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    pub gaussians: u32,
+    /// How long, all in all
+    #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
+    pub seconds: f64,
+    /// How many steps instead: the same steps and seed give the same bytes
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
+    /// Other random numbers for another seed
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub seed: u64,
+    /// Views to keep out and to score by: every:N, every:N+K or none
+    #[arg(long, value_name = "WHICH", default_value = "none")]
+    pub holdout: String,
+    /// Use so many of the other views at most, spread over the path of the camera
+    #[arg(long, value_name = "N")]
+    pub views: Option<usize>,
+    /// Cut and resize photos to this; by default they keep their shape, with 512 pixels along the longer side at most
+    #[arg(long, value_name = "WxH")]
+    pub size: Option<String>,
+    /// Also write a picture: photo, render and depth side by side, a row per view held out, or else per view
+    #[arg(long, value_name = "FILE.png")]
+    pub sheet: Option<PathBuf>,
+    /// Change a number of the method, as in views=4; docs/refine.md has them
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Print what was done as one JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// What is begun with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum From {
+    /// Pixels, where the photos agree
+    Nothing,
+    /// What a model makes of the photos
+    Weights,
+}
+
+/// What is optimized.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SpaceName {
+    /// Each by itself
+    Gaussians,
+    /// A model's
+    Tokens,
+    /// Tokens first
+    Both,
+}
+
+/// What is begun with.
+enum Start {
+    Gaussians(RawGaussians),
+    Model(Box<LoadedModel>, Reconstruction),
+}
+
+impl Refine {
+    pub fn run(self) -> Result<()> {
+        let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
+        let size = self.size.as_deref().map(parse_size).transpose()?;
+        let config = RefineConfig::with(&self.set, self.splat.is_some())?;
+        if !(self.seconds > 0. && self.seconds.is_finite()) {
+            return Err(Error::Request(format!("--seconds is {}, expected more than 0", self.seconds)).into());
+        }
+        check_writable_file(&self.out)?;
+        if let Some(sheet) = &self.sheet {
+            check_writable_file(sheet)?;
+        }
+        let capture = open_capture(&self.scene)?;
+        let (shown, held_out) = holdout.split(capture.len());
+        let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX).max(1));
+        let photos = load_photos(&capture, &shown, size)?;
+        let held_out = load_photos(&capture, &held_out, size)?;
+        let judge =
+            Judge { name: capture.name.clone(), held_out, perceptual: Perceptual::find(Device::Cpu)? };
+
+        let clock = Instant::now();
+        let start = self.start(&capture, holdout, &photos)?;
+        let begin_seconds = clock.elapsed().as_secs_f64();
+        let first = match &start {
+            Start::Gaussians(raw) => raw.activate(),
+            Start::Model(_, made) => made.in_world(),
+        };
+        let before = judge.scores_of_both(&first, &photos)?;
+        let mut work = Work {
+            photos: &photos,
+            judge: &judge,
+            config: &config,
+            steps: self.steps,
+            seconds: (self.seconds - begin_seconds).max(LEAST_SECONDS),
+            seed: self.seed,
+            stop: stop_flag()?,
+            bar: progress::bar(1000, "‰"),
+            done_steps: 0,
+            done_seconds: begin_seconds,
+            curve: vec![],
+        };
+        let mut gaussians = work.optimize(&start, self.space)?;
+        work.bar.finish_and_clear();
+        let mut after = judge.scores_of_both(&gaussians, &photos)?;
+        if after.shown.psnr < before.shown.psnr {
+            eprintln!("the photos were shown better before: what was begun with is kept");
+            (gaussians, after) = (first, before.clone());
+        }
+        write_splat(&self.out, &Splat::of(&gaussians)?)?;
+        if let Some(sheet) = &self.sheet {
+            let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
+            write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;
+        }
+        let Work { done_steps: steps, done_seconds: seconds, curve, .. } = work;
+        let (out, count) = (self.out.display(), gaussians.count());
+        if self.json {
+            let mut object = json!({
+                "splat": self.out, "gaussians": count, "photos": photos.len(), "steps": steps, "seconds": seconds,
+                "begin_seconds": begin_seconds,
+                "shown": { "before": means(&before.shown), "after": means(&after.shown) },
+            });
+            if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
+                object["held_out"] = json!({
+                    "views": after.views.len(), "before": means(before), "after": means(after), "curve": curve,
+                });
+            }
+            print_json(&object);
+            return Ok(());
+        }
+        println!("{out}: {count} Gaussians, {steps} steps in {seconds:.0} s");
+        println!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM");
+        let row = |name: String, before: &CaptureScores, after: &CaptureScores| {
+            println!("{name:<24} {:>14.2} {:>8.2} {:>8.4}", before.psnr, after.psnr, after.ssim);
+        };
+        row(format!("{} photos", photos.len()), &before.shown, &after.shown);
+        if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
+            row(format!("{} views held out", after.views.len()), before, after);
+        }
+        Ok(())
+    }
+
+    /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
+    fn start(&self, capture: &Capture, holdout: Holdout, photos: &[View]) -> Result<Start> {
+        if let Some(path) = &self.splat {
+            return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
+        }
+        let needs_model = self.weights.is_some() || self.space != SpaceName::Gaussians;
+        if self.from == Some(From::Nothing) && needs_model {
+            let why = "--from nothing has neither weights nor tokens; --from weights has";
+            return Err(Error::Request(why.into()).into());
+        }
+        if self.from == Some(From::Weights) || needs_model {
+            let loaded = model::load(self.weights.as_deref(), "f32", Device::Cpu)?;
+            let data = &loaded.config.data;
+            let count = self.views.unwrap_or(data.context_views);
+            let context = load_context(capture, holdout, Some(count), data.image_size)?;
+            let made = reconstruct(&loaded, &context, &[])?;
+            return Ok(Start::Model(Box::new(loaded), made));
+        }
+        if photos.len() < 2 {
+            let why = "one photo tells no depth: two or more are expected, or a --splat";
+            return Err(Error::Request(why.into()).into());
+        }
+        let points = points_of(capture)?;
+        Ok(Start::Gaussians(gaussians_from_photos(photos, &points, self.gaussians as usize, self.seed)))
+    }
+}
+
+/// The optimization, and how far it is.
+struct Work<'a> {
+    photos: &'a [View],
+    judge: &'a Judge,
+    config: &'a RefineConfig,
+    /// All in all, where it isn't time that counts.
+    steps: Option<u64>,
+    /// All in all, once it has begun.
+    seconds: f64,
+    seed: u64,
+    stop: Arc<AtomicBool>,
+    bar: Progress,
+    done_steps: u64,
+    /// Without the time that scoring takes.
+    done_seconds: f64,
+    curve: Vec<Mark>,
+}
+
+/// What views held out scored on the way.
+#[derive(Serialize)]
+struct Mark {
+    seconds: f64,
+    steps: u64,
+    psnr: f64,
+    ssim: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    lpips_vgg: Option<f64>,
+}
+
+impl Work<'_> {
+    /// In one space, or in one after the other.
+    fn optimize(&mut self, start: &Start, name: SpaceName) -> Result<Gaussians> {
+        let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
+        let (raw, done) = match (start, name) {
+            (Start::Gaussians(raw), _) => (raw.shallow_clone(), 0.),
+            (Start::Model(_, made), SpaceName::Gaussians) => (RawGaussians::of(&made.in_world()), 0.),
+            (Start::Model(loaded, made), SpaceName::Tokens | SpaceName::Both) => {
+                // Tokens know the normalized world alone.
+                let world = &made.world_from_normalized;
+                let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
+                let depth = scene_depth(&made.in_world(), self.photos)? / world.scale;
+                let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
+                let end = if name == SpaceName::Both { TOKENS_SHARE } else { 1. };
+                let gaussians = self.phase(&mut space, &poses, depth, [0., end], Some(world))?;
+                (RawGaussians::of(&gaussians), end)
+            }
+        };
+        if done == 1. || self.stop.load(Ordering::Relaxed) {
+            return Ok(raw.activate());
+        }
+        let depth = scene_depth(&raw.activate(), self.photos)?;
+        let mut space = GaussianSpace::new(&raw, depth, self.config);
+        self.phase(&mut space, &poses, depth, [done, 1.], None)
+    }
+
+    /// The part of the way from `from` to `to`. `poses` are those of the photos in the world of `space`, `world` the way from there to
+    /// the capture's. The Gaussians are in the capture's world.
+    fn phase(
+        &mut self,
+        space: &mut dyn Space,
+        poses: &[DMat4],
+        depth: f64,
+        [from, to]: [f64; 2],
+        world: Option<&Similarity>,
+    ) -> Result<Gaussians> {
+        let in_world = |gaussians: Gaussians| match world {
+            Some(world) => transform(&gaussians, world),
+            None => gaussians,
+        };
+        let budget = match self.steps {
+            Some(steps) => Budget::Steps(((to - from) * steps as f64).round() as u64),
+            None => Budget::Time(Duration::from_secs_f64((to - from) * self.seconds)),
+        };
+        let photos = Photos::new(self.photos, poses, self.config.levels());
+        let task = Task { photos: &photos, depth, config: self.config, budget, seed: self.seed };
+        let (steps, seconds) = (self.done_steps, self.done_seconds);
+        let mut marks = MARKS.iter().peekable();
+        let mut failure = None;
+        let gaussians = refine(space, &task, |at| {
+            self.done_steps = steps + at.step;
+            self.done_seconds = seconds + at.elapsed.as_secs_f64();
+            self.bar.set_position(((from + (to - from) * at.progress) * 1000.) as u64);
+            if marks.next_if(|&&mark| at.progress >= mark).is_some() {
+                failure = self.mark(&in_world(at.gaussians())).err();
+            }
+            failure.is_none() && !self.stop.load(Ordering::Relaxed)
+        })?;
+        if let Some(error) = failure {
+            return Err(error.into());
+        }
+        let gaussians = in_world(gaussians);
+        self.mark(&gaussians)?;
+        Ok(gaussians)
+    }
+
+    /// Scores the views held out.
+    fn mark(&mut self, gaussians: &Gaussians) -> globalsplat::Result<()> {
+        let Some(scores) = self.judge.held_out_scores(gaussians)? else { return Ok(()) };
+        self.bar.set_message(format!("{} steps, held out {:.2} dB", self.done_steps, scores.psnr));
+        let (steps, seconds) = (self.done_steps, self.done_seconds);
+        let CaptureScores { psnr, ssim, lpips_vgg, .. } = scores;
+        self.curve.push(Mark { seconds, steps, psnr, ssim, lpips_vgg });
+        Ok(())
+    }
+}
+
+/// Scores splats of a capture.
+struct Judge {
+    name: String,
+    held_out: Vec<View>,
+    perceptual: Perceptual,
+}
+
+/// Of the photos shown, and of those held out, if any.
+#[derive(Clone)]
+struct Scores {
+    shown: CaptureScores,
+    held_out: Option<CaptureScores>,
+}
+
+impl Judge {
+    fn scores_of_both(&self, gaussians: &Gaussians, shown: &[View]) -> globalsplat::Result<Scores> {
+        Ok(Scores { shown: self.scores(gaussians, shown)?, held_out: self.held_out_scores(gaussians)? })
+    }
+
+    fn scores(&self, gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<CaptureScores> {
+        let pictures: Vec<_> = rendered(gaussians, views)?.into_iter().map(|rendered| rendered.rgb).collect();
+        let mut scores = score(&self.name, &pictures, views, Some(gaussians.count()))?;
+        self.perceptual.add_to(&mut scores, &pictures, views);
+        Ok(scores)
+    }
+
+    fn held_out_scores(&self, gaussians: &Gaussians) -> globalsplat::Result<Option<CaptureScores>> {
+        (!self.held_out.is_empty()).then(|| self.scores(gaussians, &self.held_out)).transpose()
+    }
+}
+
+fn means(scores: &CaptureScores) -> Value {
+    json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": scores.lpips_vgg })
+}
+
+fn rendered(gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<Vec<Rendered>> {
+    let cameras: Vec<_> = views.iter().map(|view| view.camera).collect();
+    render_views(gaussians, &cameras)
+}

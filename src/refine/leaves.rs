@@ -1,0 +1,80 @@
+//! The numbers that are optimized.
+
+use crate::scene::{Gaussians, RawGaussians};
+use tch::{Kind, Tensor};
+
+/// Gaussians of one scene before activation, colours apart from the higher spherical harmonics, which learn more slowly.
+#[derive(Debug)]
+pub struct Leaves {
+    /// [1, N, 3].
+    pub means: Tensor,
+    /// [1, N, 3].
+    pub log_scales: Tensor,
+    /// [1, N, 4].
+    pub quaternions: Tensor,
+    /// [1, N].
+    pub opacity_logits: Tensor,
+    /// [1, N, 1, 3].
+    pub colours: Tensor,
+    /// [1, N, (degree + 1)² − 1, 3].
+    pub harmonics: Tensor,
+}
+
+impl Leaves {
+    /// Copies of `raw`, with spherical harmonics up to `degree`.
+    pub fn of(raw: &RawGaussians, degree: i64) -> Self {
+        let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
+        let size = raw.sh.size();
+        let bases = (degree + 1).pow(2);
+        let higher = Tensor::zeros([1, size[1], bases - 1, 3], (Kind::Float, raw.sh.device()));
+        let known = (size[2].min(bases) - 1).max(0);
+        higher.narrow(2, 0, known).copy_(&raw.sh.narrow(2, 1, known));
+        Leaves {
+            means: leaf(raw.means.shallow_clone()),
+            log_scales: leaf(raw.log_scales.shallow_clone()),
+            quaternions: leaf(raw.quaternions.shallow_clone()),
+            opacity_logits: leaf(raw.opacity_logits.shallow_clone()),
+            colours: leaf(raw.sh.narrow(2, 0, 1)),
+            harmonics: leaf(higher),
+        }
+    }
+
+    /// By their names, in this order.
+    pub fn named(&self) -> [(&'static str, &Tensor); 6] {
+        [
+            ("means", &self.means),
+            ("log_scales", &self.log_scales),
+            ("quaternions", &self.quaternions),
+            ("opacity_logits", &self.opacity_logits),
+            ("colours", &self.colours),
+            ("harmonics", &self.harmonics),
+        ]
+    }
+
+    /// The Gaussians, with spherical harmonics up to `degree`; differentiable.
+    pub fn activate(&self, degree: i64) -> Gaussians {
+        self.raw(degree).activate()
+    }
+
+    /// As other parts of the program take them, with spherical harmonics up to `degree`.
+    pub fn raw(&self, degree: i64) -> RawGaussians {
+        let sh = match degree {
+            0 => self.colours.shallow_clone(),
+            _ => {
+                let known = (degree + 1).pow(2) - 1;
+                let harmonics = match self.harmonics.size()[2] == known {
+                    true => self.harmonics.shallow_clone(),
+                    false => self.harmonics.narrow(2, 0, known),
+                };
+                Tensor::cat(&[&self.colours, &harmonics], 2)
+            }
+        };
+        RawGaussians {
+            means: self.means.shallow_clone(),
+            log_scales: self.log_scales.shallow_clone(),
+            quaternions: self.quaternions.shallow_clone(),
+            opacity_logits: self.opacity_logits.shallow_clone(),
+            sh,
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! A splat made better on the photos that it has to match, in seconds: as many Gaussians as there are, each optimized by itself, or
+//! all of them through the tokens that a model decodes them from. Without a splat it begins with what the photos agree on.
+
+mod begin;
+mod config;
+mod leaves;
+mod photos;
+mod relocate;
+mod space;
+mod sweep;
+
+pub use begin::gaussians_from_photos;
+pub use config::RefineConfig;
+pub use photos::{Photos, load_photos};
+pub use space::{GaussianSpace, Space, TokenSpace};
+
+use crate::data::View;
+use crate::error::{Error, Result};
+use crate::loss::photometric;
+use crate::optim::Stopwatch;
+use crate::render::cpu::KernelThreads;
+use crate::render::{DEFAULT_EPS2D, Pictures, render, render_views};
+use crate::scene::{Camera, Gaussians};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::time::{Duration, Instant};
+use tch::{Kind, Tensor};
+
+/// How long it goes on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Budget {
+    /// The same steps give the same bits.
+    Steps(u64),
+    /// So long, about.
+    Time(Duration),
+}
+
+/// Where the work stands.
+pub struct RefineStep<'a> {
+    /// Steps done.
+    pub step: u64,
+    /// From 0 to 1.
+    pub progress: f64,
+    /// Time that the steps took, without what was done in between.
+    pub elapsed: Duration,
+    /// Of this step's views, before it.
+    pub loss: &'a Tensor,
+    space: &'a dyn Space,
+}
+
+impl RefineStep<'_> {
+    /// The Gaussians as they are now.
+    pub fn gaussians(&self) -> Gaussians {
+        tch::no_grad(|| self.space.gaussians(1.)).map(Tensor::copy)
+    }
+}
+
+/// What is to be done.
+#[derive(Debug)]
+pub struct Task<'a> {
+    /// What has to be matched.
+    pub photos: &'a Photos,
+    /// The scene's, by which lengths are measured: see [`scene_depth`].
+    pub depth: f64,
+    /// How.
+    pub config: &'a RefineConfig,
+    /// How long.
+    pub budget: Budget,
+    /// Of the random numbers.
+    pub seed: u64,
+}
+
+/// Optimizes `space`. `watch` sees every step, and ends the work by false. Returns the Gaussians that it ended with.
+///
+/// # Errors
+/// What the rasterizer refuses.
+pub fn refine(
+    space: &mut dyn Space,
+    task: &Task,
+    watch: impl FnMut(&RefineStep) -> bool,
+) -> Result<Gaussians> {
+    refine_timed(space, task, &mut Stopwatch::default(), watch)
+}
+
+/// As [`refine`]; `stopwatch` hears of every part of a step.
+pub(crate) fn refine_timed(
+    space: &mut dyn Space,
+    task: &Task,
+    stopwatch: &mut Stopwatch,
+    mut watch: impl FnMut(&RefineStep) -> bool,
+) -> Result<Gaussians> {
+    let Task { photos, depth, config, budget, seed } = *task;
+    let _threads = KernelThreads::take();
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut elapsed = Duration::ZERO;
+    for step in 0.. {
+        let start = Instant::now();
+        let progress = match budget {
+            Budget::Steps(steps) => step as f64 / steps as f64,
+            Budget::Time(time) => elapsed.as_secs_f64() / time.as_secs_f64(),
+        };
+        if progress >= 1. {
+            break;
+        }
+        let level = config.sizes.iter().filter(|&&part| progress >= part).count();
+        let batch = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
+        let mut gaussians = stopwatch.time("activation", || space.gaussians(progress));
+        if config.dropout > 0. {
+            gaussians.opacities =
+                with_some_left_out(&gaussians.opacities, config.dropout * progress, &mut random);
+        }
+        let pictures = stopwatch.time("render", || render(&gaussians, &batch.cameras(), DEFAULT_EPS2D))?;
+        let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch.images, config, depth));
+        stopwatch.time("backward", || {
+            space.zero_grad();
+            loss.backward();
+        });
+        stopwatch.time("optimizer", || space.step(progress, step, &mut random));
+        elapsed += start.elapsed();
+        if !watch(&RefineStep { step: step + 1, progress, elapsed, loss: &loss, space }) {
+            break;
+        }
+    }
+    Ok(tch::no_grad(|| space.gaussians(1.)))
+}
+
+/// How far the pictures are from the photos, and the Gaussians from what they should be like.
+fn loss(
+    gaussians: &Gaussians,
+    pictures: &Pictures,
+    photos: &Tensor,
+    config: &RefineConfig,
+    depth: f64,
+) -> Tensor {
+    let mut loss = photometric(&pictures.rgb, photos, 1. - config.similar, -config.similar) + config.similar;
+    if config.opacity > 0. {
+        loss += gaussians.opacities.mean(Kind::Float) * config.opacity;
+    }
+    if config.scale > 0. {
+        loss += gaussians.scales.mean(Kind::Float) * (config.scale / depth);
+    }
+    if config.smooth > 0. {
+        loss += unevenness(&pictures.depth, photos) * config.smooth;
+    }
+    loss
+}
+
+/// The median depth of what the views show of a splat: what lengths are measured by.
+///
+/// # Errors
+/// Views that see nothing of it.
+pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
+    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+    let mut seen = vec![];
+    for rendered in render_views(gaussians, &cameras)? {
+        let depth = rendered.depth.masked_select(&rendered.alpha.gt(0.5));
+        seen.push(depth);
+    }
+    let depths = Tensor::cat(&seen, 0);
+    if depths.numel() == 0 {
+        return Err(Error::Request("the cameras see nothing of the splat: are both of one world?".into()));
+    }
+    Ok(depths.median().double_value(&[]))
+}
+
+/// Opacities with a share of them, drawn anew, at 0, and the others as much larger (Park et al. 2025, "DropGaussian").
+fn with_some_left_out(opacities: &Tensor, share: f64, random: &mut impl Rng) -> Tensor {
+    let factor = (1. / (1. - share)) as f32;
+    let factors: Vec<f32> =
+        (0..opacities.numel()).map(|_| if random.random::<f64>() < share { 0. } else { factor }).collect();
+    (opacities * Tensor::from_slice(&factors).view_as(opacities)).clamp_max(1.)
+}
+
+/// How uneven depths are, relative to themselves, where the photo is even.
+fn unevenness(depth: &Tensor, photo: &Tensor) -> Tensor {
+    let logarithm = (depth + 1e-6).log();
+    let grey = photo.mean_dim([2].as_slice(), false, Kind::Float);
+    let along = |dimension: i64| {
+        let difference = |t: &Tensor| {
+            let size = t.size()[dimension as usize];
+            t.narrow(dimension, 1, size - 1) - t.narrow(dimension, 0, size - 1)
+        };
+        (difference(&logarithm).abs() * (difference(&grey).abs() * -10.).exp()).mean(Kind::Float)
+    };
+    along(2) + along(3)
+}

@@ -1,0 +1,94 @@
+//! The photos that a splat is refined on, small and large.
+
+use crate::data::{Capture, View, ViewBatch, view_batch};
+use crate::error::Result;
+use crate::scene::{Camera, ImageSize};
+use glam::DMat4;
+use rand::Rng;
+use rand::seq::index::sample;
+use std::collections::BTreeMap;
+use tch::Device;
+
+/// A photo is resized so that its longer side is at most this, pixels: thousands of Gaussians can't show more, and pixels take time.
+const LONGEST_SIDE: f64 = 512.;
+/// A picture is halved only where its sides keep so many pixels.
+const LEAST_SIDE: i64 = 32;
+
+/// Reads the photos of `indices`, cut and resized to `size`, or each as it is where that is small enough.
+///
+/// # Errors
+/// Those of [`Capture::load`].
+pub fn load_photos(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
+    let cameras = capture.cameras();
+    let mut views = vec![];
+    for &index in indices {
+        views.extend(capture.load(&[index], size.or_else(|| smaller(&cameras[index])))?);
+    }
+    Ok(views)
+}
+
+fn smaller(camera: &Camera) -> Option<ImageSize> {
+    let scale = LONGEST_SIDE / f64::from(camera.width.max(camera.height));
+    let side = |pixels: u32| ((f64::from(pixels) * scale).round() as u32).max(1);
+    (scale < 1.).then(|| ImageSize { height: side(camera.height), width: side(camera.width) })
+}
+
+/// Photos at several sizes, from the smallest to the whole; those of one size together.
+#[derive(Debug)]
+pub struct Photos {
+    levels: Vec<Vec<ViewBatch>>,
+}
+
+impl Photos {
+    /// `views` at their own size alone.
+    pub(crate) fn of(views: ViewBatch) -> Self {
+        Photos { levels: vec![vec![views]] }
+    }
+
+    /// `views`, one at least, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world) stand for the
+    /// views' own.
+    pub fn new(views: &[View], poses: &[DMat4], levels: usize) -> Self {
+        let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
+        for (index, View { camera, .. }) in views.iter().enumerate() {
+            groups.entry((camera.height, camera.width)).or_default().push(index);
+        }
+        let batch = |group: &Vec<usize>| {
+            let (views, poses): (Vec<&View>, Vec<DMat4>) =
+                group.iter().map(|&i| (&views[i], poses[i])).unzip();
+            view_batch(&views, &poses, Device::Cpu)
+        };
+        let whole = groups.values().map(batch).collect();
+        let mut sizes: Vec<Vec<ViewBatch>> = vec![whole];
+        for _ in 1..levels {
+            let halves = sizes[sizes.len() - 1].iter().map(halved).collect();
+            sizes.push(halves);
+        }
+        sizes.reverse();
+        Photos { levels: sizes }
+    }
+
+    /// So many views of one size, each once, at level `level` from the smallest.
+    pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> ViewBatch {
+        let groups = &self.levels[level.min(self.levels.len() - 1)];
+        let count = |group: &ViewBatch| group.images.size()[1] as usize;
+        let owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));
+        let of = random.random_range(0..groups.iter().map(count).sum::<usize>());
+        let group = owners.clone().nth(of).expect("a number below the sum");
+        let mut chosen = sample(random, count(group), views.min(count(group))).into_vec();
+        chosen.sort_unstable();
+        group.select(&chosen)
+    }
+}
+
+/// As wide and high as half of them, or as they are where that is too small.
+fn halved(batch: &ViewBatch) -> ViewBatch {
+    let size = batch.images.size();
+    let (images, intrinsics) = if size[3].min(size[4]) < 2 * LEAST_SIDE {
+        (batch.images.shallow_clone(), batch.intrinsics.shallow_clone())
+    } else {
+        let intrinsics = batch.intrinsics.copy();
+        let _ = intrinsics.narrow(2, 0, 2).g_mul_scalar_(0.5);
+        (batch.images.squeeze_dim(0).avg_pool2d(2, 2, 0, false, true, None).unsqueeze(0), intrinsics)
+    };
+    ViewBatch { images, intrinsics, c2w: batch.c2w.shallow_clone(), w2c: batch.w2c.shallow_clone() }
+}

@@ -1,0 +1,254 @@
+//! Where the pixels of posed photos lie: for every pixel the depth at which its surroundings look alike in the photos taken
+//! nearby (a plane sweep; Collins 1996). No weights are needed, and no points.
+
+use crate::data::{Point, View};
+use crate::scene::{Camera, Intrinsics};
+use glam::{DMat4, DVec3};
+use tch::{Device, Kind, Tensor};
+
+/// Photos are looked at with so many pixels along the longer side.
+const LONGEST_SIDE: f64 = 128.;
+/// Inverse depths that are tried, evenly from 0 to the nearest plane's.
+const PLANES: i64 = 64;
+/// Of the picture's width: how far a pixel of the nearest plane moves in the photo taken nearest.
+const LARGEST_MOVE: f64 = 0.3;
+/// The farthest that pixels are put, in units of the nearest plane's distance.
+const FARTHEST: f64 = 500.;
+/// Photos that each one is compared with. In half of them a pixel has to look alike: in the others something may hide it.
+const NEIGHBOURS: usize = 4;
+/// Cosine of the angle between two views beyond which they hardly show the same.
+const LEAST_COSINE: f64 = 0.3;
+/// Side of the surroundings that are compared, pixels.
+const PATCH: i64 = 9;
+/// What is added to variances, so that noise is not taken for likeness.
+const LEAST_VARIANCE: f64 = 1e-4;
+/// Correlation at or below which a depth counts for nothing.
+const UNSURE: f64 = 0.5;
+/// Times that what is known is spread to wider surroundings, and what it counts there, each time.
+const SPREADS: usize = 6;
+const SPREAD_WEIGHT: f64 = 0.1;
+/// Points that a view has to see, or its nearest plane is guessed from the cameras alone.
+const LEAST_POINTS: usize = 30;
+/// Of the points, those that may be nearer than the nearest plane, and how much nearer it is than the others.
+const NEARER: f64 = 0.02;
+const ROOM: f64 = 1.3;
+
+/// A photo with a depth for every pixel.
+#[derive(Debug)]
+pub struct Swept {
+    /// At the size of the others, which is small.
+    pub camera: Camera,
+    /// [3, h, w].
+    pub image: Tensor,
+    /// Along the camera's axis, [h, w].
+    pub depth: Tensor,
+}
+
+/// A small photo.
+struct Small {
+    camera: Camera,
+    /// [3, h, w].
+    image: Tensor,
+    /// [h, w].
+    grey: Tensor,
+}
+
+/// Finds depths for the pixels of every view. `points` of the scene, where some are known, tell where it begins.
+pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
+    let small: Vec<Small> = views.iter().map(Small::of).collect();
+    let depth = |index: usize| {
+        let others = neighbours(index, &small);
+        let nearest = nearest_of_points(&small[index].camera, points)
+            .unwrap_or_else(|| nearest_of_cameras(&small[index], others.first().copied()));
+        let (inverse, likeness) = most_alike(&small[index], &others, nearest);
+        filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal()
+    };
+    let depths: Vec<Tensor> = (0..small.len()).map(depth).collect();
+    let swept = |(Small { camera, image, .. }, depth)| Swept { camera, image, depth };
+    small.into_iter().zip(depths).map(swept).collect()
+}
+
+impl Small {
+    fn of(view: &View) -> Self {
+        let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
+        let factor = (LONGEST_SIDE / side(camera.width.max(camera.height))).min(1.);
+        let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
+        let (height, width) = (resized(camera.height), resized(camera.width));
+        let image = view.image.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
+        let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
+        let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
+        let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
+        Small {
+            camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
+            image,
+            grey,
+        }
+    }
+
+    fn centre(&self) -> DVec3 {
+        self.camera.c2w.w_axis.truncate()
+    }
+
+    fn size(&self) -> [i64; 2] {
+        [i64::from(self.camera.height), i64::from(self.camera.width)]
+    }
+}
+
+/// Those taken nearest in about the same direction, the nearest first, but not from the same place.
+fn neighbours(index: usize, views: &[Small]) -> Vec<&Small> {
+    let this = &views[index];
+    let forward = |view: &Small| view.camera.c2w.z_axis.truncate();
+    let mut others: Vec<(f64, &Small)> = views
+        .iter()
+        .filter(|other| forward(other).dot(forward(this)) > LEAST_COSINE)
+        .map(|other| (other.centre().distance(this.centre()), other))
+        .filter(|(distance, _)| *distance > 0.)
+        .collect();
+    others.sort_by(|a, b| a.0.total_cmp(&b.0));
+    others.into_iter().map(|(_, other)| other).take(NEIGHBOURS).collect()
+}
+
+/// The inverse depth of the nearest plane, such that nothing moves too far in the photo taken nearest.
+fn nearest_of_cameras(this: &Small, other: Option<&Small>) -> f64 {
+    let baseline = other.map_or(1., |other| other.centre().distance(this.centre()));
+    LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
+}
+
+/// The same, such that it is nearer than the points that the camera sees; none where it sees too few.
+fn nearest_of_points(camera: &Camera, points: &[Point]) -> Option<f64> {
+    let (w2c, k) = (camera.c2w.inverse(), camera.intrinsics);
+    let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
+    let seen = points.iter().map(|point| w2c.transform_point3(point.position)).filter(|p| {
+        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
+        p.z > 0. && inside(u, camera.width) && inside(v, camera.height)
+    });
+    let mut inverse: Vec<f64> = seen.map(|p| 1. / p.z).collect();
+    inverse.sort_by(f64::total_cmp);
+    let last = ((1. - NEARER) * inverse.len() as f64) as usize;
+    (inverse.len() >= LEAST_POINTS).then(|| ROOM * inverse[last])
+}
+
+/// The inverse depth of every pixel at which it looks most alike in the others, and the correlation there, both [h, w].
+fn most_alike(this: &Small, others: &[&Small], nearest: f64) -> (Tensor, Tensor) {
+    let (size, options) = (this.size(), (Kind::Float, Device::Cpu));
+    if others.is_empty() {
+        return (Tensor::full(size, nearest / 2., options), Tensor::zeros(size, options));
+    }
+    let planes = Tensor::linspace(0., nearest, PLANES, options).view([PLANES, 1]);
+    let own = this.grey.unsqueeze(0);
+    let (own_mean, own_variance) = mean_and_variance(&own);
+    let alike = |other: &&Small| {
+        let (seen, inside) = seen_by(other, this, &planes);
+        let (mean, variance) = mean_and_variance(&seen);
+        let covariance = around(&(&seen * &own)) - mean * &own_mean;
+        (covariance / (variance * &own_variance).sqrt()).where_self(&inside, &Tensor::from(-1f32))
+    };
+    let correlations = Tensor::stack(&others.iter().map(alike).collect::<Vec<_>>(), 0);
+    let half = (others.len() as i64 / 2).max(1);
+    let (best, _) = correlations.topk(half, 0, true, false);
+    let (likeness, plane) = best.mean_dim([0].as_slice(), false, Kind::Float).max_dim(0, false);
+    (plane.to_kind(Kind::Float) * (nearest / (PLANES - 1) as f64), likeness)
+}
+
+/// What `other` shows where the pixels of `this` would be if they lay on each of the planes, and whether it shows them at all, both
+/// [PLANES, h, w].
+fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
+    let [height, width] = this.size();
+    let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
+    let rows = to_other.transpose().to_cols_array_2d();
+    // In proportion to what the camera sees of a pixel at inverse depth w: rotation · ray + w · translation.
+    let rays = rays(&this.camera.intrinsics, height, width);
+    let coordinate = |row: [f64; 4]| {
+        let turned = &rays[0] * row[0] + &rays[1] * row[1] + &rays[2] * row[2]; // [h·w]
+        turned + planes * row[3]
+    };
+    let [x, y, z] = [rows[0], rows[1], rows[2]].map(coordinate);
+    let Intrinsics { fx, fy, cx, cy } = other.camera.intrinsics;
+    // From −1 to 1 across the picture.
+    let u = (x / &z * fx + cx) * (2. / f64::from(other.camera.width)) - 1.;
+    let v = (y / &z * fy + cy) * (2. / f64::from(other.camera.height)) - 1.;
+    let volume = [PLANES, height, width];
+    let inside = u.abs().le(1.).logical_and(&v.abs().le(1.)).logical_and(&z.gt(0.)).view(volume);
+    let grid = Tensor::stack(&[u, v], -1).view([1, PLANES * height, width, 2]);
+    let (bilinear, at_the_border) = (0, 1);
+    let seen = other.grey.unsqueeze(0).unsqueeze(0).grid_sampler(&grid, bilinear, at_the_border, false);
+    (seen.view(volume), inside)
+}
+
+/// x, y and z of the pixels' rays, z being 1, [h·w] each.
+fn rays(intrinsics: &Intrinsics, height: i64, width: i64) -> [Tensor; 3] {
+    let options = (Kind::Float, Device::Cpu);
+    let x = (Tensor::arange(width, options) + 0.5 - intrinsics.cx) / intrinsics.fx;
+    let y = (Tensor::arange(height, options) + 0.5 - intrinsics.cy) / intrinsics.fy;
+    let all =
+        |t: Tensor, shape: [i64; 2]| t.view(shape).expand([height, width], false).contiguous().view([-1]);
+    [all(x, [1, width]), all(y, [height, 1]), Tensor::ones([height * width], options)]
+}
+
+/// Means over every pixel's surroundings, as far as these are inside: [.., h, w] of [.., h, w].
+fn around(t: &Tensor) -> Tensor {
+    let along = |t: &Tensor, window: [i64; 2]| {
+        t.avg_pool2d(window, 1, window.map(|side| side / 2), false, false, None)
+    };
+    along(&along(t, [PATCH, 1]), [1, PATCH])
+}
+
+fn mean_and_variance(t: &Tensor) -> (Tensor, Tensor) {
+    let mean = around(t);
+    let variance = around(&t.square()) - mean.square() + LEAST_VARIANCE;
+    (mean, variance)
+}
+
+/// Where pixels look alike nowhere, the inverse depths around them, as near as some are known.
+fn filled(inverse: &Tensor, likeness: &Tensor) -> Tensor {
+    let size = inverse.size();
+    let weight = (likeness - UNSURE).clamp_min(0.).square();
+    let (mut sum, mut weights) = ((inverse * &weight).unsqueeze(0), weight.unsqueeze(0));
+    let (mut total, mut total_weights, mut factor) = (sum.copy(), weights.copy(), 1.);
+    for _ in 0..SPREADS {
+        let pool = |t: &Tensor| t.avg_pool2d(5, 1, 2, false, true, None);
+        (sum, weights) = (pool(&pool(&sum)), pool(&pool(&weights)));
+        factor *= SPREAD_WEIGHT;
+        total += &sum * factor;
+        total_weights += &weights * factor;
+    }
+    // And where none is known far and wide, what is so in the middle.
+    let (least, median) = (1e-9, inverse.median().double_value(&[]));
+    ((total + least * median) / (total_weights + least)).view(size.as_slice())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DMat4;
+
+    /// A wavy picture on a plane at depth 4, seen by three cameras in a row.
+    #[test]
+    fn a_plane_is_found_where_it_is() {
+        let (side, depth) = (64u32, 4.);
+        let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 32. };
+        let options = (Kind::Float, Device::Cpu);
+        let view = |at: f64| {
+            let pixel = |offset: f64| (Tensor::arange(64, options) + 0.5 - 32.) / 60. * depth + offset;
+            let x = pixel(at).view([1, 64]);
+            let y = pixel(0.).view([64, 1]);
+            let wave = ((&x * 5.).sin() * (&y * 4.).cos() + (&x * 11. + &y * 7.).sin()) * 0.25 + 0.5;
+            let c2w = DMat4::from_translation(DVec3::new(at, 0., 0.));
+            let camera = Camera { intrinsics, c2w, width: side, height: side };
+            View { name: String::new(), image: wave.expand([3, 64, 64], false).contiguous(), camera }
+        };
+        let views = [view(-0.5), view(0.), view(0.5)];
+        for swept in sweep(&views, &[]) {
+            let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
+            assert!(off < 0.02, "{off}");
+        }
+        // Where points tell that the scene begins at 3, planes lie closer together.
+        let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
+        let points: Vec<Point> = (0..40).map(point).collect();
+        assert!((nearest_of_points(&views[1].camera, &points).unwrap() - 1.3 / 3.).abs() < 1e-9);
+        assert!(nearest_of_points(&views[1].camera, &points[..20]).is_none());
+        // One photo by itself tells nothing, and that is no NaN.
+        let alone = sweep(&views[..1], &[]);
+        assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
+    }
+}

@@ -1,0 +1,215 @@
+//! Splats that are optimized on photos: better on views never shown, the same bytes whatever the threads, and one sentence where it
+//! can't be done.
+
+mod common;
+
+use common::formats::{Format, rewrite, write_points};
+use common::program::{arg, command, refuse, room, succeed};
+use common::{captures, fox};
+use glam::DVec3;
+use globalsplat::data::{open_capture, points_of};
+use globalsplat::io::{read_splat, write_splat};
+use globalsplat::refine::gaussians_from_photos;
+use serde_json::Value;
+use std::path::Path;
+use tch::Kind;
+
+/// A video of a made-up world as chunks, and the name of its scene.
+fn world(folder: &Path, size: &str) -> String {
+    let out = folder.join("world");
+    succeed(&["synth", "--out", arg(&out), "--seed", "7", "--frames", "12", "--size", size]);
+    format!("{}#7_000000", out.join("000000.torch").display())
+}
+
+fn told(arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeed(arguments)).expect("JSON")
+}
+
+fn number(value: &Value, path: &str) -> f64 {
+    value.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} in {value}"))
+}
+
+/// From nothing but photos: what was never shown is seen better than by what was begun with, and the splat is written.
+#[test]
+fn photos_alone_become_a_splat() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, out, sheet) =
+        (world(folder.path(), "64"), folder.path().join("a.ply"), folder.path().join("a.png"));
+    let done = told(&[
+        "refine",
+        "--scene",
+        &scene,
+        "--out",
+        arg(&out),
+        "--holdout",
+        "every:4+1",
+        "--gaussians",
+        "2000",
+        "--steps",
+        "120",
+        "--sheet",
+        arg(&sheet),
+        "--json",
+    ]);
+    let (before, after) = (number(&done, "/held_out/before/psnr"), number(&done, "/held_out/after/psnr"));
+    assert!(after > before + 3., "{before} → {after}");
+    assert_eq!(done["gaussians"], 2000);
+    assert_eq!(done["steps"], 120);
+    let curve = done["held_out"]["curve"].as_array().unwrap();
+    assert!(curve.len() > 10 && curve.last().unwrap()["psnr"] == done["held_out"]["after"]["psnr"]);
+    // What was told is what was written.
+    let scored = told(&["eval", "--splat", arg(&out), "--scene", &scene, "--json"]);
+    let held_out: Vec<f64> = [1, 5, 9].map(|i| number(&scored, &format!("/views/{i}/psnr"))).into();
+    assert!((held_out.iter().sum::<f64>() / 3. - after).abs() < 0.01, "{held_out:?}, told {after}");
+    assert!(sheet.is_file());
+}
+
+/// The same steps and seed give the same bytes for any number of threads, in either space; another seed gives others.
+#[test]
+fn threads_do_not_change_the_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = world(folder.path(), "48");
+    for space in [&["--gaussians", "500"][..], &["--from", "weights"], &["--space", "both"]] {
+        let bytes = |name: &str, threads: &str, seed: &str| {
+            let out = folder.path().join(name);
+            let mut arguments =
+                vec!["refine", "--scene", &scene, "--out", arg(&out), "--steps", "30", "--seed", seed];
+            arguments.extend(["--set", "relocate_every=7"]);
+            arguments.extend(space);
+            let done = command(&arguments).env("OMP_NUM_THREADS", threads).output().unwrap();
+            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+            std::fs::read(out).unwrap()
+        };
+        let one = bytes("one.ply", "1", "3");
+        assert!(one == bytes("three.ply", "3", "3"), "{space:?}: threads change the bytes");
+        assert!(one != bytes("other.ply", "1", "4"), "{space:?}: another seed changes nothing");
+    }
+}
+
+/// A splat becomes better, and one that can't is kept as it is.
+#[test]
+fn a_splat_becomes_better_or_stays() {
+    let (folder, room) = room();
+    let (truth, dull, out) =
+        (room.join("truth.ply"), folder.path().join("dull.ply"), folder.path().join("a.ply"));
+    let mut splat = read_splat(&truth).unwrap();
+    splat.gaussians.sh = &splat.gaussians.sh * 0.5;
+    write_splat(&dull, &splat).unwrap();
+    let refined = |from: &Path| {
+        let steps = ["--steps", "150", "--json"];
+        told(
+            &[&["refine", "--splat", arg(from), "--scene", arg(&room), "--out", arg(&out)][..], &steps]
+                .concat(),
+        )
+    };
+    let done = refined(&dull);
+    let (before, after) = (number(&done, "/shown/before/psnr"), number(&done, "/shown/after/psnr"));
+    assert!(after > before + 5., "{before} → {after}");
+    assert_eq!(done["held_out"], Value::Null);
+    assert_eq!(read_splat(&out).unwrap().gaussians.count(), splat.gaussians.count());
+    // Its photos are its own renders: nothing is better than it.
+    let done = refined(&truth);
+    assert_eq!(done["shown"]["before"], done["shown"]["after"]);
+    assert!(number(&done, "/shown/after/psnr") > 55.);
+}
+
+/// Real photos, with held-out views far above what any of the photos shown would score.
+#[test]
+fn real_photos_become_a_splat() {
+    for capture in captures().unwrap_or_default() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("a.ply");
+        let done = told(&[
+            "refine",
+            "--scene",
+            arg(&capture),
+            "--out",
+            arg(&out),
+            "--holdout",
+            "every:3+1",
+            "--size",
+            "128x128",
+            "--gaussians",
+            "8192",
+            "--steps",
+            "250",
+            "--json",
+        ]);
+        let after = number(&done, "/held_out/after/psnr");
+        assert!(after > 24., "{}: {after}", capture.display());
+    }
+}
+
+/// Photos of several sizes, a lens that distorts, more views than are used.
+#[test]
+fn many_photos_are_used_as_they_are() {
+    let Some(fox) = fox() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("a.ply");
+    let done = told(&[
+        "refine",
+        "--scene",
+        arg(&fox),
+        "--out",
+        arg(&out),
+        "--views",
+        "12",
+        "--steps",
+        "10",
+        "--gaussians",
+        "3000",
+        "--json",
+    ]);
+    assert_eq!(done["photos"], 12);
+}
+
+/// Where a model of COLMAP has points, text or binary, Gaussians begin at them.
+#[test]
+fn points_are_begun_with() {
+    for format in [Format::ColmapText, Format::ColmapBinary] {
+        let (_folder, room) = room();
+        assert!(points_of(&open_capture(&room).unwrap()).unwrap().is_empty());
+        let truth = read_splat(&room.join("truth.ply")).unwrap().gaussians;
+        let means: Vec<f64> =
+            Vec::try_from(truth.means.to_kind(Kind::Double).contiguous().view([-1])).unwrap();
+        rewrite(&room, format);
+        let capture = open_capture(&room).unwrap();
+        assert!(points_of(&capture).unwrap().is_empty());
+        write_points(&room.join("sparse/0"), format, &means);
+        let points = points_of(&capture).unwrap();
+        assert_eq!(points.len() * 3, means.len());
+        for (point, expected) in points.iter().zip(means.chunks(3)) {
+            assert_eq!(point.position.to_array(), expected);
+            assert_eq!(point.colour, [1., 0., 0.2]);
+        }
+        // Half of them at points, the others where pixels are.
+        let views = capture.load_all(None).unwrap();
+        let raw = gaussians_from_photos(&views, &points, 1000, 0);
+        let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
+        let at_points = begun
+            .chunks(3)
+            .filter(|mean| points.iter().any(|p| p.position.distance(DVec3::from_slice(mean)) < 1e-5));
+        assert_eq!((begun.len(), at_points.count()), (3000, 500));
+    }
+}
+
+#[test]
+fn what_cannot_be_refined_is_told_in_one_sentence() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    let base = ["refine", "--scene", arg(&room), "--out", arg(&out)];
+    let with = |more: &[&str]| refuse(&[&base[..], more].concat());
+    assert!(with(&["--set", "view=3"]).contains("--set view=3: unknown field"));
+    assert!(with(&["--set", "views=\"a\""]).contains("--set views"));
+    assert!(with(&["--set", "views"]).contains("expected KEY=VALUE"));
+    assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));
+    assert!(with(&["--from", "nothing", "--space", "tokens"]).contains("nor tokens"));
+    assert!(with(&["--views", "1"]).contains("two or more"));
+    // A splat of another world.
+    let away = folder.path().join("away.ply");
+    let mut splat = read_splat(&room.join("truth.ply")).unwrap();
+    splat.gaussians.means = &splat.gaussians.means - 1000.;
+    write_splat(&away, &splat).unwrap();
+    assert!(with(&["--splat", arg(&away)]).contains("see nothing"));
+    assert!(!out.exists());
+}
