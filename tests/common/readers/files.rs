@@ -2,7 +2,7 @@
 
 use super::{file, folder, load};
 use globalsplat::config::Config;
-use globalsplat::data::{Chunk, Dataset, Split, open_capture, read_camera_path};
+use globalsplat::data::{Chunk, Dataset, Split, open_capture, points_of, read_camera_path};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
 use globalsplat::io::{decode_photo, read_splat, read_weights};
 use globalsplat::reconstruct::load_model;
@@ -42,6 +42,40 @@ pub fn colmap_binary(bytes: &[u8]) {
 
 pub fn colmap_text(bytes: &[u8]) {
     colmap("colmap_text", bytes, "txt");
+}
+
+/// The points of a model that is right: text where the first byte is even, else binary.
+pub fn colmap_points(bytes: &[u8]) {
+    let Some((first, bytes)) = bytes.split_first() else { return };
+    let reader = if first % 2 == 0 { "colmap_points_text" } else { "colmap_points_binary" };
+    let folder = folder(reader);
+    let model = |name: &str, bytes: &[u8]| file(reader, &format!("sparse/0/{name}"), bytes);
+    if first % 2 == 0 {
+        model("cameras.txt", b"1 SIMPLE_PINHOLE 8 8 8 4 4\n");
+        model("images.txt", b"1 1 0 0 0 0 0 0 1 000.png\n\n2 1 0 0 0 1 0 0 1 001.png\n\n");
+        model("points3D.txt", bytes);
+    } else {
+        let number = |value: f64| value.to_le_bytes();
+        let camera = [
+            &1u64.to_le_bytes()[..],
+            &1u32.to_le_bytes(),
+            &0i32.to_le_bytes(),
+            &8u64.to_le_bytes(),
+            &8u64.to_le_bytes(),
+        ];
+        let lens = [8., 4., 4.].map(number).concat();
+        model("cameras.bin", &[&camera.concat()[..], &lens].concat());
+        let image = |id: u32, name: &[u8]| {
+            let pose = [1., 0., 0., 0., f64::from(id), 0., 0.].map(number).concat();
+            [&id.to_le_bytes()[..], &pose, &1u32.to_le_bytes(), name, &[0], &0u64.to_le_bytes()].concat()
+        };
+        model(
+            "images.bin",
+            &[&2u64.to_le_bytes()[..], &image(1, b"000.png"), &image(2, b"001.png")].concat(),
+        );
+        model("points3D.bin", bytes);
+    }
+    let _ = points_of(&open_capture(&folder).expect("a model that is right"));
 }
 
 pub fn dataset_index(bytes: &[u8]) {

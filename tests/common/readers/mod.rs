@@ -19,12 +19,13 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 21] = [
+pub const READERS: [(&str, Reader); 22] = [
     ("cameras_json", files::cameras_json),
     ("checkpoint", files::checkpoint),
     ("chunk", files::chunk),
     ("chunk_pickle", made_chunks::chunk_pickle),
     ("colmap_binary", files::colmap_binary),
+    ("colmap_points", files::colmap_points),
     ("colmap_text", files::colmap_text),
     ("configuration", files::configuration),
     ("dataset_index", files::dataset_index),
