@@ -19,9 +19,9 @@
 //! `examples/` has this as a program, and one that optimizes Gaussians on a photo with the differentiable splat op alone.
 //!
 //! Modules, from what a person touches down to the ground; each uses those below it and [`scene`]:
-//! [`eval`] judges, [`train`] trains, [`refine`] makes splats sharp, [`reconstruct`] makes them of photos, [`config`] has what a run depends on, [`optim`] and
-//! [`loss`] are what learning needs, [`data`] reads captures, [`synth`] makes them up, [`io`] has files, [`render`] is the
-//! differentiable splat op, [`model`] the network, [`scene`] camera maths.
+//! [`eval`] judges, [`train`] trains, [`refine`] makes splats sharp, [`reconstruct`] makes them of photos, [`config`] has what a
+//! run depends on, [`optim`] and [`loss`] are what learning needs, [`data`] reads captures, [`synth`] makes them up, [`io`] has
+//! files, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] camera maths.
 
 #[doc(hidden)]
 pub mod bench;
