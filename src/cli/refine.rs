@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use glam::DMat4;
 use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
-use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, score};
+use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, spread_over_path};
 use globalsplat::refine::{
@@ -155,7 +155,7 @@ impl Refine {
             done_seconds: begin_seconds,
             curve: vec![],
         };
-        let mut gaussians = work.optimize(&start, self.space)?;
+        let mut gaussians = work.optimize(&start, &first, self.space)?;
         work.bar.finish_and_clear();
         let mut after = judge.scores_of_both(&gaussians, &photos)?;
         if after.shown.psnr < before.shown.psnr {
@@ -252,17 +252,17 @@ struct Mark {
 }
 
 impl Work<'_> {
-    /// In one space, or in one after the other.
-    fn optimize(&mut self, start: &Start, name: SpaceName) -> Result<Gaussians> {
+    /// In one space, or in one after the other. `first` are the Gaussians of `start` in the capture's world.
+    fn optimize(&mut self, start: &Start, first: &Gaussians, name: SpaceName) -> Result<Gaussians> {
         let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
         let (raw, done) = match (start, name) {
             (Start::Gaussians(raw), _) => (raw.shallow_clone(), 0.),
-            (Start::Model(_, made), SpaceName::Gaussians) => (RawGaussians::of(&made.in_world()), 0.),
+            (Start::Model(..), SpaceName::Gaussians) => (RawGaussians::of(first), 0.),
             (Start::Model(loaded, made), SpaceName::Tokens | SpaceName::Both) => {
                 // Tokens know the normalized world alone.
                 let world = &made.world_from_normalized;
                 let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
-                let depth = scene_depth(&made.in_world(), self.photos)? / world.scale;
+                let depth = scene_depth(first, self.photos)? / world.scale;
                 let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
                 let end = if name == SpaceName::Both { TOKENS_SHARE } else { 1. };
                 let gaussians = self.phase(&mut space, &poses, depth, [0., end], Some(world))?;
@@ -349,9 +349,7 @@ impl Judge {
 
     fn scores(&self, gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<CaptureScores> {
         let pictures: Vec<_> = rendered(gaussians, views)?.into_iter().map(|rendered| rendered.rgb).collect();
-        let mut scores = score(&self.name, &pictures, views, Some(gaussians.count()))?;
-        self.perceptual.add_to(&mut scores, &pictures, views);
-        Ok(scores)
+        judge_pictures(&self.name, &pictures, views, Some(gaussians.count()), &self.perceptual)
     }
 
     fn held_out_scores(&self, gaussians: &Gaussians) -> globalsplat::Result<Option<CaptureScores>> {

@@ -147,8 +147,22 @@ fn of_splat(splat: &Splat, bytes: u64, rendered: Vec<Rendered>) -> Synthesis {
 /// # Errors
 /// A picture of another size than its view.
 pub fn judge(scene: &EvalScene, made: &Synthesis, perceptual: &Perceptual) -> Result<CaptureScores> {
-    let mut scores = score(&scene.name, &made.pictures, &scene.target, made.gaussians)?;
-    perceptual.add_to(&mut scores, &made.pictures, &scene.target);
+    judge_pictures(&scene.name, &made.pictures, &scene.target, made.gaussians, perceptual)
+}
+
+/// What pictures of the views `truth` are worth, LPIPS included.
+///
+/// # Errors
+/// A picture of another size than its view.
+pub fn judge_pictures(
+    scene: &str,
+    pictures: &[Tensor],
+    truth: &[View],
+    gaussians: Option<i64>,
+    perceptual: &Perceptual,
+) -> Result<CaptureScores> {
+    let mut scores = score(scene, pictures, truth, gaussians)?;
+    perceptual.add_to(&mut scores, pictures, truth);
     Ok(scores)
 }
 

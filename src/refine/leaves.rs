@@ -21,13 +21,13 @@ pub struct Leaves {
 }
 
 impl Leaves {
-    /// Copies of `raw`, with spherical harmonics up to `degree`.
+    /// Copies of `raw`, with spherical harmonics up to `degree`, which is no less than its own.
     pub fn of(raw: &RawGaussians, degree: i64) -> Self {
         let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
         let size = raw.sh.size();
         let bases = (degree + 1).pow(2);
         let higher = Tensor::zeros([1, size[1], bases - 1, 3], (Kind::Float, raw.sh.device()));
-        let known = (size[2].min(bases) - 1).max(0);
+        let known = size[2] - 1;
         higher.narrow(2, 0, known).copy_(&raw.sh.narrow(2, 1, known));
         Leaves {
             means: leaf(raw.means.shallow_clone()),
@@ -56,8 +56,7 @@ impl Leaves {
         self.raw(degree).activate()
     }
 
-    /// As other parts of the program take them, with spherical harmonics up to `degree`.
-    pub fn raw(&self, degree: i64) -> RawGaussians {
+    fn raw(&self, degree: i64) -> RawGaussians {
         let sh = match degree {
             0 => self.colours.shallow_clone(),
             _ => {

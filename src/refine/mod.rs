@@ -43,8 +43,6 @@ pub struct RefineStep<'a> {
     pub progress: f64,
     /// Time that the steps took, without what was done in between.
     pub elapsed: Duration,
-    /// Of this step's views, before it.
-    pub loss: &'a Tensor,
     space: &'a dyn Space,
 }
 
@@ -117,7 +115,7 @@ pub(crate) fn refine_timed(
         });
         stopwatch.time("optimizer", || space.step(progress, step, &mut random));
         elapsed += start.elapsed();
-        if !watch(&RefineStep { step: step + 1, progress, elapsed, loss: &loss, space }) {
+        if !watch(&RefineStep { step: step + 1, progress, elapsed, space }) {
             break;
         }
     }

@@ -71,9 +71,9 @@ impl Photos {
     pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> ViewBatch {
         let groups = &self.levels[level.min(self.levels.len() - 1)];
         let count = |group: &ViewBatch| group.images.size()[1] as usize;
-        let owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));
+        let mut owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));
         let of = random.random_range(0..groups.iter().map(count).sum::<usize>());
-        let group = owners.clone().nth(of).expect("a number below the sum");
+        let group = owners.nth(of).expect("a number below the sum");
         let mut chosen = sample(random, count(group), views.min(count(group))).into_vec();
         chosen.sort_unstable();
         group.select(&chosen)
