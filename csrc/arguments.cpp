@@ -38,7 +38,7 @@ Inputs Arguments::on(at::Device device) const {
   const auto type = means.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   return {{there(means), there(scales), there(quaternions), there(opacities), there(sh)},
-          there(w2c.detach()), there(intrinsics.detach()), width, height, eps2d};
+          there(w2c), there(intrinsics.detach()), width, height, eps2d};
 }
 
 Arguments borrowed(const SplatArguments& of) {

@@ -21,7 +21,7 @@ struct Arguments {
   void check() const;
 
   // On `device`, contiguous, of one type: float64 where the means are, float32 else. Moving and converting are differentiable,
-  // so gradients go back to the caller's device and type. Cameras get none.
+  // so gradients go back to the caller's device and type. Intrinsics get none.
   Inputs on(at::Device device) const;
 };
 

@@ -27,6 +27,12 @@ struct Inputs {
   int64_t count() const { return gaussians.means.size(1); }  // Gaussians of a scene
 };
 
+// What a backward pass gives.
+struct Gradients {
+  Gaussians gaussians;
+  Tensor w2c;  // [B, C, 4, 4], the last rows 0; undefined where nobody asked
+};
+
 // What splat() draws, or its gradients: [B, C, 3, H, W], [B, C, H, W], [B, C, H, W].
 struct Pictures {
   Tensor rgb, alpha, depth;
@@ -42,14 +48,14 @@ struct Kept {
   virtual ~Kept() = default;
 };
 
-// New tensors have the device and the type of the inputs. Gradients come in contiguous, and go out for all five Gaussian
-// tensors.
+// New tensors have the device and the type of the inputs. Gradients come in contiguous, and go out for all five Gaussian tensors,
+// and for w2c `of_cameras`.
 struct Backend {
   at::DeviceType device;
   Pictures (*splat)(const Inputs&, std::unique_ptr<const Kept>& kept);
-  Gaussians (*splat_backward)(const Inputs&, const Pictures& drawn, const Pictures& gradients, const Kept&);
+  Gradients (*splat_backward)(const Inputs&, const Pictures& drawn, const Pictures& gradients, const Kept&, bool of_cameras);
   Projected (*project)(const Inputs&);
-  Gaussians (*project_backward)(const Inputs&, const Projected& gradients);
+  Gradients (*project_backward)(const Inputs&, const Projected& gradients, bool of_cameras);
 };
 
 }  // namespace globalsplat

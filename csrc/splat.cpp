@@ -47,9 +47,13 @@ Inputs saved_inputs(AutogradContext* ctx, const tensor_list& t) {
           ctx->saved_data["height"].toInt(), ctx->saved_data["eps2d"].toDouble()};
 }
 
-// As autograd wants them: none for cameras and numbers.
-tensor_list gradients_of(Gaussians g) {
-  tensor_list out = {g.means, g.scales, g.quaternions, g.opacities, g.sh};
+// Which of the inputs' tensors w2c is.
+constexpr size_t kW2c = 5;
+
+// As autograd wants them: none for intrinsics and numbers.
+tensor_list gradients_of(const Gradients& gradients) {
+  const Gaussians& g = gradients.gaussians;
+  tensor_list out = {g.means, g.scales, g.quaternions, g.opacities, g.sh, gradients.w2c};
   out.resize(kInputs);
   return out;
 }
@@ -79,7 +83,8 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
     const auto holder = c10::static_intrusive_pointer_cast<KeptHolder>(ctx->saved_data["kept"].toCapsule());
     return gradients_of(backend_of(t[0].device())
                             .splat_backward(saved_inputs(ctx, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
-                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->kept));
+                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->kept,
+                                            ctx->needs_input_grad(kW2c)));
   }
 };
 
@@ -97,7 +102,8 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
     const tensor_list t = ctx->get_saved_variables();
     return gradients_of(backend_of(t[0].device())
                             .project_backward(saved_inputs(ctx, t), {{}, contiguous(g[1]), contiguous(g[2]), contiguous(g[3]),
-                                                                     contiguous(g[4])}));
+                                                                     contiguous(g[4])},
+                                              ctx->needs_input_grad(kW2c)));
   }
 };
 

@@ -90,9 +90,9 @@ fn gradients_are_those_of_finite_differences() {
         let (scenes, views) = (2, 3);
         let base = gaussians(scenes, 40, degree, Kind::Double, seed);
         let c = cameras(scenes, views, 37, 29, Kind::Double);
-        let g = leaves(&base);
+        let (g, c) = (leaves(&base), Cameras { w2c: c.w2c.set_requires_grad(true), ..c });
         objective(&draw(&g, &c)).backward();
-        for (index, (name, leaf)) in fields(&g).into_iter().enumerate() {
+        for (index, (name, leaf)) in fields(&g).into_iter().chain([("w2c", &c.w2c)]).enumerate() {
             let gradient = leaf.grad();
             let (mut compared, mut drawn) = (0, 0);
             while compared < DIRECTIONS {
@@ -103,8 +103,20 @@ fn gradients_are_those_of_finite_differences() {
                     let at = |step: f64| {
                         let moved = leaf.detach() + &direction * step;
                         let mut g = base.map(Tensor::shallow_clone);
-                        *[&mut g.means, &mut g.scales, &mut g.quaternions, &mut g.opacities, &mut g.sh]
-                            [index] = moved;
+                        let mut c = Cameras {
+                            w2c: c.w2c.detach(),
+                            intrinsics: c.intrinsics.shallow_clone(),
+                            width: c.width,
+                            height: c.height,
+                        };
+                        *[
+                            &mut g.means,
+                            &mut g.scales,
+                            &mut g.quaternions,
+                            &mut g.opacities,
+                            &mut g.sh,
+                            &mut c.w2c,
+                        ][index] = moved;
                         objective(&draw(&g, &c)).double_value(&[])
                     };
                     (at(h) - at(-h)) / (2. * h)
@@ -345,13 +357,15 @@ fn instruction_sets_agree() {
 
 #[test]
 fn bits_do_not_depend_on_threads() {
-    let c = cameras(2, 3, 150, 90, Kind::Float);
     let run = |threads: i32| {
         tch::set_num_threads(threads);
         let g = leaves(&gaussians(2, 3000, 3, Kind::Float, 9));
+        let c = cameras(2, 3, 150, 90, Kind::Float);
+        let c = Cameras { w2c: c.w2c.set_requires_grad(true), ..c };
         let p = draw(&g, &c);
         objective(&p).backward();
-        let gradients = fields(&g).map(|(_, leaf)| leaf.grad());
+        let gradients: Vec<Tensor> =
+            fields(&g).into_iter().map(|(_, leaf)| leaf).chain([&c.w2c]).map(Tensor::grad).collect();
         (p, gradients)
     };
     let before = tch::get_num_threads();

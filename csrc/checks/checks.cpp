@@ -87,7 +87,8 @@ class Render {
     for (Arrays<T>& g : gradients_)
       out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data()});
     raster::StageTimes times;
-    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(asked_), out, times);
+    cameras_.assign(views_.size(), {});
+    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(asked_), out, cameras_.data(), times);
   }
 
   void drop() { frame_.reset(); }
@@ -102,6 +103,7 @@ class Render {
       const auto ours = arrays(gradients_[b]), theirs = arrays(other.gradients_[b]);
       for (size_t k = 0; k < ours.size(); ++k) expect(same(*ours[k], *theirs[k]), "gradients differ from one thread's");
     }
+    expect(same(cameras_, other.cameras_), "cameras' gradients differ from one thread's");
   }
 
  private:
@@ -120,14 +122,16 @@ class Render {
     return out;
   }
 
-  static bool same(const std::vector<T>& a, const std::vector<T>& b) {
-    return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0);
+  template <class Item>
+  static bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
+    return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
   }
 
   raster::Settings settings_;
   std::vector<raster::Gaussians<T>> scenes_;
   std::vector<raster::View<T>> views_;
   std::vector<Planes> pictures_, asked_;  // asked_: the loss's gradients
+  std::vector<raster::CameraGradient<T>> cameras_;
   std::vector<Arrays<T>> gradients_;
   std::unique_ptr<raster::Frame<T>> frame_;
 };

@@ -9,10 +9,10 @@ extern const Backend backend;
 
 // splat.cpp
 Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept);
-Gaussians splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept);
+Gradients splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept, bool of_cameras);
 
 // projection.cpp
 Projected project(const Inputs& in);
-Gaussians project_backward(const Inputs& in, const Projected& gradients);
+Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras);
 
 }  // namespace globalsplat::cpu

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <ATen/ops/empty_like.h>
+#include <ATen/ops/zeros_like.h>
 
 #include <vector>
 
@@ -55,6 +56,20 @@ std::vector<raster::View<T>> views_of(const Inputs& in) {
                        int(b)});
     }
   return views;
+}
+
+// The views' gradients as the op gives them.
+template <class T>
+Tensor w2c_gradient(const Inputs& in, const std::vector<raster::CameraGradient<T>>& of_views) {
+  const Tensor out = at::zeros_like(in.w2c);
+  for (size_t k = 0; k < of_views.size(); ++k) {
+    T* m = out.data_ptr<T>() + k * 16;
+    for (int row = 0; row < 3; ++row) {
+      for (int column = 0; column < 3; ++column) m[4 * row + column] = of_views[k].numbers[3 * row + column];
+      m[4 * row + 3] = of_views[k].numbers[9 + row];
+    }
+  }
+  return out;
 }
 
 // Not yet written.

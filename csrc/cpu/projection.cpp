@@ -66,7 +66,7 @@ Projected project_as(const Inputs& in) {
 }
 
 template <class T>
-Gaussians project_backward_as(const Inputs& in, const Projected& gradients) {
+Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool of_cameras) {
   const Seen<T> seen(in);
   // A record per visible Gaussian: the sums over pixels that project_backward() turns into just these gradients.
   const size_t views = seen.splats.size(), count = size_t(in.count());
@@ -96,13 +96,16 @@ Gaussians project_backward_as(const Inputs& in, const Projected& gradients) {
     for (size_t i = 0; i < count; ++i) first[view][i + 1] += first[view][i];
     of_views.push_back({records[view].data(), first[view].data()});
   }
-  Gaussians out = empty_like(in.gaussians);
-  const auto places = gradients_of<T>(out);
+  Gradients out{empty_like(in.gaussians), {}};
+  const auto places = gradients_of<T>(out.gaussians);
+  std::vector<raster::CameraGradient<T>> cameras(of_cameras ? views : 0);
   for (size_t b = 0; b < seen.scenes.size(); ++b) {
     const int64_t view = int64_t(b) * seen.cameras;
     raster::kernels().of<T>().project_backward(seen.scenes[b], 0, int64_t(count), seen.lenses.data() + view,
-                                               seen.cameras, of_views.data() + view, places[b]);
+                                               seen.cameras, of_views.data() + view, places[b],
+                                               of_cameras ? cameras.data() + view : nullptr);
   }
+  if (of_cameras) out.w2c = w2c_gradient(in, cameras);
   return out;
 }
 
@@ -112,8 +115,8 @@ Projected project(const Inputs& in) {
   return by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
 }
 
-Gaussians project_backward(const Inputs& in, const Projected& gradients) {
-  return by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients); });
+Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
+  return by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, of_cameras); });
 }
 
 }  // namespace globalsplat::cpu

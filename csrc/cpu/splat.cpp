@@ -58,13 +58,16 @@ Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
   });
 }
 
-Gaussians splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept) {
+Gradients splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept,
+                         bool of_cameras) {
   return by_type(in, [&](auto number) {
     using T = decltype(number);
-    Gaussians out = empty_like(in.gaussians);
-    static_cast<const KeptFrame<T>&>(kept).frame->backward(scenes_of<T>(in), pictures_of<const T>(drawn),
-                                                           pictures_of<const T>(gradients), gradients_of<T>(out),
-                                                           last_times);
+    Gradients out{empty_like(in.gaussians), {}};
+    std::vector<raster::CameraGradient<T>> cameras(of_cameras ? size_t(in.scenes() * in.cameras()) : 0);
+    static_cast<const KeptFrame<T>&>(kept).frame->backward(
+        scenes_of<T>(in), pictures_of<const T>(drawn), pictures_of<const T>(gradients), gradients_of<T>(out.gaussians),
+        of_cameras ? cameras.data() : nullptr, last_times);
+    if (of_cameras) out.w2c = w2c_gradient(in, cameras);
     return out;
   });
 }

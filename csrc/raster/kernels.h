@@ -17,7 +17,8 @@ struct KernelsOf {
                          SplatGradient<T>* records);
   PairCounts (*count)(const TileJob<T>&);
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
-                           const SplatRecords<T>* records, const GaussianGradients<T>& out);
+                           const SplatRecords<T>* records, const GaussianGradients<T>& out,
+                           CameraGradient<T>* cameras);
   // Beside the rasterizer: ssim.h, adam.h.
   double (*ssim)(const FitPlane<T>&, int begin, int end, T* room);
   double (*fit_gradient)(const FitPlane<T>&, T absolute, T similar, int begin, int end, T* room);

@@ -227,11 +227,12 @@ struct GroupGradient {
   Vector<T> mean[3] = {}, axes[9] = {}, opacity = {}, sh[kMaxBases * 3] = {};
 };
 
-// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds; in others `d` is 0.
+// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds; in others `d` is 0. Where
+// `of_camera` isn't null, it receives what they ask of the camera through each lane, in CameraGradient's order.
 template <class T>
 GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T>& lens, const Projection<T>& p,
                                       const Shading<T>& s, Mask<T> touched, const Vector<T> d[kSplatGradientNumbers],
-                                      GroupGradient<T>& out) {
+                                      GroupGradient<T>& out, Vector<T>* of_camera) {
   using V = Vector<T>;
   const V zero{};
   const V power = d[0], power_p = d[1], power_r = d[2], power_pp = d[3], power_pr = d[4], power_rr = d[5];
@@ -241,7 +242,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
   add(out.opacity, -power / g.opacity);
 
   // Colour, and the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
-  V d_colour[3], d_basis[kMaxBases], d_direction[3];
+  V d_colour[3], d_basis[kMaxBases], d_direction[3], d_r[3];
   for (int channel = 0; channel < 3; ++channel)
     d_colour[channel] = select(less(zero, s.colour[channel]), d[6 + channel], zero);
   for (int k = 0; k < bases; ++k) {
@@ -254,7 +255,10 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
   }
   sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);
   const V along = d_direction[0] * s.direction[0] + d_direction[1] * s.direction[1] + d_direction[2] * s.direction[2];
-  for (int k = 0; k < 3; ++k) add(out.mean[k], (d_direction[k] - along * s.direction[k]) * s.inverse_distance);
+  for (int k = 0; k < 3; ++k) {
+    d_r[k] = (d_direction[k] - along * s.direction[k]) * s.inverse_distance;
+    add(out.mean[k], d_r[k]);
+  }
 
   // With U = [[a, b], [0, c]], σ = ln 2·|UΔ|² and Σ2D⁻¹ = 2 ln 2·UᵀU. From M = Σ ν UΔ and W = Σ ν (UΔ)(UΔ)ᵀ,
   // ∂L/∂(u, v) = 2 ln 2·UᵀM and ∂L/∂Σ2D = −2 ln²2·UᵀWU.
@@ -296,6 +300,18 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
   for (int r = 0; r < 3; ++r)
     for (int k = 0; k < 3; ++k)
       add(out.axes[3 * r + k], w[r] * d_wrs[k] + w[3 + r] * d_wrs[3 + k] + w[6 + r] * d_wrs[6 + k]);
+
+  // t = W μ + p, V = W (R S), and r = μ − o with o = −Wᵀ p.
+  if (of_camera == nullptr) return;
+  for (int r = 0; r < 3; ++r) {
+    for (int k = 0; k < 3; ++k)
+      of_camera[3 * r + k] =
+          select(touched,
+                 d_t[r] * g.mean[k] + d_wrs[3 * r] * g.axes[3 * k] + d_wrs[3 * r + 1] * g.axes[3 * k + 1] +
+                     d_wrs[3 * r + 2] * g.axes[3 * k + 2] + camera.translation[r] * d_r[k],
+                 zero);
+    of_camera[9 + r] = select(touched, d_t[r] + w[3 * r] * d_r[0] + w[3 * r + 1] * d_r[1] + w[3 * r + 2] * d_r[2], zero);
+  }
 }
 
 // From ∂L/∂(R S) to scales and quaternions, which no camera's pixels see in any other way.
@@ -337,10 +353,11 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
   return less(Vector<T>{}, load<T>(has_any));
 }
 
-// All gradients of Gaussians begin … end − 1, from what the pixels of each of `views` cameras ask of them.
+// All gradients of Gaussians begin … end − 1, from what the pixels of each of `views` cameras ask of them. Where `cameras` isn't
+// null, what these Gaussians ask of each camera is added there.
 template <class T>
 void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
-                      const SplatRecords<T>* records, const GaussianGradients<T>& out) {
+                      const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
   using V = Vector<T>;
   for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
     Group<T> group;
@@ -356,7 +373,13 @@ void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const L
       Shading<T> shading;
       project_group(group, lenses[view], projection);
       shade_group(group, g.bases, lenses[view], touched, shading);
-      project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum);
+      V of_camera[kCameraNumbers];
+      project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum,
+                             cameras == nullptr ? nullptr : of_camera);
+      if (cameras == nullptr) continue;
+      T asked[kCameraNumbers];
+      sum_each<T>(of_camera, asked);
+      for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += asked[k];
     }
     V d_scale[3], d_quaternion[4];
     axes_backward(group, sum.axes, d_scale, d_quaternion);

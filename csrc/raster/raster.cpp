@@ -229,7 +229,8 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
 template <class T>
 void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
                         const std::vector<Pictures<const T>>& gradients,
-                        const std::vector<GaussianGradients<T>>& out, StageTimes& times) const {
+                        const std::vector<GaussianGradients<T>>& out, CameraGradient<T>* cameras,
+                        StageTimes& times) const {
   Stopwatch watch;
   const int64_t tiles = grid_.tiles();
   std::vector<Buffer<SplatGradient<T>>> gathered;
@@ -244,12 +245,22 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   });
   times.blend_backward = watch.lap();
 
+  // What each task's Gaussians ask of the cameras of their scene: [tasks][views].
+  std::vector<CameraGradient<T>> asked(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
   parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
-    const size_t scene = size_t(task / tasks_), first = first_view_[scene];
-    const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
+    const size_t scene = size_t(task / tasks_), part = size_t(task % tasks_), first = first_view_[scene];
+    const int64_t begin = int64_t(part) * kTask, end = std::min(begin + kTask, count_);
     kernels().of<T>().project_backward(scenes[scene], begin, end, lenses_.data() + first,
-                                       int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene]);
+                                       int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene],
+                                       cameras == nullptr ? nullptr : &asked[part * views_.size() + first]);
   });
+  if (cameras != nullptr)
+    for (size_t k = 0; k < views_.size() * kCameraNumbers; ++k) {
+      double sum = 0;
+      for (size_t part = 0; part < size_t(tasks_); ++part)
+        sum += double(asked[part * views_.size() + k / kCameraNumbers].numbers[k % kCameraNumbers]);
+      cameras[k / kCameraNumbers].numbers[k % kCameraNumbers] = T(sum);
+    }
   times.project_backward = watch.lap();
 }
 

@@ -40,11 +40,12 @@ class Frame {
                                      const Settings& settings, const std::vector<Pictures<T>>& out,
                                      StageTimes& times);
 
-  // `scenes` and `pictures` are draw()'s inputs and outputs, unchanged. Writes every gradient of every Gaussian; sums
-  // run over a scene's cameras and a camera's tiles in order, so the bits don't depend on the number of threads.
+  // `scenes` and `pictures` are draw()'s inputs and outputs, unchanged. Writes every gradient of every Gaussian, and of every
+  // view's camera into `cameras`, which is null where nobody asks. Sums run over a scene's cameras, a camera's tiles and, in
+  // tasks, its Gaussians in order, so the bits don't depend on the number of threads.
   void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
                 const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
-                StageTimes& times) const;
+                CameraGradient<T>* cameras, StageTimes& times) const;
 
   // What blending all views takes, for benchmarks.
   PairCounts count() const;

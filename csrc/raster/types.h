@@ -42,6 +42,13 @@ struct GaussianGradients {
   T* sh;
 };
 
+// The gradient with respect to a camera's pose: of the nine numbers of `rotation`, taken as free, then of `translation`.
+inline constexpr int kCameraNumbers = 12;
+template <class T>
+struct CameraGradient {
+  T numbers[kCameraNumbers];
+};
+
 // A pinhole camera: x_camera = rotation · x_world + translation, pixels by the intrinsics.
 template <class T>
 struct Camera {

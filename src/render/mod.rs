@@ -52,8 +52,8 @@ pub struct Pictures {
     pub depth: Tensor,
 }
 
-/// Renders every scene from its cameras. Differentiable with respect to the Gaussians; float64 tensors are rendered in
-/// float64, all others in float32. Tensors on a device that can't render are moved to the host and the pictures back.
+/// Renders every scene from its cameras. Differentiable with respect to the Gaussians and to `w2c`, its
+/// entries taken as free numbers; float64 tensors are rendered in float64, all others in float32. Tensors on a device that can't render are moved to the host and the pictures back.
 ///
 /// # Errors
 /// Shapes that don't fit together, and a `GLOBALSPLAT_SIMD` that this machine doesn't have.
@@ -78,7 +78,7 @@ pub struct Projected {
     pub colour: Tensor,
 }
 
-/// Projects as [`render()`] does. Differentiable with respect to means, scales, quaternions and SH.
+/// Projects as [`render()`] does. Differentiable with respect to means, scales, quaternions, SH and `w2c`.
 ///
 /// # Errors
 /// As [`render()`].

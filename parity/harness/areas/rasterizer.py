@@ -29,7 +29,7 @@ DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
 def splat_draws(rng, module, dtype, family, tolerance):
     """Float64 scenes are drawn again until none of their pixels is doubtful. Float32 ones say which pixels are, and
     these have no gradient."""
-    differentiate = ("means", "scales", "quaternions", "sh")
+    differentiate = ("means", "scales", "quaternions", "sh", "w2c")
     if module == "rasterizer":
         differentiate += ("opacities",)
     for label, (size, make) in family.items():
