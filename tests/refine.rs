@@ -193,6 +193,45 @@ fn points_are_begun_with() {
     }
 }
 
+/// Poses that are a little off, and photos brighter than others, are found out: of a room whose splat is known.
+#[test]
+fn what_photos_hide_is_found_out() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    let file = room.join("cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let views = cameras["views"].as_array_mut().unwrap();
+    // Shifted to and fro, so that the mean stays where it is.
+    let shift = 0.03;
+    let last = views.len() - views.len() % 2;
+    for (index, view) in views[..last].iter_mut().enumerate() {
+        let x = &mut view["c2w"][0][3];
+        *x = (x.as_f64().unwrap() + if index % 2 == 0 { shift } else { -shift }).into();
+    }
+    std::fs::write(&file, cameras.to_string()).unwrap();
+    let photo = room.join(cameras["views"][0]["image"].as_str().unwrap());
+    let picture = image::open(&photo).unwrap().to_rgb8();
+    image::RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
+        image::Rgb(picture.get_pixel(x, y).0.map(|v| (f32::from(v) * 0.8).round() as u8))
+    })
+    .save(&photo)
+    .unwrap();
+    let refined = |more: &[&str]| {
+        let truth = room.join("truth.ply");
+        let base = ["refine", "--splat", arg(&truth), "--scene", arg(&room), "--out", arg(&out), "--json"];
+        let steps = ["--steps", "300", "--set", "means=1e-4", "--set", "poses=2e-3"];
+        told(&[&base[..], &steps, more].concat())
+    };
+    let (as_told, corrected) = (refined(&[]), refined(&["--correct-poses", "--correct-exposures"]));
+    assert_eq!(as_told["corrections"], serde_json::json!([]));
+    let [before, after] = [&as_told, &corrected].map(|done| number(done, "/shown/after/psnr"));
+    assert!(after > before + 3., "{before} → {after}");
+    let of = &corrected["corrections"];
+    assert_eq!(of.as_array().unwrap().len(), cameras["views"].as_array().unwrap().len());
+    let exposure = number(of, "/0/exposure/1") / number(of, "/1/exposure/1");
+    assert!((exposure - 0.8).abs() < 0.03, "{exposure}");
+}
+
 #[test]
 fn what_cannot_be_refined_is_told_in_one_sentence() {
     let (folder, room) = room();

@@ -65,6 +65,8 @@ impl Reconstruct {
             holdout: self.holdout,
             views: self.views,
             size: None,
+            correct_poses: false,
+            correct_exposures: false,
             sheet: None,
             set: vec![],
             json: self.json,

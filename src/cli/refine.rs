@@ -9,8 +9,8 @@ use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures
 use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, spread_over_path};
 use globalsplat::refine::{
-    Budget, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace, gaussians_from_photos, load_photos,
-    refine, scene_depth,
+    Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
+    gaussians_from_photos, load_photos, refine, scene_depth,
 };
 use globalsplat::render::{Rendered, render_views, transform};
 use globalsplat::scene::{Gaussians, RawGaussians, Similarity};
@@ -77,6 +77,12 @@ pub struct Refine {
     /// Cut and resize photos to this; by default they keep their shape, with 512 pixels along the longer side at most
     #[arg(long, value_name = "WxH")]
     pub size: Option<String>,
+    /// Also learn how far each camera is from where it was said to be
+    #[arg(long)]
+    pub correct_poses: bool,
+    /// Also learn by what each photo is brighter, or of another white, than the others
+    #[arg(long)]
+    pub correct_exposures: bool,
     /// Also write a picture: photo, render and depth side by side, a row per view held out, or else per view
     #[arg(long, value_name = "FILE.png")]
     pub sheet: Option<PathBuf>,
@@ -155,12 +161,18 @@ impl Refine {
             done_seconds: begin_seconds,
             curve: vec![],
         };
-        let mut gaussians = work.optimize(&start, &first, self.space)?;
+        let depth = scene_depth(&first, &photos)?;
+        let mut corrections =
+            Corrections::new(photos.len(), self.correct_poses, self.correct_exposures, depth, &config);
+        let mut gaussians = work.optimize(&start, &first, depth, &mut corrections, self.space)?;
         work.bar.finish_and_clear();
-        let mut after = judge.scores_of_both(&gaussians, &photos)?;
+        let mut after = judge.scores_of_both(&gaussians, &corrections.applied(&photos))?;
+        let mut corrected =
+            if self.correct_poses || self.correct_exposures { corrections.told(&photos) } else { vec![] };
         if after.shown.psnr < before.shown.psnr {
             eprintln!("the photos were shown better before: what was begun with is kept");
             (gaussians, after) = (first, before.clone());
+            corrected.clear();
         }
         write_splat(&self.out, &Splat::of(&gaussians)?)?;
         if let Some(sheet) = &self.sheet {
@@ -172,7 +184,7 @@ impl Refine {
         if self.json {
             let mut object = json!({
                 "splat": self.out, "gaussians": count, "photos": photos.len(), "steps": steps, "seconds": seconds,
-                "begin_seconds": begin_seconds,
+                "begin_seconds": begin_seconds, "corrections": corrected,
                 "shown": { "before": means(&before.shown), "after": means(&after.shown) },
             });
             if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
@@ -191,6 +203,9 @@ impl Refine {
         row(format!("{} photos", photos.len()), &before.shown, &after.shown);
         if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
             row(format!("{} views held out", after.views.len()), before, after);
+        }
+        if let Some(line) = told_of(&corrected) {
+            println!("{line}");
         }
         Ok(())
     }
@@ -252,8 +267,16 @@ struct Mark {
 }
 
 impl Work<'_> {
-    /// In one space, or in one after the other. `first` are the Gaussians of `start` in the capture's world.
-    fn optimize(&mut self, start: &Start, first: &Gaussians, name: SpaceName) -> Result<Gaussians> {
+    /// In one space, or in one after the other. `first` are the Gaussians of `start` in the capture's world, `depth` is the scene's
+    /// there; `corrections` are learned with Gaussians.
+    fn optimize(
+        &mut self,
+        start: &Start,
+        first: &Gaussians,
+        depth: f64,
+        corrections: &mut Corrections,
+        name: SpaceName,
+    ) -> Result<Gaussians> {
         let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
         let (raw, done) = match (start, name) {
             (Start::Gaussians(raw), _) => (raw.shallow_clone(), 0.),
@@ -262,19 +285,19 @@ impl Work<'_> {
                 // Tokens know the normalized world alone.
                 let world = &made.world_from_normalized;
                 let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
-                let depth = scene_depth(first, self.photos)? / world.scale;
                 let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
                 let end = if name == SpaceName::Both { TOKENS_SHARE } else { 1. };
-                let gaussians = self.phase(&mut space, &poses, depth, [0., end], Some(world))?;
+                let mut none = Corrections::new(self.photos.len(), false, false, depth, self.config);
+                let depth = depth / world.scale;
+                let gaussians = self.phase(&mut space, &mut none, &poses, depth, [0., end], Some(world))?;
                 (RawGaussians::of(&gaussians), end)
             }
         };
         if done == 1. || self.stop.load(Ordering::Relaxed) {
             return Ok(raw.activate());
         }
-        let depth = scene_depth(&raw.activate(), self.photos)?;
         let mut space = GaussianSpace::new(&raw, depth, self.config);
-        self.phase(&mut space, &poses, depth, [done, 1.], None)
+        self.phase(&mut space, corrections, &poses, depth, [done, 1.], None)
     }
 
     /// The part of the way from `from` to `to`. `poses` are those of the photos in the world of `space`, `world` the way from there to
@@ -282,6 +305,7 @@ impl Work<'_> {
     fn phase(
         &mut self,
         space: &mut dyn Space,
+        corrections: &mut Corrections,
         poses: &[DMat4],
         depth: f64,
         [from, to]: [f64; 2],
@@ -300,7 +324,7 @@ impl Work<'_> {
         let (steps, seconds) = (self.done_steps, self.done_seconds);
         let mut marks = MARKS.iter().peekable();
         let mut failure = None;
-        let gaussians = refine(space, &task, |at| {
+        let gaussians = refine(space, corrections, &task, |at| {
             self.done_steps = steps + at.step;
             self.done_seconds = seconds + at.elapsed.as_secs_f64();
             self.bar.set_position(((from + (to - from) * at.progress) * 1000.) as u64);
@@ -355,6 +379,18 @@ impl Judge {
     fn held_out_scores(&self, gaussians: &Gaussians) -> globalsplat::Result<Option<CaptureScores>> {
         (!self.held_out.is_empty()).then(|| self.scores(gaussians, &self.held_out)).transpose()
     }
+}
+
+/// What was learned of the photos, in one line, if anything was.
+fn told_of(corrected: &[Correction]) -> Option<String> {
+    let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
+    let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);
+    Some(format!(
+        "corrected at most by: {:.2}° and {:.4} of the scene's depth (cameras), a factor of {:.3} (exposures)",
+        largest(|of| of.degrees)?,
+        largest(|of| of.depths)?,
+        largest(factor)?,
+    ))
 }
 
 fn means(scores: &CaptureScores) -> Value {

@@ -34,6 +34,10 @@ pub struct RefineConfig {
     pub others_end: f64,
     /// Of tokens.
     pub tokens: f64,
+    /// Of cameras' twists, in radians, and shifts, in scene depths, where poses are corrected.
+    pub poses: f64,
+    /// Of logarithms of exposures, where photos have their own.
+    pub exposures: f64,
     /// What 1 − SSIM counts, beside absolute differences with one minus it.
     pub similar: f64,
     /// What the mean opacity counts.
@@ -70,6 +74,8 @@ impl Default for RefineConfig {
             harmonics: 0.1,
             others_end: 0.2,
             tokens: 1e-2,
+            poses: 5e-4,
+            exposures: 5e-3,
             similar: 0.2,
             opacity: 1e-3,
             scale: 0.,

@@ -3,6 +3,7 @@
 
 mod begin;
 mod config;
+mod corrections;
 mod leaves;
 mod photos;
 mod relocate;
@@ -11,6 +12,7 @@ mod sweep;
 
 pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
+pub use corrections::{Correction, Corrections};
 pub use photos::{Photos, load_photos};
 pub use space::{GaussianSpace, Space, TokenSpace};
 
@@ -19,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::loss::photometric;
 use crate::optim::Stopwatch;
 use crate::render::cpu::KernelThreads;
-use crate::render::{DEFAULT_EPS2D, Pictures, render, render_views};
+use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render, render_views};
 use crate::scene::{Camera, Gaussians};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -68,21 +70,24 @@ pub struct Task<'a> {
     pub seed: u64,
 }
 
-/// Optimizes `space`. `watch` sees every step, and ends the work by false. Returns the Gaussians that it ended with.
+/// Optimizes `space`, and `corrections` of the photos. `watch` sees every step, and ends the work by false. Returns the Gaussians
+/// that it ended with.
 ///
 /// # Errors
 /// What the rasterizer refuses.
 pub fn refine(
     space: &mut dyn Space,
+    corrections: &mut Corrections,
     task: &Task,
     watch: impl FnMut(&RefineStep) -> bool,
 ) -> Result<Gaussians> {
-    refine_timed(space, task, &mut Stopwatch::default(), watch)
+    refine_timed(space, corrections, task, &mut Stopwatch::default(), watch)
 }
 
 /// As [`refine`]; `stopwatch` hears of every part of a step.
 pub(crate) fn refine_timed(
     space: &mut dyn Space,
+    corrections: &mut Corrections,
     task: &Task,
     stopwatch: &mut Stopwatch,
     mut watch: impl FnMut(&RefineStep) -> bool,
@@ -101,19 +106,25 @@ pub(crate) fn refine_timed(
             break;
         }
         let level = config.sizes.iter().filter(|&&part| progress >= part).count();
-        let batch = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
+        let (which, batch) = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
         let mut gaussians = stopwatch.time("activation", || space.gaussians(progress));
         if config.dropout > 0. {
             gaussians.opacities =
                 with_some_left_out(&gaussians.opacities, config.dropout * progress, &mut random);
         }
-        let pictures = stopwatch.time("render", || render(&gaussians, &batch.cameras(), DEFAULT_EPS2D))?;
+        let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
+        let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
+        pictures.rgb = corrections.exposed(pictures.rgb, &which);
         let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch.images, config, depth));
         stopwatch.time("backward", || {
             space.zero_grad();
+            corrections.zero_grad();
             loss.backward();
         });
-        stopwatch.time("optimizer", || space.step(progress, step, &mut random));
+        stopwatch.time("optimizer", || {
+            space.step(progress, step, &mut random);
+            corrections.step(progress);
+        });
         elapsed += start.elapsed();
         if !watch(&RefineStep { step: step + 1, progress, elapsed, space }) {
             break;

@@ -36,13 +36,22 @@ fn smaller(camera: &Camera) -> Option<ImageSize> {
 /// Photos at several sizes, from the smallest to the whole; those of one size together.
 #[derive(Debug)]
 pub struct Photos {
-    levels: Vec<Vec<ViewBatch>>,
+    levels: Vec<Vec<Group>>,
+}
+
+/// Photos of one size.
+#[derive(Debug)]
+struct Group {
+    /// Which of all photos they are.
+    indices: Vec<usize>,
+    views: ViewBatch,
 }
 
 impl Photos {
     /// `views` at their own size alone.
     pub(crate) fn of(views: ViewBatch) -> Self {
-        Photos { levels: vec![vec![views]] }
+        let indices = (0..views.images.size()[1] as usize).collect();
+        Photos { levels: vec![vec![Group { indices, views }]] }
     }
 
     /// `views`, one at least, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world) stand for the
@@ -52,31 +61,34 @@ impl Photos {
         for (index, View { camera, .. }) in views.iter().enumerate() {
             groups.entry((camera.height, camera.width)).or_default().push(index);
         }
-        let batch = |group: &Vec<usize>| {
+        let group = |indices: Vec<usize>| {
             let (views, poses): (Vec<&View>, Vec<DMat4>) =
-                group.iter().map(|&i| (&views[i], poses[i])).unzip();
-            view_batch(&views, &poses, Device::Cpu)
+                indices.iter().map(|&i| (&views[i], poses[i])).unzip();
+            Group { indices, views: view_batch(&views, &poses, Device::Cpu) }
         };
-        let whole = groups.values().map(batch).collect();
-        let mut sizes: Vec<Vec<ViewBatch>> = vec![whole];
+        let whole = groups.into_values().map(group).collect();
+        let mut sizes: Vec<Vec<Group>> = vec![whole];
         for _ in 1..levels {
-            let halves = sizes[sizes.len() - 1].iter().map(halved).collect();
+            let halves = sizes[sizes.len() - 1]
+                .iter()
+                .map(|group| Group { indices: group.indices.clone(), views: halved(&group.views) })
+                .collect();
             sizes.push(halves);
         }
         sizes.reverse();
         Photos { levels: sizes }
     }
 
-    /// So many views of one size, each once, at level `level` from the smallest.
-    pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> ViewBatch {
+    /// So many photos of one size, each once, at level `level` from the smallest; and which they are.
+    pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> (Vec<i64>, ViewBatch) {
         let groups = &self.levels[level.min(self.levels.len() - 1)];
-        let count = |group: &ViewBatch| group.images.size()[1] as usize;
+        let count = |group: &Group| group.indices.len();
         let mut owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));
         let of = random.random_range(0..groups.iter().map(count).sum::<usize>());
         let group = owners.nth(of).expect("a number below the sum");
         let mut chosen = sample(random, count(group), views.min(count(group))).into_vec();
         chosen.sort_unstable();
-        group.select(&chosen)
+        (chosen.iter().map(|&k| group.indices[k] as i64).collect(), group.views.select(&chosen))
     }
 }
 

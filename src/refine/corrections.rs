@@ -1,0 +1,212 @@
+//! What photos hide: cameras a little off from where they are said to be, and exposures of their own. Both are learned beside the
+//! splat, a few numbers a photo.
+
+use super::config::RefineConfig;
+use crate::data::{View, ViewBatch};
+use crate::optim::{AdamW, ParameterGroup};
+use glam::{DMat3, DMat4, DVec3};
+use serde::Serialize;
+use tch::{Kind, Tensor};
+
+/// Of every photo: how far its camera is from where it was said to be, and by what its colours are larger than the splat's. Over all
+/// photos either has the mean 0, as a scene that is moved or brightened as a whole is the same scene.
+#[derive(Debug)]
+pub struct Corrections {
+    /// Twist about the camera's centre as a vector along its axis, radians, and shift of the centre in scene depths, both along the
+    /// world's axes: [V, 6].
+    poses: Option<Tensor>,
+    /// Logarithms of factors of red, green and blue: [V, 3].
+    exposures: Option<Tensor>,
+    optimizer: AdamW,
+    rates: Vec<f64>,
+    rates_end: f64,
+    depth: f64,
+}
+
+/// What was learned of a photo.
+#[derive(Debug, Clone, Serialize)]
+pub struct Correction {
+    /// As the capture names it.
+    pub photo: String,
+    /// By how much its camera turned.
+    pub degrees: f64,
+    /// By how much it moved, in scene depths.
+    pub depths: f64,
+    /// By what its red, green and blue are larger than the splat's.
+    pub exposure: [f64; 3],
+}
+
+impl Corrections {
+    /// None yet, of so many photos. Lengths are measured by `depth`, that of the scene.
+    pub fn new(photos: usize, poses: bool, exposures: bool, depth: f64, config: &RefineConfig) -> Self {
+        let leaf = |numbers: i64| {
+            Tensor::zeros([photos as i64, numbers], (Kind::Float, tch::Device::Cpu)).set_requires_grad(true)
+        };
+        let poses = poses.then(|| leaf(6));
+        let exposures = exposures.then(|| leaf(3));
+        let group = |name: &str, t: &Option<Tensor>, rate: f64| {
+            let parameters = vec![(name.into(), t.as_ref()?.shallow_clone())];
+            Some((ParameterGroup { parameters, learning_rate: 0., weight_decay: 0. }, rate))
+        };
+        let groups = [group("poses", &poses, config.poses), group("exposures", &exposures, config.exposures)];
+        let (groups, rates) = groups.into_iter().flatten().unzip();
+        let optimizer = AdamW::new(groups);
+        Corrections { poses, exposures, optimizer, rates, rates_end: config.others_end, depth }
+    }
+
+    /// World-to-camera of the photos `which`, of which `views` says where they are; [1, C, 4, 4], differentiable.
+    pub(super) fn w2c(&self, views: &ViewBatch, which: &[i64]) -> Tensor {
+        let Some(poses) = &self.poses else { return views.w2c.shallow_clone() };
+        let numbers = of(poses, which).unsqueeze(0);
+        let (twist, shift) = (numbers.narrow(2, 0, 3), numbers.narrow(2, 3, 3) * self.depth);
+        // x_camera = W Tᵀ (x − o − s), with the camera's own W and o, the turn T and the shift s.
+        let rotation = views.w2c.narrow(2, 0, 3).narrow(3, 0, 3).matmul(&turn(&twist).transpose(2, 3));
+        let centre = views.c2w.narrow(2, 0, 3).narrow(3, 3, 1) + shift.unsqueeze(-1);
+        let rows = Tensor::cat(&[&rotation, &-rotation.matmul(&centre)], 3);
+        Tensor::cat(&[&rows, &views.w2c.narrow(2, 3, 1)], 2)
+    }
+
+    /// Pictures of the splat, [1, C, 3, H, W], as the photos `which` were exposed.
+    pub(super) fn exposed(&self, rgb: Tensor, which: &[i64]) -> Tensor {
+        match &self.exposures {
+            Some(exposures) => rgb * of(exposures, which).exp().view([1, -1, 3, 1, 1]),
+            None => rgb,
+        }
+    }
+
+    /// Forgets the gradients.
+    pub(super) fn zero_grad(&mut self) {
+        self.optimizer.zero_grad();
+    }
+
+    /// Follows the gradients.
+    pub(super) fn step(&mut self, progress: f64) {
+        let left = self.rates_end.powf(progress);
+        let rates: Vec<f64> = self.rates.iter().map(|rate| rate * left).collect();
+        self.optimizer.set_learning_rates(&rates);
+        self.optimizer.step();
+    }
+
+    /// The photos as the splat would have been photographed: from where they were taken, with its own exposure.
+    pub fn applied(&self, photos: &[View]) -> Vec<View> {
+        let applied = |(index, view): (usize, &View)| {
+            let numbers = self.numbers(index);
+            let turn = rows_of(&turn(&Tensor::from_slice(&numbers[..3]).view([1, 1, 3])));
+            let mut camera = view.camera;
+            let centre = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
+            camera.c2w = DMat4::from_mat3(turn * DMat3::from_mat4(camera.c2w));
+            camera.c2w.w_axis = centre.extend(1.);
+            let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
+            View { name: view.name.clone(), image: &view.image / gain, camera }
+        };
+        photos.iter().enumerate().map(applied).collect()
+    }
+
+    /// What was learned of each of `photos`.
+    pub fn told(&self, photos: &[View]) -> Vec<Correction> {
+        let told = |(index, view): (usize, &View)| {
+            let numbers = self.numbers(index);
+            let (twist, shift) = (DVec3::from_slice(&numbers[..3]), DVec3::from_slice(&numbers[3..6]));
+            Correction {
+                photo: view.name.clone(),
+                degrees: (2. * (twist.length() / 2.).atan()).to_degrees(),
+                depths: shift.length(),
+                exposure: [6, 7, 8].map(|k| numbers[k].exp()),
+            }
+        };
+        photos.iter().enumerate().map(told).collect()
+    }
+
+    /// Twist, shift and exposure of a photo; 0 where they aren't learned.
+    fn numbers(&self, index: usize) -> Vec<f64> {
+        let row = |t: &Option<Tensor>, width: usize| match t {
+            Some(t) => Vec::<f64>::try_from(of(t, &[index as i64]).to_kind(Kind::Double).view([-1]))
+                .expect("numbers"),
+            None => vec![0.; width],
+        };
+        [row(&self.poses, 6), row(&self.exposures, 3)].concat()
+    }
+}
+
+/// The rows `which` of a leaf, less the mean of all.
+fn of(leaf: &Tensor, which: &[i64]) -> Tensor {
+    (leaf - leaf.mean_dim([0].as_slice(), true, None)).index_select(0, &Tensor::from_slice(which))
+}
+
+/// Rotations [.., 3, 3] by 2 atan(|v|/2) about vectors v [.., 3] (Cayley): I + (K + K²/2) / (1 + |v|²/4), with K x = v × x.
+fn turn(vectors: &Tensor) -> Tensor {
+    // Row k holds K for the vector along axis k.
+    #[rustfmt::skip]
+    let generators = Tensor::from_slice(&[
+        0f32, 0., 0.,  0., 0., -1.,  0., 1., 0.,
+        0., 0., 1.,  0., 0., 0.,  -1., 0., 0.,
+        0., -1., 0.,  1., 0., 0.,  0., 0., 0.,
+    ]);
+    let shape = [&vectors.size()[..], &[3]].concat();
+    let generators = generators.view([3, 9]).to_kind(vectors.kind());
+    let cross = vectors.matmul(&generators).view(shape.as_slice());
+    let square = vectors.square().sum_dim_intlist([-1].as_slice(), true, None).unsqueeze(-1);
+    let share = (square / 4. + 1.).reciprocal();
+    Tensor::eye(3, (vectors.kind(), vectors.device())) + (&cross + cross.matmul(&cross) / 2.) * share
+}
+
+fn rows_of(matrix: &Tensor) -> DMat3 {
+    let rows: Vec<f64> =
+        Vec::try_from(matrix.to_kind(Kind::Double).contiguous().view([-1])).expect("nine numbers");
+    DMat3::from_cols_slice(&rows).transpose()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::view_batch;
+    use crate::scene::{Camera, Intrinsics, pose_to_rows};
+    use tch::Device;
+
+    fn view(index: usize) -> View {
+        let c2w = DMat4::from_rotation_translation(
+            glam::DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 0.1 * index as f64, -0.2),
+            DVec3::new(1., index as f64, -2.),
+        );
+        let intrinsics = Intrinsics { fx: 10., fy: 10., cx: 4., cy: 4. };
+        let camera = Camera { c2w, intrinsics, width: 8, height: 8 };
+        View {
+            name: index.to_string(),
+            image: Tensor::full([3, 8, 8], 0.5, (Kind::Float, Device::Cpu)),
+            camera,
+        }
+    }
+
+    /// What is optimized with and what is told in the end are the same cameras and colours.
+    #[test]
+    fn what_is_applied_is_what_was_learned() {
+        let views = [view(0), view(1), view(2)];
+        let poses: Vec<DMat4> = views.iter().map(|view| view.camera.c2w).collect();
+        let batch = view_batch(&views, &poses, Device::Cpu);
+        let learned = Corrections::new(3, true, true, 2., &RefineConfig::default());
+        let put = |t: &Option<Tensor>, values: &[f32]| {
+            tch::no_grad(|| t.as_ref().unwrap().shallow_clone().view([-1]).copy_(&Tensor::from_slice(values)))
+        };
+        put(
+            &learned.poses,
+            &[0.1, -0.2, 0.05, 0.3, 0., -0.1, 0., 0., 0.4, 0., 0.2, 0., 0.1, 0., 0., 0., 0., 0.],
+        );
+        put(&learned.exposures, &[0.3, 0., 0., 0., 0.6, 0., 0., 0., -0.3]);
+        let applied = learned.applied(&views);
+        let w2c = learned.w2c(&batch, &[0, 1, 2]);
+        let images = learned.exposed(batch.images.ones_like() * 0.5, &[0, 1, 2]);
+        for (index, view) in applied.iter().enumerate() {
+            let rows = Tensor::from_slice(&pose_to_rows(&view.camera.c2w.inverse())).view([4, 4]);
+            let apart = (w2c.select(0, 0).select(0, index as i64) - rows).abs().max().double_value(&[]);
+            assert!(apart < 1e-6, "camera {index} is {apart} off");
+            // Photo over exposure against picture, and picture times exposure against photo.
+            let product = &view.image * images.select(0, 0).select(0, index as i64);
+            assert!((product - 0.25).abs().max().double_value(&[]) < 1e-6);
+        }
+        let told = learned.told(&views);
+        let mean: f64 = told.iter().map(|photo| photo.exposure[0].ln()).sum();
+        assert!(
+            mean.abs() < 1e-6 && told[1].degrees > 10. && (told[1].exposure[1] - 0.4f64.exp()).abs() < 1e-6
+        );
+    }
+}
