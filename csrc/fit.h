@@ -14,6 +14,10 @@ struct AdamArguments;  // shared with Rust, see src/fit.rs
 // where the picture is and float32 else. Differentiable with respect to the picture. Throws on shapes that don't fit.
 void photometric(size_t picture, size_t photo, double absolute, double similar, rust::Slice<size_t> out);
 
+// `factor` · how uneven depths are where photos are even (raster/smooth.h), of depths [.., H, W] and photos [.., 3, H, W]. As
+// photometric() else; differentiable with respect to the depths.
+void depth_smoothness(size_t depths, size_t photos, double factor, rust::Slice<size_t> out);
+
 // Updates a tensor and its moments in place, without the knowledge of autograd. All four on the CPU, contiguous, of one shape and
 // type, float32 or float64; throws where they aren't.
 void adam(const AdamArguments& of);

@@ -202,6 +202,21 @@ int64_t fits(const std::vector<int>& thread_counts) {
       }
     }
   }
+  for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
+    const size_t all = size_t(views * height * width);
+    const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
+    const raster::DepthJob<T> job{depths.data(), photos.data(), views, width, height};
+    std::vector<T> one(all);
+    begin("smoothness, " + type_name<T>());
+    const double value = raster::depth_smoothness<T>(job, 0.3, one.data(), 1);
+    expect(raster::depth_smoothness<T>(job, 0.3, nullptr, 1) == value, "the gradient changes the value");
+    for (const int threads : thread_counts) {
+      std::vector<T> gradient(all, T(threads));
+      const double again = raster::depth_smoothness<T>(job, 0.3, gradient.data(), threads);
+      expect(again == value && same(gradient, one), "threads change smoothness");
+      ++count;
+    }
+  }
   const size_t many = 40'000;
   const std::vector<T> gradient = numbers(many), start = numbers(many);
   const auto stepped = [&](int threads) {

@@ -81,6 +81,18 @@ double photometric(const FitJob<T>& job, double absolute, double similar, T* gra
 }
 
 template <class T>
+double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads) {
+  const int64_t width = job.width, height = job.height, pixels = width * height;
+  const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
+  const double each = pairs > 0 ? factor / double(pairs) : 0;
+  return each * sum_over_rows<T>(threads, job.views, job.height, job.width, [&](int64_t view, int begin, int end, T* room) {
+           const DepthPlane<T> plane{job.depths + view * pixels, job.photos + 3 * view * pixels,
+                                     gradient != nullptr ? gradient + view * pixels : nullptr, job.width, job.height};
+           return kernels().of<T>().unevenness(plane, T(each), begin, end, room);
+         });
+}
+
+template <class T>
 void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads) {
   parallel_for(threads, (count + kNumbers - 1) / kNumbers, [&](int64_t task) {
     kernels().of<T>().adam(step, numbers, task * kNumbers, std::min((task + 1) * kNumbers, count));
@@ -89,6 +101,8 @@ void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, in
 
 template double photometric(const FitJob<float>&, double, double, float*, int);
 template double photometric(const FitJob<double>&, double, double, double*, int);
+template double depth_smoothness(const DepthJob<float>&, double, float*, int);
+template double depth_smoothness(const DepthJob<double>&, double, double*, int);
 template void adam(const AdamStep&, const AdamNumbers<float>&, int64_t, int);
 template void adam(const AdamStep&, const AdamNumbers<double>&, int64_t, int);
 

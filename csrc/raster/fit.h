@@ -1,4 +1,5 @@
-// What fitting pictures to photos needs beside drawing them: how far they are apart, with the gradient, and a step of Adam.
+// What fitting pictures to photos needs beside drawing them: how far they are apart, and how uneven depths are, with gradients,
+// and a step of Adam.
 // Shared among threads; the bits don't depend on their number.
 #pragma once
 
@@ -21,6 +22,20 @@ struct FitJob {
 // Writes the gradient with respect to the pictures, [planes, H, W], if it isn't null.
 template <class T>
 double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads);
+
+// Pictures' depths, [views, H, W], and the photos, [views, 3, H, W].
+template <class T>
+struct DepthJob {
+  const T* depths;
+  const T* photos;
+  int64_t views;
+  int width, height;
+};
+
+// `factor` · the mean over all pairs of neighbouring pixels of how uneven depths are there; see smooth.h. Writes the gradient with
+// respect to the depths, [views, H, W], if it isn't null.
+template <class T>
+double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads);
 
 // Updates `count` numbers and their moments.
 template <class T>

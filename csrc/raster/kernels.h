@@ -19,9 +19,10 @@ struct KernelsOf {
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
-  // Beside the rasterizer: ssim.h, adam.h.
+  // Beside the rasterizer: ssim.h, smooth.h, adam.h.
   double (*ssim)(const FitPlane<T>&, int begin, int end, T* room);
   double (*fit_gradient)(const FitPlane<T>&, T absolute, T similar, int begin, int end, T* room);
+  double (*unevenness)(const DepthPlane<T>&, T factor, int begin, int end, T* room);
   void (*adam)(const AdamStep&, const AdamNumbers<T>&, int64_t begin, int64_t end);
 };
 

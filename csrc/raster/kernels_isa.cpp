@@ -4,6 +4,7 @@
 #include "cover.h"
 #include "kernels.h"
 #include "project.h"
+#include "smooth.h"
 #include "ssim.h"
 
 namespace globalsplat::raster::GS_ISA {
@@ -15,9 +16,9 @@ extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
     {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>, project_backward<float>,
-     ssim<float>, fit_gradient<float>, adam<float>},
+     ssim<float>, fit_gradient<float>, unevenness<float>, adam<float>},
     {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>,
-     ssim<double>, fit_gradient<double>, adam<double>},
+     ssim<double>, fit_gradient<double>, unevenness<double>, adam<double>},
     multiply_adds,
 };
 

@@ -307,6 +307,32 @@ GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, i
 }
 #endif
 
+// Those that there are, and zeros in the other lanes.
+template <class T>
+GS_INLINE Vector<T> load_some(const T* from, int count) {
+  if (count >= Simd<T>::lanes) return load<T>(from);
+  T lane[Simd<T>::lanes] = {};
+  __builtin_memcpy(lane, from, size_t(count) * sizeof(T));
+  return load<T>(lane);
+}
+
+template <class T>
+GS_INLINE void store_some(T* to, Vector<T> v, int count) {
+  if (count >= Simd<T>::lanes) return store<T>(to, v);
+  T lane[Simd<T>::lanes];
+  store<T>(lane, v);
+  __builtin_memcpy(to, lane, size_t(count) * sizeof(T));
+}
+
+template <class T>
+GS_INLINE double sum_of_lanes(Vector<T> v) {
+  T lane[Simd<T>::lanes];
+  store<T>(lane, v);
+  double sum = 0;
+  for (const T value : lane) sum += double(value);
+  return sum;
+}
+
 // out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.
 template <class T, int count>
 GS_INLINE void sum_each(const Vector<T> (&v)[count], T* out) {

@@ -14,23 +14,6 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Those that there are, and zeros in the other lanes.
-template <class T>
-GS_INLINE Vector<T> load_some(const T* from, int count) {
-  if (count >= Simd<T>::lanes) return load<T>(from);
-  T lane[Simd<T>::lanes] = {};
-  __builtin_memcpy(lane, from, size_t(count) * sizeof(T));
-  return load<T>(lane);
-}
-
-template <class T>
-GS_INLINE void store_some(T* to, Vector<T> v, int count) {
-  if (count >= Simd<T>::lanes) return store<T>(to, v);
-  T lane[Simd<T>::lanes];
-  store<T>(lane, v);
-  __builtin_memcpy(to, lane, size_t(count) * sizeof(T));
-}
-
 // Σ SSIM over the windows whose first row is in [begin, end), and their slopes where these are asked for. `room` has
 // fit_room(width) numbers, and so below.
 template <class T>
@@ -82,11 +65,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
       store_some<T>(slopes + 2 * count, to_r, left);
     }
   }
-  T lane[lanes];
-  store<T>(lane, sum);
-  double total = 0;
-  for (const T value : lane) total += double(value);
-  return total;
+  return sum_of_lanes<T>(sum);
 }
 
 // Σ |x − y| over the rows [begin, end), and, where it is asked for, the gradient there: `absolute` times that of Σ |x − y| plus
@@ -130,11 +109,7 @@ double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, 
       if (plane.gradient != nullptr) store_some<T>(plane.gradient + at, gradient, left);
     }
   }
-  T lane[lanes];
-  store<T>(lane, sum);
-  double total = 0;
-  for (const T value : lane) total += double(value);
-  return total;
+  return sum_of_lanes<T>(sum);
 }
 
 }  // namespace globalsplat::raster::GS_ISA

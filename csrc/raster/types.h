@@ -163,8 +163,19 @@ struct FitPlane {
   int width, height;
 };
 
+// By how much a step in the photo's grey excuses one in depth, and a picture's depths with its photo and what their gradient goes
+// to; see smooth.h. Row-major.
+inline constexpr double kEdge = 10;
+template <class T>
+struct DepthPlane {
+  const T* depth;  // [H, W]
+  const T* photo;  // [3, H, W]
+  T* gradient;     // [H, W]; null: not asked for
+  int width, height;
+};
+
 // Numbers that a kernel for rows of this width works with.
-inline constexpr int fit_room(int width) { return 5 * (width + 32); }
+inline constexpr int fit_room(int width) { return 6 * (width + 33); }
 
 // What all numbers of one step of Adam share; see adam.h.
 struct AdamStep {

@@ -49,6 +49,17 @@ mod ffi {
         /// See `csrc/fit.h`.
         ///
         /// # Safety
+        /// Addresses of live tensors.
+        unsafe fn depth_smoothness(
+            depths: usize,
+            photos: usize,
+            factor: f64,
+            out: &mut [usize],
+        ) -> Result<()>;
+
+        /// See `csrc/fit.h`.
+        ///
+        /// # Safety
         /// The arguments hold addresses of live tensors that nothing else reads or writes meanwhile.
         unsafe fn adam(of: &AdamArguments) -> Result<()>;
     }

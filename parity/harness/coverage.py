@@ -16,6 +16,7 @@ CASES_OF = {
     "src/data/pixels/resample.rs": ["resample"],
     "src/loss/consistency.rs": ["consistency"],
     "src/loss/decoder_regularization.rs": ["decoder_regularization", "sh_soft_cap"],
+    "src/loss/depth_smoothness.rs": ["depth_smoothness"],
     "src/loss/frustum.rs": ["frustum"],
     "src/loss/lpips.rs": ["lpips_vgg", "lpips_alex"],
     "src/loss/mse.rs": ["mse"],

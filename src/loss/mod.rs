@@ -3,6 +3,7 @@
 mod config;
 mod consistency;
 mod decoder_regularization;
+mod depth_smoothness;
 mod frustum;
 mod lpips;
 mod mse;
@@ -13,6 +14,7 @@ mod vgg19;
 
 pub use config::{LossConfig, PerceptualKind};
 pub use decoder_regularization::{DecoderRegularization, decoder_regularization, sh_soft_cap};
+pub use depth_smoothness::depth_smoothness;
 pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
 pub use mse::{mse, psnr_of_mse};

@@ -49,6 +49,11 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.number("absolute")?,
             request.number("similar")?,
         )),
+        "depth_smoothness" => loss_of(loss::depth_smoothness(
+            request.input("depth")?,
+            request.input("photo")?,
+            request.number("factor")?,
+        )),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),

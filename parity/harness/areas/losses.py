@@ -3,6 +3,7 @@
 import numpy as np
 import reference.loss.consistency
 import reference.loss.decoder_regularization
+import reference.loss.depth_smoothness
 import reference.loss.frustum
 import reference.loss.mse
 import reference.loss.ssim
@@ -174,3 +175,19 @@ def photometric_twin(config, params, inputs):
     picture, truth = (inputs[name].flatten(0, -4) for name in ("picture", "truth"))
     difference = (picture - truth).abs().mean()
     return {"loss": config["absolute"] * difference + config["similar"] * reference.loss.ssim.ssim(picture, truth)}
+
+
+@case
+def depth_smoothness(rng):
+    """Steps in depth, some where the photo has one, and pixels that show nothing. Rows are taken sixteen at a time, and columns a
+    vector at a time: sizes lie around both."""
+    for shape, factor in [((1, 1, 1), 1.0), ((2, 17, 43), 0.7), ((1, 2, 33, 16), 3.0), ((1, 40, 1), 1.0)]:
+        photo = uniform(rng, 0.0, 1.0, *shape[:-2], 3, *shape[-2:])
+        depth = uniform(rng, 0.5, 8.0, *shape) * (uniform(rng, 0.0, 1.0, *shape) < 0.9)
+        config = {"factor": factor}
+        yield Draw(by(*shape), {"depth": depth, "photo": photo}, config=config, differentiate=("depth",))
+
+
+@twin("depth_smoothness")
+def depth_smoothness_twin(config, params, inputs):
+    return {"loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])}

@@ -1,0 +1,81 @@
+// How uneven a picture's depths are where the photo is even, and the gradient, a few rows at a time. Over the pairs of neighbours,
+// side by side or one above the other, with depths a and b and the photo's greys g and h there:
+//
+//   e^{−10 |g − h|} · 2 |a − b| / (a + b),    ∂/∂a = ± e^{−10 |g − h|} · 4b / (a + b)²
+//
+// which is |ln a − ln b| where depths are alike, and at most 2 where one thing ends before another (after Godard et al. 2017,
+// eq. 3). A pair of which one shows nothing, z = 0, counts for nothing.
+#pragma once
+
+#include "simd.h"
+#include "types.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+// Depths and greys of one row in `room`, after one number of nothing and before a vector of it: what is beyond the border is 0.
+template <class T>
+struct SmoothRow {
+  T *depth, *grey;
+};
+
+template <class T>
+GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>& to) {
+  constexpr int lanes = Simd<T>::lanes;
+  const bool inside = row >= 0 && row < plane.height;
+  const int64_t pixels = int64_t(plane.width) * plane.height, first = int64_t(row) * plane.width;
+  to.depth[0] = to.grey[0] = 0;
+  for (int i = 0; i < plane.width + lanes; i += lanes) {
+    const int left = inside && i < plane.width ? plane.width - i : 0;
+    Vector<T> depth{}, grey{};
+    if (left > 0) {
+      const T* photo = plane.photo + first + i;
+      depth = load_some<T>(plane.depth + first + i, left);
+      grey = (load_some<T>(photo, left) + load_some<T>(photo + pixels, left) + load_some<T>(photo + 2 * pixels, left)) * T(1. / 3);
+    }
+    store<T>(to.depth + 1 + i, depth);
+    store<T>(to.grey + 1 + i, grey);
+  }
+}
+
+// The sum over pairs whose first pixel is in the rows [begin, end), and, where it is asked for, the gradient of all of them in
+// these rows, times `factor`. `room` has fit_room(width) numbers.
+template <class T>
+double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* room) {
+  using V = Vector<T>;
+  constexpr int lanes = Simd<T>::lanes;
+  const int stride = plane.width + 1 + 2 * lanes;
+  SmoothRow<T> rows[3];
+  for (int k = 0; k < 3; ++k) rows[k] = {room + 2 * k * stride, room + (2 * k + 1) * stride};
+  load_row(plane, begin - 1, rows[0]);
+  load_row(plane, begin, rows[1]);
+  V sum{};
+  for (int row = begin; row < end; ++row) {
+    const int at = row - begin;
+    const SmoothRow<T>&above = rows[at % 3], &own = rows[(at + 1) % 3], &below = rows[(at + 2) % 3];
+    load_row(plane, row + 1, below);
+    for (int i = 0; i < plane.width; i += lanes) {
+      const V a = load<T>(own.depth + 1 + i), g = load<T>(own.grey + 1 + i);
+      V gradient{};
+      // The value of the pairs with a neighbour; their gradient goes to `gradient`.
+      const auto pair = [&](const SmoothRow<T>& of, int column) {
+        const V b = load<T>(of.depth + column), difference = a - b, total = a + b;
+        const V step = g - load<T>(of.grey + column);
+        const V exponent = larger(broadcast<T>(T(-kEdge * kLog2E)) * larger(step, -step), broadcast<T>(T(-126)));
+        const Mask<T> counts = both(less(V{}, a), less(V{}, b));
+        const V weight = exp2_where(counts, exponent);
+        const V inverse = select(counts, broadcast<T>(1) / total, V{});
+        const V slope = T(4) * weight * b * inverse * inverse;
+        gradient = gradient + select(less(V{}, difference), slope, select(less(difference, V{}), -slope, V{}));
+        return T(2) * weight * larger(difference, -difference) * inverse;
+      };
+      sum = sum + pair(own, i + 2) + pair(below, i + 1);
+      if (plane.gradient == nullptr) continue;
+      pair(own, i);
+      pair(above, i + 1);
+      store_some<T>(plane.gradient + int64_t(row) * plane.width + i, gradient * factor, plane.width - i);
+    }
+  }
+  return sum_of_lanes<T>(sum);
+}
+
+}  // namespace globalsplat::raster::GS_ISA
