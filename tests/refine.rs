@@ -69,7 +69,9 @@ fn photos_alone_become_a_splat() {
 fn threads_do_not_change_the_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let scene = world(folder.path(), "48");
-    for space in [&["--gaussians", "500"][..], &["--from", "weights"], &["--space", "both"]] {
+    for space in
+        [&["--gaussians", "500"][..], &["--from", "weights", "--gaussians", "6000"], &["--space", "both"]]
+    {
         let bytes = |name: &str, threads: &str, seed: &str| {
             let out = folder.path().join(name);
             let mut arguments =
@@ -184,7 +186,7 @@ fn points_are_begun_with() {
         }
         // Half of them at points, the others where pixels are.
         let views = capture.load_all(None).unwrap();
-        let raw = gaussians_from_photos(&views, &points, 1000, 0);
+        let raw = gaussians_from_photos(&views, &points, None, 1000, 0);
         let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun
             .chunks(3)

@@ -1,4 +1,4 @@
-use super::refine::{From, Refine, SpaceName};
+use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
@@ -58,7 +58,7 @@ impl Reconstruct {
             space: SpaceName::Gaussians,
             scene: self.scene,
             out: self.out,
-            gaussians: 0,
+            gaussians: DEFAULT_GAUSSIANS,
             seconds,
             steps: None,
             seed: 0,

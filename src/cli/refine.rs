@@ -3,7 +3,7 @@ use super::{model, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
-use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
+use globalsplat::data::{Capture, Holdout, Point, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
@@ -20,10 +20,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use tch::Device;
+use tch::{Device, Tensor};
 
 /// Of the time or the steps, what goes to tokens where Gaussians follow.
 const TOKENS_SHARE: f64 = 0.2;
+/// As many as the models of the paper's main size make.
+pub const DEFAULT_GAUSSIANS: u32 = 16_384;
 /// For the optimization, however long the beginning took.
 const LEAST_SECONDS: f64 = 1.;
 /// Parts of a phase at which views held out are scored.
@@ -56,8 +58,8 @@ pub struct Refine {
     /// The splat to write
     #[arg(long, value_name = "FILE.ply")]
     pub out: PathBuf,
-    /// How many Gaussians, from nothing
-    #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    /// How many Gaussians, where none were begun with, or a model's that are fewer
+    #[arg(long, value_name = "N", default_value_t = DEFAULT_GAUSSIANS, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     pub gaussians: u32,
     /// How long, all in all
     #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
@@ -99,7 +101,7 @@ pub struct Refine {
 pub enum From {
     /// Pixels, where the photos agree
     Nothing,
-    /// What a model makes of the photos
+    /// What a model makes of the photos; of pixels, what its Gaussians lack to --gaussians
     Weights,
 }
 
@@ -141,7 +143,8 @@ impl Refine {
             Judge { name: capture.name.clone(), held_out, perceptual: Perceptual::find(Device::Cpu)? };
 
         let clock = Instant::now();
-        let start = self.start(&capture, holdout, &photos)?;
+        let points = points_of(&capture)?;
+        let start = self.start(&capture, holdout, &photos, &points)?;
         let begin_seconds = clock.elapsed().as_secs_f64();
         let first = match &start {
             Start::Gaussians(raw) => raw.activate(),
@@ -150,6 +153,8 @@ impl Refine {
         let before = judge.scores_of_both(&first, &photos)?;
         let mut work = Work {
             photos: &photos,
+            points: &points,
+            gaussians: self.gaussians as usize,
             judge: &judge,
             config: &config,
             steps: self.steps,
@@ -211,7 +216,7 @@ impl Refine {
     }
 
     /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
-    fn start(&self, capture: &Capture, holdout: Holdout, photos: &[View]) -> Result<Start> {
+    fn start(&self, capture: &Capture, holdout: Holdout, photos: &[View], points: &[Point]) -> Result<Start> {
         if let Some(path) = &self.splat {
             return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
         }
@@ -232,14 +237,16 @@ impl Refine {
             let why = "one photo tells no depth: two or more are expected, or a --splat";
             return Err(Error::Request(why.into()).into());
         }
-        let points = points_of(capture)?;
-        Ok(Start::Gaussians(gaussians_from_photos(photos, &points, self.gaussians as usize, self.seed)))
+        Ok(Start::Gaussians(gaussians_from_photos(photos, points, None, self.gaussians as usize, self.seed)))
     }
 }
 
 /// The optimization, and how far it is.
 struct Work<'a> {
     photos: &'a [View],
+    points: &'a [Point],
+    /// At the least.
+    gaussians: usize,
     judge: &'a Judge,
     config: &'a RefineConfig,
     /// All in all, where it isn't time that counts.
@@ -275,29 +282,50 @@ impl Work<'_> {
         first: &Gaussians,
         depth: f64,
         corrections: &mut Corrections,
-        name: SpaceName,
+        space: SpaceName,
     ) -> Result<Gaussians> {
         let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
-        let (raw, done) = match (start, name) {
-            (Start::Gaussians(raw), _) => (raw.shallow_clone(), 0.),
-            (Start::Model(..), SpaceName::Gaussians) => (RawGaussians::of(first), 0.),
-            (Start::Model(loaded, made), SpaceName::Tokens | SpaceName::Both) => {
-                // Tokens know the normalized world alone.
-                let world = &made.world_from_normalized;
-                let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
-                let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
-                let end = if name == SpaceName::Both { TOKENS_SHARE } else { 1. };
-                let mut none = Corrections::new(self.photos.len(), false, false, depth, self.config);
-                let depth = depth / world.scale;
-                let gaussians = self.phase(&mut space, &mut none, &poses, depth, [0., end], Some(world))?;
-                (RawGaussians::of(&gaussians), end)
+        let (raw, done) = match start {
+            Start::Gaussians(raw) => (raw.shallow_clone(), 0.),
+            Start::Model(loaded, made) => {
+                self.mark(first)?;
+                let end = if space == SpaceName::Tokens { 1. } else { TOKENS_SHARE };
+                let (gaussians, done) = match space {
+                    SpaceName::Gaussians => (first.map(Tensor::shallow_clone), 0.),
+                    SpaceName::Tokens | SpaceName::Both => {
+                        // Tokens know the normalized world alone.
+                        let world = &made.world_from_normalized;
+                        let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
+                        let mut space =
+                            TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
+                        let mut none = Corrections::new(self.photos.len(), false, false, depth, self.config);
+                        let depth = depth / world.scale;
+                        (self.phase(&mut space, &mut none, &poses, depth, [0., end], Some(world))?, end)
+                    }
+                };
+                if done == 1. || self.stop.load(Ordering::Relaxed) {
+                    return Ok(gaussians);
+                }
+                (self.filled(&gaussians), done)
             }
         };
-        if done == 1. || self.stop.load(Ordering::Relaxed) {
-            return Ok(raw.activate());
-        }
         let mut space = GaussianSpace::new(&raw, depth, self.config);
         self.phase(&mut space, corrections, &poses, depth, [done, 1.], None)
+    }
+
+    /// As many Gaussians as are to be, at the least: those that are missing lie where the photos agree, and in place of those that
+    /// can't be where they are.
+    fn filled(&mut self, gaussians: &Gaussians) -> RawGaussians {
+        let raw = RawGaussians::of(gaussians);
+        if self.photos.len() < 2 || gaussians.count() >= self.gaussians as i64 {
+            return raw;
+        }
+        let clock = Instant::now();
+        let filled = gaussians_from_photos(self.photos, self.points, Some(&raw), self.gaussians, self.seed);
+        let seconds = clock.elapsed().as_secs_f64();
+        self.done_seconds += seconds;
+        self.seconds = (self.seconds - seconds).max(LEAST_SECONDS);
+        filled
     }
 
     /// The part of the way from `from` to `to`. `poses` are those of the photos in the world of `space`, `world` the way from there to

@@ -15,6 +15,8 @@ const EXTENT: f64 = 0.5;
 const LOGIT: f32 = -1.;
 /// Of all Gaussians, those that lie at points at the most: points are exact, but lie where corners are.
 const POINTS_SHARE: usize = 2;
+/// How far from the depth that the photos agree on a Gaussian may lie, of that depth.
+const NEAR: f64 = 0.1;
 
 /// A round Gaussian.
 struct Ball {
@@ -24,14 +26,61 @@ struct Ball {
 }
 
 /// `count` Gaussians where the photos agree on what they show, and at `points` of the scene, where some are known. Each is as large
-/// as the part of the pictures that it stands for. Two views at least.
-pub fn gaussians_from_photos(views: &[View], points: &[Point], count: usize, seed: u64) -> RawGaussians {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
+/// as the part of the pictures that it stands for. Of `known` Gaussians, up to `count`, those stay that the photos don't speak
+/// against. Two views at least.
+pub fn gaussians_from_photos(
+    views: &[View],
+    points: &[Point],
+    known: Option<&RawGaussians>,
+    count: usize,
+    seed: u64,
+) -> RawGaussians {
     let swept = sweep(views, points);
+    let Some(known) = known else { return anew(&swept, points, count, seed) };
+    let kept = known.select(&supported(known, &swept));
+    let left = count.saturating_sub(kept.means.size()[1] as usize);
+    kept.and(&anew(&swept, points, left, seed))
+}
+
+/// Those that are in front of nothing that a photo is sure of, and that at least one photo doesn't hide behind it.
+fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
+    let means =
+        Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
+    let maps: Vec<(Vec<f32>, Vec<bool>)> = swept
+        .iter()
+        .map(|of| {
+            let depth = Vec::try_from(of.depth.contiguous().view([-1])).expect("numbers");
+            (depth, Vec::try_from(of.sure.contiguous().view([-1])).expect("truths"))
+        })
+        .collect();
+    let holds = |mean: DVec3| {
+        let mut shown = false;
+        for (of, (depth, sure)) in swept.iter().zip(&maps) {
+            let p = of.camera.c2w.inverse().transform_point3(mean);
+            let k = of.camera.intrinsics;
+            let (u, v) = ((k.fx * p.x / p.z + k.cx).floor(), (k.fy * p.y / p.z + k.cy).floor());
+            let (width, height) = (f64::from(of.camera.width), f64::from(of.camera.height));
+            if p.z <= 0. || u < 0. || v < 0. || u >= width || v >= height {
+                continue;
+            }
+            let pixel = (v * width + u) as usize;
+            let nearness = p.z / f64::from(depth[pixel]);
+            if sure[pixel] && nearness < 1. - NEAR {
+                return false;
+            }
+            shown |= !sure[pixel] || nearness < 1. + NEAR;
+        }
+        shown
+    };
+    (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
+}
+
+fn anew(swept: &[Swept], points: &[Point], count: usize, seed: u64) -> RawGaussians {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
     let pixels: f64 = swept.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
-    let spacing = (pixels / count as f64).sqrt(); // in pixels of these small pictures
+    let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of these small pictures
     let chosen = sample(&mut random, points.len(), points.len().min(count / POINTS_SHARE));
-    let mut balls: Vec<Ball> = chosen.iter().map(|i| at_point(&points[i], &swept, spacing)).collect();
+    let mut balls: Vec<Ball> = chosen.iter().map(|i| at_point(&points[i], swept, spacing)).collect();
     let left = count - balls.len();
     for (index, of) in swept.iter().enumerate() {
         // Shares that add up.
@@ -77,5 +126,73 @@ fn raw(balls: &[Ball]) -> RawGaussians {
         quaternions: of(balls.iter().flat_map(|_| [1., 0., 0., 0.]).collect(), &[1, n, 4]),
         opacity_logits: Tensor::full([1, n], f64::from(LOGIT), (Kind::Float, tch::Device::Cpu)),
         sh: of(colours.collect(), &[1, n, 1, 3]),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::DMat4;
+    use tch::Device;
+
+    /// Two cameras that are sure of a wall at depth 4, the second of its left half alone.
+    #[test]
+    fn what_photos_speak_against_does_not_stay() {
+        let camera = |x: f64| Camera {
+            intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
+            c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
+            width: 16,
+            height: 16,
+        };
+        let options = (Kind::Float, Device::Cpu);
+        let wall = |x: f64, sure_columns: i64| Swept {
+            camera: camera(x),
+            image: Tensor::zeros([3, 16, 16], options),
+            depth: Tensor::full([16, 16], 4., options),
+            sure: Tensor::arange(16, options).lt(sure_columns as f64).expand([16, 16], false).contiguous(),
+        };
+        let swept = [wall(0., 16), wall(0.5, 8)];
+        let kept = |means: &[[f64; 3]]| {
+            let n = means.len() as i64;
+            let of = |shape: &[i64]| Tensor::zeros(shape, options);
+            let raw = RawGaussians {
+                means: Tensor::from_slice(means.as_flattened()).to_kind(Kind::Float).view([1, n, 3]),
+                log_scales: of(&[1, n, 3]),
+                quaternions: of(&[1, n, 4]),
+                opacity_logits: of(&[1, n]),
+                sh: of(&[1, n, 1, 3]),
+            };
+            supported(&raw, &swept)
+        };
+        // On the wall, before it, behind it, beside what anybody sees.
+        assert_eq!(kept(&[[0., 0., 4.1], [0., 0., 2.], [0., 0., 9.], [30., 0., 4.]]), [0]);
+        // Behind the wall of one, where the other isn't sure: it stays.
+        assert_eq!(kept(&[[3., 0., 9.], [3., 0., 2.]]), [0]);
+    }
+
+    /// As many as are asked for, those that stay first; none is dropped that there is room for.
+    #[test]
+    fn what_is_known_is_filled_up() {
+        let view = |x: f64| {
+            let camera = Camera {
+                intrinsics: Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. },
+                c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
+                width: 32,
+                height: 32,
+            };
+            View {
+                name: String::new(),
+                image: Tensor::zeros([3, 32, 32], (Kind::Float, Device::Cpu)),
+                camera,
+            }
+        };
+        let views = [view(0.), view(0.2)];
+        let known = gaussians_from_photos(&views, &[], None, 50, 1);
+        let filled = gaussians_from_photos(&views, &[], Some(&known), 80, 2);
+        assert_eq!(filled.means.size(), [1, 80, 3]);
+        // Nobody is sure of black photos.
+        assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
+        assert_eq!(gaussians_from_photos(&views, &[], Some(&known), 50, 2).means.size(), [1, 50, 3]);
     }
 }

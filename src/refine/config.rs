@@ -44,12 +44,8 @@ pub struct RefineConfig {
     pub opacity: f64,
     /// What the mean scale counts, in scene depths.
     pub scale: f64,
-    /// What differences between neighbouring depths count, relative to the depth, where the photo is even.
+    /// What the unevenness of depths counts, see [`crate::loss::depth_smoothness`].
     pub smooth: f64,
-    /// Share of Gaussians that are left out of a step, at the end of the way.
-    pub dropout: f64,
-    /// Of the noise on means of faint Gaussians: times the means' learning rate, in their own widths.
-    pub noise: f64,
     /// Steps between relocations of dead Gaussians; 0: never.
     pub relocate_every: u64,
     /// Opacity at or below which a Gaussian is dead.
@@ -62,7 +58,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         RefineConfig {
             views: 2,
-            sizes: vec![0.1, 0.3],
+            sizes: vec![0.03, 0.1],
             sh_degree: 1,
             sh_every: 0.3,
             means: 2e-3,
@@ -79,9 +75,7 @@ impl Default for RefineConfig {
             similar: 0.2,
             opacity: 1e-3,
             scale: 0.,
-            smooth: 0.,
-            dropout: 0.,
-            noise: 0.,
+            smooth: 0.7,
             relocate_every: 100,
             dead: 0.01,
             relocate_until: 0.8,

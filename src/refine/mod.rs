@@ -18,12 +18,12 @@ pub use space::{GaussianSpace, Space, TokenSpace};
 
 use crate::data::View;
 use crate::error::{Error, Result};
-use crate::loss::photometric;
+use crate::loss::{depth_smoothness, photometric};
 use crate::optim::Stopwatch;
 use crate::render::cpu::KernelThreads;
 use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render, render_views};
 use crate::scene::{Camera, Gaussians};
-use rand::{Rng, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::time::{Duration, Instant};
 use tch::{Kind, Tensor};
@@ -107,11 +107,7 @@ pub(crate) fn refine_timed(
         }
         let level = config.sizes.iter().filter(|&&part| progress >= part).count();
         let (which, batch) = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
-        let mut gaussians = stopwatch.time("activation", || space.gaussians(progress));
-        if config.dropout > 0. {
-            gaussians.opacities =
-                with_some_left_out(&gaussians.opacities, config.dropout * progress, &mut random);
-        }
+        let gaussians = stopwatch.time("activation", || space.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
         let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
         pictures.rgb = corrections.exposed(pictures.rgb, &which);
@@ -149,7 +145,7 @@ fn loss(
         loss += gaussians.scales.mean(Kind::Float) * (config.scale / depth);
     }
     if config.smooth > 0. {
-        loss += unevenness(&pictures.depth, photos) * config.smooth;
+        loss += depth_smoothness(&pictures.depth, photos, config.smooth);
     }
     loss
 }
@@ -170,26 +166,4 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
         return Err(Error::Request("the cameras see nothing of the splat: are both of one world?".into()));
     }
     Ok(depths.median().double_value(&[]))
-}
-
-/// Opacities with a share of them, drawn anew, at 0, and the others as much larger (Park et al. 2025, "DropGaussian").
-fn with_some_left_out(opacities: &Tensor, share: f64, random: &mut impl Rng) -> Tensor {
-    let factor = (1. / (1. - share)) as f32;
-    let factors: Vec<f32> =
-        (0..opacities.numel()).map(|_| if random.random::<f64>() < share { 0. } else { factor }).collect();
-    (opacities * Tensor::from_slice(&factors).view_as(opacities)).clamp_max(1.)
-}
-
-/// How uneven depths are, relative to themselves, where the photo is even.
-fn unevenness(depth: &Tensor, photo: &Tensor) -> Tensor {
-    let logarithm = (depth + 1e-6).log();
-    let grey = photo.mean_dim([2].as_slice(), false, Kind::Float);
-    let along = |dimension: i64| {
-        let difference = |t: &Tensor| {
-            let size = t.size()[dimension as usize];
-            t.narrow(dimension, 1, size - 1) - t.narrow(dimension, 0, size - 1)
-        };
-        (difference(&logarithm).abs() * (difference(&grey).abs() * -10.).exp()).mean(Kind::Float)
-    };
-    along(2) + along(3)
 }

@@ -6,18 +6,11 @@ use super::relocate::relocate;
 use crate::model::{Encoded, GlobalSplat, Stage};
 use crate::optim::{AdamW, ParameterGroup};
 use crate::scene::{Gaussians, RawGaussians};
-use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
 /// Added to the root of the second moments: gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
-
-/// Opacity at which noise has half of its strength, and how sharply it ends.
-const FAINT: f64 = 0.005;
-const STEEPNESS: f64 = 100.;
-/// Even numbers between this and its negative have variance 1.
-const UNIT: f32 = 1.732_050_8;
 
 /// Numbers that Gaussians follow from.
 pub trait Space {
@@ -81,9 +74,6 @@ impl Space for GaussianSpace {
             config.colours * config.harmonics * others,
         ]);
         self.optimizer.step();
-        if config.noise > 0. {
-            shake(&self.leaves, config.noise * config.means * means, random);
-        }
         let due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         if due && progress < config.relocate_until {
             let changed = Tensor::from_slice(&relocate(&self.leaves, config.dead, random));
@@ -92,27 +82,6 @@ impl Space for GaussianSpace {
             }
         }
     }
-}
-
-/// Moves Gaussians about within their own extent, by up to `length` of it in the middle, but only those that are all but invisible
-/// (Kheradmand et al. 2024, eq. 9): they find out where they are needed.
-fn shake(leaves: &Leaves, length: f64, random: &mut impl Rng) {
-    tch::no_grad(|| {
-        let faint = ((leaves.opacity_logits.sigmoid() * -1. + FAINT) * STEEPNESS).sigmoid() * length;
-        let noise: Vec<f32> = (0..leaves.means.numel()).map(|_| random.random_range(-UNIT..UNIT)).collect();
-        // Along the Gaussian's own axes, and then turned.
-        let own =
-            Tensor::from_slice(&noise).view_as(&leaves.means) * leaves.log_scales.exp() * faint.unsqueeze(-1);
-        let _ = leaves.means.shallow_clone().g_add_(&turned(&own, &leaves.quaternions));
-    });
-}
-
-/// Vectors [.., 3], each turned by its quaternion [.., 4] (w, x, y, z) of any length: v + 2 w (u × v) + 2 u × (u × v).
-fn turned(vectors: &Tensor, quaternions: &Tensor) -> Tensor {
-    let unit = quaternions / quaternions.square().sum_dim_intlist([-1].as_slice(), true, Kind::Float).sqrt();
-    let (w, u) = (unit.narrow(-1, 0, 1), unit.narrow(-1, 1, 3));
-    let across = u.linalg_cross(vectors, -1) * 2.;
-    vectors + w * &across + u.linalg_cross(&across, -1)
 }
 
 /// What the encoder knows of a scene; the decoder stays as it is.

@@ -24,6 +24,8 @@ const PATCH: i64 = 9;
 const LEAST_VARIANCE: f64 = 1e-4;
 /// Correlation at or below which a depth counts for nothing.
 const UNSURE: f64 = 0.5;
+/// Correlation above which a depth is right, most often.
+const SURE: f64 = 0.8;
 /// Times that what is known is spread to wider surroundings, and what it counts there, each time.
 const SPREADS: usize = 6;
 const SPREAD_WEIGHT: f64 = 0.1;
@@ -42,6 +44,8 @@ pub struct Swept {
     pub image: Tensor,
     /// Along the camera's axis, [h, w].
     pub depth: Tensor,
+    /// Where photos agree on it, and not only what lies around, [h, w].
+    pub sure: Tensor,
 }
 
 /// A small photo.
@@ -61,10 +65,11 @@ pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
         let nearest = nearest_of_points(&small[index].camera, points)
             .unwrap_or_else(|| nearest_of_cameras(&small[index], others.first().copied()));
         let (inverse, likeness) = most_alike(&small[index], &others, nearest);
-        filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal()
+        let depth = filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal();
+        (depth, likeness.gt(SURE))
     };
-    let depths: Vec<Tensor> = (0..small.len()).map(depth).collect();
-    let swept = |(Small { camera, image, .. }, depth)| Swept { camera, image, depth };
+    let depths: Vec<(Tensor, Tensor)> = (0..small.len()).map(depth).collect();
+    let swept = |(Small { camera, image, .. }, (depth, sure))| Swept { camera, image, depth, sure };
     small.into_iter().zip(depths).map(swept).collect()
 }
 

@@ -98,6 +98,33 @@ impl RawGaussians {
         }
     }
 
+    /// Those of `indices`, of every scene.
+    pub fn select(&self, indices: &[i64]) -> Self {
+        let indices = Tensor::from_slice(indices);
+        let chosen = |t: &Tensor| t.index_select(1, &indices);
+        RawGaussians {
+            means: chosen(&self.means),
+            log_scales: chosen(&self.log_scales),
+            quaternions: chosen(&self.quaternions),
+            opacity_logits: chosen(&self.opacity_logits),
+            sh: chosen(&self.sh),
+        }
+    }
+
+    /// These Gaussians and then `others`, of the same scenes, with spherical harmonics up to the higher degree of both.
+    pub fn and(&self, others: &RawGaussians) -> Self {
+        let joined = |a: &Tensor, b: &Tensor| Tensor::cat(&[a, b], 1);
+        let bases = self.sh.size()[2].max(others.sh.size()[2]);
+        let padded = |sh: &Tensor| sh.constant_pad_nd([0, 0, 0, bases - sh.size()[2]]);
+        RawGaussians {
+            means: joined(&self.means, &others.means),
+            log_scales: joined(&self.log_scales, &others.log_scales),
+            quaternions: joined(&self.quaternions, &others.quaternions),
+            opacity_logits: joined(&self.opacity_logits, &others.opacity_logits),
+            sh: joined(&padded(&self.sh), &padded(&others.sh)),
+        }
+    }
+
     /// Every tensor by its name, as an optimizer takes them.
     pub fn named(&self) -> [(&'static str, &Tensor); 5] {
         [
