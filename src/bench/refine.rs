@@ -53,7 +53,7 @@ pub fn bench_refine(
     let photos =
         Photos::of(ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c, intrinsics: cameras.intrinsics });
     let mut space = GaussianSpace::new(&RawGaussians::of(&gaussians), 1., config);
-    let mut none = Corrections::new(PHOTOS, false, false, 1., config);
+    let mut none = Corrections::none();
     let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
     refine_timed(&mut space, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 

@@ -166,10 +166,7 @@ impl Refine {
             done_seconds: begin_seconds,
             curve: vec![],
         };
-        let depth = scene_depth(&first, &photos)?;
-        let mut corrections =
-            Corrections::new(photos.len(), self.correct_poses, self.correct_exposures, depth, &config);
-        let mut gaussians = work.optimize(&start, &first, depth, &mut corrections, self.space)?;
+        let (mut gaussians, corrections) = work.optimize(&start, &first, &self)?;
         work.bar.finish_and_clear();
         let mut after = judge.scores_of_both(&gaussians, &corrections.applied(&photos))?;
         let mut corrected =
@@ -274,23 +271,21 @@ struct Mark {
 }
 
 impl Work<'_> {
-    /// In one space, or in one after the other. `first` are the Gaussians of `start` in the capture's world, `depth` is the scene's
-    /// there; `corrections` are learned with Gaussians.
+    /// In one space, or in one after the other; photos are corrected with Gaussians alone. `first` are those of `start` in the
+    /// capture's world.
     fn optimize(
         &mut self,
         start: &Start,
         first: &Gaussians,
-        depth: f64,
-        corrections: &mut Corrections,
-        space: SpaceName,
-    ) -> Result<Gaussians> {
+        asked: &Refine,
+    ) -> Result<(Gaussians, Corrections)> {
         let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
         let (raw, done) = match start {
             Start::Gaussians(raw) => (raw.shallow_clone(), 0.),
             Start::Model(loaded, made) => {
                 self.mark(first)?;
-                let end = if space == SpaceName::Tokens { 1. } else { TOKENS_SHARE };
-                let (gaussians, done) = match space {
+                let end = if asked.space == SpaceName::Tokens { 1. } else { TOKENS_SHARE };
+                let (gaussians, done) = match asked.space {
                     SpaceName::Gaussians => (first.map(Tensor::shallow_clone), 0.),
                     SpaceName::Tokens | SpaceName::Both => {
                         // Tokens know the normalized world alone.
@@ -298,29 +293,35 @@ impl Work<'_> {
                         let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
                         let mut space =
                             TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
-                        let mut none = Corrections::new(self.photos.len(), false, false, depth, self.config);
-                        let depth = depth / world.scale;
-                        (self.phase(&mut space, &mut none, &poses, depth, [0., end], Some(world))?, end)
+                        let depth = scene_depth(first, self.photos)? / world.scale;
+                        let none = &mut Corrections::none();
+                        (self.phase(&mut space, none, &poses, depth, [0., end], Some(world))?, end)
                     }
                 };
                 if done == 1. || self.stop.load(Ordering::Relaxed) {
-                    return Ok(gaussians);
+                    return Ok((gaussians, Corrections::none()));
                 }
                 (self.filled(&gaussians), done)
             }
         };
+        let depth = scene_depth(&raw.activate(), self.photos)?;
         let mut space = GaussianSpace::new(&raw, depth, self.config);
-        self.phase(&mut space, corrections, &poses, depth, [done, 1.], None)
+        let (count, config) = (self.photos.len(), self.config);
+        let mut corrections =
+            Corrections::new(count, asked.correct_poses, asked.correct_exposures, depth, config);
+        Ok((self.phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
     }
 
     /// As many Gaussians as are to be, at the least: those that are missing lie where the photos agree, and in place of those that
     /// can't be where they are.
     fn filled(&mut self, gaussians: &Gaussians) -> RawGaussians {
-        let raw = RawGaussians::of(gaussians);
+        let mut raw = RawGaussians::of(gaussians);
         if self.photos.len() < 2 || gaussians.count() >= self.gaussians as i64 {
             return raw;
         }
         let clock = Instant::now();
+        // Spherical harmonics follow when they do for the others.
+        raw.sh = raw.sh.narrow(2, 0, 1);
         let filled = gaussians_from_photos(self.photos, self.points, Some(&raw), self.gaussians, self.seed);
         let seconds = clock.elapsed().as_secs_f64();
         self.done_seconds += seconds;

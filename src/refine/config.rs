@@ -72,7 +72,7 @@ impl Default for RefineConfig {
             tokens: 1e-2,
             poses: 5e-4,
             exposures: 5e-3,
-            similar: 0.2,
+            similar: 0.4,
             opacity: 1e-3,
             scale: 0.,
             smooth: 0.7,

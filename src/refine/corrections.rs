@@ -37,6 +37,11 @@ pub struct Correction {
 }
 
 impl Corrections {
+    /// None, ever.
+    pub fn none() -> Self {
+        Corrections::new(0, false, false, 1., &RefineConfig::default())
+    }
+
     /// None yet, of so many photos. Lengths are measured by `depth`, that of the scene.
     pub fn new(photos: usize, poses: bool, exposures: bool, depth: f64, config: &RefineConfig) -> Self {
         let leaf = |numbers: i64| {
