@@ -9,11 +9,13 @@ use tch::{Device, Kind, Tensor};
 /// Photos are looked at with so many pixels along the longer side.
 const LONGEST_SIDE: f64 = 128.;
 /// Inverse depths that are tried, evenly from 0 to the nearest plane's.
-const PLANES: i64 = 64;
+const PLANES: i64 = 128;
 /// Of the picture's width: how far a pixel of the nearest plane moves in the photo taken nearest.
-const LARGEST_MOVE: f64 = 0.3;
+const LARGEST_MOVE: f64 = 0.7;
 /// The farthest that pixels are put, in units of the nearest plane's distance.
 const FARTHEST: f64 = 500.;
+/// Photos whose pixels get depths, at the most: together they have seen what there is to see.
+const MOST: usize = 32;
 /// Photos that each one is compared with. In half of them a pixel has to look alike: in the others something may hide it.
 const NEIGHBOURS: usize = 4;
 /// Cosine of the angle between two views beyond which they hardly show the same.
@@ -57,7 +59,8 @@ struct Small {
     grey: Tensor,
 }
 
-/// Finds depths for the pixels of every view. `points` of the scene, where some are known, tell where it begins.
+/// Finds depths for the pixels of the views, or of some spread over all where these are many. `points` of the scene, where some are
+/// known, tell where it begins.
 pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
     let small: Vec<Small> = views.iter().map(Small::of).collect();
     let depth = |index: usize| {
@@ -68,9 +71,11 @@ pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
         let depth = filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal();
         (depth, likeness.gt(SURE))
     };
-    let depths: Vec<(Tensor, Tensor)> = (0..small.len()).map(depth).collect();
-    let swept = |(Small { camera, image, .. }, (depth, sure))| Swept { camera, image, depth, sure };
-    small.into_iter().zip(depths).map(swept).collect()
+    let swept = |index: usize| {
+        let (depth, sure) = depth(index);
+        Swept { camera: small[index].camera, image: small[index].image.shallow_clone(), depth, sure }
+    };
+    (0..small.len()).step_by(small.len().div_ceil(MOST).max(1)).map(swept).collect()
 }
 
 impl Small {
