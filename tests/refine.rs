@@ -245,6 +245,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     assert!(with(&["--set", "views"]).contains("expected KEY=VALUE"));
     assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));
     assert!(with(&["--from", "nothing", "--space", "tokens"]).contains("nor tokens"));
+    assert!(with(&["--space", "tokens", "--correct-poses"]).contains("corrects no photos"));
     assert!(with(&["--views", "1"]).contains("two or more"));
     // A splat of another world.
     let away = folder.path().join("away.ply");

@@ -3,17 +3,17 @@ use super::{model, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
-use globalsplat::data::{Capture, Holdout, Point, View, open_capture, points_of};
+use globalsplat::data::{Holdout, Point, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
-use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, spread_over_path};
+use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
     Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
     gaussians_from_photos, load_photos, refine, scene_depth,
 };
 use globalsplat::render::{Rendered, render_views, transform};
-use globalsplat::scene::{Gaussians, RawGaussians, Similarity};
+use globalsplat::scene::{Camera, Gaussians, RawGaussians, Similarity};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -130,6 +130,10 @@ impl Refine {
         if !(self.seconds > 0. && self.seconds.is_finite()) {
             return Err(Error::Request(format!("--seconds is {}, expected more than 0", self.seconds)).into());
         }
+        if self.space == SpaceName::Tokens && (self.correct_poses || self.correct_exposures) {
+            let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
+            return Err(Error::Request(why.into()).into());
+        }
         check_writable_file(&self.out)?;
         if let Some(sheet) = &self.sheet {
             check_writable_file(sheet)?;
@@ -144,7 +148,7 @@ impl Refine {
 
         let clock = Instant::now();
         let points = points_of(&capture)?;
-        let start = self.start(&capture, holdout, &photos, &points)?;
+        let start = self.start(&photos, &points)?;
         let begin_seconds = clock.elapsed().as_secs_f64();
         let first = match &start {
             Start::Gaussians(raw) => raw.activate(),
@@ -213,7 +217,7 @@ impl Refine {
     }
 
     /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
-    fn start(&self, capture: &Capture, holdout: Holdout, photos: &[View], points: &[Point]) -> Result<Start> {
+    fn start(&self, photos: &[View], points: &[Point]) -> Result<Start> {
         if let Some(path) = &self.splat {
             return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
         }
@@ -225,8 +229,12 @@ impl Refine {
         if self.from == Some(From::Weights) || needs_model {
             let loaded = model::load(self.weights.as_deref(), "f32", Device::Cpu)?;
             let data = &loaded.config.data;
-            let count = self.views.unwrap_or(data.context_views);
-            let context = load_context(capture, holdout, Some(count), data.image_size)?;
+            let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+            let all: Vec<usize> = (0..photos.len()).collect();
+            let context = spread_over_path(&cameras, &all, self.views.unwrap_or(data.context_views))
+                .into_iter()
+                .map(|index| photos[index].fitted(data.image_size))
+                .collect::<globalsplat::Result<Vec<_>>>()?;
             let made = reconstruct(&loaded, &context, &[])?;
             return Ok(Start::Model(Box::new(loaded), made));
         }

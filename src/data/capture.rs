@@ -79,6 +79,17 @@ pub struct View {
     pub camera: Camera,
 }
 
+impl View {
+    /// Fitted to `size`, as [`Capture::load`] does it, without reading the photo again.
+    ///
+    /// # Errors
+    /// libtorch's refusal of an image of another shape.
+    pub fn fitted(&self, size: ImageSize) -> Result<Self> {
+        let (planes, camera) = fit(&io::rgb_from_tensor(&self.image)?, &self.camera, size);
+        Ok(View { name: self.name.clone(), image: planes.to_tensor(), camera })
+    }
+}
+
 impl Capture {
     /// Checks what every format has to hold: two views, rigid poses, sensible intrinsics.
     pub(super) fn new(name: String, file: PathBuf, frames: Vec<Frame>) -> Result<Self> {

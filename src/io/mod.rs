@@ -29,6 +29,6 @@ pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically,
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
 pub(crate) use images::{
-    PHOTO_EXTENSIONS, encode_photo, encoded_image_size, enlarge, read_image_size, write_jpeg,
+    PHOTO_EXTENSIONS, encode_photo, encoded_image_size, enlarge, read_image_size, rgb_from_tensor, write_jpeg,
 };
 pub(crate) use pretrained::pretrained_folders;
