@@ -8,11 +8,10 @@ done stays done.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
-from core_runs import PROGRAM, row
+from core_runs import row
+from refine_runs import refined
 
 STARTS = {"nothing": "photos alone", "weights": "the shipped weights"}
 SECONDS = [2, 3, 5, 10, 20, 30, 60]
@@ -22,14 +21,9 @@ WIDTH, HEIGHT, LEFT, TOP = 250, 190, 34, 26  # of one capture's plot, pixels
 def curve(out, capture, start, seconds):
     """[(seconds, PSNR)] of views held out, the first of them of what was begun with."""
     folder, holdout, *views = capture
-    told = out / f"{Path(folder).name}.{start}.json"
-    if not told.is_file():
-        command = [PROGRAM, "refine", "--scene", folder, "--holdout", holdout, "--size", "256x256", "--from", start]
-        command += ["--seconds", str(seconds), "--json", "--out", told.with_suffix(".ply")]
-        command += ["--views", views[0]] if views else []
-        text = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
-        told.write_text(text)
-    return [(mark["seconds"], mark["psnr"]) for mark in json.loads(told.read_text())["held_out"]["curve"]]
+    more = ["--from", start, *(["--views", views[0]] if views else [])]
+    told = refined(out / f"{Path(folder).name}.{start}.json", folder, holdout, seconds, *more)
+    return [(mark["seconds"], mark["psnr"]) for mark in told["held_out"]["curve"]]
 
 
 def at(marks, seconds):

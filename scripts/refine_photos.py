@@ -9,11 +9,10 @@ What is done stays done.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
-from core_runs import PROGRAM, row
+from core_runs import row
+from refine_runs import refined
 
 WAYS = {
     "photos alone": ["--from", "nothing"],
@@ -21,17 +20,6 @@ WAYS = {
     "tokens": ["--space", "tokens"],
     "tokens, then Gaussians": ["--space", "both"],
 }
-
-
-def refined(out, capture, photos, way, seconds):
-    """What `refine` told."""
-    folder, holdout = capture
-    told = out / f"{Path(folder).name}.{photos}.{way.replace(', ', '_').replace(' ', '_')}.json"
-    if not told.is_file():
-        command = [PROGRAM, "refine", "--scene", folder, "--holdout", holdout, "--size", "256x256", *WAYS[way]]
-        command += ["--views", str(photos), "--seconds", str(seconds), "--json", "--out", told.with_suffix(".ply")]
-        told.write_text(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
-    return json.loads(told.read_text())
 
 
 def main():
@@ -44,13 +32,17 @@ def main():
     arguments.out.mkdir(parents=True, exist_ok=True)
     row("capture, photos", *WAYS)
     row(*["---"] * (1 + len(WAYS)))
-    for capture in arguments.capture:
+    for folder, holdout in arguments.capture:
+        name = Path(folder).name
         for photos in arguments.photos:
-            told = {way: refined(arguments.out, capture, photos, way, arguments.seconds) for way in WAYS}
+            told = {}
+            for way, options in WAYS.items():
+                file = arguments.out / f"{name}.{photos}.{way.replace(', ', '_').replace(' ', '_')}.json"
+                told[way] = refined(file, folder, holdout, arguments.seconds, *options, "--views", str(photos))
             if any(one["photos"] < photos for one in told.values()):
                 continue  # the capture hasn't so many
             reached = [f"{told[way]['held_out']['after']['psnr']:.2f}" for way in WAYS]
-            row(f"{Path(capture[0]).name}, {photos}", *reached)
+            row(f"{name}, {photos}", *reached)
 
 
 if __name__ == "__main__":

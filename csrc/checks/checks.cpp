@@ -53,6 +53,11 @@ void out_of_patience(int) {
   _exit(say("FOUND: ", 7) && say(now.data(), now.size()) && say(end, sizeof end - 1) ? 1 : 2);
 }
 
+template <class Item>
+bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
+  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
+}
+
 // A frame of a scene, with all that it reads and writes.
 template <class T>
 class Render {
@@ -122,11 +127,6 @@ class Render {
     return out;
   }
 
-  template <class Item>
-  static bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
-    return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
-  }
-
   raster::Settings settings_;
   std::vector<raster::Gaussians<T>> scenes_;
   std::vector<raster::View<T>> views_;
@@ -181,41 +181,36 @@ int64_t fits(const std::vector<int>& thread_counts) {
     for (const double value : random.uniform(count, 0, 1)) values.push_back(T(value));
     return values;
   };
-  const auto same = [](const std::vector<T>& a, const std::vector<T>& b) {
-    return std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0;
-  };
   int64_t count = 0;
+  // evaluate(gradient, threads) gives a loss, and the gradient's `all` numbers unless that is null.
+  const auto expect_the_same = [&](const std::string& what, size_t all, const auto& evaluate) {
+    std::vector<T> one(all);
+    begin(what + ", " + type_name<T>());
+    const double value = evaluate(one.data(), 1);
+    expect(evaluate(nullptr, 1) == value, "the gradient changes the value");
+    for (const int threads : thread_counts) {
+      std::vector<T> gradient(all, T(threads));
+      const double again = evaluate(gradient.data(), threads);
+      expect(again == value && same(gradient, one), "threads change a loss");
+      ++count;
+    }
+  };
   for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
     const size_t all = size_t(planes * height * width);
     const std::vector<T> pictures = numbers(all), photos = numbers(all);
     const raster::FitJob<T> job{pictures.data(), photos.data(), planes, width, height};
-    for (const double similar : {0.0, -0.2}) {
-      std::vector<T> one(all);
-      begin("a fit, " + type_name<T>());
-      const double value = raster::photometric<T>(job, 0.8, similar, one.data(), 1);
-      expect(raster::photometric<T>(job, 0.8, similar, nullptr, 1) == value, "the gradient changes the value");
-      for (const int threads : thread_counts) {
-        std::vector<T> gradient(all, T(threads));
-        const double again = raster::photometric<T>(job, 0.8, similar, gradient.data(), threads);
-        expect(again == value && same(gradient, one), "threads change a fit");
-        ++count;
-      }
-    }
+    for (const double similar : {0.0, -0.2})
+      expect_the_same("a fit", all, [&](T* gradient, int threads) {
+        return raster::photometric<T>(job, 0.8, similar, gradient, threads);
+      });
   }
   for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
     const size_t all = size_t(views * height * width);
     const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
     const raster::DepthJob<T> job{depths.data(), photos.data(), views, width, height};
-    std::vector<T> one(all);
-    begin("smoothness, " + type_name<T>());
-    const double value = raster::depth_smoothness<T>(job, 0.3, one.data(), 1);
-    expect(raster::depth_smoothness<T>(job, 0.3, nullptr, 1) == value, "the gradient changes the value");
-    for (const int threads : thread_counts) {
-      std::vector<T> gradient(all, T(threads));
-      const double again = raster::depth_smoothness<T>(job, 0.3, gradient.data(), threads);
-      expect(again == value && same(gradient, one), "threads change smoothness");
-      ++count;
-    }
+    expect_the_same("smoothness", all, [&](T* gradient, int threads) {
+      return raster::depth_smoothness<T>(job, 0.3, gradient, threads);
+    });
   }
   const size_t many = 40'000;
   const std::vector<T> gradient = numbers(many), start = numbers(many);

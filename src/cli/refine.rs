@@ -3,7 +3,7 @@ use super::{model, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
-use globalsplat::data::{Holdout, Point, View, open_capture, points_of};
+use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
@@ -147,8 +147,7 @@ impl Refine {
             Judge { name: capture.name.clone(), held_out, perceptual: Perceptual::find(Device::Cpu)? };
 
         let clock = Instant::now();
-        let points = points_of(&capture)?;
-        let start = self.start(&photos, &points)?;
+        let start = self.start(&capture, &photos)?;
         let begin_seconds = clock.elapsed().as_secs_f64();
         let first = match &start {
             Start::Gaussians(raw) => raw.activate(),
@@ -156,21 +155,22 @@ impl Refine {
         };
         let before = judge.scores_of_both(&first, &photos)?;
         let mut work = Work {
+            asked: &self,
+            capture: &capture,
             photos: &photos,
-            points: &points,
-            gaussians: self.gaussians as usize,
             judge: &judge,
             config: &config,
-            steps: self.steps,
             seconds: (self.seconds - begin_seconds).max(LEAST_SECONDS),
-            seed: self.seed,
             stop: stop_flag()?,
             bar: progress::bar(1000, "‰"),
             done_steps: 0,
             done_seconds: begin_seconds,
             curve: vec![],
         };
-        let (mut gaussians, corrections) = work.optimize(&start, &first, &self)?;
+        if let (Start::Model(..), Some(scores)) = (&start, &before.held_out) {
+            work.keep(scores);
+        }
+        let (mut gaussians, corrections) = work.optimize(&start, &first)?;
         work.bar.finish_and_clear();
         let mut after = judge.scores_of_both(&gaussians, &corrections.applied(&photos))?;
         let mut corrected =
@@ -217,7 +217,7 @@ impl Refine {
     }
 
     /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
-    fn start(&self, photos: &[View], points: &[Point]) -> Result<Start> {
+    fn start(&self, capture: &Capture, photos: &[View]) -> Result<Start> {
         if let Some(path) = &self.splat {
             return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
         }
@@ -242,23 +242,30 @@ impl Refine {
             let why = "one photo tells no depth: two or more are expected, or a --splat";
             return Err(Error::Request(why.into()).into());
         }
-        Ok(Start::Gaussians(gaussians_from_photos(photos, points, None, self.gaussians as usize, self.seed)))
+        Ok(Start::Gaussians(self.gaussians_of(capture, photos, None)?))
+    }
+
+    /// As many Gaussians as were asked for; of `known` ones, those that can be where they are.
+    fn gaussians_of(
+        &self,
+        capture: &Capture,
+        photos: &[View],
+        known: Option<&RawGaussians>,
+    ) -> Result<RawGaussians> {
+        let points = points_of(capture)?;
+        Ok(gaussians_from_photos(photos, &points, known, self.gaussians as usize, self.seed))
     }
 }
 
 /// The optimization, and how far it is.
 struct Work<'a> {
+    asked: &'a Refine,
+    capture: &'a Capture,
     photos: &'a [View],
-    points: &'a [Point],
-    /// At the least.
-    gaussians: usize,
     judge: &'a Judge,
     config: &'a RefineConfig,
-    /// All in all, where it isn't time that counts.
-    steps: Option<u64>,
     /// All in all, once it has begun.
     seconds: f64,
-    seed: u64,
     stop: Arc<AtomicBool>,
     bar: Progress,
     done_steps: u64,
@@ -281,35 +288,25 @@ struct Mark {
 impl Work<'_> {
     /// In one space, or in one after the other; photos are corrected with Gaussians alone. `first` are those of `start` in the
     /// capture's world.
-    fn optimize(
-        &mut self,
-        start: &Start,
-        first: &Gaussians,
-        asked: &Refine,
-    ) -> Result<(Gaussians, Corrections)> {
-        let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
+    fn optimize(&mut self, start: &Start, first: &Gaussians) -> Result<(Gaussians, Corrections)> {
+        let asked = self.asked;
+        let end = match asked.space {
+            SpaceName::Gaussians => 0.,
+            SpaceName::Tokens => 1.,
+            SpaceName::Both => TOKENS_SHARE,
+        };
         let (raw, done) = match start {
             Start::Gaussians(raw) => (raw.shallow_clone(), 0.),
             Start::Model(loaded, made) => {
-                self.mark(first)?;
-                let end = if asked.space == SpaceName::Tokens { 1. } else { TOKENS_SHARE };
-                let (gaussians, done) = match asked.space {
-                    SpaceName::Gaussians => (first.map(Tensor::shallow_clone), 0.),
-                    SpaceName::Tokens | SpaceName::Both => {
-                        // Tokens know the normalized world alone.
-                        let world = &made.world_from_normalized;
-                        let poses: Vec<DMat4> = poses.iter().map(|c2w| world.pose_before(c2w)).collect();
-                        let mut space =
-                            TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
-                        let depth = scene_depth(first, self.photos)? / world.scale;
-                        let none = &mut Corrections::none();
-                        (self.phase(&mut space, none, &poses, depth, [0., end], Some(world))?, end)
-                    }
+                let gaussians = if end > 0. {
+                    self.through_tokens(loaded, made, first, end)?
+                } else {
+                    first.map(Tensor::shallow_clone)
                 };
-                if done == 1. || self.stop.load(Ordering::Relaxed) {
+                if end == 1. || self.stop.load(Ordering::Relaxed) {
                     return Ok((gaussians, Corrections::none()));
                 }
-                (self.filled(&gaussians), done)
+                (self.filled(&gaussians)?, end)
             }
         };
         let depth = scene_depth(&raw.activate(), self.photos)?;
@@ -317,24 +314,40 @@ impl Work<'_> {
         let (count, config) = (self.photos.len(), self.config);
         let mut corrections =
             Corrections::new(count, asked.correct_poses, asked.correct_exposures, depth, config);
+        let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
         Ok((self.phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
+    }
+
+    /// What tokens become until `end` of the way. They know the normalized world alone.
+    fn through_tokens(
+        &mut self,
+        loaded: &LoadedModel,
+        made: &Reconstruction,
+        first: &Gaussians,
+        end: f64,
+    ) -> Result<Gaussians> {
+        let world = &made.world_from_normalized;
+        let poses: Vec<DMat4> = self.photos.iter().map(|view| world.pose_before(&view.camera.c2w)).collect();
+        let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
+        let depth = scene_depth(first, self.photos)? / world.scale;
+        self.phase(&mut space, &mut Corrections::none(), &poses, depth, [0., end], Some(world))
     }
 
     /// As many Gaussians as are to be, at the least: those that are missing lie where the photos agree, and in place of those that
     /// can't be where they are.
-    fn filled(&mut self, gaussians: &Gaussians) -> RawGaussians {
+    fn filled(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
         let mut raw = RawGaussians::of(gaussians);
-        if self.photos.len() < 2 || gaussians.count() >= self.gaussians as i64 {
-            return raw;
+        if self.photos.len() < 2 || gaussians.count() >= i64::from(self.asked.gaussians) {
+            return Ok(raw);
         }
         let clock = Instant::now();
         // Spherical harmonics follow when they do for the others.
         raw.sh = raw.sh.narrow(2, 0, 1);
-        let filled = gaussians_from_photos(self.photos, self.points, Some(&raw), self.gaussians, self.seed);
+        let filled = self.asked.gaussians_of(self.capture, self.photos, Some(&raw))?;
         let seconds = clock.elapsed().as_secs_f64();
         self.done_seconds += seconds;
         self.seconds = (self.seconds - seconds).max(LEAST_SECONDS);
-        filled
+        Ok(filled)
     }
 
     /// The part of the way from `from` to `to`. `poses` are those of the photos in the world of `space`, `world` the way from there to
@@ -352,12 +365,12 @@ impl Work<'_> {
             Some(world) => transform(&gaussians, world),
             None => gaussians,
         };
-        let budget = match self.steps {
+        let budget = match self.asked.steps {
             Some(steps) => Budget::Steps(((to - from) * steps as f64).round() as u64),
             None => Budget::Time(Duration::from_secs_f64((to - from) * self.seconds)),
         };
         let photos = Photos::new(self.photos, poses, self.config.levels());
-        let task = Task { photos: &photos, depth, config: self.config, budget, seed: self.seed };
+        let task = Task { photos: &photos, depth, config: self.config, budget, seed: self.asked.seed };
         let (steps, seconds) = (self.done_steps, self.done_seconds);
         let mut marks = MARKS.iter().peekable();
         let mut failure = None;
@@ -380,12 +393,18 @@ impl Work<'_> {
 
     /// Scores the views held out.
     fn mark(&mut self, gaussians: &Gaussians) -> globalsplat::Result<()> {
-        let Some(scores) = self.judge.held_out_scores(gaussians)? else { return Ok(()) };
+        if let Some(scores) = self.judge.held_out_scores(gaussians)? {
+            self.keep(&scores);
+        }
+        Ok(())
+    }
+
+    /// What views held out score now.
+    fn keep(&mut self, scores: &CaptureScores) {
         self.bar.set_message(format!("{} steps, held out {:.2} dB", self.done_steps, scores.psnr));
         let (steps, seconds) = (self.done_steps, self.done_seconds);
-        let CaptureScores { psnr, ssim, lpips_vgg, .. } = scores;
+        let &CaptureScores { psnr, ssim, lpips_vgg, .. } = scores;
         self.curve.push(Mark { seconds, steps, psnr, ssim, lpips_vgg });
-        Ok(())
     }
 }
 

@@ -1,5 +1,6 @@
 //! How uneven depths are where a photo is even: what holds geometry together where photos are few (Godard et al. 2017, eq. 3).
 
+use crate::handed_over::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
@@ -11,12 +12,9 @@ use tch::Tensor;
 /// # Panics
 /// Shapes that don't fit.
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
-    let mut out = [0];
-    // SAFETY: the tensors outlive the call.
-    let done = unsafe {
-        fit::depth_smoothness(depths.as_ptr() as usize, photos.as_ptr() as usize, factor, &mut out)
-    };
-    done.unwrap_or_else(|error| panic!("{error}"));
-    // SAFETY: on success the C++ side has put a new tensor there and left it to us.
-    unsafe { Tensor::from_ptr(out[0] as *mut torch_sys::C_tensor) }
+    let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
+    // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+    let done = unsafe { handed_over(|out| fit::depth_smoothness(depths, photos, factor, out)) };
+    let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
+    loss
 }

@@ -1,6 +1,7 @@
 //! How far a picture is from a photo: absolute differences, and structural similarity (Wang et al. 2004), as scikit-image's
 //! `structural_similarity` with Gaussian weights computes it. (Spec 9.4.)
 
+use crate::handed_over::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
@@ -11,14 +12,11 @@ use tch::Tensor;
 /// # Panics
 /// Shapes that differ, or smaller pictures.
 pub fn photometric(picture: &Tensor, truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
-    let mut out = [0];
-    // SAFETY: the tensors outlive the call.
-    let done = unsafe {
-        fit::photometric(picture.as_ptr() as usize, truth.as_ptr() as usize, absolute, similar, &mut out)
-    };
-    done.unwrap_or_else(|error| panic!("{error}"));
-    // SAFETY: on success the C++ side has put a new tensor there and left it to us.
-    unsafe { Tensor::from_ptr(out[0] as *mut torch_sys::C_tensor) }
+    let (picture, truth) = (picture.as_ptr() as usize, truth.as_ptr() as usize);
+    // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+    let done = unsafe { handed_over(|out| fit::photometric(picture, truth, absolute, similar, out)) };
+    let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
+    loss
 }
 
 /// The mean SSIM, with sample covariances; 1 for equal pictures. As [`photometric`].

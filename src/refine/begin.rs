@@ -1,6 +1,6 @@
 //! Gaussians to begin with where nothing is known but photos, or photos and points.
 
-use super::sweep::{Swept, sweep};
+use super::sweep::{Swept, sight_of, sweep};
 use crate::data::{Point, View};
 use crate::scene::{RawGaussians, SH_C0};
 use glam::DVec3;
@@ -46,25 +46,18 @@ pub fn gaussians_from_photos(
 fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
-    let maps: Vec<(Vec<f32>, Vec<bool>)> = swept
-        .iter()
-        .map(|of| {
-            let depth = Vec::try_from(of.depth.contiguous().view([-1])).expect("numbers");
-            (depth, Vec::try_from(of.sure.contiguous().view([-1])).expect("truths"))
-        })
-        .collect();
+    let map = |of: &Swept| {
+        let depth = Vec::<f32>::try_from(of.depth.contiguous().view([-1])).expect("numbers");
+        let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
+        (sight_of(&of.camera), of.camera.width as usize, depth, sure)
+    };
+    let maps: Vec<_> = swept.iter().map(map).collect();
     let holds = |mean: DVec3| {
         let mut shown = false;
-        for (of, (depth, sure)) in swept.iter().zip(&maps) {
-            let p = of.camera.c2w.inverse().transform_point3(mean);
-            let k = of.camera.intrinsics;
-            let (u, v) = ((k.fx * p.x / p.z + k.cx).floor(), (k.fy * p.y / p.z + k.cy).floor());
-            let (width, height) = (f64::from(of.camera.width), f64::from(of.camera.height));
-            if p.z <= 0. || u < 0. || v < 0. || u >= width || v >= height {
-                continue;
-            }
-            let pixel = (v * width + u) as usize;
-            let nearness = p.z / f64::from(depth[pixel]);
+        for (seen, width, depth, sure) in &maps {
+            let Some([u, v, z]) = seen(mean) else { continue };
+            let pixel = v as usize * width + u as usize;
+            let nearness = z / f64::from(depth[pixel]);
             if sure[pixel] && nearness < 1. - NEAR {
                 return false;
             }

@@ -4,7 +4,7 @@
 use super::config::RefineConfig;
 use crate::data::{View, ViewBatch};
 use crate::optim::{AdamW, ParameterGroup};
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use tch::{Kind, Tensor};
 
@@ -96,10 +96,9 @@ impl Corrections {
     pub fn applied(&self, photos: &[View]) -> Vec<View> {
         let applied = |(index, view): (usize, &View)| {
             let numbers = self.numbers(index);
-            let turn = rows_of(&turn(&Tensor::from_slice(&numbers[..3]).view([1, 1, 3])));
             let mut camera = view.camera;
             let centre = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
-            camera.c2w = DMat4::from_mat3(turn * DMat3::from_mat4(camera.c2w));
+            camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
             camera.c2w.w_axis = centre.extend(1.);
             let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
             View { name: view.name.clone(), image: &view.image / gain, camera }
@@ -111,11 +110,10 @@ impl Corrections {
     pub fn told(&self, photos: &[View]) -> Vec<Correction> {
         let told = |(index, view): (usize, &View)| {
             let numbers = self.numbers(index);
-            let (twist, shift) = (DVec3::from_slice(&numbers[..3]), DVec3::from_slice(&numbers[3..6]));
             Correction {
                 photo: view.name.clone(),
-                degrees: (2. * (twist.length() / 2.).atan()).to_degrees(),
-                depths: shift.length(),
+                degrees: quaternion(&numbers).to_axis_angle().1.to_degrees(),
+                depths: DVec3::from_slice(&numbers[3..6]).length(),
                 exposure: [6, 7, 8].map(|k| numbers[k].exp()),
             }
         };
@@ -148,17 +146,15 @@ fn turn(vectors: &Tensor) -> Tensor {
         0., -1., 0.,  1., 0., 0.,  0., 0., 0.,
     ]);
     let shape = [&vectors.size()[..], &[3]].concat();
-    let generators = generators.view([3, 9]).to_kind(vectors.kind());
-    let cross = vectors.matmul(&generators).view(shape.as_slice());
+    let cross = vectors.matmul(&generators.view([3, 9])).view(shape.as_slice());
     let square = vectors.square().sum_dim_intlist([-1].as_slice(), true, None).unsqueeze(-1);
     let share = (square / 4. + 1.).reciprocal();
     Tensor::eye(3, (vectors.kind(), vectors.device())) + (&cross + cross.matmul(&cross) / 2.) * share
 }
 
-fn rows_of(matrix: &Tensor) -> DMat3 {
-    let rows: Vec<f64> =
-        Vec::try_from(matrix.to_kind(Kind::Double).contiguous().view([-1])).expect("nine numbers");
-    DMat3::from_cols_slice(&rows).transpose()
+/// [`turn`] by the first three of a photo's numbers.
+fn quaternion(numbers: &[f64]) -> DQuat {
+    DQuat::from_vec4((DVec3::from_slice(numbers) / 2.).extend(1.)).normalize()
 }
 
 #[cfg(test)]
@@ -170,7 +166,7 @@ mod tests {
 
     fn view(index: usize) -> View {
         let c2w = DMat4::from_rotation_translation(
-            glam::DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 0.1 * index as f64, -0.2),
+            DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 0.1 * index as f64, -0.2),
             DVec3::new(1., index as f64, -2.),
         );
         let intrinsics = Intrinsics { fx: 10., fy: 10., cx: 4., cy: 4. };

@@ -63,17 +63,17 @@ struct Small {
 /// known, tell where it begins.
 pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
     let small: Vec<Small> = views.iter().map(Small::of).collect();
-    let depth = |index: usize| {
+    let swept = |index: usize| {
         let others = neighbours(index, &small);
         let nearest = nearest_of_points(&small[index].camera, points)
             .unwrap_or_else(|| nearest_of_cameras(&small[index], others.first().copied()));
         let (inverse, likeness) = most_alike(&small[index], &others, nearest);
-        let depth = filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal();
-        (depth, likeness.gt(SURE))
-    };
-    let swept = |index: usize| {
-        let (depth, sure) = depth(index);
-        Swept { camera: small[index].camera, image: small[index].image.shallow_clone(), depth, sure }
+        Swept {
+            camera: small[index].camera,
+            image: small[index].image.shallow_clone(),
+            depth: filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal(),
+            sure: likeness.gt(SURE),
+        }
     };
     (0..small.len()).step_by(small.len().div_ceil(MOST).max(1)).map(swept).collect()
 }
@@ -118,6 +118,17 @@ fn neighbours(index: usize, views: &[Small]) -> Vec<&Small> {
     others.into_iter().map(|(_, other)| other).take(NEIGHBOURS).collect()
 }
 
+/// Where the camera sees a point, if it does: u and v in pixels, and the depth along its axis.
+pub(super) fn sight_of(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<> {
+    let (w2c, Camera { intrinsics: k, width, height, .. }) = (camera.c2w.inverse(), *camera);
+    let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
+    move |point| {
+        let p = w2c.transform_point3(point);
+        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
+        (p.z > 0. && inside(u, width) && inside(v, height)).then_some([u, v, p.z])
+    }
+}
+
 /// The inverse depth of the nearest plane, such that nothing moves too far in the photo taken nearest.
 fn nearest_of_cameras(this: &Small, other: Option<&Small>) -> f64 {
     let baseline = other.map_or(1., |other| other.centre().distance(this.centre()));
@@ -126,13 +137,9 @@ fn nearest_of_cameras(this: &Small, other: Option<&Small>) -> f64 {
 
 /// The same, such that it is nearer than the points that the camera sees; none where it sees too few.
 fn nearest_of_points(camera: &Camera, points: &[Point]) -> Option<f64> {
-    let (w2c, k) = (camera.c2w.inverse(), camera.intrinsics);
-    let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
-    let seen = points.iter().map(|point| w2c.transform_point3(point.position)).filter(|p| {
-        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
-        p.z > 0. && inside(u, camera.width) && inside(v, camera.height)
-    });
-    let mut inverse: Vec<f64> = seen.map(|p| 1. / p.z).collect();
+    let seen = sight_of(camera);
+    let mut inverse: Vec<f64> =
+        points.iter().filter_map(|point| seen(point.position)).map(|[_, _, z]| 1. / z).collect();
     inverse.sort_by(f64::total_cmp);
     let last = ((1. - NEARER) * inverse.len() as f64) as usize;
     (inverse.len() >= LEAST_POINTS).then(|| ROOM * inverse[last])

@@ -8,6 +8,7 @@ pub use transform::transform;
 pub use views::{Rendered, render_views};
 
 use crate::error::Result;
+use crate::handed_over::handed_over;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Kind, Tensor};
@@ -91,11 +92,8 @@ pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<P
 type Op = unsafe fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
 
 fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
-    let mut out = [0usize; N];
-    // SAFETY: the tensors outlive the call.
-    unsafe { op(&arguments(gaussians, cameras, eps2d), &mut out) }?;
-    // SAFETY: on success the C++ side has put new tensors there and left them to us.
-    Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
+    // SAFETY: the tensors outlive the call, and on success the C++ side has put new ones there.
+    Ok(unsafe { handed_over(|out| op(&arguments(gaussians, cameras, eps2d), out)) }?)
 }
 
 /// Valid as long as what they are made of.

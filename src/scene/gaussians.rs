@@ -87,28 +87,26 @@ impl RawGaussians {
         }
     }
 
+    /// The same for every tensor.
+    fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
+        RawGaussians {
+            means: f(&self.means),
+            log_scales: f(&self.log_scales),
+            quaternions: f(&self.quaternions),
+            opacity_logits: f(&self.opacity_logits),
+            sh: f(&self.sh),
+        }
+    }
+
     /// The same tensors.
     pub fn shallow_clone(&self) -> Self {
-        RawGaussians {
-            means: self.means.shallow_clone(),
-            log_scales: self.log_scales.shallow_clone(),
-            quaternions: self.quaternions.shallow_clone(),
-            opacity_logits: self.opacity_logits.shallow_clone(),
-            sh: self.sh.shallow_clone(),
-        }
+        self.map(Tensor::shallow_clone)
     }
 
     /// Those of `indices`, of every scene.
     pub fn select(&self, indices: &[i64]) -> Self {
         let indices = Tensor::from_slice(indices);
-        let chosen = |t: &Tensor| t.index_select(1, &indices);
-        RawGaussians {
-            means: chosen(&self.means),
-            log_scales: chosen(&self.log_scales),
-            quaternions: chosen(&self.quaternions),
-            opacity_logits: chosen(&self.opacity_logits),
-            sh: chosen(&self.sh),
-        }
+        self.map(|t| t.index_select(1, &indices))
     }
 
     /// These Gaussians and then `others`, of the same scenes, with spherical harmonics up to the higher degree of both.
