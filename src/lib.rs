@@ -29,7 +29,6 @@ pub mod config;
 pub mod data;
 pub mod error;
 pub mod eval;
-mod handed_over;
 pub mod io;
 pub mod loss;
 pub mod model;

@@ -277,7 +277,7 @@ fn weights_that_are_something_else() {
     globalsplat::io::write_weights(&file, &tensors, Default::default()).unwrap();
     let error =
         refuse(&["reconstruct", "--weights", arg(&file), "--scene", arg(&room), "--out", arg(&splat)]);
-    assert_says(&error, &["metadata globalsplat.config", "globalsplat export"]);
+    assert_says(&error, &["tensor scene_tokens is absent", "globalsplat export"]);
 }
 
 #[test]

@@ -231,12 +231,15 @@ fn unsound_pickles_are_refused() {
     assert_refused(b"\x80\x02}K\x01a.", "appends to a dict");
     assert_refused(b"\x80\x02](X\x01\x00\x00\x00aNu.", "sets items of a list");
     assert_refused(b"\x80\x02}(X\x01\x00\x00\x00au.", "a key without a value");
-    assert_refused(b"\x80\x02}(K\x01K\x02u.", "an integer as a key, where a string belongs");
+    assert_refused(b"\x80\x02}(K\x01K\x02u.", "a dict, expected a list of scenes");
     assert_refused(b"\x80\x02a.", "takes what isn't there");
     assert_refused(b"\x80\x02t.", "without a mark");
     assert_refused(b"\x80\x02K\x01K\x02.", "ends with 2 values");
     assert_refused(b"\x80\x02X\xff\xff\xff\x7fabc.", "cut off");
-    assert_refused(b"\x80\x04N.", "protocol 4");
+    assert_refused(b"\x80\x06N.", "protocol 6");
+    assert_refused(b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "asks for os.system");
+    assert_refused(b"\x80\x04K\x01K\x02\x93.", "a name that is no string");
+    assert_refused(b"\x80\x02)K\x01\x81.", "an instance of a tuple");
     assert_refused(b"\x80\x02K\x01.", "an integer, expected a list of scenes");
     assert_refused(b"\x80\x02](K\x01e.", "scene 0 is an integer, expected a dict");
     assert_refused(b"\x80\x02](}e.", "scene 0 has no images");

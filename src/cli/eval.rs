@@ -30,7 +30,7 @@ use tch::Device;
     globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png\n  \
     globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k")]
 pub struct Eval {
-    /// Weights that `globalsplat export` wrote
+    /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
     weights: Option<PathBuf>,
     /// A 3DGS splat in the capture's world; with --data a folder of them

@@ -3,8 +3,8 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
-use globalsplat::io::{read_splat, read_weights};
-use globalsplat::reconstruct::{CONFIG_KEY, STAGE_KEY};
+use globalsplat::io::{WeightsFile, read_splat};
+use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -13,7 +13,7 @@ use tch::{Kind, Tensor};
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat inspect room.ply")]
 pub struct Inspect {
-    /// A .ply, a .safetensors, a .torch, a capture, or a folder with an index.json
+    /// A .ply, a .safetensors, a .ckpt, a .torch, a capture, or a folder with an index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
     /// Print it as one JSON object
@@ -25,13 +25,14 @@ impl Inspect {
     pub fn run(self) -> Result<()> {
         let object = match self.path.extension().and_then(|e| e.to_str()) {
             Some("ply") => splat(&self.path)?,
-            Some("safetensors") => weights(&self.path)?,
+            _ if self.path.to_string_lossy().ends_with(".safetensors.index.json") => weights(&self.path)?,
+            Some("safetensors" | "ckpt" | "pt" | "pth") => weights(&self.path)?,
             Some("torch") => chunk(&self.path)?,
             Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
-                let expected = "a .ply, a .safetensors, a .torch or a capture";
+                let expected = "a .ply, a .safetensors, a .ckpt, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
             }
         };
@@ -40,6 +41,7 @@ impl Inspect {
         } else {
             for (key, value) in object.as_object().expect("an object") {
                 match value {
+                    Value::Null => {}
                     Value::String(text) => {
                         println!("{key:<20} {}", text.replace('\n', &format!("\n{:21}", "")))
                     }
@@ -78,19 +80,25 @@ fn splat(path: &Path) -> Result<Value> {
 }
 
 fn weights(path: &Path) -> Result<Value> {
-    let weights = read_weights(path)?;
-    let numbers: usize = weights.tensors.values().map(Tensor::numel).sum();
-    let mut kinds: Vec<String> = weights.tensors.values().map(|t| format!("{:?}", t.kind())).collect();
+    let weights = WeightsFile::open(path)?;
+    let shapes = weights.shapes();
+    let numbers: i64 = shapes.values().map(|(_, shape)| shape.iter().product::<i64>()).sum();
+    let mut kinds: Vec<String> = shapes.values().map(|(kind, _)| format!("{kind:?}")).collect();
     kinds.sort();
     kinds.dedup();
+    // Of weights without a configuration, what their shapes tell.
+    let model = ModelFile::open(path, &[]).ok();
+    let configuration = weights.metadata().get(CONFIG_KEY).cloned();
+    let configuration = configuration.or(model.as_ref().map(|model| model.config.to_toml()));
     Ok(json!({
         "kind": "weights",
-        "tensors": weights.tensors.len(),
+        "tensors": shapes.len(),
         "numbers": numbers,
         "types": kinds,
-        "bytes": std::fs::metadata(path)?.len(),
-        "configuration": weights.metadata.get(CONFIG_KEY),
-        "stage": weights.metadata.get(STAGE_KEY).map_or("final", String::as_str),
+        "bytes": std::fs::metadata(weights.path())?.len(),
+        "taken_for": model.and_then(|model| model.assumed),
+        "configuration": configuration,
+        "stage": weights.metadata().get(STAGE_KEY).map_or("final", String::as_str),
     }))
 }
 

@@ -10,6 +10,7 @@ mod device;
 mod doctor;
 mod eval;
 mod export;
+mod import;
 mod inspect;
 mod memory;
 mod model;
@@ -24,6 +25,7 @@ mod render;
 mod report;
 mod synth;
 mod train;
+mod weights_out;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
@@ -55,6 +57,7 @@ enum Command {
     Refine(refine::Refine),
     Render(render::Render),
     Export(export::Export),
+    Import(import::Import),
     Synth(synth::Synth),
     Pack(pack::Pack),
     Inspect(inspect::Inspect),
@@ -87,6 +90,7 @@ pub fn main() -> ExitCode {
         Command::Refine(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Import(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Pack(command) => command.run(),
         Command::Inspect(command) => command.run(),

@@ -15,6 +15,9 @@ pub fn load(weights: Option<&Path>, precision: &str, device: Device) -> Result<L
         None => shipped_model(device)?,
     };
     loaded.model.set_precision(precision);
+    if let Some(assumed) = &loaded.assumed {
+        eprintln!("{}: taken for {assumed}; `globalsplat import` can say otherwise", name(weights).display());
+    }
     if let Some(early) = early_stage(loaded.stage, &loaded.config) {
         eprintln!("{}: {early}, and are used so", name(weights).display());
     }

@@ -11,6 +11,7 @@ use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
+use std::time::Instant;
 
 /// Make a splat from posed photos.
 ///
@@ -19,7 +20,7 @@ use std::path::PathBuf;
 #[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
     globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply")]
 pub struct Reconstruct {
-    /// Weights that `globalsplat export` wrote; by default those that come with this program
+    /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt); by default those that come with this program
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
     /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
@@ -80,7 +81,9 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_file(&self.out)?;
+        let clock = Instant::now();
         let loaded = model::load(self.weights.as_deref(), &self.precision, device)?;
+        let load_seconds = clock.elapsed().as_secs_f64();
         let capture = open_capture(&self.scene)?;
         let data = &loaded.config.data;
         let count = self.views.unwrap_or(data.context_views);
@@ -99,6 +102,7 @@ impl Reconstruct {
                 "weights": model::name(self.weights.as_deref()),
                 "views": views.len(),
                 "gaussians": count,
+                "load_seconds": load_seconds,
                 "seconds": seconds,
                 "peak_memory_bytes": peak_memory_bytes(),
                 "bytes": bytes,

@@ -8,8 +8,12 @@ mod film;
 mod images;
 mod npy;
 mod pretrained;
+mod shards;
 mod splat;
+mod state_dict;
+mod torch_file;
 mod weights;
+mod weights_file;
 
 pub use atomic::{check_writable_dir, check_writable_file};
 pub use film::write_film;
@@ -19,10 +23,13 @@ pub use images::{
 };
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
+pub use shards::write_sharded;
 pub use splat::{Splat, read_splat, write_splat};
-pub use weights::{Weights, read_weights, write_weights};
+pub use torch_file::write_checkpoint;
+pub use weights::{Weights, write_weights};
+pub use weights_file::{WeightsFile, read_weights};
 
-pub(crate) use weights::weights_from;
+pub(crate) use torch_file::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 
 pub(crate) use append::AppendFile;
 pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};

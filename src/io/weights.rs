@@ -2,7 +2,7 @@
 
 use super::write_atomically;
 use crate::error::{Error, Result};
-use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use safetensors::{Dtype, tensor::TensorView};
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn};
@@ -16,45 +16,6 @@ pub struct Weights {
     pub metadata: HashMap<String, String>,
 }
 
-/// Reads a safetensors file of float32, bfloat16 or float16 tensors.
-///
-/// # Errors
-/// A file that can't be read, isn't safetensors, or holds another type.
-pub fn read_weights(path: &Path) -> Result<Weights> {
-    weights_from(&std::fs::read(path).map_err(Error::read(path))?, path)
-}
-
-/// As [`read_weights`], of a file's bytes; `path` is what errors call it.
-pub(crate) fn weights_from(bytes: &[u8], path: &Path) -> Result<Weights> {
-    let broken = |e: safetensors::SafeTensorError| {
-        Error::input(path, "the file", format!("broken ({e})"), "safetensors")
-    };
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
-    let metadata = header.metadata().clone().unwrap_or_default();
-    let file = SafeTensors::deserialize(bytes).map_err(broken)?;
-    let mut tensors = BTreeMap::new();
-    for (name, view) in file.iter() {
-        let kind = match view.dtype() {
-            Dtype::F32 => Kind::Float,
-            Dtype::F64 => Kind::Double,
-            Dtype::BF16 => Kind::BFloat16,
-            Dtype::F16 => Kind::Half,
-            Dtype::I64 => Kind::Int64,
-            other => {
-                return Err(Error::input(
-                    path,
-                    format!("tensor {name}"),
-                    format!("{other:?}"),
-                    "F32, BF16 or F16",
-                ));
-            }
-        };
-        let shape: Vec<i64> = view.shape().iter().map(|&s| s as i64).collect();
-        tensors.insert(name.to_string(), Tensor::f_from_data_size(view.data(), &shape, kind)?);
-    }
-    Ok(Weights { tensors, metadata })
-}
-
 /// Writes a safetensors file, whole or not at all.
 ///
 /// # Errors
@@ -64,7 +25,7 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    let stored = tensors.iter().map(|(name, t)| Ok((name, Stored::new(t)?))).collect::<Result<Vec<_>>>()?;
+    let stored = Stored::all(tensors)?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
     let failed = |e: &dyn std::fmt::Display| {
         Error::Failed(format!("{}: weights can't be serialized: {e}", path.display()))
@@ -87,29 +48,33 @@ fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
 }
 
 /// A tensor's bytes in row-major order.
-struct Stored {
-    dtype: Dtype,
-    shape: Vec<usize>,
-    bytes: Vec<u8>,
+pub(super) struct Stored {
+    pub kind: Kind,
+    pub shape: Vec<usize>,
+    pub bytes: Vec<u8>,
 }
 
 impl Stored {
+    pub fn all(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<(&str, Self)>> {
+        tensors.iter().map(|(name, tensor)| Ok((name.as_str(), Stored::new(tensor)?))).collect()
+    }
+
     fn new(tensor: &Tensor) -> Result<Self> {
         let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-        let dtype = match tensor.kind() {
+        let mut bytes = vec![0; tensor.numel() * tensor.kind().elt_size_in_bytes()];
+        tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
+        let shape = tensor.size().iter().map(|&s| s as usize).collect();
+        Ok(Stored { kind: tensor.kind(), shape, bytes })
+    }
+
+    fn view(&self) -> Result<TensorView<'_>> {
+        let dtype = match self.kind {
             Kind::Float => Dtype::F32,
             Kind::BFloat16 => Dtype::BF16,
             Kind::Int64 => Dtype::I64,
             other => return Err(Error::Failed(format!("tensors of kind {other:?} are not stored"))),
         };
-        let mut bytes = vec![0; tensor.numel() * tensor.kind().elt_size_in_bytes()];
-        tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
-        let shape = tensor.size().iter().map(|&s| s as usize).collect();
-        Ok(Stored { dtype, shape, bytes })
-    }
-
-    fn view(&self) -> Result<TensorView<'_>> {
-        TensorView::new(self.dtype, self.shape.clone(), &self.bytes)
+        TensorView::new(dtype, self.shape.clone(), &self.bytes)
             .map_err(|e| Error::Failed(format!("weights can't be serialized: {e}")))
     }
 }
@@ -120,34 +85,40 @@ impl Weights {
     /// # Errors
     /// Names or shapes that don't fit, before anything is copied: the first is named and the rest counted.
     pub fn load_into(&self, vs: &nn::VarStore, file: &Path) -> Result<()> {
-        let variables: BTreeMap<String, Tensor> = vs.variables().into_iter().collect();
-        let mut misfits = vec![];
-        for (name, variable) in &variables {
-            match self.tensors.get(name) {
-                None => misfits.push((name, "absent".to_string(), format!("{:?}", variable.size()))),
-                Some(t) if t.size() != variable.size() => {
-                    misfits.push((name, format!("{:?}", t.size()), format!("{:?}", variable.size())));
-                }
-                Some(_) => {}
-            }
-        }
-        for (name, t) in &self.tensors {
-            if !variables.contains_key(name) {
-                misfits.push((name, format!("{:?}", t.size()), "no such tensor".to_string()));
-            }
-        }
-        if let Some((name, found, expected)) = misfits.first() {
-            let others = match misfits.len() - 1 {
-                0 => String::new(),
-                n => format!(" (and {n} more that don't fit)"),
-            };
-            return Err(Error::input(file, format!("tensor {name}"), found, format!("{expected}{others}")));
-        }
-        tch::no_grad(|| {
-            for (name, mut variable) in variables {
-                variable.copy_(&self.tensors[&name]);
-            }
-        });
-        Ok(())
+        let shapes = self.tensors.iter().map(|(name, t)| (name.as_str(), t.size())).collect();
+        fit(vs, &shapes, file, |name, variable| Ok(variable.f_copy_(&self.tensors[name])?))
     }
+}
+
+/// Fills every variable of `vs` by `copy`, if their names and shapes are those of `file`'s tensors.
+pub(super) fn fit(
+    vs: &nn::VarStore,
+    shapes: &BTreeMap<&str, Vec<i64>>,
+    file: &Path,
+    copy: impl Fn(&str, &mut Tensor) -> Result<()>,
+) -> Result<()> {
+    let variables: BTreeMap<String, Tensor> = vs.variables().into_iter().collect();
+    let mut misfits = vec![];
+    for (name, variable) in &variables {
+        match shapes.get(name.as_str()) {
+            None => misfits.push((name.as_str(), "absent".to_string(), format!("{:?}", variable.size()))),
+            Some(shape) if shape != &variable.size() => {
+                misfits.push((name, format!("{shape:?}"), format!("{:?}", variable.size())));
+            }
+            Some(_) => {}
+        }
+    }
+    for (name, shape) in shapes {
+        if !variables.contains_key(*name) {
+            misfits.push((name, format!("{shape:?}"), "no such tensor".to_string()));
+        }
+    }
+    if let Some((name, found, expected)) = misfits.first() {
+        let others = match misfits.len() - 1 {
+            0 => String::new(),
+            n => format!(" (and {n} more that don't fit)"),
+        };
+        return Err(Error::input(file, format!("tensor {name}"), found, format!("{expected}{others}")));
+    }
+    tch::no_grad(|| variables.into_iter().try_for_each(|(name, mut variable)| copy(&name, &mut variable)))
 }

@@ -1,6 +1,6 @@
 //! How uneven depths are where a photo is even: what holds geometry together where photos are few (Godard et al. 2017, eq. 3).
 
-use crate::handed_over::handed_over;
+use crate::render::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 

@@ -2,7 +2,7 @@
 //! Perceptual Metric", 2018, equation 1. Version 0.1 of its linear weights, with which published numbers are made.
 
 use crate::error::Result;
-use crate::io::read_weights;
+use crate::io::WeightsFile;
 use std::path::Path;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
@@ -166,7 +166,7 @@ impl Lpips {
     pub fn load(path: &Path, network: LpipsNetwork, device: Device) -> Result<Self> {
         let mut vs = nn::VarStore::new(device);
         let lpips = Lpips::new(&vs.root(), network);
-        read_weights(path)?.load_into(&vs, path)?;
+        WeightsFile::open(path)?.load_into(&vs)?;
         vs.freeze();
         Ok(lpips)
     }

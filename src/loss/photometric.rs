@@ -1,7 +1,7 @@
 //! How far a picture is from a photo: absolute differences, and structural similarity (Wang et al. 2004), as scikit-image's
 //! `structural_similarity` with Gaussian weights computes it. (Spec 9.4.)
 
-use crate::handed_over::handed_over;
+use crate::render::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 

@@ -2,7 +2,7 @@
 //! Zisserman 2015) with average pooling.
 
 use crate::error::Result;
-use crate::io::read_weights;
+use crate::io::WeightsFile;
 use std::path::Path;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
@@ -62,7 +62,7 @@ impl Vgg19 {
         }
     }
 
-    /// Reads torchvision's weights as a safetensors; what comes after ReLU 5_2 isn't looked at. They take no gradient;
+    /// Reads torchvision's weights, its own file or a safetensors; what comes after ReLU 5_2 isn't looked at. They take no gradient;
     /// pictures do.
     ///
     /// # Errors
@@ -70,10 +70,9 @@ impl Vgg19 {
     pub fn load(path: &Path, device: Device) -> Result<Self> {
         let mut vs = nn::VarStore::new(device);
         let network = Vgg19::new(&vs.root());
-        let mut weights = read_weights(path)?;
         let known = vs.variables();
-        weights.tensors.retain(|name, _| known.contains_key(name));
-        weights.load_into(&vs, path)?;
+        let weights = WeightsFile::open(path)?;
+        weights.renamed(|name| known.contains_key(name).then(|| name.into())).load_into(&vs)?;
         vs.freeze();
         Ok(network)
     }

@@ -1,6 +1,7 @@
 //! The pieces that streams and mixer are made of, with the initializations of spec 4.4.
 
 use super::precision::Precision;
+use std::cell::Cell;
 use tch::{Tensor, nn};
 
 /// Of encoder linears and learnable tokens.
@@ -9,7 +10,24 @@ pub(super) const ENCODER_STD: f64 = 0.02;
 /// Normal with mean 0. Where spec 4.4 truncates normals the cut is at ±2, as in torch's `trunc_normal_`: a hundred
 /// standard deviations away, so it is the plain normal.
 pub(super) fn randn(stdev: f64) -> nn::Init {
-    nn::Init::Randn { mean: 0., stdev }
+    drawn(nn::Init::Randn { mean: 0., stdev })
+}
+
+thread_local! {
+    static DRAWS: Cell<bool> = const { Cell::new(true) };
+}
+
+/// Builds what `build` does, with zeros for random numbers. tch's paths, which every module is built from, have no room for this.
+pub(super) fn without_drawing<M>(build: impl FnOnce() -> M) -> M {
+    let before = DRAWS.replace(false);
+    let built = build();
+    DRAWS.set(before);
+    built
+}
+
+/// `init`, unless nothing is to be drawn.
+pub(super) fn drawn(init: nn::Init) -> nn::Init {
+    if DRAWS.get() { init } else { nn::Init::Const(0.) }
 }
 
 /// A linear layer with normal weights and zero bias.
@@ -22,7 +40,7 @@ pub(super) fn linear(vs: nn::Path, inputs: i64, outputs: i64, stdev: f64) -> nn:
 /// weights is another one.)
 pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool) -> nn::Linear {
     let bound = 1. / (inputs as f64).sqrt();
-    let uniform = nn::Init::Uniform { lo: -bound, up: bound };
+    let uniform = drawn(nn::Init::Uniform { lo: -bound, up: bound });
     nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
 }
 

@@ -14,6 +14,7 @@ mod mixer;
 mod precision;
 mod recompute;
 mod rotation;
+mod shapes;
 mod stream;
 mod tokens;
 
@@ -22,6 +23,7 @@ pub use decoder::{Decoded, RawOutputs};
 pub use encoder::Encoded;
 pub use merge::Stage;
 pub use precision::Precision;
+pub use shapes::MODULES;
 
 // For training, which goes through the model in parts.
 pub(crate) use leaves::{leaf, pull_back};
@@ -38,7 +40,7 @@ pub(crate) use stream::{SelfAttentionBlock, StreamRound};
 pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
-use layers::{ENCODER_STD, randn};
+use layers::{ENCODER_STD, drawn, randn, without_drawing};
 use tch::{Tensor, nn};
 
 /// The whole model.
@@ -65,6 +67,14 @@ impl GlobalSplat {
             decoder: Decoder::new(&(vs / "gaussian_decoder"), config),
             config: config.clone(),
         })
+    }
+
+    /// The same with zeros where weights begin with random numbers: for weights from a file, which are there sooner so.
+    ///
+    /// # Errors
+    /// As [`GlobalSplat::new`].
+    pub fn to_be_filled(vs: &nn::Path, config: &ModelConfig) -> Result<Self> {
+        without_drawing(|| Self::new(vs, config))
     }
 
     /// One pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics`
@@ -111,7 +121,7 @@ impl GlobalSplat {
 /// of them than dimensions.
 pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
     let init = match config.latents <= config.width {
-        true => nn::Init::Orthogonal { gain: ENCODER_STD },
+        true => drawn(nn::Init::Orthogonal { gain: ENCODER_STD }),
         false => randn(ENCODER_STD),
     };
     vs.var("scene_tokens", &[config.latents, config.width], init)

@@ -3,11 +3,13 @@
 
 mod context;
 mod model_file;
+mod published;
 mod spread;
 
 pub use context::load_context;
 pub use model_file::{
-    CONFIG_KEY, LoadedModel, ModelDtype, SHIPPED_MODEL, STAGE_KEY, load_model, save_model, shipped_model,
+    CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, SHIPPED_MODEL, STAGE_KEY, load_model, model_weights,
+    save_checkpoint, save_model, shipped_model,
 };
 
 pub use spread::spread_over_path;
@@ -37,7 +39,7 @@ pub struct Model<'a> {
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
-        let LoadedModel { model: network, config, stage, vs } = loaded;
+        let LoadedModel { model: network, config, stage, vs, .. } = loaded;
         Model { network, config, stage: *stage, device: vs.device() }
     }
 }

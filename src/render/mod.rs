@@ -1,14 +1,15 @@
 //! The differentiable splat op (spec 6), safe and typed.
 
 pub mod cpu;
+mod handed_over;
 mod transform;
 mod views;
 
+pub(crate) use handed_over::handed_over;
 pub use transform::transform;
 pub use views::{Rendered, render_views};
 
 use crate::error::Result;
-use crate::handed_over::handed_over;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Kind, Tensor};

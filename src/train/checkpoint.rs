@@ -7,7 +7,9 @@
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
-use crate::io::{read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights};
+use crate::io::{
+    WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights,
+};
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -176,7 +178,7 @@ impl Trainer {
     /// Files that can't be read, or were written for another model.
     pub(super) fn load(&mut self, checkpoint: &Path, state: &State) -> Result<()> {
         let file = checkpoint.join(MODEL_FILE);
-        read_weights(&file)?.load_into(&self.vs, &file)?;
+        WeightsFile::open(&file)?.load_into(&self.vs)?;
         self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
         (self.step, self.samples) = (state.step, state.samples);
         Ok(())

@@ -11,11 +11,10 @@ use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, Loader, Sample, SceneGroups};
 use crate::error::{Error, Result};
-use crate::io::read_weights;
 use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
 use crate::optim::{AdamW, Stopwatch};
-use crate::reconstruct::{CONFIG_KEY, Model};
+use crate::reconstruct::{Model, ModelFile};
 use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
@@ -53,16 +52,16 @@ impl Trainer {
         Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
     }
 
-    /// Takes the weights that [`crate::reconstruct::save_model`] wrote in place of the fresh ones. All Gaussians are shown from
+    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. All Gaussians are shown from
     /// the first step on: weights that were trained to the last stage know nothing of the first any more.
     ///
     /// # Errors
     /// A file that can't be read, or whose model has another shape: its keys are named.
     pub fn begin_with(&mut self, path: &Path) -> Result<()> {
-        let weights = read_weights(path)?;
-        if let Some(text) = weights.metadata.get(CONFIG_KEY) {
+        let file = ModelFile::open(path, &[])?;
+        if file.assumed.is_none() {
             let ours = Config { model: self.config.model.clone(), ..Default::default() };
-            let theirs = Config { model: Config::parse(text, &[], path)?.model, ..Default::default() };
+            let theirs = Config { model: file.config.model.clone(), ..Default::default() };
             let changed = changed_keys(&theirs.to_toml(), &ours.to_toml());
             if !changed.is_empty() {
                 let expected = "the model that the configuration describes";
@@ -70,7 +69,7 @@ impl Trainer {
             }
         }
         self.config.curriculum.full_capacity = true;
-        weights.load_into(&self.vs, path)
+        file.load_into(&self.vs)
     }
 
     /// Draws a sample and follows its gradient.

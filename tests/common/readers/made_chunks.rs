@@ -29,6 +29,11 @@ pub fn chunk_pickle(bytes: &[u8]) {
     super::files::chunk(&archive(bytes, &[png(), &cameras, &[0; 16]]));
 }
 
+/// `bytes` are the pickle of a checkpoint; storages 0 to 2 have 512, 64 and no bytes.
+pub fn weights_pickle(bytes: &[u8]) {
+    super::files::weights(&archive(bytes, &[&[0; 512], &[0; 64], &[]]));
+}
+
 /// Numbers of a camera, each another one.
 fn camera(index: u8) -> Vec<u8> {
     let (sin, cos) = (f32::from(index) * 0.1).sin_cos();

@@ -19,7 +19,7 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 22] = [
+pub const READERS: [(&str, Reader); 24] = [
     ("cameras_json", files::cameras_json),
     ("checkpoint", files::checkpoint),
     ("chunk", files::chunk),
@@ -40,8 +40,10 @@ pub const READERS: [(&str, Reader); 22] = [
     ("made_weights", made_models::weights),
     ("photo", files::photo),
     ("ply", files::ply),
+    ("shard_index", files::shard_index),
     ("transforms_json", files::transforms_json),
     ("weights", files::weights),
+    ("weights_pickle", made_chunks::weights_pickle),
 ];
 
 /// Where readers find their files: in memory, where the system has such a place.

@@ -1,8 +1,6 @@
 //! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key",
 //! "url", "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
 
-mod archive;
-mod pickle;
 mod scenes;
 mod write;
 
@@ -12,9 +10,8 @@ use super::Found;
 use crate::data::capture::{Capture, Frame, Photo};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::encoded_image_size;
+use crate::io::{Archive, encoded_image_size};
 use crate::scene::{Camera, Intrinsics};
-use archive::Archive;
 use glam::{DMat4, DVec4};
 use scenes::{Scene, scenes};
 use std::path::{Path, PathBuf};

@@ -1,8 +1,7 @@
 //! The scenes that a chunk's pickle describes, as places in its file.
 
 use super::CAMERA_NUMBERS;
-use super::archive::Archive;
-use super::pickle::{Id, Value, Values, unpickle};
+use crate::io::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 use std::ops::Range;
 use tch::{Kind, Tensor};
 
@@ -22,18 +21,10 @@ pub(super) struct Scene {
     pub images: Vec<Range<usize>>,
 }
 
-/// Numbers in the file, one after the other.
-#[derive(Debug, Clone)]
-struct Array {
-    dtype: Kind,
-    size: Vec<usize>,
-    bytes: Range<usize>,
-}
-
 impl Scene {
     /// The numbers of every view's camera, in `file`.
     pub fn cameras(&self, file: &[u8]) -> Vec<f32> {
-        let Array { dtype, size, bytes } = &self.cameras;
+        let Array { dtype, size, bytes, .. } = &self.cameras;
         let size: Vec<i64> = size.iter().map(|&size| size as i64).collect();
         let cameras = Tensor::from_data_size(&file[bytes.clone()], &size, *dtype).to_kind(Kind::Float);
         Vec::try_from(cameras.flatten(0, -1)).expect("float32 on the host")
@@ -45,7 +36,7 @@ impl Scene {
 /// # Errors
 /// A pickle that asks for what it may not, or is no list of scenes.
 pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
-    let values = unpickle(&bytes[archive.pickle.clone()])?;
+    let values = unpickle(&mut &bytes[archive.pickle.clone()], Strangers::Refused)?;
     let most = VIEWS + bytes.len() / BYTES_OF_VIEW;
     scenes_of(&values, archive, most).map_err(|why| format!("unusable ({why})"))
 }
@@ -89,12 +80,7 @@ impl<'v, 'a> Fields<'v, 'a> {
     }
 
     fn get(&self, field: &str) -> Result<&'v Value<'a>, String> {
-        let pairs = self.dict.chunks_exact(2).rev();
-        let found = pairs
-            .map(|pair| (self.values.get(pair[0]), pair[1]))
-            .find(|(key, _)| **key == Value::Text(field));
-        let (_, value) = found.ok_or_else(|| format!("scene {} has no {field}", self.index))?;
-        Ok(self.values.get(value))
+        self.values.entry(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
     }
 
     fn list(&self, field: &str) -> Result<&'v [Id], String> {
@@ -111,42 +97,13 @@ impl<'v, 'a> Fields<'v, 'a> {
         }
     }
 
-    /// `value`, which is in `field`, as numbers inside their storage, in one piece, in one dimension or two.
+    /// `value`, which is in `field`, as numbers one after the other, in one dimension or two.
     fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
-        let &Value::Tensor { storage, offset, size, stride } = value else {
-            return Err(format!("{} has {}, expected a tensor", self.name(field), value.name()));
-        };
-        let plain = || format!("{} is no plain tensor", self.name(field));
-        let &Value::Storage { dtype, key } = self.values.get(storage) else { return Err(plain()) };
-        let record = self.archive.storages.get(key);
-        let record =
-            record.ok_or_else(|| format!("{} asks for data/{key}, which is not there", self.name(field)))?;
-        let offset = self.number(offset).ok_or_else(plain)?;
-        let (size, stride) = (self.numbers(size).ok_or_else(plain)?, self.numbers(stride).ok_or_else(plain)?);
-        let count = contiguous(&size, &stride).ok_or_else(plain)?;
-        let place = || {
-            let start = offset.checked_mul(dtype.elt_size_in_bytes())?;
-            let length = count.checked_mul(dtype.elt_size_in_bytes())?;
-            let end = start.checked_add(length).filter(|&end| end <= record.len())?;
-            Some(record.start + start..record.start + end)
-        };
-        let bytes = place().ok_or_else(|| {
-            format!("{} reaches beyond its data of {} bytes", self.name(field), record.len())
-        })?;
-        Ok(Array { dtype, size, bytes })
-    }
-
-    fn number(&self, id: Id) -> Option<usize> {
-        match self.values.get(id) {
-            &Value::Integer(number) => usize::try_from(number).ok(),
-            _ => None,
-        }
-    }
-
-    fn numbers(&self, tuple: Id) -> Option<Vec<usize>> {
-        match self.values.get(tuple) {
-            Value::Tuple(items) if items.len() <= 2 => items.iter().map(|&item| self.number(item)).collect(),
-            _ => None,
+        let array = Array::of(self.values, &self.archive.storages, value)
+            .map_err(|why| format!("{} {why}", self.name(field)))?;
+        match array.is_contiguous() && array.size.len() <= 2 {
+            true => Ok(array),
+            false => Err(format!("{} is no plain tensor", self.name(field))),
         }
     }
 
@@ -168,7 +125,7 @@ impl<'v, 'a> Fields<'v, 'a> {
         }
         let (key, _url) = (self.text("key")?, self.text("url")?);
         let image = |&id: &Id| match self.array("images", self.values.get(id))? {
-            Array { dtype: Kind::Uint8, size, bytes } if size.len() == 1 => Ok(bytes),
+            Array { dtype: Kind::Uint8, size, bytes, .. } if size.len() == 1 => Ok(bytes),
             Array { dtype, size, .. } => {
                 let found = format!("{dtype:?} {size:?}");
                 Err(format!("an image of {} is {found}, expected the bytes of a JPEG", self.name("images")))
@@ -177,18 +134,4 @@ impl<'v, 'a> Fields<'v, 'a> {
         let images = images.iter().map(image).collect::<Result<_, String>>()?;
         Ok(Scene { key: key.to_string(), cameras, images })
     }
-}
-
-/// How many elements a tensor has that lies in its storage without gaps; none for any other.
-fn contiguous(size: &[usize], stride: &[usize]) -> Option<usize> {
-    let count = size.iter().try_fold(1usize, |count, &size| count.checked_mul(size))?;
-    let mut expected = 1;
-    let dimensions = size.iter().zip(stride).rev();
-    let dense = size.len() == stride.len()
-        && dimensions.into_iter().all(|(&size, &stride)| {
-            let dense = size == 1 || stride == expected;
-            expected *= size;
-            dense
-        });
-    (dense || count == 0).then_some(count)
 }

@@ -1,106 +1,33 @@
 //! A pickle of tensors, lists, dicts, strings and numbers, as values.
 //!
 //! A pickle is a program for a small stack machine, and Python's machine calls whatever the program names. This one calls
-//! nothing: it knows the instructions that torch.save needs, and the two functions that a tensor is put together by are words
-//! to it. Values refer to each other by their numbers, so one that is part of itself does no harm, and each takes a byte of the
+//! nothing: it knows the instructions that torch.save needs, and the functions that data are put together by are words to it. Values
+//! refer to each other by their numbers, so one that is part of itself does no harm, and each takes a byte of the
 //! program at least: what a pickle makes grows with its length, whatever it says.
 
-use tch::Kind;
+use super::globals::{known, makes_data};
+use super::value::{Id, Rebuild, Value, Values};
 
-/// By which tensors are put together; everything else that a pickle can name is refused.
-const GLOBALS: [(&str, &str, Value); 12] = [
-    ("torch._utils", "_rebuild_tensor_v2", Value::RebuildTensor),
-    ("collections", "OrderedDict", Value::OrderedDict),
-    ("torch", "ByteStorage", Value::Dtype(Kind::Uint8)),
-    ("torch", "CharStorage", Value::Dtype(Kind::Int8)),
-    ("torch", "ShortStorage", Value::Dtype(Kind::Int16)),
-    ("torch", "IntStorage", Value::Dtype(Kind::Int)),
-    ("torch", "LongStorage", Value::Dtype(Kind::Int64)),
-    ("torch", "HalfStorage", Value::Dtype(Kind::Half)),
-    ("torch", "BFloat16Storage", Value::Dtype(Kind::BFloat16)),
-    ("torch", "FloatStorage", Value::Dtype(Kind::Float)),
-    ("torch", "DoubleStorage", Value::Dtype(Kind::Double)),
-    ("torch", "BoolStorage", Value::Dtype(Kind::Bool)),
-];
-
-/// A value's number among [`Values`].
-pub(super) type Id = usize;
-
-/// What a pickle makes.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Value<'a> {
-    /// None, a truth value or a fraction: no field has one.
-    Constant,
-    Integer(i64),
-    Text(&'a str),
-    /// The function that makes a tensor.
-    RebuildTensor,
-    /// The type of a tensor's hooks.
-    OrderedDict,
-    /// The type of a storage: what its numbers are.
-    Dtype(Kind),
-    /// Bytes in the archive. On which device they were when they were saved doesn't matter.
-    Storage {
-        dtype: Kind,
-        key: &'a str,
-    },
-    /// A view of a storage, in its elements.
-    Tensor {
-        storage: Id,
-        offset: Id,
-        size: Id,
-        stride: Id,
-    },
-    /// Of a tensor.
-    Hooks,
-    Tuple(Vec<Id>),
-    List(Vec<Id>),
-    /// Keys and values by turns; of equal keys the last one counts.
-    Dict(Vec<Id>),
+/// What to do with values that aren't tensors, lists, dicts, strings or numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Strangers {
+    /// For files that need none.
+    Refused,
+    /// Taken for data, of which nothing is known; but a pickle that would have Python call a function, other than those that are
+    /// known to put data together, is refused.
+    Kept,
 }
 
-impl Value<'_> {
-    /// As errors call it.
-    pub fn name(&self) -> &'static str {
-        match self {
-            Value::Constant => "a constant",
-            Value::Integer(_) => "an integer",
-            Value::Text(_) => "a string",
-            Value::RebuildTensor | Value::OrderedDict => "a function",
-            Value::Dtype(_) => "a type",
-            Value::Storage { .. } => "a storage",
-            Value::Tensor { .. } => "a tensor",
-            Value::Hooks => "a tensor's hooks",
-            Value::Tuple(_) => "a tuple",
-            Value::List(_) => "a list",
-            Value::Dict(_) => "a dict",
-        }
-    }
-}
-
-/// Everything that a pickle made.
-#[derive(Debug)]
-pub(super) struct Values<'a> {
-    values: Vec<Value<'a>>,
-    /// What it was made for.
-    pub root: Id,
-}
-
-impl<'a> Values<'a> {
-    /// Value number `id`.
-    pub fn get(&self, id: Id) -> &Value<'a> {
-        &self.values[id]
-    }
-}
-
-/// Follows `pickle`.
+/// Follows the pickle that `rest` begins with, and leaves there what is behind it.
 ///
 /// # Errors
 /// What it asks for that it may not, or what is broken about it.
-pub(super) fn unpickle(pickle: &[u8]) -> Result<Values<'_>, String> {
-    let mut machine = Machine { rest: pickle, values: vec![], stack: vec![], marks: vec![], memo: vec![] };
+pub(crate) fn unpickle<'a>(rest: &mut &'a [u8], strangers: Strangers) -> Result<Values<'a>, String> {
+    let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
+    let mut machine = Machine { rest, strangers, values, stack, marks, memo };
     loop {
         if let Some(root) = machine.instruction()? {
+            *rest = machine.rest;
             return Ok(Values { values: machine.values, root });
         }
     }
@@ -108,6 +35,7 @@ pub(super) fn unpickle(pickle: &[u8]) -> Result<Values<'_>, String> {
 
 struct Machine<'a> {
     rest: &'a [u8],
+    strangers: Strangers,
     values: Vec<Value<'a>>,
     stack: Vec<Id>,
     /// Lengths of the stack.
@@ -170,6 +98,8 @@ impl<'a> Machine<'a> {
         let list = self.pop()?;
         match &mut self.values[list] {
             Value::List(items) => items.extend_from_slice(values),
+            // Of a class that is a list, or of a set.
+            Value::Object(_) => {}
             other => return Err(format!("a pickle that appends to {}", other.name())),
         }
         self.stack.push(list);
@@ -181,16 +111,9 @@ impl<'a> Machine<'a> {
         if !values.len().is_multiple_of(2) {
             return Err("a pickle with a key without a value".into());
         }
-        let strange = values.iter().step_by(2).find(|&&key| !matches!(self.values[key], Value::Text(_)));
-        if let Some(&key) = strange {
-            return Err(format!(
-                "a pickle with {} as a key, where a string belongs",
-                self.values[key].name()
-            ));
-        }
         let dict = self.pop()?;
         match &mut self.values[dict] {
-            Value::Dict(items) => items.extend_from_slice(values),
+            Value::Dict(items) | Value::Object(items) => items.extend_from_slice(values),
             other => return Err(format!("a pickle that sets items of {}", other.name())),
         }
         self.stack.push(dict);
@@ -216,10 +139,13 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    fn global(&mut self) -> Result<(), String> {
-        let (module, name) = (self.line()?, self.line()?);
-        let known = GLOBALS.into_iter().find(|(m, n, _)| (*m, *n) == (module, name));
-        let (.., value) = known.ok_or_else(|| format!("a pickle that asks for {module}.{name}"))?;
+    /// What has this name, in Python or in ours.
+    fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
+        let value = match (known(module, name), self.strangers) {
+            (Some(value), _) => value,
+            (None, Strangers::Kept) => Value::Named { module, name },
+            (None, Strangers::Refused) => return Err(format!("a pickle that asks for {module}.{name}")),
+        };
         self.push(value);
         Ok(())
     }
@@ -231,11 +157,18 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// What a persistent id stands for: ("storage", its type, its key, the device, the number of its elements).
+    /// What a persistent id stands for: ("storage", its type, its key, the device, the number of its elements); in files that are no
+    /// archives one thing more, what it is a part of, if it is.
     fn storage(&self, id: Id) -> Result<Value<'a>, String> {
         let strange = || "a pickle with a persistent id that is no storage".to_string();
-        let &[tag, dtype, key, device, length] = self.tuple(id) else { return Err(strange()) };
-        let of = |id: Id| &self.values[id];
+        let of = |id: &Id| &self.values[*id];
+        let (fields, whole) = match self.tuple(id) {
+            [fields @ .., whole] if fields.len() == 5 && self.strangers == Strangers::Kept => {
+                (fields, of(whole) == &Value::Constant)
+            }
+            fields => (fields, true),
+        };
+        let [tag, dtype, key, device, length] = fields else { return Err(strange()) };
         match (of(tag), of(dtype), of(key), of(device), of(length)) {
             (
                 Value::Text("storage"),
@@ -243,7 +176,7 @@ impl<'a> Machine<'a> {
                 Value::Text(key),
                 Value::Text(_),
                 Value::Integer(_),
-            ) => Ok(Value::Storage { dtype, key }),
+            ) if whole => Ok(Value::Storage { dtype, key }),
             _ => Err(strange()),
         }
     }
@@ -251,10 +184,10 @@ impl<'a> Machine<'a> {
     /// What `function` makes of the tuple `arguments`.
     fn call(&self, function: Id, arguments: Id) -> Result<Value<'a>, String> {
         let is = |id: Id, what: fn(&Value) -> bool| what(&self.values[id]);
+        let is_object = |id: Id| is(id, |v| matches!(v, Value::Object(_)));
         match (&self.values[function], self.tuple(arguments)) {
-            (Value::OrderedDict, []) => Ok(Value::Hooks),
-            // Behind these come whether it needs a gradient, its hooks, and maybe more.
-            (Value::RebuildTensor, &[storage, offset, size, stride, ..])
+            (Value::OrderedDict, []) => Ok(Value::Dict(vec![])),
+            (Value::Rebuild(Rebuild::View), &[storage, offset, size, stride, ..])
                 if is(storage, |v| matches!(v, Value::Storage { .. }))
                     && is(offset, |v| matches!(v, Value::Integer(_)))
                     && is(size, |v| matches!(v, Value::Tuple(_)))
@@ -262,11 +195,32 @@ impl<'a> Machine<'a> {
             {
                 Ok(Value::Tensor { storage, offset, size, stride })
             }
-            (Value::RebuildTensor, _) => {
+            (Value::Rebuild(Rebuild::Parameter), &[data, ..])
+                if is(data, |v| matches!(v, Value::Tensor { .. })) =>
+            {
+                Ok(self.values[data].clone())
+            }
+            (Value::Rebuild(_), &[data, ..]) if is_object(data) => Ok(Value::Object(vec![])),
+            (Value::Rebuild(_), _) => {
                 Err("a pickle with a tensor of other than storage, offset, size and stride".into())
             }
+            (&Value::Named { module, name }, _) => match makes_data(module, name) {
+                true => Ok(Value::Object(vec![])),
+                false => Err(format!("a pickle that calls {module}.{name}")),
+            },
             (other, _) => Err(format!("a pickle that calls {}", other.name())),
         }
+    }
+
+    /// An instance of `class`, which Python makes without calling anything.
+    fn instance(&mut self, class: Id) -> Result<(), String> {
+        let made = match &self.values[class] {
+            Value::Named { .. } => Value::Object(vec![]),
+            Value::OrderedDict => Value::Dict(vec![]),
+            other => return Err(format!("a pickle with an instance of {}", other.name())),
+        };
+        self.push(made);
+        Ok(())
     }
 
     /// Follows one instruction; what the pickle was made for at its end.
@@ -275,16 +229,33 @@ impl<'a> Machine<'a> {
         match self.take(1)?[0] {
             // PROTO
             0x80 => match self.unsigned(1)? {
-                2 => {}
+                2..=5 => {}
                 other => return Err(format!("a pickle of protocol {other}")),
             },
-            // EMPTY_LIST, EMPTY_DICT, EMPTY_TUPLE, MARK
+            // FRAME: what follows is read one by one all the same.
+            0x95 => {
+                self.take(8)?;
+            }
+            // EMPTY_LIST, EMPTY_DICT, EMPTY_TUPLE, EMPTY_SET, MARK
             b']' => self.push(Value::List(vec![])),
             b'}' => self.push(Value::Dict(vec![])),
             b')' => self.push(Value::Tuple(vec![])),
+            0x8f => self.push(Value::Object(vec![])),
             b'(' => self.marks.push(self.stack.len()),
+            // POP, POP_MARK, DUP
+            b'0' => {
+                self.pop()?;
+            }
+            b'1' => {
+                self.pop_to_mark()?;
+            }
+            b'2' => {
+                let top = self.pop()?;
+                self.stack.extend([top, top]);
+            }
             // NONE, NEWTRUE, NEWFALSE
-            b'N' | 0x88 | 0x89 => self.push(Value::Constant),
+            b'N' => self.push(Value::Constant),
+            opcode @ (0x88 | 0x89) => self.push(Value::Truth(opcode == 0x88)),
             // BININT1, BININT2, BININT
             opcode @ (b'K' | b'M') => {
                 let number = self.unsigned(if opcode == b'K' { 1 } else { 2 })?;
@@ -300,26 +271,49 @@ impl<'a> Machine<'a> {
                     let number = self.signed(bytes)?;
                     self.push(number);
                 }
-                bytes => return Err(format!("a pickle with a number of {bytes} bytes")),
+                bytes => {
+                    self.take(bytes)?;
+                    self.push(Value::Constant);
+                }
             },
             // BINFLOAT
             b'G' => {
                 self.take(8)?;
                 self.push(Value::Constant);
             }
-            // BINUNICODE
-            b'X' => {
-                let length = self.unsigned(4)?;
+            // SHORT_BINUNICODE, BINUNICODE, BINUNICODE8
+            opcode @ (0x8c | b'X' | 0x8d) => {
+                let length = self.unsigned(length_bytes(opcode))?;
                 let text = self.text(length)?;
                 self.push(Value::Text(text));
             }
+            // SHORT_BINBYTES, BINBYTES, BINBYTES8, BYTEARRAY8
+            opcode @ (b'C' | b'B' | 0x8e | 0x96) => {
+                let length = self.unsigned(length_bytes(opcode))?;
+                self.take(length)?;
+                self.push(Value::Object(vec![]));
+            }
             // GLOBAL
-            b'c' => self.global()?,
+            b'c' => {
+                let (module, name) = (self.line()?, self.line()?);
+                self.global(module, name)?;
+            }
+            // STACK_GLOBAL
+            0x93 => {
+                let (name, module) = (self.pop()?, self.pop()?);
+                let (&Value::Text(module), &Value::Text(name)) = (&self.values[module], &self.values[name])
+                else {
+                    return Err("a pickle with a name that is no string".into());
+                };
+                self.global(module, name)?;
+            }
             // BINPUT, LONG_BINPUT, BINGET, LONG_BINGET
             b'q' => self.unsigned(1).and_then(|id| self.remember(id))?,
             b'r' => self.unsigned(4).and_then(|id| self.remember(id))?,
             b'h' => self.unsigned(1).and_then(|id| self.recall(id))?,
             b'j' => self.unsigned(4).and_then(|id| self.recall(id))?,
+            // MEMOIZE
+            0x94 => self.remember(self.memo.len())?,
             // TUPLE, TUPLE1, TUPLE2, TUPLE3
             b't' => {
                 let values = self.pop_to_mark()?;
@@ -330,12 +324,17 @@ impl<'a> Machine<'a> {
                 values.reverse();
                 self.push(Value::Tuple(values));
             }
-            // APPEND, APPENDS, SETITEM, SETITEMS
+            // FROZENSET
+            0x91 => {
+                self.pop_to_mark()?;
+                self.push(Value::Object(vec![]));
+            }
+            // APPEND; APPENDS, ADDITEMS; SETITEM; SETITEMS
             b'a' => {
                 let value = self.pop()?;
                 self.append(&[value])?;
             }
-            b'e' => {
+            b'e' | 0x90 => {
                 let values = self.pop_to_mark()?;
                 self.append(&values)?;
             }
@@ -353,6 +352,18 @@ impl<'a> Machine<'a> {
                 let made = self.call(function, arguments)?;
                 self.push(made);
             }
+            // NEWOBJ, NEWOBJ_EX
+            opcode @ (0x81 | 0x92) => {
+                if opcode == 0x92 {
+                    self.pop()?;
+                }
+                let (_arguments, class) = (self.pop()?, self.pop()?);
+                self.instance(class)?;
+            }
+            // BUILD, which gives an object its fields
+            b'b' => {
+                self.pop()?;
+            }
             // BINPERSID
             b'Q' => {
                 let id = self.pop()?;
@@ -369,5 +380,14 @@ impl<'a> Machine<'a> {
             opcode => return Err(format!("a pickle with instruction {opcode:#04x}, which no tensors need")),
         }
         Ok(None)
+    }
+}
+
+/// Bytes of the length that stands before a string or bytes.
+fn length_bytes(opcode: u8) -> usize {
+    match opcode {
+        0x8c | b'C' => 1,
+        b'X' | b'B' => 4,
+        _ => 8,
     }
 }

@@ -1,7 +1,7 @@
 //! The zip archive that torch.save writes: a pickle, and the bytes of its tensors, all of it stored as it is.
 
+use super::Storages;
 use crate::error::{Error, Result};
-use std::collections::HashMap;
 use std::fmt::Display;
 use std::io::Cursor;
 use std::ops::Range;
@@ -9,13 +9,16 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::read::ZipArchive;
 
+/// How an archive begins.
+pub(super) const MAGIC: &[u8] = b"PK\x03\x04";
+
 /// An archive's parts, as places in its file. None overlaps another.
 #[derive(Debug)]
-pub(super) struct Archive {
+pub(crate) struct Archive {
     /// Of data.pkl.
     pub pickle: Range<usize>,
     /// Of the tensors' storages, by the keys under which the pickle asks for them.
-    pub storages: HashMap<String, Range<usize>>,
+    pub storages: Storages,
 }
 
 /// A file in the archive.
@@ -32,7 +35,7 @@ impl Archive {
     ///
     /// # Errors
     /// A file that is no such archive, was cut off, or has changed since it was written.
-    pub(super) fn open(file: &Path, bytes: &[u8]) -> Result<Self> {
+    pub fn open(file: &Path, bytes: &[u8]) -> Result<Self> {
         let refuse = |field: &str, found: &dyn Display, expected: &str| {
             Err(Error::input(file, field, found, expected))
         };
@@ -67,7 +70,7 @@ impl Archive {
         if let Some(pair) = entries.windows(2).find(|pair| pair[0].contents.end > pair[1].contents.start) {
             return refuse(&pair[0].name, &"in one place with another entry", "a place of its own");
         }
-        let (mut pickle, mut storages) = (None, HashMap::new());
+        let (mut pickle, mut storages) = (None, Storages::new());
         for Entry { name, contents, crc32 } in entries {
             if crc32fast::hash(&bytes[contents.clone()]) != crc32 {
                 return refuse(&name, &"damaged: its checksum differs", "the bytes that were written");
@@ -75,6 +78,9 @@ impl Archive {
             // The first folder is the archive's own name.
             match name.split_once('/').map(|(_, inside)| inside) {
                 Some("data.pkl") => pickle = Some(contents),
+                Some("byteorder") if &bytes[contents.clone()] != b"little" => {
+                    return refuse(&name, &String::from_utf8_lossy(&bytes[contents]), "little");
+                }
                 Some(inside) => {
                     if let Some(key) = inside.strip_prefix("data/") {
                         storages.insert(key.into(), contents);

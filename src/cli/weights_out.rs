@@ -1,0 +1,100 @@
+//! What `export` and `import` write, and what they tell of it.
+
+use super::{model, print_json};
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use globalsplat::config::Config;
+use globalsplat::io::{check_writable_file, write_sharded};
+use globalsplat::model::Stage;
+use globalsplat::reconstruct::{ModelDtype, model_weights, save_checkpoint};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use tch::nn;
+
+#[derive(Args)]
+pub struct WeightsOut {
+    /// The file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// How weights are stored
+    #[arg(long, value_enum, default_value = "f32")]
+    dtype: Dtype,
+    /// Weights in more bytes than this go to several files with an index; as in 500MB or 5GB
+    #[arg(long, value_name = "SIZE", default_value = "5GB", value_parser = parse_size)]
+    max_shard_size: u64,
+    /// Print what was written as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Dtype {
+    F32,
+    Bf16,
+}
+
+/// What contains weights.
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+pub enum Format {
+    Safetensors,
+    /// A checkpoint for torch.load, as the authors' are
+    Torch,
+}
+
+impl WeightsOut {
+    pub fn check(&self) -> Result<()> {
+        Ok(check_writable_file(&self.out)?)
+    }
+
+    /// Writes the variables of `vs` and tells it; JSON gets the entries of `more`, too, and people `note`.
+    pub fn write(
+        &self,
+        vs: &nn::VarStore,
+        config: &Config,
+        stage: Stage,
+        format: Format,
+        (more, note): (Value, Option<String>),
+    ) -> Result<()> {
+        let dtype = match self.dtype {
+            Dtype::F32 => ModelDtype::F32,
+            Dtype::Bf16 => ModelDtype::BF16,
+        };
+        let weights = model_weights(vs, config, stage, dtype);
+        let bytes: usize = weights.tensors.values().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
+        let written = match format {
+            Format::Safetensors => write_sharded(&self.out, &weights, self.max_shard_size)?,
+            Format::Torch => {
+                save_checkpoint(&self.out, weights)?;
+                self.out.clone()
+            }
+        };
+        // Of one file with its header.
+        let bytes = if written == self.out { std::fs::metadata(&written)?.len() } else { bytes as u64 };
+        let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
+        if self.json {
+            let mut told =
+                json!({ "weights": written, "parameters": parameters, "bytes": bytes, "stage": stage });
+            for (key, value) in more.as_object().into_iter().flatten() {
+                told[key] = value.clone();
+            }
+            print_json(&told);
+        } else {
+            let notes: String = [model::early_stage(stage, config), note]
+                .into_iter()
+                .flatten()
+                .map(|n| format!(", {n}"))
+                .collect();
+            println!("{}: {parameters} parameters, {:.1} MB{notes}", written.display(), bytes as f64 / 1e6);
+        }
+        Ok(())
+    }
+}
+
+/// Bytes of `500MB` or `5GB`, by thousands as disks are sold.
+fn parse_size(text: &str) -> Result<u64, String> {
+    let units = [("GB", 1_000_000_000), ("MB", 1_000_000), ("KB", 1000), ("B", 1), ("", 1)];
+    let (number, unit) =
+        units.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, unit))).expect("the last fits");
+    let bytes = number.trim().parse::<u64>().ok().and_then(|number| number.checked_mul(*unit));
+    bytes.filter(|&bytes| bytes > 0).ok_or_else(|| "expected a size, as in 500MB or 5GB".into())
+}

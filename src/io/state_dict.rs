@@ -1,0 +1,64 @@
+//! Weights among what a checkpoint of torch.save holds: Lightning's, a plain state dict, or one under another customary name.
+
+use super::torch_file::{Array, TorchFile, Value};
+use crate::error::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::Path;
+
+/// Arrays by name, and metadata.
+pub(super) type Contents = (BTreeMap<String, Array>, HashMap<String, String>);
+
+/// Where a checkpoint has its state dict; Lightning's have the first.
+const PLACES: [&str; 3] = ["state_dict", "model_state_dict", "model"];
+/// What shapes of weights don't tell, as settings call it. Wherever it stands in a checkpoint, it is taken if it is said alike.
+const SETTINGS: [&str; 1] = ["num_heads"];
+
+/// The tensors of the state dict in `file`, which is `path`; and as metadata the strings beside it, and settings.
+///
+/// # Errors
+/// No state dict, or a tensor that isn't whole.
+pub(super) fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
+    let TorchFile { values, storages } = file;
+    let refuse = |found: &str| {
+        Err(Error::input(path, "the contents", found, "a state dict, or a checkpoint with a state_dict"))
+    };
+    let root = match values.get(values.root) {
+        Value::Dict(items) => items,
+        other => return refuse(other.name()),
+    };
+    let inner = PLACES.iter().find_map(|place| match values.entry(root, place) {
+        Some(Value::Dict(items)) => Some(items),
+        _ => None,
+    });
+    let mut arrays = BTreeMap::new();
+    for pair in inner.unwrap_or(root).chunks_exact(2) {
+        let (&Value::Text(name), tensor @ Value::Tensor { .. }) = (values.get(pair[0]), values.get(pair[1]))
+        else {
+            continue;
+        };
+        let array = Array::of(values, storages, tensor).map_err(|why| {
+            Error::input(path, format!("tensor {name}"), format!("broken: it {why}"), "a whole one")
+        })?;
+        arrays.insert(name.to_string(), array);
+    }
+    if arrays.is_empty() {
+        return refuse("a dict without tensors");
+    }
+    let mut metadata = HashMap::new();
+    for pair in root.chunks_exact(2) {
+        if let (&Value::Text(key), &Value::Text(text)) = (values.get(pair[0]), values.get(pair[1])) {
+            metadata.insert(key.to_string(), text.to_string());
+        }
+    }
+    for setting in SETTINGS {
+        let said = values.iter().filter_map(|value| match value {
+            Value::Dict(items) | Value::Object(items) => values.entry(items, setting),
+            _ => None,
+        });
+        let said: BTreeSet<i64> = said.filter_map(Value::integer).collect();
+        if let (Some(number), 1) = (said.first(), said.len()) {
+            metadata.insert(setting.to_string(), number.to_string());
+        }
+    }
+    Ok((arrays, metadata))
+}

@@ -1,0 +1,89 @@
+//! A tensor in a file of torch.save's, as a place.
+
+use super::Storages;
+use super::value::{Id, Value, Values};
+use std::ops::Range;
+use tch::Kind;
+
+/// Numbers in a file.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Array {
+    pub dtype: Kind,
+    pub size: Vec<usize>,
+    /// In elements.
+    pub stride: Vec<usize>,
+    /// From the first element to the last.
+    pub bytes: Range<usize>,
+}
+
+impl Array {
+    /// Where `tensor` lies. Whatever it says, that is inside its storage, and it has no more elements than there are.
+    ///
+    /// # Errors
+    /// What is wrong with it, to be read behind its name.
+    pub fn of(values: &Values, storages: &Storages, tensor: &Value) -> Result<Self, String> {
+        let &Value::Tensor { storage, offset, size, stride } = tensor else {
+            return Err(format!("has {}, expected a tensor", tensor.name()));
+        };
+        let plain = || "is no plain tensor".to_string();
+        let &Value::Storage { dtype, key } = values.get(storage) else { return Err(plain()) };
+        let storage = storages.get(key);
+        let storage = storage.ok_or_else(|| format!("asks for data/{key}, which is not there"))?;
+        let offset = number(values, offset).ok_or_else(plain)?;
+        let (size, stride) =
+            (numbers(values, size).ok_or_else(plain)?, numbers(values, stride).ok_or_else(plain)?);
+        if size.len() != stride.len() {
+            return Err(plain());
+        }
+        let beyond = || format!("reaches beyond its data of {} bytes", storage.len());
+        let (count, span) = extent(&size, &stride).ok_or_else(beyond)?;
+        if count > span {
+            return Err(plain());
+        }
+        let place = || {
+            let start = offset.checked_mul(dtype.elt_size_in_bytes())?;
+            let end = start.checked_add(span.checked_mul(dtype.elt_size_in_bytes())?)?;
+            (end <= storage.len()).then(|| storage.start + start..storage.start + end)
+        };
+        Ok(Array { dtype, bytes: place().ok_or_else(beyond)?, size, stride })
+    }
+
+    /// Whether the elements lie one after the other, in row-major order.
+    pub fn is_contiguous(&self) -> bool {
+        let mut expected = 1;
+        self.bytes.is_empty()
+            || self.size.iter().zip(&self.stride).rev().all(|(&size, &stride)| {
+                let dense = size == 1 || stride == expected;
+                expected *= size;
+                dense
+            })
+    }
+}
+
+/// How many elements a tensor has, and how many there are from its first to its last; none where that overflows.
+fn extent(size: &[usize], stride: &[usize]) -> Option<(usize, usize)> {
+    let count = size.iter().try_fold(1usize, |count, &size| count.checked_mul(size))?;
+    if count == 0 {
+        return Some((0, 0));
+    }
+    let steps = size.iter().zip(stride);
+    let span = steps
+        .into_iter()
+        .try_fold(1usize, |span, (&size, &stride)| span.checked_add((size - 1).checked_mul(stride)?))?;
+    Some((count, span))
+}
+
+fn number(values: &Values, id: Id) -> Option<usize> {
+    values.get(id).integer().and_then(|number| usize::try_from(number).ok())
+}
+
+fn numbers(values: &Values, tuple: Id) -> Option<Vec<usize>> {
+    /// Weights have fewer dimensions. The limit keeps what a pickle makes as short as what it says.
+    const MOST: usize = 8;
+    match values.get(tuple) {
+        Value::Tuple(items) if items.len() <= MOST => {
+            items.iter().map(|&item| number(values, item)).collect()
+        }
+        _ => None,
+    }
+}

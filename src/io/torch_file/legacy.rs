@@ -1,0 +1,67 @@
+//! What torch.save wrote before torch 1.6, and writes still where it is told to (`_use_new_zipfile_serialization=False`): four
+//! pickles, which are a magic number, a version, the system, and the contents; one with the storages' keys; and the storages in
+//! their order, each behind the number of its elements, of eight bytes.
+
+use super::pickle::{Strangers, unpickle};
+use super::value::Value;
+use super::{Storages, TorchFile};
+use std::collections::HashMap;
+
+/// The magic number, of ten bytes, as a pickle of any protocol has it.
+const MAGIC: &[u8] = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
+/// Bytes among which it ends, behind what tells the protocol.
+const HEAD: usize = 32;
+/// How a pickle begins.
+const PICKLE: u8 = 0x80;
+/// Of the format, not of torch.
+const VERSION: i64 = 1001;
+
+/// Whether `bytes` begin with the magic number.
+pub(super) fn is_one(bytes: &[u8]) -> bool {
+    let head = &bytes[..bytes.len().min(HEAD)];
+    head.first() == Some(&PICKLE) && head.windows(MAGIC.len()).any(|window| window == MAGIC)
+}
+
+/// What `bytes` hold.
+///
+/// # Errors
+/// What is wrong with them.
+pub(super) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
+    let mut rest = bytes;
+    unpickle(&mut rest, Strangers::Refused)?;
+    let version = unpickle(&mut rest, Strangers::Refused)?;
+    if version.get(version.root) != &Value::Integer(VERSION) {
+        return Err("of a version that nobody knows".into());
+    }
+    let system = unpickle(&mut rest, Strangers::Refused)?;
+    let Value::Dict(items) = system.get(system.root) else {
+        return Err("without its system".into());
+    };
+    if system.entry(items, "little_endian") != Some(&Value::Truth(true)) {
+        return Err("with numbers that are not little-endian".into());
+    }
+    let values = unpickle(&mut rest, Strangers::Kept)?;
+    let keys = unpickle(&mut rest, Strangers::Refused)?;
+    let Value::List(ids) = keys.get(keys.root) else { return Err("without the keys of its storages".into()) };
+
+    let dtypes: HashMap<&str, _> = values
+        .iter()
+        .filter_map(|value| match value {
+            &Value::Storage { dtype, key } => Some((key, dtype)),
+            _ => None,
+        })
+        .collect();
+    let mut storages = Storages::new();
+    for &id in ids {
+        let &Value::Text(key) = keys.get(id) else { return Err("with a key that is no string".into()) };
+        let dtype = dtypes.get(key).ok_or_else(|| format!("with a storage {key} of an unknown type"))?;
+        let cut = || format!("cut off in storage {key}");
+        let (length, behind) = rest.split_first_chunk().ok_or_else(cut)?;
+        let length = usize::try_from(i64::from_le_bytes(*length)).ok();
+        let length = length.and_then(|count| count.checked_mul(dtype.elt_size_in_bytes()));
+        let start = bytes.len() - behind.len();
+        rest = length.and_then(|length| behind.get(length..)).ok_or_else(cut)?;
+        storages.insert(key.into(), start..bytes.len() - rest.len());
+    }
+    Ok(TorchFile { values, storages })
+}

@@ -1,0 +1,53 @@
+//! What torch.save writes, read without torch: a pickle, and the bytes of the tensors that it describes. Nothing that a file says is
+//! run, and nothing that it says about sizes is believed.
+
+mod archive;
+mod array;
+mod globals;
+mod legacy;
+mod pickle;
+mod value;
+mod write;
+
+pub(crate) use archive::Archive;
+pub(crate) use array::Array;
+pub(crate) use pickle::{Strangers, unpickle};
+pub(crate) use value::{Id, Value, Values};
+pub use write::write_checkpoint;
+
+use crate::error::{Error, Result};
+use std::collections::HashMap;
+use std::ops::Range;
+use std::path::Path;
+
+/// Where tensors' bytes lie in a file, by the keys under which its pickle asks for them.
+pub(crate) type Storages = HashMap<String, Range<usize>>;
+
+/// What a file of any kind holds beside the tensors that are wanted of it: strangers are kept.
+#[derive(Debug)]
+pub(crate) struct TorchFile<'a> {
+    pub values: Values<'a>,
+    pub storages: Storages,
+}
+
+impl<'a> TorchFile<'a> {
+    /// Whether `bytes` begin as torch.save's files do, today's or those before torch 1.6.
+    pub fn is_one(bytes: &[u8]) -> bool {
+        bytes.starts_with(archive::MAGIC) || legacy::is_one(bytes)
+    }
+
+    /// Reads `bytes`, which `file` holds.
+    ///
+    /// # Errors
+    /// A file that is damaged, or would run code in Python.
+    pub fn parse(file: &Path, bytes: &'a [u8]) -> Result<Self> {
+        let expected = "numbers, strings and tensors, as in a checkpoint that runs nothing; nothing was run";
+        let refuse = |found: String| Error::input(file, "the pickle", found, expected);
+        if legacy::is_one(bytes) {
+            return legacy::parse(bytes).map_err(refuse);
+        }
+        let Archive { pickle, storages } = Archive::open(file, bytes)?;
+        let values = unpickle(&mut &bytes[pickle], Strangers::Kept).map_err(refuse)?;
+        Ok(TorchFile { values, storages })
+    }
+}

@@ -1,0 +1,145 @@
+//! A checkpoint as torch.save writes it, for `torch.load`, which needs nothing of ours to read it: pickle protocol 2, and the bytes
+//! of each tensor in a stored entry of a zip archive.
+
+use crate::error::{Error, Result};
+use crate::io::weights::{Stored, Weights};
+use crate::io::write_atomically;
+use std::collections::HashMap;
+use std::io::{Cursor, Write};
+use std::path::Path;
+use tch::Kind;
+use zip::CompressionMethod;
+use zip::result::ZipError;
+use zip::write::{FileOptions, ZipWriter};
+
+/// Where tensors' bytes begin is a multiple of it, as in torch's own files.
+const ALIGNMENT: u16 = 64;
+/// Of the archive's layout.
+const VERSION: &[u8] = b"3\n";
+
+/// Lightning asks for them, and takes what it finds for a checkpoint of its own.
+const OF_LIGHTNING: &str = "pytorch-lightning_version";
+const LIGHTNING_VERSION: &str = "2.0.0";
+const COUNTERS: [&str; 2] = ["epoch", "global_step"];
+
+/// Writes a checkpoint with `weights` as its state dict and their metadata beside it, whole or not at all. Lightning reads it, too.
+///
+/// # Errors
+/// A type of numbers that isn't stored, or the system's refusal to write.
+pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
+    let tensors = Stored::all(&weights.tensors)?;
+    let pickle = pickle(&tensors, &weights.metadata)?;
+    let mut zip = ZipWriter::new(Cursor::new(vec![]));
+    let mut add = |name: &str, contents: &[u8]| {
+        let options = FileOptions::default()
+            .compression_method(CompressionMethod::Stored)
+            .large_file(contents.len() > u32::MAX as usize);
+        zip.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT)?;
+        zip.write_all(contents).map_err(ZipError::from)
+    };
+    let written = (|| {
+        add("data.pkl", &pickle)?;
+        add("byteorder", b"little")?;
+        for (key, (_, tensor)) in tensors.iter().enumerate() {
+            add(&format!("data/{key}"), &tensor.bytes)?;
+        }
+        add("version", VERSION)
+    })();
+    let failed = |e: ZipError| Error::Failed(format!("{}: {e}", path.display()));
+    written.map_err(failed)?;
+    let bytes = zip.finish().map_err(failed)?.into_inner();
+    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+}
+
+fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Result<Vec<u8>> {
+    // PROTO 2, EMPTY_DICT, MARK
+    let mut p = Pickle(b"\x80\x02}(".into());
+    p.text("state_dict");
+    p.ordered_dict();
+    p.0.push(b'(');
+    for (key, (name, Stored { kind, shape, .. })) in tensors.iter().enumerate() {
+        let storage = match kind {
+            Kind::Float => "FloatStorage",
+            Kind::Double => "DoubleStorage",
+            Kind::BFloat16 => "BFloat16Storage",
+            Kind::Half => "HalfStorage",
+            Kind::Int64 => "LongStorage",
+            other => return Err(Error::Failed(format!("tensors of kind {other:?} are not stored"))),
+        };
+        let mut stride = vec![1; shape.len()];
+        for i in (1..shape.len()).rev() {
+            stride[i - 1] = stride[i] * shape[i].max(1);
+        }
+        p.text(name);
+        p.global("torch._utils", "_rebuild_tensor_v2");
+        p.0.push(b'(');
+        // The persistent id of a storage, BINPERSID.
+        p.0.push(b'(');
+        p.text("storage");
+        p.global("torch", storage);
+        p.text(&key.to_string());
+        p.text("cpu");
+        p.integer(shape.iter().product());
+        p.0.extend(b"tQ");
+        // Its offset, size and stride, whether it needs a gradient (NEWFALSE), and no hooks.
+        p.integer(0);
+        p.tuple(shape);
+        p.tuple(&stride);
+        p.0.push(0x89);
+        p.ordered_dict();
+        // TUPLE, REDUCE
+        p.0.extend(b"tR");
+    }
+    // SETITEMS
+    p.0.push(b'u');
+    let mut strings: Vec<(&str, &str)> = metadata.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+    strings.push((OF_LIGHTNING, LIGHTNING_VERSION));
+    strings.sort();
+    for (key, text) in strings {
+        p.text(key);
+        p.text(text);
+    }
+    for key in COUNTERS {
+        p.text(key);
+        p.integer(0);
+    }
+    // SETITEMS, STOP
+    p.0.extend(b"u.");
+    Ok(p.0)
+}
+
+/// A program for Python's stack machine, instruction by instruction.
+struct Pickle(Vec<u8>);
+
+impl Pickle {
+    /// BINUNICODE
+    fn text(&mut self, text: &str) {
+        self.0.push(b'X');
+        self.0.extend((text.len() as u32).to_le_bytes());
+        self.0.extend(text.as_bytes());
+    }
+
+    /// LONG1 of eight bytes.
+    fn integer(&mut self, number: usize) {
+        self.0.extend([0x8a, 8]);
+        self.0.extend((number as u64).to_le_bytes());
+    }
+
+    /// MARK and TUPLE
+    fn tuple(&mut self, numbers: &[usize]) {
+        self.0.push(b'(');
+        numbers.iter().for_each(|&number| self.integer(number));
+        self.0.push(b't');
+    }
+
+    /// GLOBAL
+    fn global(&mut self, module: &str, name: &str) {
+        self.0.extend(format!("c{module}\n{name}\n").as_bytes());
+    }
+
+    /// An empty one: EMPTY_TUPLE, REDUCE
+    fn ordered_dict(&mut self) {
+        self.global("collections", "OrderedDict");
+        self.0.extend(b")R");
+    }
+}
