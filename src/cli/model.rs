@@ -1,8 +1,9 @@
-//! `--weights` and `--precision f32|bf16`.
+//! `--weights`, `--precision f32|bf16` and `--views-at`.
 
 use globalsplat::config::Config;
 use globalsplat::model::Stage;
-use globalsplat::reconstruct::{LoadedModel, SHIPPED_MODEL, load_model, shipped_model};
+use globalsplat::reconstruct::{Input, LoadedModel, SHIPPED_MODEL, ViewsAs, load_model, shipped_model};
+use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
@@ -27,6 +28,24 @@ pub fn load(weights: Option<&Path>, precision: &str, device: Device) -> Result<L
 /// What errors and reports call the weights.
 pub fn name(weights: Option<&Path>) -> &Path {
     weights.unwrap_or(Path::new(SHIPPED_MODEL))
+}
+
+/// Told where photos are smaller than what they are fitted to.
+pub const ENLARGED: &str = "smaller photos are enlarged, which shows no more of the scene";
+
+/// What photos become for a model that was trained with images of `trained`.
+pub fn shown_as(input: Input, trained: ImageSize) -> String {
+    let pixels = |size: ImageSize| format!("{}×{} pixels", size.width, size.height);
+    let (photo, trained, views) =
+        (pixels(input.photo_size(trained)), pixels(trained), input.views_of_photo());
+    match input.views_as() {
+        _ if input.is_plain() => format!("the {trained} that the model sees"),
+        ViewsAs::Polyphase => format!("{photo}, {views} views of the {trained} that the model sees"),
+        ViewsAs::Whole => {
+            format!("{photo}, a view of more than the {trained} that the model was trained with")
+        }
+        ViewsAs::Repeated => format!("the {trained} that the model sees, {views} times each"),
+    }
 }
 
 /// What is to be told of weights whose training was stopped on the way.

@@ -6,7 +6,7 @@ use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::peak_memory_bytes;
 use globalsplat::io::{Splat, check_writable_file, write_splat};
-use globalsplat::reconstruct::{load_context, reconstruct};
+use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::collections::BTreeSet;
@@ -18,7 +18,8 @@ use std::time::Instant;
 /// The splat is in the capture's own world, so the capture's cameras see it where the photos show it.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
-    globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply")]
+    globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply\n  \
+    globalsplat reconstruct --weights model.safetensors --scene captures/room --views-at 512 --out room.ply")]
 pub struct Reconstruct {
     /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt); by default those that come with this program
     #[arg(long, value_name = "FILE")]
@@ -29,14 +30,18 @@ pub struct Reconstruct {
     /// The splat to write
     #[arg(long, value_name = "FILE.ply")]
     out: PathBuf,
-    /// Use this many views at most, spread over the path of the camera; by default as many as the model saw in training
+    /// Use this many photos at most, spread over the path of the camera; by default as many as the model saw in training
     #[arg(long, value_name = "N")]
     views: Option<usize>,
+    /// Show photos of this height, a multiple of what the model was trained with: of N times that a photo becomes N² views, which
+    /// share its pixels out and take N² times as long
+    #[arg(long, value_name = "PIXELS")]
+    views_at: Option<u32>,
     /// Views not to use: every:N, every:N+K or none
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
-    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device"])]
+    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
     refine: Option<f64>,
     /// f32, or bf16 for matrix products: faster on machines with instructions for it
     #[arg(long, default_value = "f32")]
@@ -86,21 +91,28 @@ impl Reconstruct {
         let load_seconds = clock.elapsed().as_secs_f64();
         let capture = open_capture(&self.scene)?;
         let data = &loaded.config.data;
+        let input = match self.views_at {
+            Some(height) => Input::at(height, ViewsAs::Polyphase, data.image_size)?,
+            None => Input::PLAIN,
+        };
         let count = self.views.unwrap_or(data.context_views);
-        let views = load_context(&capture, holdout, Some(count), data.image_size)?;
-        if let Some(line) = fitting(&capture, views.len(), data.image_size) {
+        let photos = load_context(&capture, holdout, Some(count), input.photo_size(data.image_size))?;
+        if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
             eprintln!("{line}");
         }
-        let reconstruction = reconstruct(&loaded, &views, &[])?;
+        let reconstruction = reconstruct(Model { input, ..Model::from(&loaded) }, &photos, &[])?;
         write_splat(&self.out, &Splat::of(&reconstruction.in_world())?)?;
 
         let bytes = std::fs::metadata(&self.out)?.len();
+        let views = photos.len() * input.views_of_photo();
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());
         if self.json {
             print_json(&json!({
                 "splat": self.out,
                 "weights": model::name(self.weights.as_deref()),
-                "views": views.len(),
+                "photos": photos.len(),
+                "image_size": input.photo_size(data.image_size),
+                "views": views,
                 "gaussians": count,
                 "load_seconds": load_seconds,
                 "seconds": seconds,
@@ -110,9 +122,8 @@ impl Reconstruct {
         } else {
             let megabytes = bytes as f64 / 1e6;
             println!(
-                "{}: {count} Gaussians from {} views, {megabytes:.2} MB; forward pass {seconds:.2} s, peak memory {:.2} GB",
+                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; forward pass {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),
-                views.len(),
                 peak_memory_bytes() as f64 / 1e9
             );
         }
@@ -130,17 +141,21 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
     seconds.filter(|s| *s > 0. && s.is_finite()).ok_or_else(|| "expected a time, as in 60s or 2m".into())
 }
 
-/// What is done to a capture's photos before `shown` of them are seen at `size`, if anything.
-fn fitting(capture: &Capture, shown: usize, size: ImageSize) -> Option<String> {
+/// What is done to a capture's photos before `shown` of them are seen by a model that was trained with images of `trained`, if
+/// anything.
+fn fitting(capture: &Capture, shown: usize, input: Input, trained: ImageSize) -> Option<String> {
+    let size = input.photo_size(trained);
     let sizes: BTreeSet<(u32, u32)> = capture.cameras().iter().map(|c| (c.width, c.height)).collect();
     let chosen = (shown < capture.len())
         .then(|| format!("{shown} of {} photos are shown, spread over the camera's path", capture.len()));
-    let model = format!("the {}×{} pixels that the model sees", size.width, size.height);
+    let model = model::shown_as(input, trained);
     let fitted = match sizes.first() {
         Some((width, height)) if sizes.len() == 1 => ((*width, *height) != (size.width, size.height))
             .then(|| format!("{width}×{height} pixels are cut and resized to {model}")),
         _ => Some(format!("photos of {} sizes are cut and resized to {model}", sizes.len())),
     };
-    let parts: Vec<String> = chosen.into_iter().chain(fitted).collect();
+    let fitted = fitted.or_else(|| (!input.is_plain()).then(|| format!("photos are shown as {model}")));
+    let enlarged = (!input.is_plain() && capture.has_smaller(size)).then(|| model::ENLARGED.to_string());
+    let parts: Vec<String> = chosen.into_iter().chain(fitted).chain(enlarged).collect();
     (!parts.is_empty()).then(|| format!("{}: {}", capture.name, parts.join("; ")))
 }

@@ -80,6 +80,11 @@ pub struct View {
 }
 
 impl View {
+    /// The same; the pixels are shared.
+    pub fn shallow_clone(&self) -> Self {
+        View { name: self.name.clone(), image: self.image.shallow_clone(), camera: self.camera }
+    }
+
     /// Fitted to `size`, as [`Capture::load`] does it, without reading the photo again.
     ///
     /// # Errors
@@ -118,6 +123,12 @@ impl Capture {
     /// The cameras, at the sizes of the files.
     pub fn cameras(&self) -> Vec<Camera> {
         self.frames.iter().map(|frame| frame.camera).collect()
+    }
+
+    /// Whether any photo has fewer pixels than `size` along a side: to be fitted it is enlarged, which shows no more of the scene.
+    pub fn has_smaller(&self, size: ImageSize) -> bool {
+        let is_smaller = |camera: &Camera| camera.height < size.height || camera.width < size.width;
+        self.frames.iter().any(|frame| is_smaller(&frame.camera))
     }
 
     /// The images' names, in order.

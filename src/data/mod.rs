@@ -9,6 +9,7 @@ mod holdout;
 mod loading;
 mod made_up;
 mod pixels;
+mod polyphase;
 mod room;
 
 pub use batch::{ViewBatch, view_batch};
@@ -23,6 +24,7 @@ pub use holdout::Holdout;
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Sample, SceneGroups, TrainingScenes};
 pub use made_up::{MadeUp, read_pictures};
 pub use pixels::{Planes, fit};
+pub use polyphase::polyphase;
 pub use room::write_room;
 
 // For the parity checks, which run every part by itself.

@@ -2,11 +2,13 @@
 //! capture's world.
 
 mod context;
+mod input;
 mod model_file;
 mod published;
 mod spread;
 
 pub use context::load_context;
+pub use input::{Input, ViewsAs};
 pub use model_file::{
     CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, SHIPPED_MODEL, STAGE_KEY, load_model, model_weights,
     save_checkpoint, save_model, shipped_model,
@@ -35,12 +37,14 @@ pub struct Model<'a> {
     pub stage: Stage,
     /// Where the weights are.
     pub device: Device,
+    /// What it sees of a photo.
+    pub input: Input,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
         let LoadedModel { model: network, config, stage, vs, .. } = loaded;
-        Model { network, config, stage: *stage, device: vs.device() }
+        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN }
     }
 }
 
@@ -66,28 +70,34 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model over `context`. `targets` are poses (camera-to-world, in the capture's world) of target views:
-/// they take part in the normalization, as in the paper's protocol.
+/// Runs the model over `photos`, which become the views that it sees ([`Input`]). `targets` are poses (camera-to-world, in the
+/// capture's world) of target views: they take part in the normalization, as in the paper's protocol. A photo does so once,
+/// whatever it becomes.
 ///
 /// # Errors
-/// Fewer than two views, images that the model's patches don't divide, cameras without a mean direction.
+/// Fewer than two photos, images that the model's patches don't divide, cameras without a mean direction.
 pub fn reconstruct<'a>(
     model: impl Into<Model<'a>>,
-    context: &[View],
+    photos: &[View],
     targets: &[DMat4],
 ) -> Result<Reconstruction> {
-    let Model { network, config, stage, device } = model.into();
-    if context.len() < 2 {
+    let Model { network, config, stage, device, input } = model.into();
+    if photos.len() < 2 {
         return Err(Error::Request(format!(
             "a reconstruction needs two views or more, found {}",
-            context.len()
+            photos.len()
         )));
     }
     let poses: Vec<DMat4> =
-        context.iter().map(|view| view.camera.c2w).chain(targets.iter().copied()).collect();
+        photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
-    let (context_poses, target_poses) = normalization.c2w.split_at(context.len());
-    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(context, context_poses, device);
+    let (photo_poses, target_poses) = normalization.c2w.split_at(photos.len());
+    let (mut views, mut poses) = (vec![], vec![]);
+    for (photo, &pose) in photos.iter().zip(photo_poses) {
+        views.extend(input.views(photo)?);
+        poses.resize(views.len(), pose);
+    }
+    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(&views, &poses, device);
     config.model.check_image(images.size()[3], images.size()[4])?;
 
     let start = Instant::now();

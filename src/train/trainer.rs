@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
 use crate::optim::{AdamW, Stopwatch};
-use crate::reconstruct::{Model, ModelFile};
+use crate::reconstruct::{Input, Model, ModelFile};
 use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
@@ -214,6 +214,7 @@ impl Trainer {
     /// The model as it is now, to reconstruct with.
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
-        Model { network: &self.model, config: &self.config, stage, device: self.vs.device() }
+        let (network, config, device) = (&self.model, &self.config, self.vs.device());
+        Model { network, config, stage, device, input: Input::PLAIN }
     }
 }
