@@ -35,7 +35,7 @@ fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
 
 /// The splat that was published for the capture in `folder`, at all of its cameras.
 fn published_splat(folder: &Path, capture: &Capture) -> (EvalScene, Synthesis) {
-    let scene = EvalScene::all_views(capture).expect("photos");
+    let scene = EvalScene::all_views(capture, None).expect("photos");
     let made = Method::Splat(folder.join("reference.ply")).synthesize(&scene).expect("pictures");
     (scene, made)
 }

@@ -8,8 +8,10 @@ use globalsplat::eval::{
     contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
 use globalsplat::io::{check_writable_dir, check_writable_file, write_png};
-use globalsplat::reconstruct::LoadedModel;
+use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
+use globalsplat::scene::ImageSize;
 use serde_json::json;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::Device;
@@ -28,7 +30,8 @@ use tch::Device;
 #[command(group(ArgGroup::new("photos").required(true)))]
 #[command(after_help = "Examples:\n  globalsplat eval --splat scene.ply --scene captures/room --json\n  \
     globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png\n  \
-    globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k")]
+    globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k\n  \
+    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --views-at 512 --pictures-at 512")]
 pub struct Eval {
     /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
@@ -61,9 +64,20 @@ pub struct Eval {
     /// Target views: every:N or every:N+K; by default as the model was trained
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
-    /// Views the model sees, spread over the path of the camera; by default all that are not held out
+    /// Photos the model is shown, spread over the path of the camera; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
+    /// Show the model photos of this height, a multiple of what it was trained with
+    #[arg(long, value_name = "PIXELS", conflicts_with_all = ["splat", "renders"])]
+    views_at: Option<u32>,
+    /// What a photo of N times the height becomes: N² views that share its pixels out (polyphase), one larger view (whole), or N²
+    /// times the same view of a photo made small again (repeated)
+    #[arg(long, value_name = "HOW", requires = "views_at", default_value_t)]
+    views_as: ViewsAs,
+    /// Score pictures of this height, in the shape of the model's images, or square; by default as large as the model's images, for
+    /// others' pictures of a data set 256, and of one capture as its photos
+    #[arg(long, value_name = "PIXELS")]
+    pictures_at: Option<u32>,
     /// Also write a picture: photo, render and depth side by side, a row per view
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
@@ -93,14 +107,17 @@ impl Eval {
         }
         let capture = open_capture(scene)?;
         let loaded = self.load_model(device)?;
-        let scene = self.one_scene(&capture, loaded.as_ref())?;
-        let made = self.method(loaded.as_ref()).synthesize(&scene)?;
+        let model = self.model(loaded.as_ref())?;
+        let scene = self.one_scene(&capture, model)?;
+        if self.chooses_size() && scene.enlarged {
+            eprintln!("{}: {}", scene.name, model::ENLARGED);
+        }
+        let made = self.method(model).synthesize(&scene)?;
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
         let scores = judge(&scene, &made, &perceptual)?;
         // Beside a model, what answering without one would score.
-        let baselines =
-            loaded.as_ref().map(|_| Baselines::of(&scene.name, &scene.context, &scene.target)).transpose()?;
+        let baselines = model.map(|model| self.baselines(&capture, model, &scene)).transpose()?;
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &contact_sheet(&scene.target, &made.rendered))?;
         }
@@ -110,6 +127,15 @@ impl Eval {
         if self.json {
             let mut object = serde_json::to_value(&scores)?;
             object["peak_memory_bytes"] = peak_memory.into();
+            if let Some(Model { input, config, .. }) = model {
+                let (photos, size) = (scene.context.len(), config.data.image_size);
+                object["image_size"] = json!(self.picture_size(model)?);
+                object["input"] = json!({
+                    "photos": photos, "image_size": input.photo_size(size), "views_as": input.views_as(),
+                    "views": photos * input.views_of_photo(),
+                });
+                object["forward_seconds"] = json!(made.forward_seconds);
+            }
             if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
                 let means = |scores: &CaptureScores| json!({ "psnr": scores.psnr, "ssim": scores.ssim });
                 object["baselines"] =
@@ -130,19 +156,70 @@ impl Eval {
     }
 
     /// What a model is shown and has to match; of splats and pictures all photos.
-    fn one_scene(&self, capture: &Capture, loaded: Option<&LoadedModel>) -> Result<EvalScene> {
-        let Some(loaded) = loaded else { return Ok(EvalScene::all_views(capture)?) };
-        let data = &loaded.config.data;
-        let holdout = match &self.holdout {
-            Some(text) => text.parse::<Holdout>().map_err(Error::Request)?,
-            None => data.holdout,
+    fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
+        let picture_size = self.picture_size(model)?;
+        let Some(model) = model else {
+            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size))?);
         };
-        Ok(EvalScene::held_out(capture, holdout, self.views, data.image_size)?)
+        let photo_size = model.input.photo_size(model.config.data.image_size);
+        Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, picture_size)?)
+    }
+
+    /// What the photos that `model` is shown of `scene` would score, as large as the pictures are.
+    fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
+        let size = self.picture_size(Some(model))?;
+        if size == model.input.photo_size(model.config.data.image_size) {
+            return Ok(Baselines::of(&scene.name, &scene.context, &scene.target)?);
+        }
+        let photos = load_context(capture, self.holdout(model)?, self.views, size)?;
+        Ok(Baselines::of(&scene.name, &photos, &scene.target)?)
+    }
+
+    fn holdout(&self, model: Model) -> Result<Holdout> {
+        match &self.holdout {
+            Some(text) => Ok(text.parse::<Holdout>().map_err(Error::Request)?),
+            None => Ok(model.config.data.holdout),
+        }
+    }
+
+    /// Whether a size was asked for that photos may lack the pixels for.
+    fn chooses_size(&self) -> bool {
+        self.views_at.is_some() || self.pictures_at.is_some()
+    }
+
+    /// Of what is scored.
+    fn picture_size(&self, model: Option<Model>) -> Result<ImageSize> {
+        let default = model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size);
+        let Some(height) = self.pictures_at else { return Ok(default) };
+        let aspect = f64::from(default.width) / f64::from(default.height);
+        let width = (f64::from(height) * aspect).round() as u32;
+        if !(PICTURE_SIDES.contains(&height) && PICTURE_SIDES.contains(&width)) {
+            let (least, most) = (PICTURE_SIDES.start(), PICTURE_SIDES.end());
+            let why = format!(
+                "--pictures-at is {height}, expected pictures with sides of {least} to {most} pixels"
+            );
+            return Err(Error::Request(why).into());
+        }
+        Ok(ImageSize { height, width })
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
         let load = |path: &PathBuf| model::load(Some(path), &self.precision, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
+    }
+
+    /// The model, and what it is to see of photos.
+    fn model<'a>(&self, loaded: Option<&'a LoadedModel>) -> Result<Option<Model<'a>>> {
+        let Some(loaded) = loaded else { return Ok(None) };
+        let trained = loaded.config.data.image_size;
+        let input = match self.views_at {
+            Some(height) => Input::at(height, self.views_as, trained)?,
+            None => Input::PLAIN,
+        };
+        if !input.is_plain() {
+            eprintln!("photos are cut and resized to {}", model::shown_as(input, trained));
+        }
+        Ok(Some(Model { input, ..loaded.into() }))
     }
 
     /// The file or folder that is judged.
@@ -151,9 +228,9 @@ impl Eval {
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
     }
 
-    fn method<'a>(&self, loaded: Option<&'a LoadedModel>) -> Method<'a> {
-        match (loaded, &self.splat) {
-            (Some(loaded), _) => Method::Model(loaded),
+    fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {
+        match (model, &self.splat) {
+            (Some(model), _) => Method::Model(model),
             (None, Some(_)) => Method::Splat(self.path().to_owned()),
             (None, None) => Method::Renders(self.path().to_owned()),
         }
@@ -176,6 +253,8 @@ impl Eval {
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
         let (loaded, path) = (self.load_model(device)?, self.path());
+        let model = self.model(loaded.as_ref())?;
+        let picture_size = self.picture_size(model)?;
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
@@ -185,17 +264,21 @@ impl Eval {
                 "f32" => String::new(),
                 other => format!(" {other}"),
             };
+            let setting = match (model, self.views_at) {
+                (Some(Model { input, .. }), Some(height)) if !input.is_plain() => {
+                    format!("{precision} {} {height}", self.views_as)
+                }
+                _ => precision,
+            };
             let sweep = Sweep {
-                method: self.method(loaded.as_ref()),
-                name: self.name.clone().unwrap_or(stem + &precision),
-                fingerprint: fingerprint(path)? + &precision,
+                method: self.method(model),
+                name: self.name.clone().unwrap_or(stem + &setting),
+                fingerprint: fingerprint(path)? + &setting,
                 dataset: &dataset,
                 root: data,
                 dataset_name,
                 index,
-                image_size: loaded
-                    .as_ref()
-                    .map_or(PROTOCOL_SIZE.into(), |loaded| loaded.config.data.image_size),
+                picture_size,
                 machine: machine(device)?,
                 out: &folder,
             };
@@ -214,6 +297,10 @@ impl Eval {
                 let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
                 why.iter().for_each(|line| eprintln!("{line}"));
             }
+            let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();
+            if self.chooses_size() && enlarged > 0 {
+                eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
+            }
             write_evaluation(&folder, &evaluation)?;
             write_csv(&folder.join("scores.csv"), &evaluation)?;
             evaluations.push((folder, evaluation));
@@ -230,7 +317,7 @@ impl Eval {
                 .map(|(folder, e)| {
                     json!({
                         "folder": folder, "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
-                        "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
+                        "input": e.input, "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
                         "efficiency": e.efficiency, "failures": e.failures,
                     })
                 })
@@ -268,6 +355,8 @@ impl Eval {
 
 /// [height, width] of the protocol's pictures (spec 9.1).
 const PROTOCOL_SIZE: [u32; 2] = [256, 256];
+/// In pixels: SSIM looks through windows of 11×11.
+const PICTURE_SIDES: RangeInclusive<u32> = 11..=16_384;
 
 /// Where each index's scores go: into `out` itself where there is one alone.
 fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {

@@ -1,6 +1,7 @@
 //! What an evaluation over a data set found: the contents of `scores.json`, which the report shows.
 
 use super::scores::CaptureScores;
+use crate::reconstruct::Input;
 use serde::{Deserialize, Serialize};
 
 /// One method (a model, somebody's splats, somebody's pictures) scored by one index.
@@ -14,6 +15,9 @@ pub struct Evaluation {
     pub index: String,
     /// Context views of every scene.
     pub context_views: usize,
+    /// What a model saw of them, where one was run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<Input>,
     /// [height, width] of the pictures that were scored.
     pub image_size: [u32; 2],
     /// Scenes that the index names; the data set may hold fewer.
@@ -76,6 +80,9 @@ pub struct SceneScores {
     pub context: Vec<usize>,
     /// Frames that had to be matched.
     pub target: Vec<usize>,
+    /// Whether photos have fewer pixels than they were shown or matched with.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub enlarged: bool,
     /// Size of the splat as a PLY, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub splat_bytes: Option<u64>,

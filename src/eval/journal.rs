@@ -52,7 +52,10 @@ impl Journal {
         if entries.next().is_some()
             && let Ok(text) = std::fs::read(&file)
         {
-            let wanted = |of: &Identity| format!("{} on {} by {}", of.method, of.dataset, of.index);
+            let wanted = |of: &Identity| {
+                let [height, width] = of.image_size;
+                format!("{} on {} by {}, {width}×{height} pixels", of.method, of.dataset, of.index)
+            };
             return match serde_json::from_slice::<Identity>(&text) {
                 Ok(found) if found == *identity => Ok(journal),
                 Ok(found) => {

@@ -7,9 +7,9 @@ use super::scores::{CaptureScores, score};
 use crate::data::View;
 use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, Splat, read_image, read_splat, tensor_from_rgb};
-use crate::reconstruct::{LoadedModel, Model, Reconstruction, reconstruct};
+use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
-use crate::scene::Camera;
+use crate::scene::{Camera, ImageSize};
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 use tch::Tensor;
@@ -18,7 +18,7 @@ use tch::Tensor;
 #[derive(Debug, Clone)]
 pub enum Method<'a> {
     /// A model, which sees the context views.
-    Model(&'a LoadedModel),
+    Model(Model<'a>),
     /// A splat in the capture's own world.
     Splat(PathBuf),
     /// A folder of pictures named as the photos ([`crate::data::Capture::picture_names`]).
@@ -52,7 +52,7 @@ impl Method<'_> {
     /// for every scene.
     pub fn of_scene(&self, key: &str) -> Self {
         match self {
-            Method::Model(loaded) => Method::Model(loaded),
+            Method::Model(model) => Method::Model(*model),
             Method::Splat(folder) => Method::Splat(folder.join(format!("{key}.ply"))),
             Method::Renders(folder) => {
                 let plain = folder.join(key);
@@ -67,9 +67,8 @@ impl Method<'_> {
     /// Whatever the reconstruction fails with, a splat that can't be read, a picture that is missing.
     pub fn synthesize(&self, scene: &EvalScene) -> Result<Synthesis> {
         match self {
-            Method::Model(loaded) => {
-                let (reconstruction, rendered) =
-                    synthesize_views((*loaded).into(), &scene.context, &scene.target)?;
+            Method::Model(model) => {
+                let (reconstruction, rendered) = synthesize_views(*model, &scene.context, &scene.target)?;
                 let splat = Splat::of(&reconstruction.gaussians)?;
                 let seconds = reconstruction.forward_time.as_secs_f64();
                 Ok(Synthesis {
@@ -100,11 +99,27 @@ impl Method<'_> {
         }
     }
 
+    /// How photos become what a model sees; none where no model is judged.
+    pub fn input(&self) -> Option<Input> {
+        match self {
+            Method::Model(model) => Some(model.input),
+            Method::Splat(_) | Method::Renders(_) => None,
+        }
+    }
+
+    /// What context photos have to be fitted to; none where no model looks at them.
+    pub(super) fn photo_size(&self) -> Option<ImageSize> {
+        match self {
+            Method::Model(model) => Some(model.input.photo_size(model.config.data.image_size)),
+            Method::Splat(_) | Method::Renders(_) => None,
+        }
+    }
+
     /// So far; none where no model is judged.
     pub(super) fn memory(&self) -> Option<Memory> {
         match self {
-            Method::Model(loaded) => {
-                let device = device_memory_bytes(loaded.vs.device());
+            Method::Model(model) => {
+                let device = device_memory_bytes(model.device);
                 Some(Memory { host: peak_memory_bytes(), device })
             }
             _ => None,

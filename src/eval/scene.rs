@@ -12,7 +12,7 @@ use std::sync::mpsc::SyncSender;
 pub struct EvalScene {
     /// The capture's, or the key in an index.
     pub name: String,
-    /// What a model sees; none where no model is judged.
+    /// The photos that a model is shown; none where no model is judged.
     pub context: Vec<View>,
     /// What has to be matched.
     pub target: Vec<View>,
@@ -20,20 +20,29 @@ pub struct EvalScene {
     pub picture_names: Vec<String>,
     /// Their positions in the capture, where an index tells them.
     pub frames: Option<SceneFrames>,
+    /// Whether photos of the capture were enlarged, to be shown or to be matched.
+    pub enlarged: bool,
 }
 
 impl EvalScene {
-    /// Every photo of `capture` as it is, for splats and pictures.
+    /// Every photo of `capture`, fitted to `size` or as it is, for splats and pictures.
     ///
     /// # Errors
     /// Photos that can't be read.
-    pub fn all_views(capture: &Capture) -> Result<Self> {
-        let (target, picture_names) = (capture.load_all(None)?, capture.picture_names());
-        Ok(EvalScene { name: capture.name.clone(), context: vec![], target, picture_names, frames: None })
+    pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Self> {
+        let enlarged = size.is_some_and(|size| capture.has_smaller(size));
+        Ok(EvalScene {
+            name: capture.name.clone(),
+            context: vec![],
+            target: capture.load_all(size)?,
+            picture_names: capture.picture_names(),
+            frames: None,
+            enlarged,
+        })
     }
 
-    /// For a model that takes pictures of `size`: it sees the views that `holdout` leaves, or so many of them, spread over the
-    /// camera's path, and has to match the others.
+    /// For a model: it is shown the photos that `holdout` leaves, or so many of them, spread over the camera's path, fitted to
+    /// `photo_size`, and has to match the others at `picture_size`.
     ///
     /// # Errors
     /// Nothing held out, or photos that can't be read.
@@ -41,27 +50,36 @@ impl EvalScene {
         capture: &Capture,
         holdout: Holdout,
         views: Option<usize>,
-        size: ImageSize,
+        photo_size: ImageSize,
+        picture_size: ImageSize,
     ) -> Result<Self> {
         let (_, held_out) = split_views(capture, holdout)?;
-        let context = load_context(capture, holdout, views, size)?;
-        let target = capture.load(&held_out, Some(size))?;
         let all = capture.picture_names();
-        let picture_names = held_out.iter().map(|&view| all[view].clone()).collect();
-        Ok(EvalScene { name: capture.name.clone(), context, target, picture_names, frames: None })
+        Ok(EvalScene {
+            name: capture.name.clone(),
+            context: load_context(capture, holdout, views, photo_size)?,
+            target: capture.load(&held_out, Some(picture_size))?,
+            picture_names: held_out.iter().map(|&view| all[view].clone()).collect(),
+            frames: None,
+            enlarged: [photo_size, picture_size].into_iter().any(|size| capture.has_smaller(size)),
+        })
     }
 
     /// The frames of scene `key` in `index`, named by their numbers.
     fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
         let frames = loader.index.frames(key, capture.len())?.clone();
-        let size = Some(loader.image_size);
-        let context = if loader.with_context { capture.load(&frames.context, size)? } else { vec![] };
-        let mut target = capture.load(&frames.target, size)?;
+        let context = match loader.photo_size {
+            Some(size) => capture.load(&frames.context, Some(size))?,
+            None => vec![],
+        };
+        let mut target = capture.load(&frames.target, Some(loader.picture_size))?;
         let picture_names: Vec<String> = frames.target.iter().map(|&frame| frame_name(frame)).collect();
         for (view, name) in target.iter_mut().zip(&picture_names) {
             view.name = name.clone();
         }
-        Ok(EvalScene { name: key.into(), context, target, picture_names, frames: Some(frames) })
+        let mut sizes = loader.photo_size.into_iter().chain([loader.picture_size]);
+        let enlarged = sizes.any(|size| capture.has_smaller(size));
+        Ok(EvalScene { name: key.into(), context, target, picture_names, frames: Some(frames), enlarged })
     }
 }
 
@@ -84,9 +102,10 @@ fn frame_name(frame: usize) -> String {
 /// Reads the scenes of an index, beside the thread that judges them.
 pub(super) struct SceneLoader<'a> {
     pub index: &'a EvaluationIndex,
-    pub image_size: ImageSize,
-    /// Only a model looks at it.
-    pub with_context: bool,
+    /// Of the targets.
+    pub picture_size: ImageSize,
+    /// Of the context, which only a model looks at.
+    pub photo_size: Option<ImageSize>,
 }
 
 impl SceneLoader<'_> {

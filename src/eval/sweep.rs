@@ -35,8 +35,8 @@ pub struct Sweep<'a> {
     pub dataset_name: String,
     /// Their frames.
     pub index: &'a EvaluationIndex,
-    /// To which photos are fitted, and which pictures have.
-    pub image_size: ImageSize,
+    /// Of pictures, and of the photos that they have to match.
+    pub picture_size: ImageSize,
     /// Processor, cores and device.
     pub machine: String,
     /// The folder for `scenes/`.
@@ -100,8 +100,8 @@ impl Sweep<'_> {
         // Loading the judges' networks would count as the method's memory, so they come after the first scene of which pictures
         // were made, whatever failed before it.
         let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
-        let with_context = matches!(self.method, Method::Model(_));
-        let loader = SceneLoader { index: self.index, image_size: self.image_size, with_context };
+        let (picture_size, photo_size) = (self.picture_size, self.method.photo_size());
+        let loader = SceneLoader { index: self.index, picture_size, photo_size };
         std::thread::scope(|scope| -> Result<()> {
             let (sender, receiver) = sync_channel(LOADED_AHEAD);
             scope.spawn(move || loader.send(missing, &sender));
@@ -156,7 +156,8 @@ impl Sweep<'_> {
             dataset: self.dataset_name.clone(),
             index: self.index.name(),
             context_views: self.index.context_views(),
-            image_size: self.image_size.into(),
+            input: self.method.input(),
+            image_size: self.picture_size.into(),
             indexed_scenes: self.index.scenes.len(),
             summary: Summary::of(&scenes),
             efficiency: Efficiency::of(&scenes),
@@ -175,14 +176,14 @@ impl Sweep<'_> {
             method: self.fingerprint.clone(),
             dataset: root.display().to_string(),
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
-            image_size: self.image_size.into(),
+            image_size: self.picture_size.into(),
         })
     }
 
     /// Scores from before. What is of other files, or lacks a score that could be had now, is scored again.
     fn kept(&self, journal: &Journal, key: &str) -> Option<SceneScores> {
         let scores = journal.kept(key, self.method.of_scene(key).files())?;
-        (!Perceptual::could_add_to(&scores.scores, self.image_size)).then_some(scores)
+        (!Perceptual::could_add_to(&scores.scores, self.picture_size)).then_some(scores)
     }
 
     /// The groups that hold indexed scenes, with these.
@@ -215,6 +216,7 @@ impl Sweep<'_> {
             scores,
             context: frames.context.clone(),
             target: frames.target.clone(),
+            enlarged: scene.enlarged,
             splat_bytes: made.splat_bytes,
             forward_seconds: made.forward_seconds,
             warm_up: false,

@@ -1,0 +1,60 @@
+#!/usr/bin/env python3
+"""What the pixels that a model is shown, and those of its pictures, do to its scores: PSNR and SSIM of views held out, and time.
+
+    .venv/bin/python scripts/high_resolution.py --capture DIR HOLDOUT [--capture …] [--trained 96] [--phase 2] [--pictures 96 192]
+        [--views N] [--weights models/tiny.safetensors] [--out OUT]
+
+Prints a Markdown table for each capture. What is done stays done.
+"""
+
+import argparse
+import json
+import subprocess
+from pathlib import Path
+
+from core_runs import PROGRAM, row
+
+SETTINGS = {"small": "as in training", "polyphase": "polyphase", "whole": "whole", "repeated": "repeated"}
+
+
+def scored(arguments, capture, setting, phase, pictures):
+    """What `eval` told."""
+    folder, holdout = capture
+    told = arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json"
+    if not told.is_file():
+        command = [PROGRAM, "eval", "--weights", arguments.weights, "--scene", folder, "--holdout", holdout]
+        command += ["--views", str(arguments.views), "--pictures-at", str(pictures), "--json"]
+        if setting != "small":
+            command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
+        told.write_text(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
+    return json.loads(told.read_text())
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--capture", nargs=2, action="append", required=True, metavar=("DIR", "HOLDOUT"))
+    parser.add_argument("--trained", type=int, default=96, help="the height of the images that the model was trained with")
+    parser.add_argument("--phase", type=int, nargs="+", default=[2])
+    parser.add_argument("--pictures", type=int, nargs="+", default=[96, 192])
+    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--weights", default="models/tiny.safetensors")
+    parser.add_argument("--out", type=Path, default=Path("runs/high_resolution"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for capture in arguments.capture:
+        print(f"\n{Path(capture[0]).name}:\n")
+        row("shown", "views", *(f"pictures of {size}×{size}" for size in arguments.pictures), "forward pass, s")
+        row(*["---"] * (3 + len(arguments.pictures)))
+        settings = [("small", 1)] + [(name, phase) for phase in arguments.phase for name in SETTINGS if name != "small"]
+        for name, phase in settings:
+            told = [scored(arguments, capture, name, phase, size) for size in arguments.pictures]
+            side = phase * arguments.trained
+            scores = [f"{one['psnr']:.2f} / {one['ssim']:.3f}" for one in told]
+            seconds = min(one["forward_seconds"] for one in told)
+            row(SETTINGS[name] + (f", {side}" if phase > 1 else ""), str(told[0]["input"]["views"]), *scores, f"{seconds:.2f}")
+        nearest = [one["baselines"]["nearest_photo"] for one in told]
+        row("the nearest photo", "", *(f"{one['psnr']:.2f} / {one['ssim']:.3f}" for one in nearest), "")
+
+
+if __name__ == "__main__":
+    main()
