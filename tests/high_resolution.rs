@@ -214,7 +214,7 @@ fn settings_share_one_normalized_world() {
     let set = Set::new();
     let loaded = load_model(&set.weights, Device::Cpu).unwrap();
     let (capture, size) = (set.capture(), loaded.config.data.image_size);
-    let targets = [capture.cameras()[1].c2w, capture.cameras()[7].c2w];
+    let targets = [capture.cameras()[1].c2w, capture.cameras()[2].c2w];
     let world = |input: Input| {
         let photos = load_context(&capture, Holdout::None, Some(3), input.photo_size(size)).unwrap();
         let model = Model { input, ..Model::from(&loaded) };
