@@ -44,7 +44,7 @@ pub fn shown_as(input: Input, trained: ImageSize) -> String {
         ViewsAs::Whole => {
             format!("{photo}, a view of more than the {trained} that the model was trained with")
         }
-        ViewsAs::Repeated => format!("the {trained} that the model sees, {views} times each"),
+        ViewsAs::Repeated => format!("the {trained} that the model sees, {views} times the same view"),
     }
 }
 

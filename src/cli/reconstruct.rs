@@ -34,7 +34,7 @@ pub struct Reconstruct {
     #[arg(long, value_name = "N")]
     views: Option<usize>,
     /// Show photos of this height, a multiple of what the model was trained with: of N times that a photo becomes N² views, which
-    /// share its pixels out and take N² times as long
+    /// share its pixels out; time and memory grow with views, N²-fold at most
     #[arg(long, value_name = "PIXELS")]
     views_at: Option<u32>,
     /// Views not to use: every:N, every:N+K or none
