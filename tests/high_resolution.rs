@@ -87,7 +87,7 @@ impl Set {
 }
 
 fn without_times(mut told: Value) -> Value {
-    for name in ["seconds", "forward_seconds", "peak_memory_bytes"] {
+    for name in ["load_seconds", "seconds", "forward_seconds", "peak_memory_bytes"] {
         told.as_object_mut().unwrap().remove(name);
     }
     told
@@ -108,7 +108,8 @@ fn photos_become_as_many_views_as_they_have_phases() {
 
     // At the model's own size nothing is another way.
     let (same, said, bytes) = set.reconstruct(&["--views-at", "32"]);
-    assert_eq!((without_times(same), said, &bytes), (without_times(told), err, &plain));
+    assert_eq!((without_times(same), said), (without_times(told), err));
+    assert!(bytes == plain, "another splat");
 
     let (told, err, sharp) = set.reconstruct(&["--views-at", "64"]);
     assert_eq!(

@@ -1,18 +1,19 @@
-use super::{parse_size, print_json, progress};
+use super::{model, parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::{DMat4, DVec3};
-use globalsplat::data::{Capture, open_capture, read_camera_path};
+use globalsplat::data::{Capture, Holdout, open_capture, read_camera_path};
 use globalsplat::error::Error;
 use globalsplat::io::{
     Splat, check_writable_dir, check_writable_file, colourize_depth, read_splat, tile_horizontally,
     write_film, write_png,
 };
+use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{Rendered, render_views};
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_cameras, orbit_around_point};
 use serde_json::json;
 use std::path::PathBuf;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 const FRAMES_PER_SECOND: u32 = 20;
 /// Of an orbit.
@@ -20,19 +21,24 @@ const DEFAULT_FRAMES: usize = 60;
 /// Of a picture when no capture tells one.
 const DEFAULT_SIZE: u32 = 512;
 
-/// Render a splat from a capture's cameras, along a path, or on an orbit.
+/// Render a splat, or what a model makes of a capture's photos, from the capture's cameras, along a path, or on an orbit.
 ///
 /// Colour always; --depth and --alpha add those, side by side in a film and as files of their own in a folder.
 #[derive(Args)]
+#[command(group(ArgGroup::new("source").required(true)))]
 #[command(group(ArgGroup::new("cameras").required(true).multiple(true)))]
 #[command(
     after_help = "Examples:\n  globalsplat render --splat room.ply --scene captures/room --out views/\n  \
-    globalsplat render --splat room.ply --scene captures/room --orbit --out orbit.gif"
+    globalsplat render --splat room.ply --scene captures/room --orbit --out orbit.gif\n  \
+    globalsplat render --weights model.ckpt --scene captures/room --orbit --out orbit.gif"
 )]
 pub struct Render {
     /// A 3DGS splat
-    #[arg(long, value_name = "FILE.ply")]
-    splat: PathBuf,
+    #[arg(long, value_name = "FILE.ply", group = "source")]
+    splat: Option<PathBuf>,
+    /// What a model makes of the capture's photos, as `reconstruct` does: what `export` or `import` wrote, or a checkpoint (.ckpt)
+    #[arg(long, value_name = "FILE", group = "source", requires = "scene")]
+    weights: Option<PathBuf>,
     /// Cameras of this capture; with --orbit, an orbit amid them
     #[arg(long, value_name = "PATH", group = "cameras")]
     scene: Option<PathBuf>,
@@ -71,8 +77,8 @@ impl Render {
         } else {
             check_writable_dir(&self.out)?
         }
-        let splat = read_splat(&self.splat)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let splat = self.splat(capture.as_ref())?;
         let (names, cameras) = self.cameras(&splat, capture.as_ref())?;
 
         let bar = progress::bar(cameras.len() as u64, "views");
@@ -117,6 +123,16 @@ impl Render {
             println!("{}: {} views", self.out.display(), cameras.len());
         }
         Ok(())
+    }
+
+    fn splat(&self, capture: Option<&Capture>) -> Result<Splat> {
+        let (Some(weights), Some(capture)) = (&self.weights, capture) else {
+            return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
+        };
+        let loaded = model::load(Some(weights), "f32", Device::Cpu)?;
+        let data = &loaded.config.data;
+        let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
+        Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
     }
 
     /// Colour and what else was asked for, [3, H, W], each with its file's suffix.
