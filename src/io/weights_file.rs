@@ -2,7 +2,7 @@
 //! files are mapped, so a tensor is read when it is asked for, once, and straight to where it belongs.
 
 use super::state_dict::{Contents, state_dict};
-use super::torch_file::{Array, TorchFile};
+use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
 use memmap2::Mmap;
@@ -238,10 +238,7 @@ fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
         let (from, to) = info.data_offsets;
         let start = LENGTH + header_length;
         let size = info.shape.clone();
-        let mut stride = vec![1; size.len()];
-        for i in (1..size.len()).rev() {
-            stride[i - 1] = stride[i] * size[i].max(1);
-        }
+        let stride = row_major(&size);
         arrays.insert(name, Array { dtype, size, stride, bytes: start + from..start + to });
     }
     Ok((arrays, header.metadata().clone().unwrap_or_default()))

@@ -60,6 +60,15 @@ impl Array {
     }
 }
 
+/// Steps from one element to the next of each dimension where all lie one after the other, the last dimension fastest.
+pub(crate) fn row_major(size: &[usize]) -> Vec<usize> {
+    let mut stride = vec![1; size.len()];
+    for i in (1..size.len()).rev() {
+        stride[i - 1] = stride[i] * size[i].max(1);
+    }
+    stride
+}
+
 /// How many elements a tensor has, and how many there are from its first to its last; none where that overflows.
 fn extent(size: &[usize], stride: &[usize]) -> Option<(usize, usize)> {
     let count = size.iter().try_fold(1usize, |count, &size| count.checked_mul(size))?;

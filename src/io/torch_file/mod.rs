@@ -10,7 +10,7 @@ mod value;
 mod write;
 
 pub(crate) use archive::Archive;
-pub(crate) use array::Array;
+pub(crate) use array::{Array, row_major};
 pub(crate) use pickle::{Strangers, unpickle};
 pub(crate) use value::{Id, Value, Values};
 pub use write::write_checkpoint;

@@ -1,6 +1,7 @@
 //! A checkpoint as torch.save writes it, for `torch.load`, which needs nothing of ours to read it: pickle protocol 2, and the bytes
 //! of each tensor in a stored entry of a zip archive.
 
+use super::array::row_major;
 use crate::error::{Error, Result};
 use crate::io::weights::{Stored, Weights};
 use crate::io::write_atomically;
@@ -66,10 +67,6 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
             Kind::Int64 => "LongStorage",
             other => return Err(Error::Failed(format!("tensors of kind {other:?} are not stored"))),
         };
-        let mut stride = vec![1; shape.len()];
-        for i in (1..shape.len()).rev() {
-            stride[i - 1] = stride[i] * shape[i].max(1);
-        }
         p.text(name);
         p.global("torch._utils", "_rebuild_tensor_v2");
         p.0.push(b'(');
@@ -84,7 +81,7 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
         // Its offset, size and stride, whether it needs a gradient (NEWFALSE), and no hooks.
         p.integer(0);
         p.tuple(shape);
-        p.tuple(&stride);
+        p.tuple(&row_major(shape));
         p.0.push(0x89);
         p.ordered_dict();
         // TUPLE, REDUCE
