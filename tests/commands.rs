@@ -14,6 +14,19 @@ fn json(arguments: &[&str]) -> Value {
 }
 
 #[test]
+fn who_reads_no_further_is_told_nothing() {
+    let (_folder, room) = room();
+    let mut program = command(&["inspect", arg(&room)])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(program.stdout.take());
+    let done = program.wait_with_output().unwrap();
+    assert_eq!((done.status.code(), String::from_utf8_lossy(&done.stderr).as_ref()), (Some(1), ""));
+}
+
+#[test]
 fn every_command_helps_with_an_example() {
     for command in [
         "train",

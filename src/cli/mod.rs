@@ -118,7 +118,10 @@ fn tell(message: &str) {
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: the system refuses memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
-        eprintln!("globalsplat: standard output can't be written: {why}");
+        // Who reads no further, such as `head`, has what they want.
+        if !why.contains("Broken pipe") {
+            eprintln!("globalsplat: standard output can't be written: {why}");
+        }
     } else {
         eprintln!("globalsplat: {message}");
     }
