@@ -49,8 +49,8 @@ impl Bench {
 #[command(after_help = "Examples:\n  globalsplat bench raster\n  \
     globalsplat bench raster --splat room.ply --scene captures/room --threads 1")]
 pub struct Raster {
-    /// A 3DGS splat
-    #[arg(long, value_name = "FILE.ply", requires = "scene")]
+    /// A splat: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE", requires = "scene")]
     splat: Option<PathBuf>,
     /// The capture whose cameras look at it, all in one call
     #[arg(long, value_name = "PATH", requires = "splat")]

@@ -23,8 +23,8 @@ use tch::Device;
 ///
 /// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
 /// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
-/// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, anybody's pictures
-/// DIR/SCENE/000012.png, named by the frame.
+/// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
+/// anybody's pictures DIR/SCENE/000012.png, named by the frame.
 #[derive(Args)]
 #[command(group(ArgGroup::new("subject").required(true)))]
 #[command(group(ArgGroup::new("photos").required(true)))]
@@ -36,8 +36,8 @@ pub struct Eval {
     /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
     weights: Option<PathBuf>,
-    /// A 3DGS splat in the capture's world; with --data a folder of them
-    #[arg(long, value_name = "FILE.ply|DIR", group = "subject")]
+    /// A splat in the capture's world: .ply, .compressed.ply, .spz or .splat; with --data a folder of them
+    #[arg(long, value_name = "FILE|DIR", group = "subject")]
     splat: Option<PathBuf>,
     /// A folder of pictures named as the photos; with --data a folder of these
     #[arg(long, value_name = "DIR", group = "subject")]

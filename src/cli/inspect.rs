@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
-use globalsplat::io::{WeightsFile, read_splat};
+use globalsplat::io::{WeightsFile, is_splat_name, read_splat};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,8 @@ use tch::{Kind, Tensor};
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat inspect room.ply")]
 pub struct Inspect {
-    /// A .ply, a .safetensors, a .ckpt, a .torch, a capture, or a folder with an index.json
+    /// A splat (.ply, .compressed.ply, .spz, .splat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
+    /// index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
     /// Print it as one JSON object
@@ -24,7 +25,7 @@ pub struct Inspect {
 impl Inspect {
     pub fn run(self) -> Result<()> {
         let object = match self.path.extension().and_then(|e| e.to_str()) {
-            Some("ply") => splat(&self.path)?,
+            _ if is_splat_name(&self.path) => splat(&self.path)?,
             _ if self.path.to_string_lossy().ends_with(".safetensors.index.json") => weights(&self.path)?,
             Some("safetensors" | "ckpt" | "pt" | "pth") => weights(&self.path)?,
             Some("torch") => chunk(&self.path)?,
@@ -32,7 +33,7 @@ impl Inspect {
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
-                let expected = "a .ply, a .safetensors, a .ckpt, a .torch or a capture";
+                let expected = "a splat (.ply, .compressed.ply, .spz or .splat), a .safetensors, a .ckpt, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
             }
         };

@@ -6,6 +6,7 @@
 mod bench;
 mod bench_refine;
 mod bench_train;
+mod convert;
 mod device;
 mod doctor;
 mod eval;
@@ -56,6 +57,7 @@ enum Command {
     Reconstruct(reconstruct::Reconstruct),
     Refine(refine::Refine),
     Render(render::Render),
+    Convert(convert::Convert),
     Export(export::Export),
     Import(import::Import),
     Synth(synth::Synth),
@@ -89,6 +91,7 @@ pub fn main() -> ExitCode {
         Command::Reconstruct(command) => command.run(),
         Command::Refine(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Convert(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Synth(command) => command.run(),

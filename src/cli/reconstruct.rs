@@ -5,7 +5,7 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::peak_memory_bytes;
-use globalsplat::io::{Splat, check_writable_file, write_splat};
+use globalsplat::io::{Splat, check_writable_splat, write_splat};
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
@@ -27,8 +27,8 @@ pub struct Reconstruct {
     /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
-    /// The splat to write
-    #[arg(long, value_name = "FILE.ply")]
+    /// The splat to write: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Use this many photos at most, spread over the path of the camera; by default as many as the model saw in training
     #[arg(long, value_name = "N")]
@@ -85,7 +85,7 @@ impl Reconstruct {
         }
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
-        check_writable_file(&self.out)?;
+        check_writable_splat(&self.out)?;
         let clock = Instant::now();
         let loaded = model::load(self.weights.as_deref(), &self.precision, device)?;
         let load_seconds = clock.elapsed().as_secs_f64();

@@ -6,7 +6,7 @@ use glam::DMat4;
 use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
-use globalsplat::io::{Splat, check_writable_file, read_splat, write_png, write_splat};
+use globalsplat::io::{Splat, check_writable_file, check_writable_splat, read_splat, write_png, write_splat};
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
     Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
@@ -40,8 +40,8 @@ const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8
     globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
     globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
 pub struct Refine {
-    /// The splat to begin with, in the capture's world
-    #[arg(long, value_name = "FILE.ply", conflicts_with = "gaussians")]
+    /// The splat to begin with, in the capture's world: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
     pub splat: Option<PathBuf>,
     /// What to begin with where there is no splat: the photos alone, or what a model makes of them
     #[arg(long, value_enum, conflicts_with = "splat")]
@@ -55,8 +55,8 @@ pub struct Refine {
     /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// The splat to write
-    #[arg(long, value_name = "FILE.ply")]
+    /// The splat to write, of one of these endings
+    #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
     /// How many Gaussians, where none were begun with, or a model's that are fewer
     #[arg(long, value_name = "N", default_value_t = DEFAULT_GAUSSIANS, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
@@ -134,7 +134,7 @@ impl Refine {
             let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
             return Err(Error::Request(why.into()).into());
         }
-        check_writable_file(&self.out)?;
+        check_writable_splat(&self.out)?;
         if let Some(sheet) = &self.sheet {
             check_writable_file(sheet)?;
         }

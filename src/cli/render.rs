@@ -33,8 +33,8 @@ const DEFAULT_SIZE: u32 = 512;
     globalsplat render --weights model.ckpt --scene captures/room --orbit --out orbit.gif"
 )]
 pub struct Render {
-    /// A 3DGS splat
-    #[arg(long, value_name = "FILE.ply", group = "source")]
+    /// A splat: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE", group = "source")]
     splat: Option<PathBuf>,
     /// What a model makes of the capture's photos, as `reconstruct` does: what `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "source", requires = "scene")]
@@ -197,7 +197,11 @@ fn median_depth(splat: &Splat, cameras: &[Camera]) -> Result<f64> {
 }
 
 /// Around the middle of the splat's opaque part, far enough to see most of it.
-fn orbit_around_splat(splat: &Splat, ImageSize { width, height }: ImageSize, frames: usize) -> Vec<Camera> {
+pub(super) fn orbit_around_splat(
+    splat: &Splat,
+    ImageSize { width, height }: ImageSize,
+    frames: usize,
+) -> Vec<Camera> {
     let g = &splat.gaussians;
     let means = g.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);

@@ -6,7 +6,7 @@ use super::scene::EvalScene;
 use super::scores::{CaptureScores, score};
 use crate::data::View;
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, Splat, read_image, read_splat, tensor_from_rgb};
+use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
 use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
 use crate::scene::{Camera, ImageSize};
@@ -34,7 +34,7 @@ pub struct Synthesis {
     pub rendered: Vec<Rendered>,
     /// Of the splat, where there is one.
     pub gaussians: Option<i64>,
-    /// Size of the splat's file, or of the PLY that it would be.
+    /// Of the PLY that the splat is, or would be.
     pub splat_bytes: Option<u64>,
     /// Of a model's forward pass.
     pub forward_seconds: Option<f64>,
@@ -48,12 +48,12 @@ pub(super) struct Memory {
 }
 
 impl Method<'_> {
-    /// That of scene `key`, where this one names a folder with `SCENE.ply`, or with folders `SCENE` or `SCENE/color` of pictures,
-    /// for every scene.
+    /// That of scene `key`, where this one names a folder with `SCENE.ply` or a splat of another format, or with folders `SCENE`
+    /// or `SCENE/color` of pictures, for every scene.
     pub fn of_scene(&self, key: &str) -> Self {
         match self {
             Method::Model(model) => Method::Model(*model),
-            Method::Splat(folder) => Method::Splat(folder.join(format!("{key}.ply"))),
+            Method::Splat(folder) => Method::Splat(find_splat(folder, key)),
             Method::Renders(folder) => {
                 let plain = folder.join(key);
                 Method::Renders(Some(plain.join("color")).filter(|color| color.is_dir()).unwrap_or(plain))
@@ -71,16 +71,13 @@ impl Method<'_> {
                 let (reconstruction, rendered) = synthesize_views(*model, &scene.context, &scene.target)?;
                 let splat = Splat::of(&reconstruction.gaussians)?;
                 let seconds = reconstruction.forward_time.as_secs_f64();
-                Ok(Synthesis {
-                    forward_seconds: Some(seconds),
-                    ..of_splat(&splat, splat.ply_bytes(), rendered)
-                })
+                Ok(Synthesis { forward_seconds: Some(seconds), ..of_splat(&splat, rendered) })
             }
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
                 let cameras: Vec<_> = scene.target.iter().map(|view| view.camera).collect();
                 let rendered = render_views(&splat.gaussians, &cameras)?;
-                Ok(of_splat(&splat, file.metadata().map_err(Error::read(file))?.len(), rendered))
+                Ok(of_splat(&splat, rendered))
             }
             Method::Renders(folder) => {
                 let pictures = scene
@@ -147,12 +144,12 @@ impl Method<'_> {
     }
 }
 
-fn of_splat(splat: &Splat, bytes: u64, rendered: Vec<Rendered>) -> Synthesis {
+fn of_splat(splat: &Splat, rendered: Vec<Rendered>) -> Synthesis {
     Synthesis {
         pictures: colours(&rendered),
         rendered,
         gaussians: Some(splat.gaussians.count()),
-        splat_bytes: Some(bytes),
+        splat_bytes: Some(splat.ply_bytes()),
         forward_seconds: None,
     }
 }

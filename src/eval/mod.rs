@@ -3,6 +3,7 @@
 mod comparison_image;
 mod contact_sheet;
 mod evaluation;
+mod fidelity;
 mod held_out;
 mod index;
 mod journal;
@@ -20,6 +21,7 @@ mod sweep;
 
 pub use contact_sheet::contact_sheet;
 pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
+pub use fidelity::psnr_between;
 pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use machine::machine;

@@ -1,4 +1,4 @@
-//! Files: splats (PLY), weights (safetensors), images, films, arrays (NPY) and TensorBoard's events. Writing never leaves half a file.
+//! Files: splats, weights (safetensors), images, films, arrays (NPY) and TensorBoard's events. Writing never leaves half a file.
 
 mod append;
 mod atomic;
@@ -24,7 +24,7 @@ pub use images::{
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::write_sharded;
-pub use splat::{Splat, read_splat, write_splat};
+pub use splat::{Splat, check_writable_splat, find_splat, fit_splat, is_splat_name, read_splat, write_splat};
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};
 pub use weights_file::{WeightsFile, read_weights};

@@ -2,10 +2,12 @@
 
 pub mod cpu;
 mod handed_over;
+mod harmonics;
 mod transform;
 mod views;
 
 pub(crate) use handed_over::handed_over;
+pub use harmonics::{HarmonicLimits, fit_harmonics};
 pub use transform::transform;
 pub use views::{Rendered, render_views};
 

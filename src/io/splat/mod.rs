@@ -1,11 +1,21 @@
-//! Splats as files: a file a format, and a line in [`FORMATS`], among which a file's ending chooses.
+//! Splats as files: a file a format, and a line in [`FORMATS`]. The ending of a name says what is written; what is read says so
+//! itself, where it can.
 
+mod antimatter;
+mod compressed_ply;
+mod morton;
 mod ply;
+mod ply_body;
+mod ply_header;
+mod spz;
+mod values;
 
 use crate::error::{Error, Result};
-use crate::scene::Gaussians;
-use std::path::Path;
-use tch::{Device, Kind};
+use crate::io::atomic::check_writable_file;
+use crate::render::{HarmonicLimits, fit_harmonics};
+use crate::scene::{Camera, Gaussians};
+use std::path::{Path, PathBuf};
+use tch::{Device, Kind, Tensor};
 
 /// What a splat's file holds: the Gaussians of one scene.
 #[derive(Debug)]
@@ -34,6 +44,15 @@ impl Splat {
         self.bases().isqrt() - 1
     }
 
+    /// The same with spherical harmonics up to `degree`: those above are left out, those that weren't there are 0.
+    pub fn with_sh_degree(&self, degree: i64) -> Self {
+        let bases = (degree + 1) * (degree + 1);
+        let more = (bases - self.bases()).max(0);
+        let sh = self.gaussians.sh.constant_pad_nd([0, 0, 0, more]).narrow(2, 0, bases).contiguous();
+        let gaussians = self.gaussians.map(Tensor::shallow_clone);
+        Splat { gaussians: Gaussians { sh, ..gaussians } }
+    }
+
     /// Spherical harmonics of a colour channel.
     fn bases(&self) -> i64 {
         self.gaussians.sh.size()[2]
@@ -47,32 +66,110 @@ impl Splat {
 
 /// A format.
 struct Format {
-    /// Of file names.
+    /// Of file names, in small letters.
     ending: &'static str,
-    read: fn(&Path) -> Result<Splat>,
+    /// Whether bytes are of it, without a doubt.
+    recognizes: fn(&[u8]) -> bool,
+    read: fn(&Path, &[u8]) -> Result<Splat>,
     write: fn(&Path, &Splat) -> Result<()>,
+    limits: fn() -> HarmonicLimits,
 }
 
-/// Files of other endings are taken for the first.
-const FORMATS: [Format; 1] = [Format { ending: "ply", read: ply::read, write: ply::write }];
+/// The first whose ending fits, or that recognizes a file, is it.
+const FORMATS: [Format; 4] = [
+    Format {
+        ending: ".compressed.ply",
+        recognizes: compressed_ply::recognizes,
+        read: compressed_ply::read,
+        write: compressed_ply::write,
+        limits: compressed_ply::limits,
+    },
+    Format {
+        ending: ".ply",
+        recognizes: ply::recognizes,
+        read: ply::read,
+        write: ply::write,
+        limits: ply::limits,
+    },
+    Format {
+        ending: ".spz",
+        recognizes: spz::recognizes,
+        read: spz::read,
+        write: spz::write,
+        limits: spz::limits,
+    },
+    Format {
+        ending: ".splat",
+        recognizes: |_| false,
+        read: antimatter::read,
+        write: antimatter::write,
+        limits: antimatter::limits,
+    },
+];
 
-fn format_of(path: &Path) -> &'static Format {
-    let ending = path.extension().unwrap_or_default();
-    FORMATS.iter().find(|format| ending.eq_ignore_ascii_case(format.ending)).unwrap_or(&FORMATS[0])
+/// The format that the ending of `path` tells.
+fn format_of(path: &Path) -> Result<&'static Format> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
+        let found = path.extension().map_or("absent".into(), |ending| format!(".{}", ending.display()));
+        Error::input(path, "the ending", found, ".ply, .compressed.ply, .spz or .splat")
+    })
 }
 
-/// Reads a splat of the format that the ending of `path` tells.
+/// Whether the ending of `path` is that of a splat's format.
+pub fn is_splat_name(path: &Path) -> bool {
+    format_of(path).is_ok()
+}
+
+/// The splat called `name` in `folder`, of whatever format; where there is none, the PLY that is missing.
+pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
+    let candidates = FORMATS.map(|format| folder.join(format!("{name}{}", format.ending)));
+    candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| folder.join(format!("{name}.ply")))
+}
+
+/// Whether a splat could be written at `path`. Call it before the work, not after.
 ///
 /// # Errors
-/// A file that can't be read or breaks its format's rules.
+/// An ending that is no format's, or a request error that names the path.
+pub fn check_writable_splat(path: &Path) -> Result<()> {
+    format_of(path)?;
+    check_writable_file(path)
+}
+
+/// Reads a splat of the format that it is recognized by, else of the one that the ending of `path` tells.
+///
+/// # Errors
+/// An ending that is no format's, a file that can't be read or breaks its format's rules.
 pub fn read_splat(path: &Path) -> Result<Splat> {
-    (format_of(path).read)(path)
+    let named = format_of(path)?;
+    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    let recognized = FORMATS.iter().find(|format| (format.recognizes)(&bytes));
+    (recognized.unwrap_or(named).read)(path, &bytes)
 }
 
 /// Writes a splat in the format that the ending of `path` tells, whole or not at all.
 ///
 /// # Errors
-/// Gaussians with numbers that aren't finite, or the system's refusal to write.
+/// An ending that is no format's, Gaussians that the format can't hold, such as those with numbers that aren't finite, or the
+/// system's refusal to write.
 pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
-    (format_of(path).write)(path, splat)
+    (format_of(path)?.write)(path, splat)
+}
+
+/// What `cameras` see of `splat` in spherical harmonics that the format of `path` holds, up to `sh_degree`.
+///
+/// # Errors
+/// An ending that is no format's.
+pub fn fit_splat(path: &Path, splat: &Splat, sh_degree: i64, cameras: &[Camera]) -> Result<Splat> {
+    let limits = (format_of(path)?.limits)();
+    let limits = HarmonicLimits { degree: limits.degree.min(sh_degree), ..limits };
+    Ok(Splat { gaussians: fit_harmonics(&splat.gaussians, cameras, &limits) })
+}
+
+/// Whether all of `numbers`, which are to be written at `path`, are finite.
+fn all_finite(path: &Path, numbers: &Tensor) -> Result<()> {
+    match numbers.isfinite().all().int64_value(&[]) {
+        0 => Err(Error::Failed(format!("{}: the splat has numbers that aren't finite", path.display()))),
+        _ => Ok(()),
+    }
 }

@@ -1,0 +1,95 @@
+use super::{print_json, render::orbit_around_splat};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::data::open_capture;
+use globalsplat::eval::psnr_between;
+use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
+use globalsplat::scene::ImageSize;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+/// On an orbit around a splat whose capture isn't named.
+const VIEWS: usize = 8;
+const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
+
+/// Write a splat in another format, or with spherical harmonics of another degree, and tell what is lost.
+///
+/// Formats are 3DGS' PLY (.ply), PlayCanvas' compressed PLY (.compressed.ply), Niantic's SPZ (.spz) and antimatter15's .splat,
+/// which has no spherical harmonics. What was written is read again and drawn beside the original: the loss is the PSNR between
+/// both, of eight views around the splat or of the capture's cameras.
+///
+/// SPZ's coefficients are within ±1 and a .splat has one for each colour. Where the capture is named, those that are left show its
+/// cameras what all did before; else what a format can't hold is cut off, which may cost much.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
+    globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room")]
+pub struct Convert {
+    /// The splat: .ply, .compressed.ply, .spz or .splat
+    #[arg(value_name = "FROM")]
+    from: PathBuf,
+    /// The file to write, whose ending tells the format
+    #[arg(value_name = "TO")]
+    to: PathBuf,
+    /// Leave out spherical harmonics of higher degrees, or add some that are 0
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..=3))]
+    sh_degree: Option<i64>,
+    /// Lose least for the cameras of this capture, and tell the loss by them
+    #[arg(long, value_name = "PATH")]
+    scene: Option<PathBuf>,
+    /// Print what was done as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Convert {
+    pub fn run(self) -> Result<()> {
+        check_writable_splat(&self.to)?;
+        let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let original = read_splat(&self.from)?;
+        // Before the file is replaced, if it is the same.
+        let from = description(&self.from, &original)?;
+        let degree = self.sh_degree.unwrap_or(original.sh_degree());
+        let made = match &capture {
+            Some(capture) => fit_splat(&self.to, &original, degree, &capture.cameras())?,
+            None => original.with_sh_degree(degree),
+        };
+        write_splat(&self.to, &made.with_sh_degree(degree))?;
+        let copy = read_splat(&self.to)?;
+        let to = description(&self.to, &copy)?;
+
+        let cameras = match &capture {
+            Some(capture) => capture.cameras(),
+            None => orbit_around_splat(&original, SIZE, VIEWS),
+        };
+        let psnr = psnr_between(&original.gaussians, &copy.gaussians, &cameras)?;
+        let views = cameras.len();
+        if self.json {
+            let told = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
+            print_json(&told);
+        } else {
+            let loss = match psnr {
+                Some(psnr) => format!("{psnr:.2} dB between renders of both"),
+                None => "the same pixels".into(),
+            };
+            println!("{}\n{}\n{views} views: {loss}", line(&from), line(&to));
+        }
+        Ok(())
+    }
+}
+
+fn description(path: &Path, splat: &Splat) -> Result<Value> {
+    Ok(json!({
+        "splat": path,
+        "gaussians": splat.gaussians.count(),
+        "sh_degree": splat.sh_degree(),
+        "bytes": std::fs::metadata(path)?.len(),
+    }))
+}
+
+fn line(told: &Value) -> String {
+    let name = told["splat"].as_str().unwrap_or_default();
+    format!(
+        "{name}: {} Gaussians, SH degree {}, {} bytes",
+        told["gaussians"], told["sh_degree"], told["bytes"]
+    )
+}

@@ -1,0 +1,82 @@
+//! antimatter15's `.splat`, 32 bytes a Gaussian and nothing else (spec 10.13).
+
+use super::Splat;
+use super::values::{Values, normalized};
+use crate::error::{Error, Result};
+use crate::io::atomic::write_atomically;
+use crate::render::HarmonicLimits;
+use crate::scene::SH_C0;
+use std::path::Path;
+
+/// Of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
+const BYTES: usize = 32;
+
+/// Reads a `.splat`, whose colours are the same from every side.
+///
+/// # Errors
+/// A file that isn't made of whole Gaussians, a number that isn't finite, a scale below zero.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+    let (gaussians, rest) = bytes.as_chunks::<BYTES>();
+    if gaussians.is_empty() || !rest.is_empty() {
+        let found = format!("{} bytes", bytes.len());
+        return Err(Error::input(path, "the length", found, format!("{BYTES} bytes for each Gaussian")));
+    }
+    let three = |bytes: &[u8]| -> [f32; 3] {
+        std::array::from_fn(|axis| {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|byte| bytes[4 * axis + byte]);
+            f32::from_le_bytes([a, b, c, d])
+        })
+    };
+    let colour = |byte: u8| ((f64::from(byte) / 255. - 0.5) / SH_C0) as f32;
+    let values = Values {
+        means: gaussians.iter().map(|gaussian| three(&gaussian[..12])).collect(),
+        scales: gaussians.iter().map(|gaussian| three(&gaussian[12..24])).collect(),
+        bases: 1,
+        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| colour(gaussian[at]))).collect(),
+        opacities: gaussians.iter().map(|gaussian| f32::from(gaussian[27]) / 255.).collect(),
+        quaternions: gaussians
+            .iter()
+            .map(|gaussian| normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)))
+            .collect(),
+    };
+    values.into_splat(path)
+}
+
+/// Colours are those that a screen shows, the same from every side.
+pub(super) fn limits() -> HarmonicLimits {
+    HarmonicLimits { degree: 0, constant: -0.5 / SH_C0..=0.5 / SH_C0, others: 0. ..=0. }
+}
+
+/// Writes a `.splat`: the Gaussians that cover most come first, for viewers that show what has arrived.
+///
+/// # Errors
+/// No Gaussian at all, numbers that aren't finite, or the system's refusal to write.
+pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let values = Values::of(path, splat)?;
+    if values.count() == 0 {
+        return Err(Error::Failed(format!(
+            "{}: a .splat holds one Gaussian at least, found 0",
+            path.display()
+        )));
+    }
+    let importance = |&index: &usize| {
+        let volume: f64 = values.scales[index].iter().map(|&scale| f64::from(scale)).product();
+        volume * f64::from(values.opacities[index])
+    };
+    let mut order: Vec<usize> = (0..values.count()).collect();
+    order.sort_by(|a, b| importance(b).total_cmp(&importance(a)));
+    write_atomically(path, |writer| {
+        for index in order {
+            let mut gaussian = Vec::with_capacity(BYTES);
+            for number in values.means[index].iter().chain(&values.scales[index]) {
+                gaussian.extend(number.to_le_bytes());
+            }
+            let colour = values.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
+            gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
+            gaussian.push((values.opacities[index] * 255.).round() as u8);
+            gaussian.extend(values.quaternions[index].map(|part| (part * 128. + 128.).round() as u8));
+            writer.write_all(&gaussian).map_err(Error::write(path))?;
+        }
+        Ok(())
+    })
+}

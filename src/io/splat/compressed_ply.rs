@@ -1,0 +1,264 @@
+//! PlayCanvas' compressed PLY (spec 10.11): four words of 32 bits a Gaussian, of numbers between the bounds of 256 of them, and
+//! a byte for each spherical harmonic above degree 0.
+
+use super::Splat;
+use super::morton::morton_order;
+use super::ply::bases_of_rest;
+use super::ply_body::columns;
+use super::ply_header::{Header, Kind, Scalar};
+use super::values::{Values, normalized};
+use crate::error::{Error, Result};
+use crate::io::atomic::write_atomically;
+use crate::render::HarmonicLimits;
+use crate::scene::SH_C0;
+use std::f64::consts::SQRT_2;
+use std::path::Path;
+
+/// Gaussians that share their bounds.
+const CHUNK: usize = 256;
+/// What is bounded: position, logarithm of the scale, colour.
+const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"]];
+/// Of a Gaussian.
+const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+/// Bits of a position's or scale's three parts, of a rotation's three and of a colour's four.
+const WIDE: [u32; 3] = [11, 10, 11];
+const ROTATION: [u32; 3] = [10, 10, 10];
+const COLOUR: [u32; 4] = [8, 8, 8, 8];
+/// Logarithms of scales beyond would widen the bounds of their chunk for nothing that is seen.
+const MAX_LOG_SCALE: f32 = 20.;
+/// Spherical harmonics are within ± half of this.
+const SH_RANGE: f64 = 8.;
+
+/// Whether `bytes` are a compressed PLY's.
+pub(super) fn recognizes(bytes: &[u8]) -> bool {
+    let header = Header::begins(bytes).then(|| Header::parse(Path::new(""), bytes).ok()).flatten();
+    header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
+}
+
+/// Reads a compressed PLY of any SH degree; older ones have no bounds of colours.
+///
+/// # Errors
+/// Anything that is missing or of another type, bounds that aren't finite, a file cut short.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+    let header = Header::parse(path, bytes)?;
+    let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
+    expect_type(path, &header, "vertex", &owned(&WORDS), Scalar::U32)?;
+    let words = columns(path, bytes, &header, "vertex", &owned(&WORDS), |number| number as u32)?;
+    let (words, _) = words.as_chunks::<{ WORDS.len() }>();
+
+    let colours = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
+    let bounded = if colours { &BOUNDED[..] } else { &BOUNDED[..2] };
+    let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
+    let bounds = columns(path, bytes, &header, "chunk", &names, |number| number as f32)?;
+    for (chunk, bounds) in bounds.chunks_exact(names.len()).enumerate() {
+        if let Some((bad, name)) = bounds.iter().zip(&names).find(|(bound, _)| !bound.is_finite()) {
+            return Err(Error::input(path, format!("{name} of chunk {chunk}"), bad, "a finite number"));
+        }
+    }
+    let chunks: Vec<&[f32]> = bounds.chunks_exact(names.len()).collect();
+    if chunks.len() < words.len().div_ceil(CHUNK) {
+        let expected = format!("{} for {} Gaussians", words.len().div_ceil(CHUNK), words.len());
+        return Err(Error::input(path, "the number of chunks", chunks.len(), expected));
+    }
+
+    let (rest, bases) = read_rest(path, bytes, &header, words.len())?;
+    let mut values = Values::with_capacity(words.len(), bases);
+    for (index, &[position, rotation, scale, colour]) in words.iter().enumerate() {
+        let bounds = chunks[index / CHUNK];
+        let between = |bounds: &[f32], parts: [f64; 3]| -> [f32; 3] {
+            std::array::from_fn(|axis| {
+                let (low, high) = (f64::from(bounds[axis]), f64::from(bounds[3 + axis]));
+                (low * (1. - parts[axis]) + high * parts[axis]) as f32
+            })
+        };
+        values.means.push(between(&bounds[..6], unpack(position, WIDE)));
+        values.scales.push(between(&bounds[6..12], unpack(scale, WIDE)).map(f32::exp));
+        values.quaternions.push(unpack_rotation(rotation));
+        let [red, green, blue, opacity] = unpack(colour, COLOUR);
+        let colour = match bounds.get(12..) {
+            Some(bounds @ [_, ..]) => between(bounds, [red, green, blue]),
+            _ => [red, green, blue].map(|channel| channel as f32),
+        };
+        values.opacities.push(opacity as f32);
+        values.sh.push(colour.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
+        let rest = &rest[index * 3 * (bases - 1)..];
+        let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
+        values.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
+    }
+    values.into_splat(path)
+}
+
+/// The bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and how many of all degrees a
+/// channel has.
+fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result<(Vec<u8>, usize)> {
+    let Some(element) = header.element("sh") else { return Ok((vec![], 1)) };
+    let names: Vec<String> =
+        (0..).map(|k| format!("f_rest_{k}")).take_while(|name| element.has(name)).collect();
+    let bases = bases_of_rest(path, names.len())? as usize;
+    if element.count != count {
+        let field = "the number of rows of the element sh";
+        return Err(Error::input(path, field, element.count, format!("{count}, as many as Gaussians")));
+    }
+    expect_type(path, header, "sh", &names, Scalar::U8)?;
+    Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, bases))
+}
+
+/// What is packed is numbers of one type.
+fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], scalar: Scalar) -> Result<()> {
+    let properties = header.element(element).into_iter().flat_map(|element| &element.properties);
+    for property in properties.filter(|property| names.contains(&property.name)) {
+        if property.kind != Kind::Number(scalar) {
+            let expected = if scalar == Scalar::U8 { "uchar" } else { "uint" };
+            return Err(Error::input(path, format!("the type of {}", property.name), "another", expected));
+        }
+    }
+    Ok(())
+}
+
+fn bound_names(of: &[&str; 3]) -> Vec<String> {
+    ["min", "max"].iter().flat_map(|end| of.map(|name| format!("{end}_{name}"))).collect()
+}
+
+/// Colours of a chunk are between bounds of their own.
+pub(super) fn limits() -> HarmonicLimits {
+    HarmonicLimits { degree: 3, constant: f64::MIN..=f64::MAX, others: -SH_RANGE / 2. ..=SH_RANGE / 2. }
+}
+
+/// Writes a compressed PLY: Gaussians in Morton order, so that those of a chunk are near each other.
+///
+/// # Errors
+/// Gaussians with numbers that aren't finite, or the system's refusal to write.
+pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let values = Values::of(path, splat)?;
+    let order = morton_order(&values.means);
+    let (mut bounds, mut words) = (vec![], vec![]);
+    for chunk in order.chunks(CHUNK) {
+        let of_chunk = |number: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f32; 3]> {
+            chunk.iter().map(|&index| number(index)).collect()
+        };
+        let means = Bounded::of(of_chunk(&|index| values.means[index]));
+        let log_scales = Bounded::of(of_chunk(&|index| {
+            values.scales[index].map(|scale| scale.ln().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+        }));
+        let colours = Bounded::of(of_chunk(&|index| {
+            values.sh_of(index)[0].map(|dc| (f64::from(dc) * SH_C0 + 0.5) as f32)
+        }));
+        for bounded in [&means, &log_scales, &colours] {
+            bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
+        }
+        for (row, &index) in chunk.iter().enumerate() {
+            let [red, green, blue] = colours.parts(row);
+            let colour = [red, green, blue, f64::from(values.opacities[index])];
+            let packed = [
+                pack(means.parts(row), WIDE),
+                pack_rotation(values.quaternions[index]),
+                pack(log_scales.parts(row), WIDE),
+                pack(colour, COLOUR),
+            ];
+            words.extend(packed.iter().flat_map(|word| word.to_le_bytes()));
+        }
+    }
+    let rest = order.iter().flat_map(|&index| {
+        let rest = &values.sh_of(index)[1..];
+        (0..3).flat_map(move |channel| rest.iter().map(move |of_basis| pack_sh(of_basis[channel])))
+    });
+    let rest: Vec<u8> = rest.collect();
+    let header = header(values.count(), values.bases);
+    write_atomically(path, |writer| {
+        let parts = [header.as_bytes(), &bounds, &words, &rest];
+        parts.iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
+    })
+}
+
+fn header(count: usize, bases: usize) -> String {
+    let mut lines = vec!["ply".to_string(), "format binary_little_endian 1.0".into()];
+    lines.push(format!("element chunk {}", count.div_ceil(CHUNK)));
+    lines.extend(BOUNDED.iter().flat_map(bound_names).map(|name| format!("property float {name}")));
+    lines.push(format!("element vertex {count}"));
+    lines.extend(WORDS.iter().map(|name| format!("property uint {name}")));
+    if bases > 1 {
+        lines.push(format!("element sh {count}"));
+        lines.extend((0..3 * (bases - 1)).map(|k| format!("property uchar f_rest_{k}")));
+    }
+    lines.push("end_header\n".into());
+    lines.join("\n")
+}
+
+/// Numbers of a chunk, and what they are between.
+struct Bounded {
+    numbers: Vec<[f32; 3]>,
+    low: [f32; 3],
+    high: [f32; 3],
+}
+
+impl Bounded {
+    fn of(numbers: Vec<[f32; 3]>) -> Self {
+        let extreme = |choose: fn(f32, f32) -> f32| -> [f32; 3] {
+            std::array::from_fn(|axis| {
+                numbers.iter().map(|of_one| of_one[axis]).reduce(choose).expect("a chunk has a Gaussian")
+            })
+        };
+        Bounded { low: extreme(f32::min), high: extreme(f32::max), numbers }
+    }
+
+    /// How far from the lower bound to the upper one, in [0, 1].
+    fn parts(&self, row: usize) -> [f64; 3] {
+        std::array::from_fn(|axis| {
+            let (low, high) = (f64::from(self.low[axis]), f64::from(self.high[axis]));
+            if high > low { (f64::from(self.numbers[row][axis]) - low) / (high - low) } else { 0. }
+        })
+    }
+}
+
+/// Parts of 1, the first in the highest of as many `bits`.
+fn pack<const N: usize>(parts: [f64; N], bits: [u32; N]) -> u32 {
+    parts.iter().zip(bits).fold(0, |word, (part, bits)| {
+        let largest = (1u32 << bits) - 1;
+        (word << bits) | ((part * f64::from(largest)).round() as u32).min(largest)
+    })
+}
+
+fn unpack<const N: usize>(mut word: u32, bits: [u32; N]) -> [f64; N] {
+    let mut parts = [0.; N];
+    for (part, bits) in parts.iter_mut().zip(bits).rev() {
+        let largest = u32::MAX >> (32 - bits);
+        *part = f64::from(word & largest) / f64::from(largest);
+        word >>= bits;
+    }
+    parts
+}
+
+/// Which part is the largest, in two bits, and the other three of the quaternion or its opposite where that one is positive.
+fn pack_rotation(quaternion: [f32; 4]) -> u32 {
+    let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
+    let largest = (0..4).rev().max_by(larger).expect("four parts");
+    let sign = f64::from(quaternion[largest].signum());
+    let mut others = (0..4).filter(|&part| part != largest);
+    let parts = ROTATION.map(|_| {
+        let part = others.next().expect("three others");
+        sign * f64::from(quaternion[part]) / SQRT_2 + 0.5
+    });
+    (largest as u32) << 30 | pack(parts, ROTATION)
+}
+
+fn unpack_rotation(word: u32) -> [f32; 4] {
+    let others = unpack(word, ROTATION).map(|part| (part - 0.5) * SQRT_2);
+    let rest = 1. - others.iter().map(|part| part * part).sum::<f64>();
+    let mut quaternion = others.to_vec();
+    quaternion.insert((word >> 30) as usize, rest.max(0.).sqrt());
+    normalized(std::array::from_fn(|part| quaternion[part] as f32))
+}
+
+fn pack_sh(value: f32) -> u8 {
+    ((f64::from(value) / SH_RANGE + 0.5) * 256.) as u8
+}
+
+/// The middle of what packs to the same byte, but the ends of the range for the first and the last.
+fn unpack_sh(byte: u8) -> f32 {
+    let part = match byte {
+        0 => 0.,
+        255 => 1.,
+        _ => (f64::from(byte) + 0.5) / 256.,
+    };
+    ((part - 0.5) * SH_RANGE) as f32
+}

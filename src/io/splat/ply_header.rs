@@ -1,0 +1,169 @@
+//! What stands before the numbers of a PLY: how they are written, and of which elements and properties they are (spec 10.9).
+
+use crate::error::{Error, Result};
+use std::path::Path;
+
+/// How numbers are written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Encoding {
+    Ascii,
+    LittleEndian,
+    BigEndian,
+}
+
+/// A number type.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return None,
+        })
+    }
+
+    /// In bytes, where numbers are binary.
+    pub fn size(self) -> usize {
+        match self {
+            Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::F64 => 8,
+        }
+    }
+}
+
+/// What a row has of a property.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Kind {
+    Number(Scalar),
+    /// A number of this type says how many of that type follow.
+    List(Scalar, Scalar),
+}
+
+pub struct Property {
+    pub name: String,
+    pub kind: Kind,
+}
+
+/// Rows of the same properties.
+pub struct Element {
+    pub name: String,
+    /// Rows, as the file claims.
+    pub count: usize,
+    pub properties: Vec<Property>,
+}
+
+impl Element {
+    pub fn has(&self, name: &str) -> bool {
+        self.properties.iter().any(|property| property.name == name)
+    }
+}
+
+pub struct Header {
+    /// Bytes up to the first row.
+    pub length: usize,
+    pub encoding: Encoding,
+    pub elements: Vec<Element>,
+}
+
+impl Header {
+    /// Whether `bytes` are those of a PLY.
+    pub fn begins(bytes: &[u8]) -> bool {
+        bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
+    }
+
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        if !Self::begins(bytes) {
+            return Err(Error::input(path, "the file", "no PLY", "a PLY of a 3D Gaussian splat"));
+        }
+        let (mut length, mut encoding) = (0, None);
+        let mut elements: Vec<Element> = vec![];
+        for line in bytes.split_inclusive(|&byte| byte == b'\n') {
+            length += line.len();
+            let text = String::from_utf8_lossy(line);
+            let words: Vec<&str> = text.split_whitespace().collect();
+            match words.as_slice() {
+                ["end_header"] if line.ends_with(b"\n") => {
+                    let Some(encoding) = encoding else {
+                        return Err(Error::input(
+                            path,
+                            "the line format",
+                            "absent",
+                            "how numbers are written",
+                        ));
+                    };
+                    return Ok(Header { length, encoding, elements });
+                }
+                ["format", name, ..] => encoding = Some(parse_encoding(path, name)?),
+                ["element", name, count] => {
+                    let Ok(count) = count.parse() else {
+                        let field = format!("the number of rows of the element {name}");
+                        return Err(Error::input(path, field, count, "a whole number"));
+                    };
+                    elements.push(Element { name: name.to_string(), count, properties: vec![] });
+                }
+                ["property", kind @ .., name] => {
+                    let Some(element) = elements.last_mut() else {
+                        let field = format!("the property {name}");
+                        return Err(Error::input(
+                            path,
+                            field,
+                            "without an element",
+                            "a line element before it",
+                        ));
+                    };
+                    let kind = parse_kind(path, kind, name)?;
+                    element.properties.push(Property { name: name.to_string(), kind });
+                }
+                _ => {} // comments
+            }
+        }
+        Err(Error::input(path, "the header", "without its end", "a line end_header"))
+    }
+
+    pub fn element(&self, name: &str) -> Option<&Element> {
+        self.elements.iter().find(|element| element.name == name)
+    }
+}
+
+fn parse_encoding(path: &Path, name: &str) -> Result<Encoding> {
+    match name {
+        "ascii" => Ok(Encoding::Ascii),
+        "binary_little_endian" => Ok(Encoding::LittleEndian),
+        "binary_big_endian" => Ok(Encoding::BigEndian),
+        _ => Err(Error::input(path, "the format", name, "ascii, binary_little_endian or binary_big_endian")),
+    }
+}
+
+fn parse_kind(path: &Path, words: &[&str], name: &str) -> Result<Kind> {
+    let scalar = |word: &str| {
+        Scalar::parse(word)
+            .ok_or_else(|| Error::input(path, format!("the type of {name}"), word, "a PLY number type"))
+    };
+    match words {
+        [word] => Ok(Kind::Number(scalar(word)?)),
+        ["list", count, item] => Ok(Kind::List(scalar(count)?, scalar(item)?)),
+        _ => {
+            let found = format!("{:?}", words.join(" "));
+            Err(Error::input(path, format!("the type of {name}"), found, "a number type, or a list of one"))
+        }
+    }
+}

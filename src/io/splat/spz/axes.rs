@@ -1,0 +1,55 @@
+//! In which directions axes go. Formats of splats have x to the right, y down, z forward; SPZ, as a rule, has y up, z back.
+
+use crate::error::{Error, Result};
+use std::path::Path;
+
+/// Of which axes a spherical harmonic, in the order of spec 6.3 from degree 1, changes its sign with: y, z, x; xy, yz, …
+const ODD: [[bool; 3]; 15] = {
+    const X: [bool; 3] = [true, false, false];
+    const Y: [bool; 3] = [false, true, false];
+    const Z: [bool; 3] = [false, false, true];
+    const NONE: [bool; 3] = [false; 3];
+    const XY: [bool; 3] = [true, true, false];
+    const YZ: [bool; 3] = [false, true, true];
+    const XZ: [bool; 3] = [true, false, true];
+    const XYZ: [bool; 3] = [true; 3];
+    [Y, Z, X, XY, YZ, NONE, XZ, NONE, Y, XYZ, Y, Z, X, Z, X]
+};
+
+/// Signs by which x, y and z of SPZ's axes become those to the right, down and forward, or the other way round.
+#[derive(Debug, Clone, Copy)]
+pub struct Axes([f32; 3]);
+
+impl Axes {
+    /// Right, up, back: SPZ's own.
+    pub const RUB: Axes = Axes([1., -1., -1.]);
+
+    /// By its number in the extension SPZ_ADOBE_coordinate_system: 1 to 8 are LDB, RDB, LUB, RUB, LDF, RDF, LUF and RUF, 0 says
+    /// nothing.
+    pub fn numbered(path: &Path, number: u32) -> Result<Self> {
+        let sign = |positive: bool| if positive { 1. } else { -1. };
+        match number {
+            0 => Ok(Axes::RUB),
+            1..=8 => {
+                let bits = number - 1;
+                Ok(Axes([sign(bits & 1 != 0), sign(bits & 2 == 0), sign(bits & 4 != 0)]))
+            }
+            _ => Err(Error::input(path, "the coordinate system", number, "1 to 8 (LDB to RUF)")),
+        }
+    }
+
+    pub fn position(self, position: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|axis| self.0[axis] * position[axis])
+    }
+
+    /// The rotation (w, x, y, z), which turns about an axis the other way round where just one of the other two is turned back.
+    pub fn rotation(self, [w, x, y, z]: [f32; 4]) -> [f32; 4] {
+        let [of_x, of_y, of_z] = self.0;
+        [w, of_y * of_z * x, of_x * of_z * y, of_x * of_y * z]
+    }
+
+    /// By what spherical harmonics of degree 1 and more are multiplied.
+    pub fn harmonics(self) -> [f32; 15] {
+        ODD.map(|odd| odd.iter().zip(self.0).map(|(&odd, sign)| if odd { sign } else { 1. }).product())
+    }
+}

@@ -1,0 +1,251 @@
+//! What SPZ packs Gaussians into: a header and six streams, in gzip up to version 3, in Zstandard each since version 4.
+
+use super::axes::Axes;
+use crate::error::{Error, Result};
+use crate::io::atomic::write_atomically;
+use flate2::Compression;
+use flate2::bufread::GzDecoder;
+use flate2::write::GzEncoder;
+use std::io::{Read, Write};
+use std::path::Path;
+
+/// What every version begins with, once it is out of its gzip.
+const MAGIC: [u8; 4] = *b"NGSP";
+/// What gzip begins with. Of the next byte, the flags, the upper three bits are 0.
+const GZIP: [u8; 3] = [0x1f, 0x8b, 8];
+/// Bytes of the header up to version 3, and since.
+const GZIP_HEADER: usize = 16;
+const PLAIN_HEADER: usize = 32;
+/// Says that there are extensions: after the streams up to version 3, before them since.
+const HAS_EXTENSIONS: u8 = 2;
+/// Of the extension that names the axes.
+const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
+/// Bytes of extensions, at most.
+const MAX_EXTENSIONS: u64 = 1 << 16;
+/// A file unfolds to at most so many times its bytes, and a little more: real splats do to ten times.
+const MAX_RATIO: u128 = 256;
+const MAX_SMALL: u128 = 1 << 20;
+/// The version that is written.
+const WRITTEN: u32 = 3;
+
+/// The streams, in the file's order, each with the numbers of all Gaussians.
+pub struct Streams {
+    /// Three numbers, float16 in version 1, of 24 bits since.
+    pub positions: Vec<u8>,
+    pub opacities: Vec<u8>,
+    pub colours: Vec<u8>,
+    pub scales: Vec<u8>,
+    /// Three bytes up to version 2, four since.
+    pub rotations: Vec<u8>,
+    pub harmonics: Vec<u8>,
+}
+
+/// What a file says of its streams.
+#[derive(Debug, Clone, Copy)]
+pub struct Description {
+    pub version: u32,
+    pub count: usize,
+    pub sh_degree: usize,
+    /// Of positions.
+    pub fractional_bits: u32,
+    pub axes: Axes,
+}
+
+impl Description {
+    pub fn written(count: usize, sh_degree: usize, fractional_bits: u32) -> Self {
+        Description { version: WRITTEN, count, sh_degree, fractional_bits, axes: Axes::RUB }
+    }
+
+    /// The beginning that all versions have in common.
+    fn parse(path: &Path, header: &[u8]) -> Result<(Self, u8)> {
+        let word = |at: usize| u32::from_le_bytes([0, 1, 2, 3].map(|byte| header[at + byte]));
+        if header[..4] != MAGIC {
+            return Err(Error::input(path, "the first bytes", format!("{:?}", &header[..4]), "NGSP"));
+        }
+        let (version, count) = (word(4), word(8) as usize);
+        let [sh_degree, fractional_bits, flags] = [12, 13, 14].map(|at| header[at]);
+        if !(1..=4).contains(&version) {
+            return Err(Error::input(path, "the version", version, "1 to 4"));
+        }
+        if sh_degree > 3 {
+            return Err(Error::input(path, "the SH degree", sh_degree, "0 to 3"));
+        }
+        if fractional_bits > 30 {
+            return Err(Error::input(path, "the number of fractional bits", fractional_bits, "0 to 30"));
+        }
+        let (sh_degree, fractional_bits) = (sh_degree.into(), fractional_bits.into());
+        Ok((Description { version, count, sh_degree, fractional_bits, axes: Axes::RUB }, flags))
+    }
+
+    /// Bytes of a Gaussian in each stream.
+    fn widths(&self) -> [usize; 6] {
+        let position = if self.version == 1 { 6 } else { 9 };
+        let rotation = if self.version >= 3 { 4 } else { 3 };
+        [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1).pow(2) - 1)]
+    }
+
+    /// Whether a file of `length` bytes may unfold to what this one claims: nothing is made room for before.
+    fn check_claim(&self, path: &Path, length: usize) -> Result<()> {
+        let bytes = self.widths().iter().sum::<usize>() as u128 * self.count as u128;
+        if bytes > MAX_SMALL + MAX_RATIO * length as u128 {
+            let found = format!("{}, {bytes} bytes of them in a file of {length}", self.count);
+            let expected = format!("{MAX_RATIO} times the file's bytes at most");
+            return Err(Error::input(path, "the number of Gaussians", found, expected));
+        }
+        Ok(())
+    }
+}
+
+/// Whether `bytes` are those of an SPZ of any version.
+pub fn recognizes(bytes: &[u8]) -> bool {
+    bytes.starts_with(&MAGIC) || (bytes.starts_with(&GZIP) && bytes.get(3).is_some_and(|flags| flags < &0x20))
+}
+
+pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
+    if !recognizes(bytes) {
+        return Err(Error::input(path, "the file", "no SPZ", "one in gzip, or NGSP"));
+    }
+    let (description, streams) =
+        if bytes.starts_with(&MAGIC) { read_plain(path, bytes)? } else { read_gzip(path, bytes)? };
+    let mut streams = streams.into_iter();
+    let mut next = || streams.next().expect("six streams");
+    let streams = Streams {
+        positions: next(),
+        opacities: next(),
+        colours: next(),
+        scales: next(),
+        rotations: next(),
+        harmonics: next(),
+    };
+    Ok((description, streams))
+}
+
+/// Versions 1 to 3: header, streams and extensions in one gzip.
+fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
+    let mut decoder = GzDecoder::new(bytes);
+    let mut unfold = |length: u64, what: &str| -> Result<Vec<u8>> {
+        let mut unfolded = vec![];
+        let read = decoder.by_ref().take(length).read_to_end(&mut unfolded);
+        read.map_err(|why| Error::input(path, what, format!("damaged: {why}"), "a whole gzip"))?;
+        Ok(unfolded)
+    };
+    let header = unfold(GZIP_HEADER as u64, "the header")?;
+    if header.len() < GZIP_HEADER {
+        let found = format!("{} bytes", header.len());
+        return Err(Error::input(path, "the header", found, format!("{GZIP_HEADER} bytes")));
+    }
+    let (mut description, flags) = Description::parse(path, &header)?;
+    if description.version > 3 {
+        return Err(Error::input(path, "the version in gzip", description.version, "1 to 3"));
+    }
+    description.check_claim(path, bytes.len())?;
+    let mut streams = vec![];
+    for width in description.widths() {
+        let length = width * description.count;
+        let stream = unfold(length as u64, "the body")?;
+        if stream.len() < length {
+            let found = format!("cut short: {} bytes of a stream", stream.len());
+            let expected = format!("{length} bytes for {} Gaussians", description.count);
+            return Err(Error::input(path, "the body", found, expected));
+        }
+        streams.push(stream);
+    }
+    // Reading to the end also compares gzip's checksum.
+    let extensions = unfold(MAX_EXTENSIONS, "the end")?;
+    if flags & HAS_EXTENSIONS != 0 {
+        description.axes = axes_of(path, &extensions)?;
+    }
+    Ok((description, streams))
+}
+
+/// Version 4: header, extensions and a table of contents as they are, then each stream by itself.
+fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
+    if bytes.len() < PLAIN_HEADER {
+        let found = format!("{} bytes", bytes.len());
+        return Err(Error::input(path, "the header", found, format!("{PLAIN_HEADER} bytes")));
+    }
+    let (mut description, flags) = Description::parse(path, bytes)?;
+    if description.version < 4 {
+        return Err(Error::input(path, "the version outside of gzip", description.version, "4"));
+    }
+    description.check_claim(path, bytes.len())?;
+    let contents = u32::from_le_bytes([16, 17, 18, 19].map(|at| bytes[at])) as usize;
+    let streams = usize::from(bytes[15]);
+    let end = contents.saturating_add(16 * streams);
+    if contents < PLAIN_HEADER || end > bytes.len() {
+        let expected = format!("{streams} entries within the file's {} bytes", bytes.len());
+        return Err(Error::input(path, "the table of contents", format!("at {contents}"), expected));
+    }
+    if flags & HAS_EXTENSIONS != 0 {
+        description.axes = axes_of(path, &bytes[PLAIN_HEADER..contents])?;
+    }
+    let mut rest = &bytes[end..];
+    let mut entries = bytes[contents..end].as_chunks::<16>().0.iter();
+    let mut unfolded = vec![];
+    for (index, width) in description.widths().into_iter().enumerate() {
+        let length = width * description.count;
+        let Some(entry) = entries.next() else {
+            if length > 0 {
+                let expected = format!("one of {length} bytes");
+                return Err(Error::input(path, format!("stream {index}"), "absent", expected));
+            }
+            unfolded.push(vec![]);
+            continue;
+        };
+        let stored = u64::from_le_bytes([0, 1, 2, 3, 4, 5, 6, 7].map(|at| entry[at]));
+        let Some((stream, after)) = usize::try_from(stored).ok().and_then(|at| rest.split_at_checked(at))
+        else {
+            let found = format!("cut short: {} bytes", rest.len());
+            return Err(Error::input(path, format!("stream {index}"), found, format!("{stored} bytes")));
+        };
+        rest = after;
+        let mut bytes = vec![];
+        let read = zstd::stream::read::Decoder::new(stream)
+            .and_then(|decoder| decoder.take(length as u64 + 1).read_to_end(&mut bytes));
+        read.map_err(|why| {
+            Error::input(path, format!("stream {index}"), format!("damaged: {why}"), "Zstandard")
+        })?;
+        if bytes.len() != length {
+            let found = format!("{} bytes or more", bytes.len());
+            let expected = format!("{length} bytes for {} Gaussians", description.count);
+            return Err(Error::input(path, format!("stream {index}"), found, expected));
+        }
+        unfolded.push(bytes);
+    }
+    Ok((description, unfolded))
+}
+
+/// The axes that one of the `extensions` names; each is a type, its length and so many bytes.
+fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
+    let mut axes = Axes::RUB;
+    while let Some((head, rest)) = extensions.split_first_chunk::<8>() {
+        let [kind, length] = [0, 4].map(|at| u32::from_le_bytes([0, 1, 2, 3].map(|byte| head[at + byte])));
+        let Some((contents, after)) = rest.split_at_checked(length as usize) else {
+            let found = format!("cut short: {} bytes", rest.len());
+            return Err(Error::input(path, "an extension", found, format!("{length} bytes")));
+        };
+        if let (COORDINATE_SYSTEM, Some(number)) = (kind, contents.first_chunk()) {
+            axes = Axes::numbered(path, u32::from_le_bytes(*number))?;
+        }
+        extensions = after;
+    }
+    Ok(axes)
+}
+
+/// Writes them in gzip, whole or not at all.
+///
+/// # Errors
+/// The system's refusal to write.
+pub fn write(path: &Path, description: &Description, streams: &Streams) -> Result<()> {
+    let mut header = MAGIC.to_vec();
+    header.extend(description.version.to_le_bytes());
+    header.extend((description.count as u32).to_le_bytes());
+    header.extend([description.sh_degree as u8, description.fractional_bits as u8, 0, 0]);
+    let Streams { positions, opacities, colours, scales, rotations, harmonics } = streams;
+    write_atomically(path, |writer| {
+        let mut encoder = GzEncoder::new(writer, Compression::best());
+        let parts = [&header, positions, opacities, colours, scales, rotations, harmonics];
+        parts.iter().try_for_each(|part| encoder.write_all(part)).map_err(Error::write(path))?;
+        encoder.finish().map(drop).map_err(Error::write(path))
+    })
+}

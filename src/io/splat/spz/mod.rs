@@ -1,0 +1,170 @@
+//! Niantic's SPZ (spec 10.12): a byte for most numbers, all Gaussians' of a kind one after the other, compressed. Versions 1 to 4
+//! are read. Version 3 is written: it is the oldest whose rotations are exact enough, and what reads version 4 reads it, too.
+
+mod axes;
+mod container;
+
+use super::Splat;
+use super::values::{Values, normalized};
+use crate::error::{Error, Result};
+use crate::render::HarmonicLimits;
+use axes::Axes;
+use container::{Description, Streams};
+use half::f16;
+use std::f64::consts::FRAC_1_SQRT_2;
+use std::path::Path;
+
+pub(super) use container::recognizes;
+
+/// By which an SH coefficient of degree 0 is multiplied, beside ½.
+const COLOUR_SCALE: f64 = 0.15;
+/// What a logarithm of a scale is counted in, from where.
+const LOG_SCALE_STEPS: f64 = 16.;
+const LOG_SCALE_BEGIN: f64 = -10.;
+/// Largest number of 24 bits with a sign.
+const MAX_FIXED: f64 = ((1 << 23) - 1) as f64;
+/// Bits after the point of a position, at most.
+const MAX_FRACTIONAL_BITS: u32 = 24;
+/// Largest part of a rotation but one, in nine bits.
+const MAX_PART: u32 = (1 << 9) - 1;
+/// Bits that are kept of a coefficient's eight, of degree 1 and above. Niantic's library keeps 5 and 4, which costs splats whose
+/// colours depend much on the side 10 dB and more between renders, and saves a third of the file (docs/splats.md).
+const SH_BITS: [u32; 2] = [8, 7];
+
+/// Reads an SPZ.
+///
+/// # Errors
+/// Another version, a higher SH degree, a file that is damaged or cut short, or claims more than it can hold.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+    let (description, streams) = container::read(path, bytes)?;
+    let Description { version, fractional_bits, axes, .. } = description;
+    let fixed = |bytes: &[u8; 3]| {
+        let shifted = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]); // the sign where it belongs
+        (f64::from(shifted >> 8) / f64::from(1u32 << fractional_bits)) as f32
+    };
+    let coordinates: Vec<f32> = match version {
+        1 => {
+            streams.positions.as_chunks().0.iter().map(|&bytes| f16::from_le_bytes(bytes).to_f32()).collect()
+        }
+        _ => streams.positions.as_chunks().0.iter().map(fixed).collect(),
+    };
+    let threes = |bytes: &[u8], number: &dyn Fn(u8) -> f64| -> Vec<[f32; 3]> {
+        bytes.as_chunks().0.iter().map(|of_one: &[u8; 3]| of_one.map(|byte| number(byte) as f32)).collect()
+    };
+    let signs = axes.harmonics();
+    let colours = threes(&streams.colours, &|byte| (f64::from(byte) / 255. - 0.5) / COLOUR_SCALE);
+    let harmonics = threes(&streams.harmonics, &|byte| (f64::from(byte) - 128.) / 128.);
+    let bases = (description.sh_degree + 1).pow(2);
+    let mut sh = Vec::with_capacity(colours.len() * bases);
+    for (index, colour) in colours.into_iter().enumerate() {
+        sh.push(colour);
+        let of_one = &harmonics[index * (bases - 1)..][..bases - 1];
+        sh.extend(of_one.iter().zip(signs).map(|(colour, sign)| colour.map(|channel| sign * channel)));
+    }
+    let rotations = match version {
+        1 | 2 => streams.rotations.as_chunks().0.iter().map(|&bytes| first_three(bytes)).collect::<Vec<_>>(),
+        _ => streams.rotations.as_chunks().0.iter().map(|&bytes| smallest_three(bytes)).collect(),
+    };
+    let values = Values {
+        means: coordinates.as_chunks().0.iter().map(|&mean| axes.position(mean)).collect(),
+        scales: threes(&streams.scales, &|byte| (f64::from(byte) / LOG_SCALE_STEPS + LOG_SCALE_BEGIN).exp()),
+        quaternions: rotations.into_iter().map(|rotation| axes.rotation(rotation)).collect(),
+        opacities: streams.opacities.iter().map(|&byte| f32::from(byte) / 255.).collect(),
+        bases,
+        sh,
+    };
+    values.into_splat(path)
+}
+
+/// What a byte can say.
+pub(super) fn limits() -> HarmonicLimits {
+    let largest = f64::from(pack_sh(f32::MAX, SH_BITS[1]));
+    let (constant, others) = (0.5 / COLOUR_SCALE, (largest - 128.) / 128.);
+    HarmonicLimits { degree: 3, constant: -constant..=constant, others: -1. ..=others }
+}
+
+/// x, y and z of a rotation whose w isn't negative.
+fn first_three(bytes: [u8; 3]) -> [f32; 4] {
+    let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.);
+    let w = (1. - x * x - y * y - z * z).max(0.).sqrt();
+    normalized([w, x, y, z].map(|part| part as f32))
+}
+
+/// All but the largest of x, y, z and w, whose place is in the upper two bits.
+fn smallest_three(bytes: [u8; 4]) -> [f32; 4] {
+    let mut word = u32::from_le_bytes(bytes);
+    let largest = (word >> 30) as usize;
+    let mut parts = [0.; 4];
+    for place in (0..4).rev().filter(|&place| place != largest) {
+        let size = f64::from(word & MAX_PART) / f64::from(MAX_PART) * FRAC_1_SQRT_2;
+        parts[place] = if word & (MAX_PART + 1) == 0 { size } else { -size };
+        word >>= 10;
+    }
+    parts[largest] = (1. - parts.iter().map(|part| part * part).sum::<f64>()).max(0.).sqrt();
+    let [x, y, z, w] = parts;
+    normalized([w, x, y, z].map(|part| part as f32))
+}
+
+fn pack_smallest_three([w, x, y, z]: [f32; 4]) -> [u8; 4] {
+    let parts = [x, y, z, w];
+    let larger = |a: &usize, b: &usize| parts[*a].abs().total_cmp(&parts[*b].abs());
+    let largest = (0..4).max_by(larger).expect("four parts");
+    let others = (0..4).filter(|&place| place != largest).map(|place| parts[place]);
+    let word = others.fold(largest as u32, |word, part| {
+        let size = (f64::from(part.abs()) / FRAC_1_SQRT_2 * f64::from(MAX_PART)).round() as u32;
+        let negative = part.is_sign_negative() != parts[largest].is_sign_negative();
+        word << 10 | u32::from(negative) << 9 | size.min(MAX_PART)
+    });
+    word.to_le_bytes()
+}
+
+/// Writes an SPZ. Scales, colours and spherical harmonics outside of what a byte can say become what is nearest.
+///
+/// # Errors
+/// Numbers that aren't finite, positions too far away for 24 bits, or the system's refusal to write.
+pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let values = Values::of(path, splat)?;
+    let farthest = values.means.as_flattened().iter().fold(0f32, |farthest, x| farthest.max(x.abs()));
+    let fits = |bits: &u32| f64::from(farthest) * f64::from(1u32 << bits) <= MAX_FIXED;
+    let Some(fractional_bits) = (0..=MAX_FRACTIONAL_BITS).rev().find(fits) else {
+        let limit = format!("at most {MAX_FIXED} in an SPZ");
+        return Err(Error::Failed(format!(
+            "{}: a coordinate is {farthest}, expected {limit}",
+            path.display()
+        )));
+    };
+    let axes = Axes::RUB;
+    let byte = |number: f64| number.round() as u8; // what is outside becomes 0 or 255
+    let (mut positions, mut harmonics) = (vec![], vec![]);
+    for mean in &values.means {
+        for coordinate in axes.position(*mean) {
+            let fixed = (f64::from(coordinate) * f64::from(1u32 << fractional_bits)).round() as i32;
+            positions.extend(&fixed.to_le_bytes()[..3]);
+        }
+    }
+    let signs = axes.harmonics();
+    for index in 0..values.count() {
+        for (basis, (colour, sign)) in values.sh_of(index)[1..].iter().zip(signs).enumerate() {
+            let bits = SH_BITS[usize::from(basis >= 3)];
+            harmonics.extend(colour.map(|channel| pack_sh(sign * channel, bits)));
+        }
+    }
+    let colours = (0..values.count()).flat_map(|index| values.sh_of(index)[0]);
+    let scales = values.scales.as_flattened().iter();
+    let streams = Streams {
+        positions,
+        opacities: values.opacities.iter().map(|&opacity| byte(f64::from(opacity) * 255.)).collect(),
+        colours: colours.map(|dc| byte((f64::from(dc) * COLOUR_SCALE + 0.5) * 255.)).collect(),
+        scales: scales.map(|&s| byte((f64::from(s).ln() - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
+        rotations: values.quaternions.iter().flat_map(|&q| pack_smallest_three(axes.rotation(q))).collect(),
+        harmonics,
+    };
+    let description = Description::written(values.count(), values.bases.isqrt() - 1, fractional_bits);
+    container::write(path, &description, &streams)
+}
+
+/// The nearest of 2^`bits` numbers, of which 0 is one.
+fn pack_sh(value: f32, bits: u32) -> u8 {
+    let step = f64::from(1u32 << (8 - bits));
+    ((f64::from(value) * 128. / step).round() * step + 128.) as u8
+}

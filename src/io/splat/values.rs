@@ -1,0 +1,108 @@
+//! A splat's numbers on the host, as the formats take and give them that pack each Gaussian into bytes.
+
+use super::{Splat, all_finite};
+use crate::error::{Error, Result};
+use crate::scene::Gaussians;
+use std::path::Path;
+use tch::Tensor;
+
+/// A list has an entry a Gaussian, unless it says otherwise.
+pub(super) struct Values {
+    pub means: Vec<[f32; 3]>,
+    /// Linear.
+    pub scales: Vec<[f32; 3]>,
+    /// (w, x, y, z), of length 1.
+    pub quaternions: Vec<[f32; 4]>,
+    /// In [0, 1].
+    pub opacities: Vec<f32>,
+    /// Spherical harmonics of a colour channel.
+    pub bases: usize,
+    /// Gaussian by Gaussian, basis by basis: red, green and blue.
+    pub sh: Vec<[f32; 3]>,
+}
+
+impl Values {
+    /// Room for so many Gaussians.
+    pub fn with_capacity(count: usize, bases: usize) -> Self {
+        Values {
+            means: Vec::with_capacity(count),
+            scales: Vec::with_capacity(count),
+            quaternions: Vec::with_capacity(count),
+            opacities: Vec::with_capacity(count),
+            bases,
+            sh: Vec::with_capacity(count * bases),
+        }
+    }
+
+    /// The numbers of `splat`, which is to be written at `path`.
+    ///
+    /// # Errors
+    /// Numbers that aren't finite.
+    pub fn of(path: &Path, splat: &Splat) -> Result<Self> {
+        let g = &splat.gaussians;
+        for tensor in [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh] {
+            all_finite(path, tensor)?;
+        }
+        let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1));
+        Ok(Values {
+            means: grouped(&numbers(&g.means)?),
+            scales: grouped(&numbers(&g.scales)?),
+            quaternions: grouped(&numbers(&g.quaternions)?).into_iter().map(normalized).collect(),
+            opacities: numbers(&g.opacities)?.into_iter().map(|opacity| opacity.clamp(0., 1.)).collect(),
+            bases: splat.bases() as usize,
+            sh: grouped(&numbers(&g.sh)?),
+        })
+    }
+
+    /// Gaussians.
+    pub fn count(&self) -> usize {
+        self.means.len()
+    }
+
+    /// The spherical harmonics of Gaussian `index`.
+    pub fn sh_of(&self, index: usize) -> &[[f32; 3]] {
+        &self.sh[index * self.bases..][..self.bases]
+    }
+
+    /// The splat, as it was read at `path`.
+    ///
+    /// # Errors
+    /// Numbers that aren't finite, scales below zero.
+    pub fn into_splat(self, path: &Path) -> Result<Splat> {
+        let (n, bases) = (self.count() as i64, self.bases as i64);
+        check(path, "the position", &self.means, |value| value.is_finite())?;
+        check(path, "the scale", &self.scales, |value| value.is_finite() && value >= 0.)?;
+        let tensor = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape);
+        let gaussians = Gaussians {
+            means: tensor(self.means.as_flattened(), &[1, n, 3]),
+            scales: tensor(self.scales.as_flattened(), &[1, n, 3]),
+            quaternions: tensor(self.quaternions.as_flattened(), &[1, n, 4]),
+            opacities: tensor(&self.opacities, &[1, n]),
+            sh: tensor(self.sh.as_flattened(), &[1, n, bases, 3]),
+        };
+        Ok(Splat { gaussians })
+    }
+}
+
+fn check(path: &Path, what: &str, values: &[[f32; 3]], good: impl Fn(f32) -> bool) -> Result<()> {
+    for (index, of_one) in values.iter().enumerate() {
+        if let Some(bad) = of_one.iter().find(|&&value| !good(value)) {
+            let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
+            return Err(Error::input(path, format!("{what} of Gaussian {index}"), bad, expected));
+        }
+    }
+    Ok(())
+}
+
+fn grouped<const N: usize>(values: &[f32]) -> Vec<[f32; N]> {
+    values.as_chunks().0.to_vec()
+}
+
+/// Nothing tells how a quaternion of length 0 is turned: then it isn't.
+pub(super) fn normalized(quaternion: [f32; 4]) -> [f32; 4] {
+    let length = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum::<f64>().sqrt();
+    match length > 0. {
+        true => quaternion.map(|part| (f64::from(part) / length) as f32),
+        false => [1., 0., 0., 0.],
+    }
+}

@@ -1,0 +1,256 @@
+//! Spherical harmonics within bounds, or of fewer degrees, that show a capture's cameras what they saw before (spec 10.14).
+//!
+//! Files that keep a byte for a coefficient hold none beyond a bound. Cutting off what is beyond changes colours everywhere, though
+//! cameras look at a Gaussian from few sides, from which other coefficients would show the same.
+
+use crate::scene::{Camera, Gaussians, SH_C0};
+use glam::DVec3;
+use globalsplat_csrc::render::sh_basis;
+use rayon::prelude::*;
+use std::ops::RangeInclusive;
+use tch::Tensor;
+
+/// Spherical harmonics of a colour channel, up to degree 3.
+const BASES: usize = 16;
+/// What counts from all sides, beside what cameras see.
+const ELSEWHERE: f64 = 1e-5;
+/// Rounds through the coefficients; they hardly change after half as many.
+const ROUNDS: usize = 40;
+/// How much too dark a Gaussian may be before it is made more opaque, and how opaque at most.
+const TOO_DARK: f64 = 1.05;
+const MAX_OPACITY: f64 = 0.98;
+/// What a picture counts for that doesn't show the middle of a Gaussian, beside one that does.
+const OUTSIDE: f64 = 0.01;
+/// Nearer than this, nothing is drawn (spec 6.2).
+const NEAR: f64 = 0.01;
+
+/// Coefficients that a file can hold.
+#[derive(Debug, Clone)]
+pub struct HarmonicLimits {
+    /// Of the spherical harmonics, at most.
+    pub degree: i64,
+    /// Of degree 0.
+    pub constant: RangeInclusive<f64>,
+    /// Of the others.
+    pub others: RangeInclusive<f64>,
+}
+
+impl HarmonicLimits {
+    fn of(&self, basis: usize) -> (f64, f64) {
+        let range = if basis == 0 { &self.constant } else { &self.others };
+        let bases = (self.degree + 1) * (self.degree + 1);
+        if (basis as i64) < bases { (*range.start(), *range.end()) } else { (0., 0.) }
+    }
+}
+
+/// The same Gaussians, [1, N, ..] in float32 on the host, with coefficients within `limits`: the nearest, or where `cameras` see a
+/// Gaussian whose coefficients aren't, those that show them its colours best. One that would be too dark becomes more opaque.
+pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &HarmonicLimits) -> Gaussians {
+    let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
+    let (means, opacities, sh) =
+        (numbers(&gaussians.means), numbers(&gaussians.opacities), numbers(&gaussians.sh));
+    let bases = gaussians.sh.size()[2] as usize;
+    let fitted: Vec<_> = (0..opacities.len())
+        .into_par_iter()
+        .map(|index| {
+            let mut coefficients = [[0.; 3]; BASES];
+            for (basis, colour) in sh[3 * bases * index..][..3 * bases].chunks_exact(3).enumerate() {
+                coefficients[basis] = [0, 1, 2].map(|channel| f64::from(colour[channel]));
+            }
+            let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
+            Fit::of(mean, coefficients, cameras, limits).best(f64::from(opacities[index]))
+        })
+        .collect();
+    let kept = bases.min(((limits.degree + 1) * (limits.degree + 1)) as usize);
+    let sh: Vec<f32> = fitted
+        .iter()
+        .flat_map(|(coefficients, _)| coefficients[..kept].as_flattened().iter().map(|&c| c as f32))
+        .collect();
+    let opacities: Vec<f32> = fitted.iter().map(|&(_, opacity)| opacity as f32).collect();
+    Gaussians {
+        sh: Tensor::from_slice(&sh).view([1, -1, kept as i64, 3]),
+        opacities: Tensor::from_slice(&opacities).view([1, -1]),
+        ..gaussians.map(Tensor::shallow_clone)
+    }
+}
+
+type Coefficients = [[f64; 3]; BASES];
+
+/// What is asked of the coefficients of one Gaussian.
+struct Fit<'a> {
+    original: Coefficients,
+    /// The functions' values towards each camera that sees it, and the camera's weight; weights add up to 1.
+    seen: Vec<([f64; BASES], f64)>,
+    /// Σ weight·Y·Yᵀ over cameras, and a little of the identity: what a change of coefficients costs.
+    cost: [[f64; BASES]; BASES],
+    limits: &'a HarmonicLimits,
+}
+
+impl<'a> Fit<'a> {
+    fn of(mean: DVec3, original: Coefficients, cameras: &[Camera], limits: &'a HarmonicLimits) -> Self {
+        let mut seen: Vec<_> = cameras
+            .iter()
+            .filter_map(|camera| Some((basis_towards(camera, mean), weight(camera, mean)?)))
+            .collect();
+        let total: f64 = seen.iter().map(|(_, weight)| weight).sum();
+        seen.iter_mut().for_each(|(_, weight)| *weight /= total);
+        let mut cost = [[0.; BASES]; BASES];
+        for (row, costs) in cost.iter_mut().enumerate() {
+            costs[row] = ELSEWHERE;
+            for (basis, weight) in &seen {
+                costs.iter_mut().zip(basis).for_each(|(cost, other)| *cost += weight * basis[row] * other);
+            }
+        }
+        Fit { original, seen, cost, limits }
+    }
+
+    /// The coefficients, and the opacity.
+    fn best(mut self, opacity: f64) -> (Coefficients, f64) {
+        let within = self.clamped(&self.original);
+        if within == self.original || self.seen.is_empty() {
+            return (within, opacity);
+        }
+        let fitted = self.solve();
+        let dark = self.darkness(&fitted);
+        if dark <= TOO_DARK || opacity >= MAX_OPACITY {
+            return (fitted, opacity);
+        }
+        // The product of colour and opacity stays; ½ belongs to the colour.
+        let raised = (opacity * dark).min(MAX_OPACITY);
+        let factor = opacity / raised;
+        self.original.iter_mut().flatten().for_each(|coefficient| *coefficient *= factor);
+        self.original[0].iter_mut().for_each(|constant| *constant += (factor - 1.) * 0.5 / SH_C0);
+        (self.solve(), raised)
+    }
+
+    fn clamped(&self, coefficients: &Coefficients) -> Coefficients {
+        std::array::from_fn(|basis| {
+            let (low, high) = self.limits.of(basis);
+            coefficients[basis].map(|coefficient| coefficient.clamp(low, high))
+        })
+    }
+
+    /// The least Δᵀ·cost·Δ, Δ what the coefficients change by, within the limits: one coefficient after the other, round by round.
+    fn solve(&self) -> Coefficients {
+        let mut solution = self.clamped(&self.original);
+        for channel in 0..3 {
+            let mut slope: [f64; BASES] = std::array::from_fn(|row| {
+                let change = |basis: usize| solution[basis][channel] - self.original[basis][channel];
+                (0..BASES).map(|basis| self.cost[row][basis] * change(basis)).sum()
+            });
+            for _ in 0..ROUNDS {
+                for basis in 0..BASES {
+                    let (low, high) = self.limits.of(basis);
+                    let before = solution[basis][channel];
+                    let after = (before - slope[basis] / self.cost[basis][basis]).clamp(low, high);
+                    solution[basis][channel] = after;
+                    let costs = self.cost[basis].iter();
+                    slope.iter_mut().zip(costs).for_each(|(slope, cost)| *slope += cost * (after - before));
+                }
+            }
+        }
+        solution
+    }
+
+    /// By what the colours of `fitted` would have to be multiplied, of the channel that needs it most.
+    fn darkness(&self, fitted: &Coefficients) -> f64 {
+        let colour = |coefficients: &Coefficients, basis: &[f64; BASES], channel: usize| {
+            let sum: f64 = basis.iter().zip(coefficients).map(|(y, of_basis)| y * of_basis[channel]).sum();
+            (sum + 0.5).max(0.)
+        };
+        let of_channel = |channel: usize| {
+            let (mut product, mut square) = (0., 0.);
+            for (basis, weight) in &self.seen {
+                let (was, is) = (colour(&self.original, basis, channel), colour(fitted, basis, channel));
+                product += weight * was * is;
+                square += weight * is * is;
+            }
+            if square > 0. { product / square } else { 1. }
+        };
+        (0..3).map(of_channel).fold(1., f64::max)
+    }
+}
+
+/// The functions' values in the direction in which `camera` sees what is at `mean`.
+fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
+    let direction = (mean - camera.c2w.w_axis.truncate()).normalize_or_zero();
+    let mut basis = [0.; BASES];
+    sh_basis(&direction.to_array(), &mut basis);
+    basis
+}
+
+/// As many pixels as what is at `mean` covers in the picture of `camera`, but for a factor; none where it is behind. What isn't in
+/// the picture counts little: of a large Gaussian, a part may be.
+fn weight(camera: &Camera, mean: DVec3) -> Option<f64> {
+    let seen = camera.c2w.inverse().transform_point3(mean);
+    let (k, width, height) = (camera.intrinsics, f64::from(camera.width), f64::from(camera.height));
+    let (x, y) = (k.fx * seen.x / seen.z + k.cx, k.fy * seen.y / seen.z + k.cy);
+    let inside = (0. ..=width).contains(&x) && (0. ..=height).contains(&y);
+    let factor = if inside { 1. } else { OUTSIDE };
+    (seen.z > NEAR).then(|| factor * k.fx * k.fy / (seen.z * seen.z))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::render_views;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+    use tch::{Device, Kind};
+
+    fn cameras(count: i32) -> Vec<Camera> {
+        let intrinsics = Intrinsics { fx: 40., fy: 40., cx: 16., cy: 16. };
+        let c2w = |i: i32| DMat4::from_translation(DVec3::new(0.15 * f64::from(i - count / 2), 0., 0.));
+        (0..count).map(|i| Camera { intrinsics, c2w: c2w(i), width: 32, height: 32 }).collect()
+    }
+
+    /// A Gaussian in front of the cameras, one behind them, and one whose coefficients need no change.
+    fn gaussians(coefficient: f64) -> Gaussians {
+        let options = (Kind::Float, Device::Cpu);
+        let sh = Tensor::zeros([1, 3, 16, 3], options);
+        let _ = sh.narrow(1, 0, 2).narrow(2, 2, 1).fill_(coefficient); // z
+        let _ = sh.narrow(1, 0, 2).narrow(2, 12, 1).fill_(-coefficient); // z, of degree 3
+        let _ = sh.narrow(1, 2, 1).fill_(0.25);
+        Gaussians {
+            means: Tensor::from_slice(&[0f32, 0., 4., 0., 0., -4., 0.5, 0.5, 5.]).view([1, 3, 3]),
+            scales: Tensor::full([1, 3, 3], 0.3, options),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
+            opacities: Tensor::full([1, 3], 0.1, options),
+            sh,
+        }
+    }
+
+    fn loss(a: &Gaussians, b: &Gaussians, cameras: &[Camera]) -> f64 {
+        let seen = |g| render_views(g, cameras).unwrap();
+        let errors = seen(a).into_iter().zip(seen(b)).map(|(a, b)| (a.rgb - b.rgb).abs().max());
+        errors.map(|error| error.double_value(&[])).fold(0., f64::max)
+    }
+
+    #[test]
+    fn cameras_see_the_same_with_smaller_coefficients() {
+        let limits = HarmonicLimits { degree: 3, constant: -3. ..=3., others: -1. ..=1. };
+        let original = gaussians(3.);
+        let fitted = fit_harmonics(&original, &cameras(5), &limits);
+        let clamped = fit_harmonics(&original, &[], &limits);
+        assert!(
+            fitted.sh.abs().max().double_value(&[]) <= 3. && clamped.sh.abs().max().double_value(&[]) <= 1.
+        );
+        // Between and beside the cameras, too.
+        let (fit, clamp) = (loss(&original, &fitted, &cameras(9)), loss(&original, &clamped, &cameras(9)));
+        assert!(fit < 0.003 && clamp > 0.02, "{fit} fitted, {clamp} clamped");
+        assert!(fitted.sh.narrow(1, 1, 1).equal(&clamped.sh.narrow(1, 1, 1)), "seen by nobody");
+        assert!(fitted.sh.narrow(1, 2, 1).equal(&original.sh.narrow(1, 2, 1)), "within the limits");
+    }
+
+    #[test]
+    fn what_cannot_be_bright_becomes_opaque() {
+        let limits = HarmonicLimits { degree: 0, constant: -1.77..=1.77, others: 0. ..=0. };
+        let mut original = gaussians(0.);
+        original.sh = Tensor::zeros_like(&original.sh);
+        let _ = original.sh.narrow(2, 0, 1).fill_(3.5 / SH_C0); // 4 times what a screen shows
+        let fitted = fit_harmonics(&original, &cameras(5), &limits);
+        assert_eq!(fitted.sh.size(), [1, 3, 1, 3]);
+        let opacities = Vec::<f32>::try_from(fitted.opacities.flatten(0, 1)).unwrap();
+        assert!((opacities[0] - 0.4).abs() < 0.01 && opacities[1] == 0.1, "{opacities:?}");
+    }
+}
