@@ -339,7 +339,7 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
     let weights = tiny_weights(folder.path(), &room);
     let (splat, config) = (room.join("truth.ply"), tiny_config(folder.path(), &room));
     // A file where a folder has to be: no rights to bypass, even for root.
-    let blocked = room.join("cameras.json").join("below");
+    let blocked = room.join("cameras.json").join("below.ply");
     let before = std::fs::read(room.join("cameras.json")).unwrap();
     for arguments in [
         &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&blocked)][..],
@@ -348,11 +348,13 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
         &["train", "--config", arg(&config), "--out", arg(&blocked)],
         &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&blocked)],
     ] {
-        assert_says(&refuse(arguments), &["cameras.json/below can't be written"]);
+        assert_says(&refuse(arguments), &["cameras.json/below.ply can't be written"]);
     }
     assert_eq!(std::fs::read(room.join("cameras.json")).unwrap(), before);
+    let taken = folder.path().join("taken.ply");
+    std::fs::create_dir(&taken).unwrap();
     let error =
-        refuse(&["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&room)]);
+        refuse(&["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&taken)]);
     assert_says(&error, &["a folder", "the name of a file"]);
 }
 

@@ -609,3 +609,25 @@ fn convert_tells_what_is_lost() {
     let higher = common::program::globalsplat(&["convert", arg(&truth), arg(&out), "--sh-degree", "4"]);
     assert_eq!(higher.status.code(), Some(2));
 }
+
+/// Coefficients beyond SPZ's bounds are cut off where nobody looks, and changed for others where a capture says who does.
+#[test]
+fn convert_keeps_what_a_capture_sees() {
+    let (folder, room) = room();
+    let strong = folder.path().join("strong.ply");
+    let splat = read_splat(&room.join("truth.ply")).unwrap().with_sh_degree(3);
+    let size = splat.gaussians.sh.size();
+    splat.gaussians.sh.narrow(2, 1, 15).copy_(&(Random::new(3).symmetric(&[1, size[1], 15, 3]) * 3.));
+    write_splat(&strong, &splat).unwrap();
+    let cameras = globalsplat::data::open_capture(&room).unwrap().cameras();
+    for (ending, gain) in [("spz", 6.), ("splat", 0.5)] {
+        let psnr = |options: &[&str]| {
+            let to = folder.path().join(format!("a.{ending}"));
+            succeed(&[&["convert", arg(&strong), arg(&to)], options].concat());
+            let copy = read_splat(&to).unwrap();
+            globalsplat::eval::psnr_between(&splat.gaussians, &copy.gaussians, &cameras).unwrap().unwrap()
+        };
+        let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
+        assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
+    }
+}

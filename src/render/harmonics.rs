@@ -1,4 +1,4 @@
-//! Spherical harmonics within bounds, or of fewer degrees, that show a capture's cameras what they saw before (spec 10.14).
+//! Spherical harmonics within bounds, or of fewer degrees, that show a capture's cameras what they saw before (spec 10.15).
 //!
 //! Files that keep a byte for a coefficient hold none beyond a bound. Cutting off what is beyond changes colours everywhere, though
 //! cameras look at a Gaussian from few sides, from which other coefficients would show the same.
@@ -19,8 +19,9 @@ const ROUNDS: usize = 40;
 /// How much too dark a Gaussian may be before it is made more opaque, and how opaque at most.
 const TOO_DARK: f64 = 1.05;
 const MAX_OPACITY: f64 = 0.98;
-/// What a picture counts for that doesn't show the middle of a Gaussian, beside one that does.
-const OUTSIDE: f64 = 0.01;
+/// Standard deviations that a Gaussian reaches, and what a picture counts for that it doesn't reach, beside one that it does.
+const REACH: f64 = 2.;
+const OUTSIDE: f64 = 1e-6;
 /// Nearer than this, nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
@@ -47,8 +48,8 @@ impl HarmonicLimits {
 /// Gaussian whose coefficients aren't, those that show them its colours best. One that would be too dark becomes more opaque.
 pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &HarmonicLimits) -> Gaussians {
     let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
-    let (means, opacities, sh) =
-        (numbers(&gaussians.means), numbers(&gaussians.opacities), numbers(&gaussians.sh));
+    let (means, scales) = (numbers(&gaussians.means), numbers(&gaussians.scales));
+    let (opacities, sh) = (numbers(&gaussians.opacities), numbers(&gaussians.sh));
     let bases = gaussians.sh.size()[2] as usize;
     let fitted: Vec<_> = (0..opacities.len())
         .into_par_iter()
@@ -58,7 +59,9 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
                 coefficients[basis] = [0, 1, 2].map(|channel| f64::from(colour[channel]));
             }
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
-            Fit::of(mean, coefficients, cameras, limits).best(f64::from(opacities[index]))
+            let radius =
+                scales[3 * index..][..3].iter().fold(0., |largest: f64, &s| largest.max(f64::from(s)));
+            Fit::of(mean, REACH * radius, coefficients, cameras, limits).best(f64::from(opacities[index]))
         })
         .collect();
     let kept = bases.min(((limits.degree + 1) * (limits.degree + 1)) as usize);
@@ -87,10 +90,16 @@ struct Fit<'a> {
 }
 
 impl<'a> Fit<'a> {
-    fn of(mean: DVec3, original: Coefficients, cameras: &[Camera], limits: &'a HarmonicLimits) -> Self {
+    fn of(
+        mean: DVec3,
+        radius: f64,
+        original: Coefficients,
+        cameras: &[Camera],
+        limits: &'a HarmonicLimits,
+    ) -> Self {
         let mut seen: Vec<_> = cameras
             .iter()
-            .filter_map(|camera| Some((basis_towards(camera, mean), weight(camera, mean)?)))
+            .filter_map(|camera| Some((basis_towards(camera, mean), weight(camera, mean, radius)?)))
             .collect();
         let total: f64 = seen.iter().map(|(_, weight)| weight).sum();
         seen.iter_mut().for_each(|(_, weight)| *weight /= total);
@@ -130,44 +139,44 @@ impl<'a> Fit<'a> {
         })
     }
 
-    /// The least Δᵀ·cost·Δ, Δ what the coefficients change by, within the limits: one coefficient after the other, round by round.
     fn solve(&self) -> Coefficients {
         let mut solution = self.clamped(&self.original);
-        for channel in 0..3 {
-            let mut slope: [f64; BASES] = std::array::from_fn(|row| {
-                let change = |basis: usize| solution[basis][channel] - self.original[basis][channel];
-                (0..BASES).map(|basis| self.cost[row][basis] * change(basis)).sum()
-            });
-            for _ in 0..ROUNDS {
-                for basis in 0..BASES {
-                    let (low, high) = self.limits.of(basis);
-                    let before = solution[basis][channel];
-                    let after = (before - slope[basis] / self.cost[basis][basis]).clamp(low, high);
-                    solution[basis][channel] = after;
-                    let costs = self.cost[basis].iter();
-                    slope.iter_mut().zip(costs).for_each(|(slope, cost)| *slope += cost * (after - before));
-                }
-            }
-        }
+        (0..3).for_each(|channel| self.solve_channel(channel, &mut solution));
         solution
     }
 
-    /// By what the colours of `fitted` would have to be multiplied, of the channel that needs it most.
+    /// The least Δᵀ·cost·Δ, Δ what the coefficients change by, within the limits: one coefficient after the other, round by round.
+    fn solve_channel(&self, channel: usize, solution: &mut Coefficients) {
+        let mut slope: [f64; BASES] = std::array::from_fn(|row| {
+            let change = |basis: usize| solution[basis][channel] - self.original[basis][channel];
+            (0..BASES).map(|basis| self.cost[row][basis] * change(basis)).sum()
+        });
+        for _ in 0..ROUNDS {
+            for (basis, costs) in self.cost.iter().enumerate() {
+                let (low, high) = self.limits.of(basis);
+                let before = solution[basis][channel];
+                let after = (before - slope[basis] / costs[basis]).clamp(low, high);
+                solution[basis][channel] = after;
+                slope.iter_mut().zip(costs).for_each(|(slope, cost)| *slope += cost * (after - before));
+            }
+        }
+    }
+
+    /// By what the colours of `fitted` would have to be multiplied, to be nearest to the original's.
     fn darkness(&self, fitted: &Coefficients) -> f64 {
         let colour = |coefficients: &Coefficients, basis: &[f64; BASES], channel: usize| {
             let sum: f64 = basis.iter().zip(coefficients).map(|(y, of_basis)| y * of_basis[channel]).sum();
             (sum + 0.5).max(0.)
         };
-        let of_channel = |channel: usize| {
-            let (mut product, mut square) = (0., 0.);
-            for (basis, weight) in &self.seen {
+        let (mut product, mut square) = (0., 0.);
+        for (basis, weight) in &self.seen {
+            for channel in 0..3 {
                 let (was, is) = (colour(&self.original, basis, channel), colour(fitted, basis, channel));
                 product += weight * was * is;
                 square += weight * is * is;
             }
-            if square > 0. { product / square } else { 1. }
-        };
-        (0..3).map(of_channel).fold(1., f64::max)
+        }
+        if square > 0. { product / square } else { 1. }
     }
 }
 
@@ -179,13 +188,14 @@ fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
     basis
 }
 
-/// As many pixels as what is at `mean` covers in the picture of `camera`, but for a factor; none where it is behind. What isn't in
-/// the picture counts little: of a large Gaussian, a part may be.
-fn weight(camera: &Camera, mean: DVec3) -> Option<f64> {
+/// As many pixels as a Gaussian covers in the picture of `camera`, but for a factor, where its `radius` reaches into the picture;
+/// none where its middle is behind.
+fn weight(camera: &Camera, mean: DVec3, radius: f64) -> Option<f64> {
     let seen = camera.c2w.inverse().transform_point3(mean);
     let (k, width, height) = (camera.intrinsics, f64::from(camera.width), f64::from(camera.height));
     let (x, y) = (k.fx * seen.x / seen.z + k.cx, k.fy * seen.y / seen.z + k.cy);
-    let inside = (0. ..=width).contains(&x) && (0. ..=height).contains(&y);
+    let (wide, high) = (k.fx * radius / seen.z, k.fy * radius / seen.z);
+    let inside = (-wide..=width + wide).contains(&x) && (-high..=height + high).contains(&y);
     let factor = if inside { 1. } else { OUTSIDE };
     (seen.z > NEAR).then(|| factor * k.fx * k.fy / (seen.z * seen.z))
 }

@@ -1,4 +1,4 @@
-//! antimatter15's `.splat`, 32 bytes a Gaussian and nothing else (spec 10.13).
+//! antimatter15's `.splat`, 32 bytes a Gaussian and nothing else (spec 10.14).
 
 use super::Splat;
 use super::values::{Values, normalized};

@@ -1,4 +1,4 @@
-//! PlayCanvas' compressed PLY (spec 10.11): four words of 32 bits a Gaussian, of numbers between the bounds of 256 of them, and
+//! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits a Gaussian, of numbers between the bounds of 256 of them, and
 //! a byte for each spherical harmonic above degree 0.
 
 use super::Splat;

@@ -1,4 +1,4 @@
-//! Niantic's SPZ (spec 10.12): a byte for most numbers, all Gaussians' of a kind one after the other, compressed. Versions 1 to 4
+//! Niantic's SPZ (spec 10.13): a byte for most numbers, all Gaussians' of a kind one after the other, compressed. Versions 1 to 4
 //! are read. Version 3 is written: it is the oldest whose rotations are exact enough, and what reads version 4 reads it, too.
 
 mod axes;
