@@ -4,7 +4,7 @@ use super::{file, folder, load};
 use globalsplat::config::Config;
 use globalsplat::data::{Chunk, Dataset, Split, open_capture, points_of, read_camera_path};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
-use globalsplat::io::{decode_photo, read_splat, read_weights};
+use globalsplat::io::{decode_photo, read_splat, read_weights, write_splat};
 use globalsplat::reconstruct::load_model;
 use globalsplat::train::latest_checkpoint;
 use std::path::Path;
@@ -108,6 +108,22 @@ pub fn photo(bytes: &[u8]) {
 
 pub fn ply(bytes: &[u8]) {
     let _ = read_splat(&file("ply", "splat.ply", bytes));
+}
+
+pub fn compressed_ply(bytes: &[u8]) {
+    let _ = read_splat(&file("compressed_ply", "splat.compressed.ply", bytes));
+}
+
+pub fn spz(bytes: &[u8]) {
+    let _ = read_splat(&file("spz", "splat.spz", bytes));
+}
+
+/// A `.splat`; one that is read has to come back when it was written.
+pub fn antimatter(bytes: &[u8]) {
+    let Ok(splat) = read_splat(&file("antimatter", "splat.splat", bytes)) else { return };
+    let copy = file("antimatter", "copy.splat", b"");
+    write_splat(&copy, &splat).unwrap();
+    assert_eq!(read_splat(&copy).unwrap().gaussians.count(), splat.gaussians.count());
 }
 
 pub fn weights(bytes: &[u8]) {

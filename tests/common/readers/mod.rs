@@ -9,6 +9,7 @@ mod made_captures;
 mod made_chunks;
 mod made_configurations;
 mod made_models;
+mod made_spzs;
 
 use globalsplat::data::Capture;
 use std::fs;
@@ -19,7 +20,8 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 24] = [
+pub const READERS: [(&str, Reader); 28] = [
+    ("antimatter", files::antimatter),
     ("cameras_json", files::cameras_json),
     ("checkpoint", files::checkpoint),
     ("chunk", files::chunk),
@@ -27,6 +29,7 @@ pub const READERS: [(&str, Reader); 24] = [
     ("colmap_binary", files::colmap_binary),
     ("colmap_points", files::colmap_points),
     ("colmap_text", files::colmap_text),
+    ("compressed_ply", files::compressed_ply),
     ("configuration", files::configuration),
     ("dataset_index", files::dataset_index),
     ("evaluation", files::evaluation),
@@ -36,11 +39,13 @@ pub const READERS: [(&str, Reader); 24] = [
     ("made_colmap", made_captures::colmap),
     ("made_configuration", made_configurations::configuration),
     ("made_ply", made_models::ply),
+    ("made_spz", made_spzs::spz),
     ("made_transforms", made_captures::transforms),
     ("made_weights", made_models::weights),
     ("photo", files::photo),
     ("ply", files::ply),
     ("shard_index", files::shard_index),
+    ("spz", files::spz),
     ("transforms_json", files::transforms_json),
     ("weights", files::weights),
     ("weights_pickle", made_chunks::weights_pickle),
