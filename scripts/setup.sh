@@ -2,7 +2,7 @@
 # Finds a Rust toolchain, a C++ compiler, Python and libtorch, and says in one clear line which is missing. The weights of
 # LPIPS come along where they can be had; without them evaluation leaves LPIPS out.
 #   setup.sh           what building needs: libtorch comes in .venv, unless LIBTORCH names one already
-#   setup.sh venv      .venv in any case: the parity checks run in it
+#   setup.sh venv      .venv in any case: the parity checks run in it, and packages of Node.js where that is there
 #   setup.sh weights   the weights, or a failure
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -62,6 +62,18 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
 fi
 # Cargo looks for libtorch here (.cargo/config.toml), whatever the Python version is called.
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch
+
+# Other programs' readers of splats, which tests compare ours with. Without Node.js, or a registry, these tests are skipped.
+if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true ] && command -v npm >/dev/null \
+    && ! cmp -s parity/npm/package-lock.json parity/npm/node_modules/.installed; then
+    echo "setup: installing what parity/npm pins" >&2
+    if (cd parity/npm && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error >/dev/null); then
+        cp parity/npm/package-lock.json parity/npm/node_modules/.installed
+    else
+        rm -rf parity/npm/node_modules
+        echo "setup: npm can't install it; tests that need it are skipped" >&2
+    fi
+fi
 
 weights --if-possible
 if [ -n "${early:-}" ]; then
