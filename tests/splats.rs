@@ -4,7 +4,7 @@ mod common;
 
 use common::program::{arg, refuse, room, succeed};
 use common::{Random, largest_error};
-use globalsplat::io::{Splat, find_splat, read_splat, write_splat};
+use globalsplat::io::{Splat, find_splat, fit_splat, read_splat, write_splat};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Camera, Gaussians, Intrinsics};
 use serde_json::Value;
@@ -630,4 +630,21 @@ fn convert_keeps_what_a_capture_sees() {
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
         assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
     }
+    // Who has the capture at hand needs no telling; who hasn't is told.
+    let (out, own) = (folder.path().join("b.spz"), folder.path().join("b.ply"));
+    let said = |more: &[&str]| {
+        let done = common::program::globalsplat(&[&["convert", arg(&strong), arg(&out)], more].concat());
+        String::from_utf8(done.stderr).unwrap()
+    };
+    assert!(said(&[]).contains("beyond what the format holds"), "{}", said(&[]));
+    assert_eq!(said(&["--scene", arg(&room)]), "");
+    for to in [&out, &own] {
+        let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
+        succeed(&[&refine[..], &[arg(to)]].concat());
+    }
+    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap().gaussians);
+    let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
+    let cut = fit_splat(&out, &Splat { gaussians: large.map(Tensor::copy) }, 3, &[]).unwrap().gaussians;
+    let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
+    assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
 }

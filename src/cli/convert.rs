@@ -7,6 +7,7 @@ use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_
 use globalsplat::scene::ImageSize;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use tch::Kind;
 
 /// On an orbit around a splat whose capture isn't named.
 const VIEWS: usize = 8;
@@ -61,6 +62,9 @@ impl Convert {
             Some(capture) => capture.cameras(),
             None => orbit_around_splat(&original, SIZE, VIEWS),
         };
+        if capture.is_none() {
+            tell_cut(&self.to, &original, degree)?;
+        }
         let psnr = psnr_between(&original.gaussians, &copy.gaussians, &cameras)?;
         let views = cameras.len();
         if self.json {
@@ -75,6 +79,22 @@ impl Convert {
         }
         Ok(())
     }
+}
+
+/// Says so where coefficients are beyond what the format of `path` holds, and nobody said for which cameras that matters.
+fn tell_cut(path: &Path, original: &Splat, degree: i64) -> Result<()> {
+    let held = fit_splat(path, original, degree, &[])?.gaussians.sh;
+    let cut = original.gaussians.sh.narrow(2, 0, held.size()[2]).not_equal_tensor(&held);
+    let share = cut.to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+    if share > 0. {
+        eprintln!(
+            "{}: {:.1} % of the colours' coefficients are beyond what the format holds and cut off; --scene, with the cameras that \
+             matter, loses less",
+            path.display(),
+            100. * share
+        );
+    }
+    Ok(())
 }
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {

@@ -6,7 +6,9 @@ use glam::DMat4;
 use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
-use globalsplat::io::{Splat, check_writable_file, check_writable_splat, read_splat, write_png, write_splat};
+use globalsplat::io::{
+    Splat, check_writable_file, check_writable_splat, fit_splat, read_splat, write_png, write_splat,
+};
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
     Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
@@ -180,7 +182,8 @@ impl Refine {
             (gaussians, after) = (first, before.clone());
             corrected.clear();
         }
-        write_splat(&self.out, &Splat::of(&gaussians)?)?;
+        let splat = Splat::of(&gaussians)?;
+        write_splat(&self.out, &fit_splat(&self.out, &splat, splat.sh_degree(), &capture.cameras())?)?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
             write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;

@@ -42,6 +42,13 @@ impl HarmonicLimits {
         let bases = (self.degree + 1) * (self.degree + 1);
         if (basis as i64) < bases { (*range.start(), *range.end()) } else { (0., 0.) }
     }
+
+    fn clamped(&self, coefficients: &Coefficients) -> Coefficients {
+        std::array::from_fn(|basis| {
+            let (low, high) = self.of(basis);
+            coefficients[basis].map(|coefficient| coefficient.clamp(low, high))
+        })
+    }
 }
 
 /// The same Gaussians, [1, N, ..] in float32 on the host, with coefficients within `limits`: the nearest, or where `cameras` see a
@@ -57,6 +64,9 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
             let mut coefficients = [[0.; 3]; BASES];
             for (basis, colour) in sh[3 * bases * index..][..3 * bases].chunks_exact(3).enumerate() {
                 coefficients[basis] = [0, 1, 2].map(|channel| f64::from(colour[channel]));
+            }
+            if limits.clamped(&coefficients) == coefficients {
+                return (coefficients, f64::from(opacities[index]));
             }
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
             let radius =
@@ -115,9 +125,8 @@ impl<'a> Fit<'a> {
 
     /// The coefficients, and the opacity.
     fn best(mut self, opacity: f64) -> (Coefficients, f64) {
-        let within = self.clamped(&self.original);
-        if within == self.original || self.seen.is_empty() {
-            return (within, opacity);
+        if self.seen.is_empty() {
+            return (self.limits.clamped(&self.original), opacity);
         }
         let fitted = self.solve();
         let dark = self.darkness(&fitted);
@@ -132,15 +141,8 @@ impl<'a> Fit<'a> {
         (self.solve(), raised)
     }
 
-    fn clamped(&self, coefficients: &Coefficients) -> Coefficients {
-        std::array::from_fn(|basis| {
-            let (low, high) = self.limits.of(basis);
-            coefficients[basis].map(|coefficient| coefficient.clamp(low, high))
-        })
-    }
-
     fn solve(&self) -> Coefficients {
-        let mut solution = self.clamped(&self.original);
+        let mut solution = self.limits.clamped(&self.original);
         (0..3).for_each(|channel| self.solve_channel(channel, &mut solution));
         solution
     }
