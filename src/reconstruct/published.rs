@@ -1,4 +1,4 @@
-//! Weights that come without a configuration of ours: the authors' checkpoints, and anybody's state dicts.
+//! Weights that come without a configuration of ours: the authors' checkpoints, and anybody's state dicts (spec 10.16).
 
 use crate::config::Config;
 use crate::error::{Error, Result};

@@ -1,5 +1,5 @@
 //! What torch.save writes, read without torch: a pickle, and the bytes of the tensors that it describes. Nothing that a file says is
-//! run, and nothing that it says about sizes is believed.
+//! run, and nothing that it says about sizes is believed (spec 10.16).
 
 mod archive;
 mod array;
