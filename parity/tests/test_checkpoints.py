@@ -194,6 +194,10 @@ def test_tensors_may_share_storages_and_lie_in_them_as_they_like(weights, tmp_pa
             assert not state[name].is_contiguous()
     state = {name: torch.nn.Parameter(tensor) for name, tensor in state.items()}
     state["twice"] = state["scene_tokens"]
+    # Attributes make torch save them in other ways.
+    state["slot_encoder.scale_emb"].tag = "a parameter"
+    state["slot_encoder.mem_regs"] = weights["slot_encoder.mem_regs"].clone()
+    state["slot_encoder.mem_regs"].tag = "a tensor"
     file = tmp_path / "model.pt"
     torch.save(state, file, _use_new_zipfile_serialization=not legacy)
     read, _ = imported(file, tmp_path / "model.safetensors")
@@ -299,6 +303,9 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
     assert shards[1] in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
     error = refuse("import", "--from", model, "--out", model, "--max-shard-size", "1KB")
     assert "would be taken for the shards" in error
+    config = model.with_name("config.toml")
+    as_torch = ["--config", config, "--format", "torch", "--out", tmp_path / "a.ckpt", "--max-shard-size", "1KB"]
+    assert "a checkpoint for torch is one file" in refuse("export", *as_torch)
     described["weight_map"]["scene_tokens"] = "../model.safetensors"
     index.write_text(json.dumps(described))
     assert "beside the index" in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")

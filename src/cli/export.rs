@@ -35,7 +35,7 @@ pub struct Export {
 
 impl Export {
     pub fn run(self) -> Result<()> {
-        self.out.check()?;
+        self.out.check(self.format)?;
         let (vs, config, stage) = match (&self.run, &self.config) {
             (Some(run), _) => {
                 let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };

@@ -29,7 +29,7 @@ pub struct Import {
 
 impl Import {
     pub fn run(self) -> Result<()> {
-        self.out.check()?;
+        self.out.check(Format::Safetensors)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
         let loaded = file.load(Device::Cpu)?;

@@ -3,6 +3,7 @@
 use super::{model, print_json};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
+use globalsplat::Error;
 use globalsplat::config::Config;
 use globalsplat::io::{check_writable_file, write_sharded};
 use globalsplat::model::Stage;
@@ -10,6 +11,9 @@ use globalsplat::reconstruct::{ModelDtype, model_weights, save_checkpoint};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use tch::nn;
+
+/// In bytes, as Hugging Face's libraries have it.
+const MAX_SHARD_SIZE: u64 = 5_000_000_000;
 
 #[derive(Args)]
 pub struct WeightsOut {
@@ -19,9 +23,9 @@ pub struct WeightsOut {
     /// How weights are stored
     #[arg(long, value_enum, default_value = "f32")]
     dtype: Dtype,
-    /// Weights in more bytes than this go to several files with an index; as in 500MB or 5GB
-    #[arg(long, value_name = "SIZE", default_value = "5GB", value_parser = parse_size)]
-    max_shard_size: u64,
+    /// Weights in more bytes than this go to several safetensors files with an index, as in 500MB; by default 5GB
+    #[arg(long, value_name = "SIZE", value_parser = parse_size)]
+    max_shard_size: Option<u64>,
     /// Print what was written as one JSON object
     #[arg(long)]
     json: bool,
@@ -42,7 +46,11 @@ pub enum Format {
 }
 
 impl WeightsOut {
-    pub fn check(&self) -> Result<()> {
+    pub fn check(&self, format: Format) -> Result<()> {
+        if format == Format::Torch && self.max_shard_size.is_some() {
+            let why = "--max-shard-size: a checkpoint for torch is one file, expected --format safetensors";
+            return Err(Error::Request(why.into()).into());
+        }
         Ok(check_writable_file(&self.out)?)
     }
 
@@ -62,7 +70,9 @@ impl WeightsOut {
         let weights = model_weights(vs, config, stage, dtype);
         let bytes: usize = weights.tensors.values().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
         let written = match format {
-            Format::Safetensors => write_sharded(&self.out, &weights, self.max_shard_size)?,
+            Format::Safetensors => {
+                write_sharded(&self.out, &weights, self.max_shard_size.unwrap_or(MAX_SHARD_SIZE))?
+            }
             Format::Torch => {
                 save_checkpoint(&self.out, weights)?;
                 self.out.clone()

@@ -4,11 +4,12 @@ use super::value::{Rebuild, Value};
 use tch::Kind;
 
 /// What tensors are put together by.
-const KNOWN: [(&str, &str, Value); 22] = [
+const KNOWN: [(&str, &str, Value); 23] = [
     ("torch._utils", "_rebuild_tensor", Value::Rebuild(Rebuild::View)),
     ("torch._utils", "_rebuild_tensor_v2", Value::Rebuild(Rebuild::View)),
     ("torch._utils", "_rebuild_parameter", Value::Rebuild(Rebuild::Parameter)),
     ("torch._utils", "_rebuild_parameter_with_state", Value::Rebuild(Rebuild::Parameter)),
+    ("torch._tensor", "_rebuild_from_type_v2", Value::Rebuild(Rebuild::OfClass)),
     ("collections", "OrderedDict", Value::OrderedDict),
     ("torch", "ByteStorage", Value::Dtype(Kind::Uint8)),
     ("torch", "CharStorage", Value::Dtype(Kind::Int8)),
@@ -31,7 +32,7 @@ const KNOWN: [(&str, &str, Value); 22] = [
 
 /// Functions and classes that put data together and do nothing else when Python calls them: what settings, optimizers and the state
 /// of a training are made of.
-const HARMLESS: [(&str, &[&str]); 20] = [
+const HARMLESS: [(&str, &[&str]); 19] = [
     ("__builtin__", BUILTINS),
     ("builtins", BUILTINS),
     ("_codecs", &["encode"]),
@@ -49,7 +50,6 @@ const HARMLESS: [(&str, &[&str]); 20] = [
     ("pathlib", &["Path", "PosixPath", "PurePosixPath", "PureWindowsPath", "WindowsPath"]),
     ("pathlib._local", &["Path", "PosixPath", "PurePosixPath", "PureWindowsPath", "WindowsPath"]),
     ("torch", &["Size", "device"]),
-    ("torch._tensor", &["_rebuild_from_type_v2"]),
     ("torch._utils", &["_rebuild_qtensor", "_rebuild_sparse_tensor", "_rebuild_tensor_v3"]),
     ("torch.serialization", &["_get_layout"]),
 ];

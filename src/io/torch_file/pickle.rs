@@ -200,6 +200,12 @@ impl<'a> Machine<'a> {
             {
                 Ok(self.values[data].clone())
             }
+            (Value::Rebuild(Rebuild::OfClass), &[function, _class, arguments, ..]) => {
+                match &self.values[function] {
+                    Value::Rebuild(Rebuild::View | Rebuild::Parameter) => self.call(function, arguments),
+                    _ => Ok(Value::Object(vec![])),
+                }
+            }
             (Value::Rebuild(_), &[data, ..]) if is_object(data) => Ok(Value::Object(vec![])),
             (Value::Rebuild(_), _) => {
                 Err("a pickle with a tensor of other than storage, offset, size and stride".into())

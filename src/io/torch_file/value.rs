@@ -51,6 +51,8 @@ pub(crate) enum Rebuild {
     View,
     /// Of a tensor: a parameter of a model.
     Parameter,
+    /// Of what makes a tensor, a class, the arguments for the first, and attributes.
+    OfClass,
 }
 
 impl Value<'_> {
