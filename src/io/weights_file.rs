@@ -217,7 +217,9 @@ fn dimensions(sizes: &[usize]) -> Vec<i64> {
 
 /// Where the tensors of a safetensors file lie in its `bytes`.
 fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
-    let broken = |e: SafeTensorError| Error::input(path, "the file", format!("broken ({e})"), "safetensors");
+    let broken = |e: SafeTensorError| {
+        Error::input(path, "the file", format!("broken ({e})"), "safetensors, or what torch.save writes")
+    };
     let (header_length, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
     SafeTensors::deserialize(bytes).map_err(broken)?;
     /// Of the header's length.
