@@ -109,6 +109,11 @@ impl Error {
 
     /// Whether the request was wrong (exit code 2) rather than the work having failed (exit code 1).
     pub fn is_request(&self) -> bool {
-        matches!(self, Error::Input { .. } | Error::Request(_) | Error::Read { .. })
+        match self {
+            Error::Input { .. } | Error::Request(_) => true,
+            // A file for which there is no room to be mapped is all right.
+            Error::Read { source, .. } => source.kind() != std::io::ErrorKind::OutOfMemory,
+            _ => false,
+        }
     }
 }
