@@ -47,6 +47,7 @@ EXCEPTED = {
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
     "src/model/precision.rs": "every case of the encoder runs in float32; tests/model.rs holds bf16 against it",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
+    "src/model/shapes.rs": "a configuration read off shapes; parity/tests/test_checkpoints.py holds it against models made here",
     "src/loss/config.rs": "factors",
     "src/loss/terms.rs": "names of the terms, and their weighted sum, which its own test holds",
     "src/loss/mod.rs": "what the terms look at; they are held one by one",
