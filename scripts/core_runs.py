@@ -41,6 +41,18 @@ def train(run, config, settings, **variables):
     return json.loads(result.read_text())
 
 
+def told(*command):
+    """What a command of the program told."""
+    return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
+
+
+def told_once(file, *command):
+    """The same, which `file` keeps: it isn't run again."""
+    if not file.is_file():
+        file.write_text(json.dumps(told(*command)))
+    return json.loads(file.read_text())
+
+
 def row(*cells):
     """Of a Markdown table."""
     print("|", " | ".join(cells), "|", flush=True)

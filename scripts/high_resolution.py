@@ -8,11 +8,9 @@ Prints a Markdown table for each capture. What is done stays done.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
-from core_runs import PROGRAM, row
+from core_runs import row, told_once
 
 SETTINGS = {"small": "as in training", "polyphase": "polyphase", "whole": "whole", "repeated": "repeated"}
 
@@ -20,14 +18,11 @@ SETTINGS = {"small": "as in training", "polyphase": "polyphase", "whole": "whole
 def scored(arguments, capture, setting, phase, pictures):
     """What `eval` told."""
     folder, holdout = capture
-    told = arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json"
-    if not told.is_file():
-        command = [PROGRAM, "eval", "--weights", arguments.weights, "--scene", folder, "--holdout", holdout]
-        command += ["--views", str(arguments.views), "--pictures-at", str(pictures), "--json"]
-        if setting != "small":
-            command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
-        told.write_text(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
-    return json.loads(told.read_text())
+    command = ["eval", "--weights", arguments.weights, "--scene", folder, "--holdout", holdout]
+    command += ["--views", str(arguments.views), "--pictures-at", str(pictures)]
+    if setting != "small":
+        command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
+    return told_once(arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json", *command)
 
 
 def main():

@@ -8,17 +8,11 @@ scored by the photos. Prints a Markdown table.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
-from core_runs import PROGRAM, row
+from core_runs import row, told
 
 ENDINGS = ["ply", "compressed.ply", "spz", "splat"]
-
-
-def told(*command):
-    return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
 
 
 def photos_psnr(splat, capture):

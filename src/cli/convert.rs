@@ -1,7 +1,7 @@
 use super::{print_json, render::orbit_around_splat};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
+use globalsplat::data::{Capture, open_capture};
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
 use globalsplat::scene::ImageSize;
@@ -50,11 +50,9 @@ impl Convert {
         // Before the file is replaced, if it is the same.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.unwrap_or(original.sh_degree());
-        let made = match &capture {
-            Some(capture) => fit_splat(&self.to, &original, degree, &capture.cameras())?,
-            None => original.with_sh_degree(degree),
-        };
-        write_splat(&self.to, &made.with_sh_degree(degree))?;
+        let fit = |capture: &Capture| fit_splat(&self.to, &original, degree, &capture.cameras());
+        let fitted = capture.as_ref().map(fit).transpose()?;
+        write_splat(&self.to, &fitted.as_ref().unwrap_or(&original).with_sh_degree(degree))?;
         let copy = read_splat(&self.to)?;
         let to = description(&self.to, &copy)?;
 

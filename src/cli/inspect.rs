@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
-use globalsplat::io::{WeightsFile, is_splat_name, read_splat};
+use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -26,8 +26,7 @@ impl Inspect {
     pub fn run(self) -> Result<()> {
         let object = match self.path.extension().and_then(|e| e.to_str()) {
             _ if is_splat_name(&self.path) => splat(&self.path)?,
-            _ if self.path.to_string_lossy().ends_with(".safetensors.index.json") => weights(&self.path)?,
-            Some("safetensors" | "ckpt" | "pt" | "pth") => weights(&self.path)?,
+            _ if is_weights_name(&self.path) => weights(&self.path)?,
             Some("torch") => chunk(&self.path)?,
             Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
@@ -87,19 +86,20 @@ fn weights(path: &Path) -> Result<Value> {
     let mut kinds: Vec<String> = shapes.values().map(|(kind, _)| format!("{kind:?}")).collect();
     kinds.sort();
     kinds.dedup();
+    let bytes = std::fs::metadata(weights.path())?.len();
+    let [configuration, stage] = [CONFIG_KEY, STAGE_KEY].map(|key| weights.metadata().get(key).cloned());
     // Of weights without a configuration, what their shapes tell.
-    let model = ModelFile::open(path, &[]).ok();
-    let configuration = weights.metadata().get(CONFIG_KEY).cloned();
+    let model = ModelFile::of(weights, &[]).ok();
     let configuration = configuration.or(model.as_ref().map(|model| model.config.to_toml()));
     Ok(json!({
         "kind": "weights",
         "tensors": shapes.len(),
         "numbers": numbers,
         "types": kinds,
-        "bytes": std::fs::metadata(weights.path())?.len(),
+        "bytes": bytes,
         "taken_for": model.and_then(|model| model.assumed),
         "configuration": configuration,
-        "stage": weights.metadata().get(STAGE_KEY).map_or("final", String::as_str),
+        "stage": stage.as_deref().unwrap_or("final"),
     }))
 }
 

@@ -5,7 +5,7 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::peak_memory_bytes;
-use globalsplat::io::{Splat, check_writable_splat, fit_splat, write_splat};
+use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
@@ -101,8 +101,7 @@ impl Reconstruct {
             eprintln!("{line}");
         }
         let reconstruction = reconstruct(Model { input, ..Model::from(&loaded) }, &photos, &[])?;
-        let splat = Splat::of(&reconstruction.in_world())?;
-        write_splat(&self.out, &fit_splat(&self.out, &splat, splat.sh_degree(), &capture.cameras())?)?;
+        write_splat_for(&self.out, &Splat::of(&reconstruction.in_world())?, &capture.cameras())?;
 
         let bytes = std::fs::metadata(&self.out)?.len();
         let views = photos.len() * input.views_of_photo();

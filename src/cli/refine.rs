@@ -7,7 +7,7 @@ use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{
-    Splat, check_writable_file, check_writable_splat, fit_splat, read_splat, write_png, write_splat,
+    Splat, check_writable_file, check_writable_splat, read_splat, write_png, write_splat_for,
 };
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
@@ -182,8 +182,7 @@ impl Refine {
             (gaussians, after) = (first, before.clone());
             corrected.clear();
         }
-        let splat = Splat::of(&gaussians)?;
-        write_splat(&self.out, &fit_splat(&self.out, &splat, splat.sh_degree(), &capture.cameras())?)?;
+        write_splat_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras())?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
             write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;

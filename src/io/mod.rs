@@ -24,10 +24,13 @@ pub use images::{
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::write_sharded;
-pub use splat::{Splat, check_writable_splat, find_splat, fit_splat, is_splat_name, read_splat, write_splat};
+pub use splat::{
+    Splat, check_writable_splat, find_splat, fit_splat, is_splat_name, read_splat, write_splat,
+    write_splat_for,
+};
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};
-pub use weights_file::{WeightsFile, read_weights};
+pub use weights_file::{WeightsFile, is_weights_name, read_weights};
 
 pub(crate) use torch_file::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 

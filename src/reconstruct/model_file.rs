@@ -134,12 +134,16 @@ impl ModelFile {
         Self::of(WeightsFile::open(path)?, overrides)
     }
 
-    fn of(weights: WeightsFile, overrides: &[String]) -> Result<Self> {
+    /// The same of a file that is open.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn of(weights: WeightsFile, overrides: &[String]) -> Result<Self> {
         let path = weights.path().to_owned();
         let text = weights.metadata().get(CONFIG_KEY).cloned();
         let stage = weights.metadata().get(STAGE_KEY).cloned();
         // What `export` wrote as safetensors has the model's names and no others.
-        let (weights, left_out) = match text.is_some() && weights.shapes().keys().any(|name| is_ours(name)) {
+        let (weights, left_out) = match text.is_some() && weights.names().any(is_ours) {
             true => (weights, 0),
             false => model_tensors(weights)?,
         };

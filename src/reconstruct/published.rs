@@ -38,7 +38,7 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
         let parts: Vec<&str> = name.split('.').filter(|part| !WRAPPERS.contains(part)).collect();
         parts.join(".")
     };
-    let names: Vec<String> = file.shapes().keys().map(|name| plain(name)).collect();
+    let names: Vec<String> = file.names().map(plain).collect();
     let prefixes = names.iter().filter_map(|name| name.strip_suffix(ANCHOR));
     let prefixes = prefixes.filter(|prefix| prefix.is_empty() || prefix.ends_with('.'));
     // Of several, such as a moving average's, the one that is trained.
@@ -53,7 +53,7 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
         is_ours(&name).then_some(name)
     };
     let file = file.renamed(of_model);
-    let left_out = names.len() - file.shapes().len();
+    let left_out = names.len() - file.names().len();
     Ok((file, left_out))
 }
 

@@ -4,7 +4,7 @@
 //! cameras look at a Gaussian from few sides, from which other coefficients would show the same.
 
 use crate::scene::{Camera, Gaussians, SH_C0};
-use glam::DVec3;
+use glam::{DMat4, DVec3};
 use globalsplat_csrc::render::sh_basis;
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
@@ -58,6 +58,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
     let (means, scales) = (numbers(&gaussians.means), numbers(&gaussians.scales));
     let (opacities, sh) = (numbers(&gaussians.opacities), numbers(&gaussians.sh));
     let bases = gaussians.sh.size()[2] as usize;
+    let cameras: Vec<_> = cameras.iter().map(|&camera| (camera, camera.c2w.inverse())).collect();
     let fitted: Vec<_> = (0..opacities.len())
         .into_par_iter()
         .map(|index| {
@@ -71,7 +72,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
             let radius =
                 scales[3 * index..][..3].iter().fold(0., |largest: f64, &s| largest.max(f64::from(s)));
-            Fit::of(mean, REACH * radius, coefficients, cameras, limits).best(f64::from(opacities[index]))
+            Fit::of(mean, REACH * radius, coefficients, &cameras, limits).best(f64::from(opacities[index]))
         })
         .collect();
     let kept = bases.min(((limits.degree + 1) * (limits.degree + 1)) as usize);
@@ -104,12 +105,14 @@ impl<'a> Fit<'a> {
         mean: DVec3,
         radius: f64,
         original: Coefficients,
-        cameras: &[Camera],
+        cameras: &[(Camera, DMat4)],
         limits: &'a HarmonicLimits,
     ) -> Self {
         let mut seen: Vec<_> = cameras
             .iter()
-            .filter_map(|camera| Some((basis_towards(camera, mean), weight(camera, mean, radius)?)))
+            .filter_map(|(camera, w2c)| {
+                Some((basis_towards(camera, mean), weight(camera, w2c, mean, radius)?))
+            })
             .collect();
         let total: f64 = seen.iter().map(|(_, weight)| weight).sum();
         seen.iter_mut().for_each(|(_, weight)| *weight /= total);
@@ -192,8 +195,8 @@ fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
 
 /// As many pixels as a Gaussian covers in the picture of `camera`, but for a factor, where its `radius` reaches into the picture;
 /// none where its middle is behind.
-fn weight(camera: &Camera, mean: DVec3, radius: f64) -> Option<f64> {
-    let seen = camera.c2w.inverse().transform_point3(mean);
+fn weight(camera: &Camera, w2c: &DMat4, mean: DVec3, radius: f64) -> Option<f64> {
+    let seen = w2c.transform_point3(mean);
     let (k, width, height) = (camera.intrinsics, f64::from(camera.width), f64::from(camera.height));
     let (x, y) = (k.fx * seen.x / seen.z + k.cx, k.fy * seen.y / seen.z + k.cy);
     let (wide, high) = (k.fx * radius / seen.z, k.fy * radius / seen.z);
@@ -207,7 +210,6 @@ mod tests {
     use super::*;
     use crate::render::render_views;
     use crate::scene::Intrinsics;
-    use glam::DMat4;
     use tch::{Device, Kind};
 
     fn cameras(count: i32) -> Vec<Camera> {

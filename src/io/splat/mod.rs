@@ -156,6 +156,14 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
     (format_of(path)?.write)(path, splat)
 }
 
+/// As [`write_splat`], in spherical harmonics that the format holds and that show `cameras` the same.
+///
+/// # Errors
+/// As there.
+pub fn write_splat_for(path: &Path, splat: &Splat, cameras: &[Camera]) -> Result<()> {
+    write_splat(path, &fit_splat(path, splat, splat.sh_degree(), cameras)?)
+}
+
 /// What `cameras` see of `splat` in spherical harmonics that the format of `path` holds, up to `sh_degree`.
 ///
 /// # Errors

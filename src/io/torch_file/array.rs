@@ -50,13 +50,9 @@ impl Array {
 
     /// Whether the elements lie one after the other, in row-major order.
     pub fn is_contiguous(&self) -> bool {
-        let mut expected = 1;
+        let steps = self.stride.iter().zip(row_major(&self.size));
         self.bytes.is_empty()
-            || self.size.iter().zip(&self.stride).rev().all(|(&size, &stride)| {
-                let dense = size == 1 || stride == expected;
-                expected *= size;
-                dense
-            })
+            || self.size.iter().zip(steps).all(|(&size, (&stride, dense))| size == 1 || stride == dense)
     }
 }
 
