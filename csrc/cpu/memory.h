@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "../backend.h"
+#include "../raster/lens.h"
 #include "../raster/raster.h"
 
 namespace globalsplat::cpu {
@@ -48,12 +49,8 @@ std::vector<raster::View<T>> views_of(const Inputs& in) {
   std::vector<raster::View<T>> views;
   for (int64_t b = 0; b < in.scenes(); ++b)
     for (int64_t c = 0; c < in.cameras(); ++c) {
-      const T* m = in.w2c.data_ptr<T>() + (b * in.cameras() + c) * 16;
-      const T* k = in.intrinsics.data_ptr<T>() + (b * in.cameras() + c) * 9;
-      views.push_back({{{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]},
-                        {m[3], m[7], m[11]},
-                        k[0], k[4], k[2], k[5]},
-                       int(b)});
+      const int64_t view = b * in.cameras() + c;
+      views.push_back({raster::camera_of(in.w2c.data_ptr<T>() + view * 16, in.intrinsics.data_ptr<T>() + view * 9), int(b)});
     }
   return views;
 }

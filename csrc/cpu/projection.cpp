@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "../raster/kernels.h"
+#include "../raster/lens.h"
 #include "backend.h"
 #include "memory.h"
 

@@ -1,22 +1,10 @@
-// Alpha blending of one 16×16 tile, forward and backward (spec 6.4 and 6.5).
-//
-// For a pixel and the splats in front-to-back order i = 1, 2, …
-//     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
-//     α_i = min(0.999, 2^e_i),            skipped when e_i < −log₂ 255
-//     w_i = T_i α_i,  T_{i+1} = T_i − w_i,  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
-//     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.
-//
-// Backward. With the pictures' gradients g_C, g_A, g_D, ∂D/∂w_i = (z_i − D) / A, so that
-//     q_i = ∂L/∂w_i = g_C·c_i + (g_D / A) z_i + (g_A − g_D D / A)
-//     α_i ∂L/∂α_i = w_i q_i − (Σ_{j>i} w_j q_j) α_i / (1 − α_i) = w_i (q_i − (Σ_{j>i} w_j q_j) / T_{i+1}).
-// The sum over what lies behind is the pixel's total, known from the pictures alone, Q = Σ w_j q_j = g_C·C + g_A A,
-// less what has been passed: the tile is replayed front to back and nothing per pixel has to be stored.
+// Alpha blending of one 16×16 tile, forward and backward: which pixels meet which splats, and when; pixel.h has the maths.
 //
 // The unit of work is a block of 4×4 pixels, which is one vector on AVX-512 and several elsewhere: splats are small and round
-// rather than long, so a square is filled better than a row. Pixels that ended, or lie outside the image, have T = 0:
-// their weights vanish and T_{i+1} ≤ 1e-4 holds for ever, so no other mask is carried.
+// rather than long, so a square is filled better than a row.
 #pragma once
 
+#include "pixel.h"
 #include "simd.h"
 #include "types.h"
 
@@ -47,50 +35,6 @@ inline constexpr int64_t kPrefetch = 12;
 template <class T>
 GS_INLINE void prefetch_splat(const TileJob<T>& job, int64_t item) {
   if (item < job.count) __builtin_prefetch(job.splats + job.entries[item].splat);
-}
-
-// What a splat is at a vector of pixels.
-template <class T>
-struct Exponent {
-  Vector<T> p, r;
-  Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
-};
-
-// And what it does to them.
-template <class T>
-struct Contribution : Exponent<T> {
-  Vector<T> weight;   // 0 also where the pixel ends, or ended before
-  Vector<T> behind;   // T behind the splat
-  Mask<T> goes_on;    // T behind the splat > 1e-4
-};
-
-template <class T>
-GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Exponent<T>& e) {
-  const Vector<T> dx = s.u - x, dy = s.v - y;
-  e.p = fma(broadcast<T>(s.a), dx, s.b * dy);
-  e.r = s.c * dy;
-  const Vector<T> exponent = fnma(e.p, e.p, fnma(e.r, e.r, broadcast<T>(s.log2_opacity)));
-  e.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
-}
-
-template <class T>
-GS_INLINE void blend(Vector<T> transmittance, Contribution<T>& c) {
-  const Vector<T> alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
-  c.behind = fnma(transmittance, alpha, transmittance);
-  c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
-  c.weight = select(c.goes_on, transmittance * alpha, Vector<T>{});
-}
-
-template <class T>
-GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
-  evaluate(s, x, y, c);
-  blend(transmittance, c);
-}
-
-// 0 where the pixel ends.
-template <class T>
-GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c) {
-  return select(c.goes_on, c.behind, Vector<T>{});
 }
 
 // A block's pixels in an image plane, and which of them lie inside the image.
@@ -132,12 +76,6 @@ GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
   for (int k = 0; k < kVectors<T>; ++k) transmittance[k] = load<T>(ones + k * Simd<T>::lanes);
 }
 
-// Sums of a vector of pixels.
-template <class T>
-struct Pixels {
-  Vector<T> transmittance, alpha{}, red{}, green{}, blue{}, z{};
-};
-
 // The tile's list is taken in parts whose splats fit the first-level cache; each vector of pixels goes through those that
 // reach its block with all its sums in registers.
 template <class T>
@@ -175,12 +113,7 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
           const Splat<T>& s = job.splats[list[i]];
           Contribution<T> c;
           contribute(s, x, y, px.transmittance, c);
-          px.alpha += c.weight;
-          px.red = fma(c.weight, broadcast<T>(s.red), px.red);
-          px.green = fma(c.weight, broadcast<T>(s.green), px.green);
-          px.blue = fma(c.weight, broadcast<T>(s.blue), px.blue);
-          px.z = fma(c.weight, broadcast<T>(s.z), px.z);
-          px.transmittance = next_transmittance(c);
+          add(s, c, px);
         }
         goes_on |= any(less(V{}, px.transmittance));
         pixels[block][k] = px;
@@ -200,7 +133,7 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
       green[k] = px.green;
       blue[k] = px.blue;
       alpha[k] = px.alpha;
-      depth[k] = select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), px.z / px.alpha, V{});
+      depth[k] = expected_depth(px);
     }
     store_block(red, at, out.rgb);
     store_block(green, at, out.rgb + plane);
@@ -209,13 +142,6 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
     store_block(depth, at, out.depth);
   }
 }
-
-// What the backward pass knows of a vector of pixels: T, Q less what has been passed, and q_i = g_red·r + g_green·g +
-// g_blue·b + per_z·z + constant.
-template <class T>
-struct PixelGradients {
-  Vector<T> transmittance, remaining, g_red, g_green, g_blue, per_z, constant;
-};
 
 template <class T>
 GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const Pictures<const T>& pictures,
@@ -233,11 +159,8 @@ GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const Picture
   load_block(pictures.depth, at, depth);
   load_block(gradients.depth, at, g_depth);
   for (int k = 0; k < kVectors<T>; ++k) {
-    const V per_z = select(less(broadcast<T>(T(kMinDepthAlpha)), alpha[k]), g_depth[k] / alpha[k], V{});
-    V total = g_alpha[k] * alpha[k];
-    for (int channel = 0; channel < 3; ++channel) total = fma(g_colour[channel][k], colour[channel][k], total);
-    out[k] = {transmittance[k], total, g_colour[0][k], g_colour[1][k], g_colour[2][k], per_z,
-              g_alpha[k] - per_z * depth[k]};
+    const V c[3] = {colour[0][k], colour[1][k], colour[2][k]}, g[3] = {g_colour[0][k], g_colour[1][k], g_colour[2][k]};
+    out[k] = pixel_gradients<T>(transmittance[k], c, alpha[k], depth[k], g, g_alpha[k], g_depth[k]);
   }
 }
 
@@ -273,7 +196,7 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
     const TileEntry& entry = job.entries[item];
     prefetch_splat(job, item + kPrefetch);
     const Splat<T>& s = job.splats[entry.splat];
-    V power{}, power_p{}, power_r{}, power_pp{}, power_pr{}, power_rr{}, red{}, green{}, blue{}, z{};
+    V sums[kSplatGradientNumbers] = {};
     const uint32_t reached = entry.blocks & alive;
     for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
@@ -281,37 +204,8 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
     }
     for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
-      for (int k = 0; k < kVectors<T>; ++k) {
-        PixelGradients<T>& px = pixels[block][k];
-        Contribution<T> c;
-        static_cast<Exponent<T>&>(c) = exponents[block][k];
-        blend(px.transmittance, c);
-        V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
-        q = fma(px.g_green, broadcast<T>(s.green), q);
-        q = fma(px.g_blue, broadcast<T>(s.blue), q);
-        q = fma(px.per_z, broadcast<T>(s.z), q);
-        px.remaining = fnma(c.weight, q, px.remaining);
-
-        // ν = −α ∂L/∂α, nothing through the cap.
-        const Mask<T> follows = both(c.goes_on, less(c.raw, broadcast<T>(T(kMaxAlpha))));
-        const V nu = select(follows, c.weight * (px.remaining * reciprocal(c.behind) - q), V{});
-        const V nu_p = nu * c.p, nu_r = nu * c.r;
-        power += nu;
-        power_p += nu_p;
-        power_r += nu_r;
-        power_pp = fma(nu_p, c.p, power_pp);
-        power_pr = fma(nu_p, c.r, power_pr);
-        power_rr = fma(nu_r, c.r, power_rr);
-        red = fma(c.weight, px.g_red, red);
-        green = fma(c.weight, px.g_green, green);
-        blue = fma(c.weight, px.g_blue, blue);
-        z = fma(c.weight, px.per_z, z);
-
-        px.transmittance = next_transmittance(c);
-      }
+      for (int k = 0; k < kVectors<T>; ++k) pass(s, exponents[block][k], pixels[block][k], sums);
     }
-    const V sums[kSplatGradientNumbers] = {power,    power_p, power_r, power_pp, power_pr,
-                                           power_rr, red,     green,   blue,     z};
     sum_each(sums, &records[entry.record].power);
   }
 }

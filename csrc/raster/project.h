@@ -81,7 +81,7 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   load_columns(g.quaternions + 4 * begin, 4, group.count, group.unit);
   load_columns(g.opacities + begin, 1, group.count, &group.opacity);
   load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, group.count, group.sh);
-  for (int lane = 0; lane < lanes; ++lane) group.log2_opacity[lane] = T(__builtin_log2(double(group.opacity[lane])));
+  group.log2_opacity = log2_of<T>(group.opacity);
 
   V* q = group.unit;
   group.inverse_norm = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
@@ -353,44 +353,57 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
   return less(Vector<T>{}, load<T>(has_any));
 }
 
-// All gradients of Gaussians begin … end − 1, from what the pixels of each of `views` cameras ask of them. Where `cameras` isn't
-// null, what these Gaussians ask of each camera is added there.
-template <class T>
-void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
-                      const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
+// All gradients of the group from Gaussian `i` on, from what the pixels of each of `views` cameras ask of them:
+// records_of(view) are a camera's. Where `of_cameras` holds, asked(view, numbers) hears what the group asks of each camera, in
+// CameraGradient's order.
+template <class T, class RecordsOf, class Asked>
+GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const Lens<T>* lenses, int64_t views,
+                                      const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,
+                                      const Asked& asked) {
   using V = Vector<T>;
-  for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
-    Group<T> group;
-    load_group(g, i, end, group);
-    GroupGradient<T> sum;
-    Mask<T> ever{};
-    for (int64_t view = 0; view < views; ++view) {
-      V d[kSplatGradientNumbers];
-      const Mask<T> touched = sum_records(records[view], i, group.count, d);
-      if (!any(touched)) continue;
+  Group<T> group;
+  load_group(g, i, end, group);
+  GroupGradient<T> sum;
+  Mask<T> ever{};
+  for (int64_t view = 0; view < views; ++view) {
+    V d[kSplatGradientNumbers], of_camera[kCameraNumbers] = {};
+    const Mask<T> touched = sum_records(records_of(view), i, group.count, d);
+    if (any(touched)) {
       ever = Mask<T>(ever | touched);
       Projection<T> projection;
       Shading<T> shading;
       project_group(group, lenses[view], projection);
-      shade_group(group, g.bases, lenses[view], touched, shading);
-      V of_camera[kCameraNumbers];
-      project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum,
-                             cameras == nullptr ? nullptr : of_camera);
-      if (cameras == nullptr) continue;
-      T asked[kCameraNumbers];
-      sum_each<T>(of_camera, asked);
-      for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += asked[k];
+      if (any(projection.visible)) {  // as all are that have records
+        shade_group(group, g.bases, lenses[view], touched, shading);
+        project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum,
+                               of_cameras ? of_camera : nullptr);
+      }
     }
-    V d_scale[3], d_quaternion[4];
-    axes_backward(group, sum.axes, d_scale, d_quaternion);
-    for (V& v : d_scale) v = select(ever, v, V{});
-    for (V& v : d_quaternion) v = select(ever, v, V{});
-    store_columns(sum.mean, 3, group.count, out.means + 3 * i);
-    store_columns(d_scale, 3, group.count, out.scales + 3 * i);
-    store_columns(d_quaternion, 4, group.count, out.quaternions + 4 * i);
-    store_columns(&sum.opacity, 1, group.count, out.opacities + i);
-    store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
+    if (of_cameras) asked(view, of_camera);
   }
+  V d_scale[3], d_quaternion[4];
+  axes_backward(group, sum.axes, d_scale, d_quaternion);
+  for (V& v : d_scale) v = select(ever, v, V{});
+  for (V& v : d_quaternion) v = select(ever, v, V{});
+  store_columns(sum.mean, 3, group.count, out.means + 3 * i);
+  store_columns(d_scale, 3, group.count, out.scales + 3 * i);
+  store_columns(d_quaternion, 4, group.count, out.quaternions + 4 * i);
+  store_columns(&sum.opacity, 1, group.count, out.opacities + i);
+  store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
+}
+
+// The same of Gaussians begin … end − 1. Where `cameras` isn't null, what these ask of each camera is added there.
+template <class T>
+void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+                      const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
+  const auto asked = [&](int64_t view, const Vector<T>(&of_camera)[kCameraNumbers]) {
+    T numbers[kCameraNumbers];
+    sum_each<T>(of_camera, numbers);
+    for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += numbers[k];
+  };
+  for (int64_t i = begin; i < end; i += Simd<T>::lanes)
+    project_backward_group(g, i, end, lenses, views, [&](int64_t view) { return records[view]; }, out, cameras != nullptr,
+                           asked);
 }
 
 }  // namespace globalsplat::raster::GS_ISA

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "kernels.h"
+#include "lens.h"
 #include "parallel.h"
 
 namespace globalsplat::raster {
@@ -32,19 +33,6 @@ class Stopwatch {
 int64_t parts(int64_t count, int64_t size) { return (count + size - 1) / size; }
 
 }  // namespace
-
-template <class T>
-Lens<T> lens_of(const Camera<T>& camera, int width, int height, double eps2d) {
-  Lens<T> lens{camera, width, height, T(eps2d), {}, 0, 0, 0, 0};
-  const T *r = camera.rotation, *t = camera.translation;
-  for (int k = 0; k < 3; ++k) lens.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
-  const T margin_x = T(kJacobianMargin) * width / camera.fx, margin_y = T(kJacobianMargin) * height / camera.fy;
-  lens.x_low = -camera.cx / camera.fx - margin_x;
-  lens.x_high = (width - camera.cx) / camera.fx + margin_x;
-  lens.y_low = -camera.cy / camera.fy - margin_y;
-  lens.y_high = (height - camera.cy) / camera.fy + margin_y;
-  return lens;
-}
 
 template <class T>
 struct Frame<T>::PerView {
@@ -295,8 +283,6 @@ double multiply_add_peak(int threads, double seconds) {
   return sum;
 }
 
-template Lens<float> lens_of(const Camera<float>&, int, int, double);
-template Lens<double> lens_of(const Camera<double>&, int, int, double);
 template class Frame<float>;
 template class Frame<double>;
 

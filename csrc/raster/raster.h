@@ -27,9 +27,6 @@ struct StageTimes {
   double blend_backward = 0, project_backward = 0;
 };
 
-template <class T>
-Lens<T> lens_of(const Camera<T>& camera, int width, int height, double eps2d);
-
 // What a forward pass leaves for its backward pass: per view the splats and the tile lists.
 template <class T>
 class Frame {

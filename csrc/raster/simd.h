@@ -2,11 +2,17 @@
 // lack (fused multiply-add, masks in a form each machine likes, approximations) is here, once per instruction set. This
 // file is compiled several times with different instruction sets, so everything is inside the namespace that the
 // including kernel file names, and nothing of the standard library is instantiated here: the linker would keep one copy
-// for all.
+// for all. Where GS_LANE is defined, a vector is one number.
 #pragma once
+
+#ifdef GS_LANE
+#include "lane.h"
+#else
 
 #include <cmath>
 #include <cstdint>
+
+#include "types.h"
 
 #if defined(__x86_64__)
 #include <immintrin.h>
@@ -251,7 +257,7 @@ GS_INLINE Vector<float> reciprocal(Vector<float> v) { return 1.0f / v; }
 GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
 
 // 2^x where `m` holds, for x ≥ −126, and 0 elsewhere. x = n + f with |f| ≤ ½, and a polynomial
-// of degree 6 that is within 1.9e-9 of 2^f (Remez): with its rounding, the relative error is below 1.2e-7. Its terms are
+// of degree 6: with its rounding, the relative error is below 1.2e-7. Its terms are
 // paired (Estrin), because it is waiting for one after the other that costs. All machines give the same bits.
 GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
   using V = Vector<float>;
@@ -263,9 +269,8 @@ GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
   const V n = shifted - magic;
 #endif
   const V f = x - n, f2 = f * f;
-  const auto line = [&](float c0, float c1) { return fma(broadcast<float>(c1), f, broadcast<float>(c0)); };
-  const V high = fma(broadcast<float>(1.534581201e-4f), f2, line(9.618488957e-3f, 1.339993122e-3f));
-  const V p = fma(fma(high, f2, line(2.402264689e-1f, 5.550328777e-2f)), f2, line(1.0f, 6.931472057e-1f));
+  const auto line = [&](int k) { return fma(broadcast<float>(kExp2[k + 1]), f, broadcast<float>(kExp2[k])); };
+  const V p = fma(fma(fma(broadcast<float>(kExp2[6]), f2, line(4)), f2, line(2)), f2, line(0));
 #if defined(__AVX512F__)
   return _mm512_maskz_scalef_ps(m, p, n);  // other lanes may be small enough to stumble over
 #else
@@ -279,6 +284,13 @@ GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
 GS_INLINE Vector<double> exp2_where(Mask<double> m, Vector<double> x) {
   for (int i = 0; i < Simd<double>::lanes; ++i) x[i] = __builtin_exp2(x[i]);
   return select(m, x, Vector<double>{});
+}
+
+// The logarithm to base 2, rounded from float64's.
+template <class T>
+GS_INLINE Vector<T> log2_of(Vector<T> v) {
+  for (int lane = 0; lane < Simd<T>::lanes; ++lane) v[lane] = T(__builtin_log2(double(v[lane])));
+  return v;
 }
 
 // Copies those of `count` values whose flags have bit `bit` to `out`, in order, and returns how many they are. `out` has
@@ -383,3 +395,4 @@ GS_INLINE void sum_each(const Vector<float> (&v)[count], float* out) {
 #endif
 
 }  // namespace globalsplat::raster::GS_ISA
+#endif

@@ -15,6 +15,9 @@ inline constexpr double kJacobianMargin = 0.15;     // share of the width (heigh
 inline constexpr double kMinDepthAlpha = 1e-10;     // expected depth is 0 where the accumulated opacity is not above
 inline constexpr double kLog2E = 1.4426950408889634;
 inline constexpr double kLog2Of255 = 7.994353436858858;
+// 2^f for |f| ≤ ½ to 1.9e-9 (Remez), by powers of f.
+inline constexpr float kExp2[7] = {1.0f,           6.931472057e-1f, 2.402264689e-1f, 5.550328777e-2f,
+                                   9.618488957e-3f, 1.339993122e-3f, 1.534581201e-4f};
 inline constexpr int kTile = 16;                    // tile edge in pixels
 inline constexpr int kBlock = 4;                    // edge in pixels of the blocks that a tile is culled and blended by
 inline constexpr int kCoverTask = 512;              // splats whose tiles are listed in one go

@@ -1,0 +1,78 @@
+// One number in the place of a vector: what simd.h has, for a thread of a GPU. Each function gives the bits that a lane of any
+// instruction set gives, but for reciprocal().
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "types.h"
+
+#define GS_INLINE inline __attribute__((always_inline))
+
+namespace globalsplat::raster::GS_ISA {
+
+template <class T>
+struct Simd {
+  static constexpr int lanes = 1;
+};
+template <class T>
+using Vector = T;
+template <class T>
+using Mask = bool;
+
+template <class T>
+GS_INLINE T broadcast(T value) {
+  return value;
+}
+
+template <class T>
+GS_INLINE T load(const T* from) {
+  return *from;
+}
+
+template <class T>
+GS_INLINE void store(T* to, T v) {
+  *to = v;
+}
+
+GS_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
+GS_INLINE float fnma(float a, float b, float c) { return ::fmaf(-a, b, c); }
+GS_INLINE float sqrt(float v) { return ::sqrtf(v); }
+GS_INLINE float reciprocal(float v) { return 1.0f / v; }
+
+GS_INLINE float select(bool m, float a, float b) { return m ? a : b; }
+GS_INLINE bool less(float a, float b) { return a < b; }
+GS_INLINE bool at_most(float a, float b) { return a <= b; }
+GS_INLINE bool both(bool a, bool b) { return a & b; }
+GS_INLINE bool any(bool m) { return m; }
+GS_INLINE int lane_bits(bool m) { return m; }
+
+// The second operand where either is NaN.
+GS_INLINE float smaller(float a, float b) { return a < b ? a : b; }
+GS_INLINE float larger(float a, float b) { return a > b ? a : b; }
+GS_INLINE float clamp(float v, float low, float high) { return smaller(larger(v, low), high); }
+
+GS_INLINE float exp2_where(bool m, float x) {
+  const float shifted = x + 12582912.0f;  // 1.5·2²³: adding it rounds to an integer in the low bits
+  const float f = x - (shifted - 12582912.0f), f2 = f * f;
+  const auto line = [&](int k) { return fma(kExp2[k + 1], f, kExp2[k]); };
+  const float p = fma(fma(fma(kExp2[6], f2, line(4)), f2, line(2)), f2, line(0));
+  union {
+    float number;
+    uint32_t bits;
+  } power{p}, rounded{shifted};
+  power.bits += rounded.bits << 23;
+  return m ? power.number : 0;
+}
+
+template <class T>
+GS_INLINE T log2_of(T v) {
+  return T(::log2(double(v)));
+}
+
+template <class T, int count>
+GS_INLINE void sum_each(const T (&v)[count], T* out) {
+  for (int k = 0; k < count; ++k) out[k] = v[k];
+}
+
+}  // namespace globalsplat::raster::GS_ISA

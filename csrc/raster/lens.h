@@ -1,0 +1,28 @@
+// What all Gaussians of a camera share.
+#pragma once
+
+#include "types.h"
+
+namespace globalsplat::raster {
+
+// From rows of w2c, 4×4, and of the intrinsics, 3×3 in pixels.
+template <class T>
+inline Camera<T> camera_of(const T* w2c, const T* intrinsics) {
+  const T *m = w2c, *k = intrinsics;
+  return {{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]}, {m[3], m[7], m[11]}, k[0], k[4], k[2], k[5]};
+}
+
+template <class T>
+inline Lens<T> lens_of(const Camera<T>& camera, int width, int height, double eps2d) {
+  Lens<T> lens{camera, width, height, T(eps2d), {}, 0, 0, 0, 0};
+  const T *r = camera.rotation, *t = camera.translation;
+  for (int k = 0; k < 3; ++k) lens.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
+  const T margin_x = T(kJacobianMargin) * width / camera.fx, margin_y = T(kJacobianMargin) * height / camera.fy;
+  lens.x_low = -camera.cx / camera.fx - margin_x;
+  lens.x_high = (width - camera.cx) / camera.fx + margin_x;
+  lens.y_low = -camera.cy / camera.fy - margin_y;
+  lens.y_high = (height - camera.cy) / camera.fy + margin_y;
+  return lens;
+}
+
+}  // namespace globalsplat::raster

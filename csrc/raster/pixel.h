@@ -1,0 +1,137 @@
+// Alpha blending at pixels, forward and backward (spec 6.4 and 6.5).
+//
+// For a pixel and the splats in front-to-back order i = 1, 2, …
+//     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
+//     α_i = min(0.999, 2^e_i),            skipped when e_i < −log₂ 255
+//     w_i = T_i α_i,  T_{i+1} = T_i − w_i,  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
+//     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.
+//
+// Backward. With the pictures' gradients g_C, g_A, g_D, ∂D/∂w_i = (z_i − D) / A, so that
+//     q_i = ∂L/∂w_i = g_C·c_i + (g_D / A) z_i + (g_A − g_D D / A)
+//     α_i ∂L/∂α_i = w_i q_i − (Σ_{j>i} w_j q_j) α_i / (1 − α_i) = w_i (q_i − (Σ_{j>i} w_j q_j) / T_{i+1}).
+// The sum over what lies behind is the pixel's total, known from the pictures alone, Q = Σ w_j q_j = g_C·C + g_A A,
+// less what has been passed: the tile is replayed front to back and nothing per pixel has to be stored.
+//
+// Pixels that ended, or lie outside the image, have T = 0: their weights vanish and T_{i+1} ≤ 1e-4 holds for ever, so no other
+// mask is carried.
+#pragma once
+
+#include "simd.h"
+#include "types.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+// What a splat is at a vector of pixels.
+template <class T>
+struct Exponent {
+  Vector<T> p, r;
+  Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
+};
+
+// And what it does to them.
+template <class T>
+struct Contribution : Exponent<T> {
+  Vector<T> weight;   // 0 also where the pixel ends, or ended before
+  Vector<T> behind;   // T behind the splat
+  Mask<T> goes_on;    // T behind the splat > 1e-4
+};
+
+template <class T>
+GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Exponent<T>& e) {
+  const Vector<T> dx = s.u - x, dy = s.v - y;
+  e.p = fma(broadcast<T>(s.a), dx, s.b * dy);
+  e.r = s.c * dy;
+  const Vector<T> exponent = fnma(e.p, e.p, fnma(e.r, e.r, broadcast<T>(s.log2_opacity)));
+  e.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
+}
+
+template <class T>
+GS_INLINE void blend(Vector<T> transmittance, Contribution<T>& c) {
+  const Vector<T> alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
+  c.behind = fnma(transmittance, alpha, transmittance);
+  c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
+  c.weight = select(c.goes_on, transmittance * alpha, Vector<T>{});
+}
+
+template <class T>
+GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
+  evaluate(s, x, y, c);
+  blend(transmittance, c);
+}
+
+// 0 where the pixel ends.
+template <class T>
+GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c) {
+  return select(c.goes_on, c.behind, Vector<T>{});
+}
+
+// Sums of a vector of pixels.
+template <class T>
+struct Pixels {
+  Vector<T> transmittance, alpha{}, red{}, green{}, blue{}, z{};
+};
+
+template <class T>
+GS_INLINE void add(const Splat<T>& s, const Contribution<T>& c, Pixels<T>& px) {
+  px.alpha += c.weight;
+  px.red = fma(c.weight, broadcast<T>(s.red), px.red);
+  px.green = fma(c.weight, broadcast<T>(s.green), px.green);
+  px.blue = fma(c.weight, broadcast<T>(s.blue), px.blue);
+  px.z = fma(c.weight, broadcast<T>(s.z), px.z);
+  px.transmittance = next_transmittance(c);
+}
+
+template <class T>
+GS_INLINE Vector<T> expected_depth(const Pixels<T>& px) {
+  return select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), px.z / px.alpha, Vector<T>{});
+}
+
+// What the backward pass knows of a vector of pixels: T, Q less what has been passed, and q_i = g_red·r + g_green·g +
+// g_blue·b + per_z·z + constant.
+template <class T>
+struct PixelGradients {
+  Vector<T> transmittance, remaining, g_red, g_green, g_blue, per_z, constant;
+};
+
+// Before the first splat, from what the forward pass drew and the gradients with respect to it.
+template <class T>
+GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vector<T> colour[3], Vector<T> alpha, Vector<T> depth,
+                                            const Vector<T> g_colour[3], Vector<T> g_alpha, Vector<T> g_depth) {
+  const Vector<T> per_z = select(less(broadcast<T>(T(kMinDepthAlpha)), alpha), g_depth / alpha, Vector<T>{});
+  Vector<T> total = g_alpha * alpha;
+  for (int channel = 0; channel < 3; ++channel) total = fma(g_colour[channel], colour[channel], total);
+  return {transmittance, total, g_colour[0], g_colour[1], g_colour[2], per_z, g_alpha - per_z * depth};
+}
+
+// Passes a splat, and adds what it asks of it to its sums, in SplatGradient's order.
+template <class T>
+GS_INLINE void pass(const Splat<T>& s, const Exponent<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
+  using V = Vector<T>;
+  Contribution<T> c;
+  static_cast<Exponent<T>&>(c) = e;
+  blend(px.transmittance, c);
+  V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
+  q = fma(px.g_green, broadcast<T>(s.green), q);
+  q = fma(px.g_blue, broadcast<T>(s.blue), q);
+  q = fma(px.per_z, broadcast<T>(s.z), q);
+  px.remaining = fnma(c.weight, q, px.remaining);
+
+  // ν = −α ∂L/∂α, nothing through the cap.
+  const Mask<T> follows = both(c.goes_on, less(c.raw, broadcast<T>(T(kMaxAlpha))));
+  const V nu = select(follows, c.weight * (px.remaining * reciprocal(c.behind) - q), V{});
+  const V nu_p = nu * c.p, nu_r = nu * c.r;
+  sums[0] += nu;
+  sums[1] += nu_p;
+  sums[2] += nu_r;
+  sums[3] = fma(nu_p, c.p, sums[3]);
+  sums[4] = fma(nu_p, c.r, sums[4]);
+  sums[5] = fma(nu_r, c.r, sums[5]);
+  sums[6] = fma(c.weight, px.g_red, sums[6]);
+  sums[7] = fma(c.weight, px.g_green, sums[7]);
+  sums[8] = fma(c.weight, px.g_blue, sums[8]);
+  sums[9] = fma(c.weight, px.per_z, sums[9]);
+
+  px.transmittance = next_transmittance(c);
+}
+
+}  // namespace globalsplat::raster::GS_ISA

@@ -1,0 +1,65 @@
+// Which tiles, and which 4×4 blocks of their pixels, a splat reaches: exactly those where s = (aΔx + bΔy)² + (cΔy)² is at
+// most `reach` for some point between a block's outermost pixel centres.
+//
+// s is convex with its minimum 0 at Δ = 0. Over a rectangle that doesn't hold Δ = 0, its minimum lies on a side that faces
+// it: on x = x*, the value nearest to 0 among the rectangle's, or on y = y*. On either side s is a parabola, least at
+// −slope_y·x* (or −slope_x·y*), clamped to the side. Sixteen rectangles, four by four, are tested at a time: first tiles,
+// then the blocks of each tile reached.
+#pragma once
+
+#include "simd.h"
+#include "types.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+// Bit 4·j + i tells whether the splat reaches cell (i, j) of a 4×4 array of cells of size × size pixels, whose first pixel
+// is (x0, y0).
+template <class T>
+GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
+  using V = Vector<T>;
+  constexpr int lanes = Simd<T>::lanes;
+  constexpr auto columns = [] {
+    struct { T x[16], y[16]; } cells{};
+    for (int i = 0; i < 16; ++i) {
+      cells.x[i] = T(i % 4);
+      cells.y[i] = T(i / 4);
+    }
+    return cells;
+  }();
+  const T right = s.u - (T(x0) + T(0.5)), bottom = s.v - (T(y0) + T(0.5));  // Δ at the first pixel: the largest
+  const V zero{}, extent = broadcast<T>(T(size - 1)), step = broadcast<T>(T(size));
+  uint32_t bits = 0;
+  for (int first = 0; first < 16; first += lanes) {
+    const V x_high = right - step * load<T>(columns.x + first), x_low = x_high - extent;
+    const V y_high = bottom - step * load<T>(columns.y + first), y_low = y_high - extent;
+    const V x_near = clamp(zero, x_low, x_high), y_near = clamp(zero, y_low, y_high);
+    const V y = clamp(-s.slope_y * x_near, y_low, y_high), x = clamp(-s.slope_x * y_near, x_low, x_high);
+    const auto value = [&](V x, V y) {
+      const V p = fma(broadcast<T>(s.a), x, s.b * y), r = s.c * y;
+      return fma(p, p, r * r);
+    };
+    const V least = smaller(value(x_near, y), value(x, y_near));
+    bits |= uint32_t(lane_bits(at_most(least, broadcast<T>(s.reach)))) << first;
+  }
+  return bits;
+}
+
+// Columns x0 … x1 and rows y0 … y1 of tiles.
+struct Box {
+  int x0, x1, y0, y1;
+  int width() const { return x1 - x0 + 1; }
+  int64_t tiles() const { return int64_t(width()) * (y1 - y0 + 1); }
+};
+
+// The tiles in reach of a splat's bounding box; false if there are none.
+template <class T>
+GS_INLINE bool box_of(const Splat<T>& s, const Grid& grid, Box& box) {
+  const T left = s.u - s.half_width, right = s.u + s.half_width;
+  const T top = s.v - s.half_height, bottom = s.v + s.half_height;
+  if (!(s.z > 0 && right > 0 && left < T(grid.width) && bottom > 0 && top < T(grid.height))) return false;
+  box = {left > 0 ? int(left) / kTile : 0, right < T(grid.width) ? int(right) / kTile : grid.columns - 1,
+         top > 0 ? int(top) / kTile : 0, bottom < T(grid.height) ? int(bottom) / kTile : grid.rows - 1};
+  return true;
+}
+
+}  // namespace globalsplat::raster::GS_ISA
