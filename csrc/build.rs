@@ -44,7 +44,7 @@ fn libtorch() -> PathBuf {
 fn main() {
     let libtorch = libtorch();
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
-    cxx_build::bridges(["src/chunk.rs", "src/fit.rs", "src/render.rs"])
+    cxx_build::bridges(["src/chunk.rs", "src/cuda.rs", "src/fit.rs", "src/render.rs"])
         .std("c++17")
         // The work is done in raster/ and in libtorch.
         .opt_level(1)
@@ -52,13 +52,19 @@ fn main() {
         .flag(&include)
         .flag("-isystem")
         .flag(format!("{include}/torch/csrc/api/include"))
-        .include(".")
+        .includes([".", "raster"])
         .file("torch.cpp")
         .compile("globalsplat_torch");
 
     cpp()
         .files(["raster/raster.cpp", "raster/fit.cpp", "raster/parallel.cpp", "raster/kernels.cpp"])
         .compile("globalsplat_raster");
+    // Kernels for GPUs give the CPU's bits, so here, too, nothing is fused that isn't written so.
+    cpp()
+        .includes(["raster", "cuda"])
+        .flag("-ffp-contract=off")
+        .files(["cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
+        .compile("globalsplat_cuda");
     match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
         Ok("x86_64") => {
             kernels("avx512", &["-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw", "-mfma"]);

@@ -9,6 +9,7 @@
 #include "arguments.h"
 #include "backend.h"
 #include "cpu/backend.h"
+#include "cuda/backend.h"
 #include "globalsplat-csrc/src/render.rs.h"
 #include "raster/sh.h"
 
@@ -18,13 +19,12 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
 
-// The first serves the devices that have none of their own.
-const Backend* const kBackends[] = {&cpu::backend};
-
-const Backend& backend_of(at::Device device) {
-  for (const Backend* backend : kBackends)
-    if (backend->device == device.type()) return *backend;
-  return *kBackends[0];
+// What serves tensors of that device and type. The CPU's backend serves devices that have none, and float64, which exists to prove
+// gradients.
+const Backend& backend_of(const Tensor& means) {
+  if (means.scalar_type() == at::kDouble) return cpu::backend;
+  if (const Backend* emulated = cuda::emulated_backend()) return *emulated;
+  return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
 // ---- what autograd keeps of a call: the inputs' seven tensors and three numbers, then the op's own tensors ----
@@ -72,7 +72,7 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
                              Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
     std::unique_ptr<const Kept> kept;
-    const Pictures drawn = backend_of(means.device()).splat(in, kept);
+    const Pictures drawn = backend_of(means).splat(in, kept);
     save(ctx, in, {drawn.rgb, drawn.alpha, drawn.depth});
     ctx->saved_data["kept"] = c10::IValue::make_capsule(c10::make_intrusive<KeptHolder>(std::move(kept)));
     return {drawn.rgb, drawn.alpha, drawn.depth};
@@ -81,7 +81,7 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
     const auto holder = c10::static_intrusive_pointer_cast<KeptHolder>(ctx->saved_data["kept"].toCapsule());
-    return gradients_of(backend_of(t[0].device())
+    return gradients_of(backend_of(t[0])
                             .splat_backward(saved_inputs(ctx, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
                                             {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->kept,
                                             ctx->needs_input_grad(kW2c)));
@@ -92,7 +92,7 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
   static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
                              Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
-    const Projected seen = backend_of(means.device()).project(in);
+    const Projected seen = backend_of(means).project(in);
     save(ctx, in);
     ctx->mark_non_differentiable({seen.visible});
     return {seen.visible, seen.mean2d, seen.conic, seen.depth, seen.colour};
@@ -100,7 +100,7 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
-    return gradients_of(backend_of(t[0].device())
+    return gradients_of(backend_of(t[0])
                             .project_backward(saved_inputs(ctx, t), {{}, contiguous(g[1]), contiguous(g[2]), contiguous(g[3]),
                                                                      contiguous(g[4])},
                                               ctx->needs_input_grad(kW2c)));
@@ -113,7 +113,8 @@ void run(const SplatArguments& of, rust::Slice<size_t> out) {
   const Arguments a = borrowed(of);
   a.check();
   const at::Device home = a.means.device();
-  const Inputs in = a.on(backend_of(home).device == home.type() ? home : at::Device(backend_of(home).device));
+  const at::DeviceType there = backend_of(a.means).device;
+  const Inputs in = a.on(there == home.type() ? home : at::Device(there));
   const Gaussians& g = in.gaussians;
   const tensor_list results = Function::apply(g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics,
                                               in.width, in.height, in.eps2d);

@@ -3,6 +3,7 @@
 #include "chunk.cpp"
 #include "cpu/projection.cpp"
 #include "cpu/splat.cpp"
+#include "cuda/splat.cpp"
 #include "fit.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

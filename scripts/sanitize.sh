@@ -37,13 +37,19 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in raster/{raster,fit,parallel,kernels}.cpp checks/{checks,refusals}.cpp; do
-        compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}"
+    for source in raster/{raster,fit,parallel,kernels}.cpp cuda/frame.cpp checks/{checks,refusals,schedules}.cpp; do
+        compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/raster
     done
+    compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/raster
+    # ThreadSanitizer looks at the threads that a GPU would have, not at what makes them take turns.
+    case $sanitizer in
+    thread) compile thread-emulator cuda/emulator.cpp -O1 -g1 -DGS_UNDER_TSAN -Icsrc/raster ;;
+    *) compile "$sanitizer-emulator" cuda/emulator.cpp "${flags_of[$sanitizer]}" -Icsrc/raster ;;
+    esac
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster fit parallel kernels checks refusals; do objects+=("$out/$sanitizer-$part.o"); done
+    for part in $isas raster fit parallel kernels frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
     # shellcheck disable=SC2086
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done
@@ -59,18 +65,18 @@ compiler=$("${CXX:-g++}" --version | head -1)
 processor=$(sed -n 's/^model name[^:]*: //p' /proc/cpuinfo | head -1)
 echo "Renders, forward and backward, that were checked: $form, $compiler, $(nproc) × ${processor:-$(uname -m)}"
 echo
-echo "| sanitizer | instructions | bits | callers | threads | memory | children | seconds | found |"
-echo "|---|---|---|---|---|---|---|---|---|"
+echo "| sanitizer | instructions | bits | callers | threads | memory | orders | children | seconds | found |"
+echo "|---|---|---|---|---|---|---|---|---|---|"
 found=0
 for sanitizer in $sanitizers; do
-    shared="threads memory children"
+    shared="threads memory orders children"
     for isa in $isas; do
         export GLOBALSPLAT_SIMD=$isa
         "${unscattered[@]}" "$out/$sanitizer" simd >/dev/null || continue
         row="| ${name_of[$sanitizer]} | $isa |"
         began=$(date +%s)
         result=nothing
-        for check in bits callers threads memory children; do
+        for check in bits callers threads memory orders children; do
             # ThreadSanitizer doesn't follow a child that starts threads.
             if [[ $sanitizer-$check = thread-children || ($check != bits && $check != callers && -z $shared) ]]; then
                 row+=" – |"
@@ -87,4 +93,17 @@ for sanitizer in $sanitizers; do
         [ "$form" != short ] || shared=
     done
 done
-exit "$found"
+
+# Would a barrier be missed? Without any one of those in the kernels for GPUs, threads race.
+export GLOBALSPLAT_SIMD=portable
+barriers=$("${unscattered[@]}" "$out/thread" barriers)
+missed=0
+for ((n = 0; n < barriers; ++n)); do
+    if "${unscattered[@]}" "$out/thread" orders short "$n" >/dev/null 2>&1; then
+        echo "the kernels' barrier number $n can be left out, and nothing is found" >&2
+        missed=$((missed + 1))
+    fi
+done
+echo
+echo "Of $barriers barriers in the kernels for GPUs, $((barriers - missed)) are missed by ThreadSanitizer when they are left out."
+exit $((found + missed > 0))

@@ -2,7 +2,9 @@
 // for ever, lose memory, or depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
 //
 //   checks CHECK short|long     tells how many renders, forward and backward, or calls were checked
+//   checks orders short N       the same without the N-th barrier of the kernels for GPUs, which must be noticed
 //   checks simd                 tells the instruction set
+//   checks barriers             tells how many barriers these kernels have
 #include <signal.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -18,11 +20,13 @@
 #include <string>
 #include <thread>
 
+#include "../cuda/emulated.h"
 #include "../raster/fit.h"
 #include "../raster/kernels.h"
 #include "../raster/parallel.h"
 #include "refusals.h"
 #include "scenes.h"
+#include "schedules.h"
 
 namespace globalsplat::checks {
 namespace {
@@ -418,6 +422,31 @@ int64_t memory(bool is_short) {
   return count;
 }
 
+// The kernels for GPUs, in other orders of blocks and threads.
+int64_t orders(bool is_short) {
+  const std::vector<uint64_t> seeds = is_short ? std::vector<uint64_t>{1, 2} : std::vector<uint64_t>{1, 2, 3, 4, 5};
+  const auto expect_none = [](const std::string& difference) {
+    if (!difference.empty()) fail(difference);
+  };
+  begin("sums of kernels");
+  for (const uint64_t seed : seeds) expect_none(sums_differ(seed));
+  int64_t count = int64_t(seeds.size());
+  size_t turn = 0;
+  for (const int bases : {1, 4, 9, 16}) {
+    const std::vector<Scene<double>> scenes = all_scenes(bases);
+    for (size_t i = 0; i < scenes.size(); ++i) {
+      const bool is_large = !scenes[i].gaussians.empty() &&
+                            int64_t(scenes[i].gaussians[0].opacities.size()) * scenes[i].width * scenes[i].height > 1'000'000;
+      if (is_short && (i % 4 != turn || is_large)) continue;
+      begin(scenes[i].name + ", in orders of kernels, " + std::to_string(bases) + " bases");
+      expect_none(schedules_differ(as<float>(scenes[i]), seeds));
+      count += int64_t(seeds.size());
+    }
+    ++turn;
+  }
+  return count;
+}
+
 // A child process, which has a copy of everything but the threads.
 int64_t children(bool is_short) {
   const Scene<float> scene = as<float>(small_scene());
@@ -455,6 +484,7 @@ int main(int count, char** arguments) {
                {"callers", checks::callers},
                {"threads", checks::threads},
                {"memory", checks::memory},
+               {"orders", checks::orders},
                {"children", checks::children}};
   signal(SIGALRM, checks::out_of_patience);
   const std::string check = count > 1 ? arguments[1] : "";
@@ -466,11 +496,16 @@ int main(int count, char** arguments) {
       return 1;  // named by GLOBALSPLAT_SIMD, and not to be had
     }
   }
+  if (check == "barriers") {
+    std::printf("%d\n", cuda::emulated::barriers());
+    return 0;
+  }
+  if (count == 4) cuda::emulated::leave_out_barrier(std::atoi(arguments[3]));
   for (const auto& one : known)
-    if (check == one.name && count == 3) {
+    if (check == one.name && (count == 3 || count == 4)) {
       std::printf("%lld\n", static_cast<long long>(one.run(std::strcmp(arguments[2], "short") == 0)));
       return 0;
     }
-  std::fprintf(stderr, "checks simd, or bits, callers, threads, memory or children, and short or long\n");
+  std::fprintf(stderr, "checks simd, or bits, callers, threads, memory, orders or children, and short or long\n");
   return 2;
 }

@@ -1,0 +1,174 @@
+#include "schedules.h"
+
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+
+#include "../cuda/emulated.h"
+#include "../cuda/frame.h"
+
+namespace globalsplat::checks {
+namespace {
+
+using Numbers = std::vector<float>;
+
+// What a render leaves, of all scenes and views one after the other.
+struct Left {
+  Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c;
+  std::vector<Numbers*> all() { return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c}; }
+  static constexpr size_t kPictures = 3;  // the first of them
+};
+
+void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
+
+// What the pictures' gradients are.
+Numbers asked(Random& random, size_t count) {
+  Numbers numbers;
+  for (const double value : random.uniform(count, -1, 1)) numbers.push_back(float(value));
+  return numbers;
+}
+
+size_t count_of(const Scene<float>& scene) { return scene.gaussians.empty() ? 0 : scene.gaussians[0].opacities.size(); }
+
+Left emptied(const Scene<float>& scene) {
+  const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
+  const size_t count = count_of(scene) * scene.gaussians.size();
+  const auto empty = [](size_t numbers) { return Numbers(numbers, std::nanf("")); };
+  return {empty(3 * pixels), empty(pixels), empty(pixels), empty(3 * count), empty(3 * count), empty(4 * count),
+          empty(count), empty(size_t(scene.bases) * 3 * count), empty(16 * scene.views.size())};
+}
+
+Left by_kernels(const Scene<float>& scene, uint64_t seed) {
+  Numbers means, scales, quaternions, opacities, sh, w2c, intrinsics;
+  for (const Arrays<float>& g : scene.gaussians) {
+    append(means, g.means);
+    append(scales, g.scales);
+    append(quaternions, g.quaternions);
+    append(opacities, g.opacities);
+    append(sh, g.sh);
+  }
+  for (const raster::View<float>& view : scene.views) {
+    const raster::Camera<float>& c = view.camera;
+    for (int row = 0; row < 3; ++row) {
+      w2c.insert(w2c.end(), c.rotation + 3 * row, c.rotation + 3 * row + 3);
+      w2c.push_back(c.translation[row]);
+    }
+    append(w2c, {0, 0, 0, 1});
+    append(intrinsics, {c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1});
+  }
+  Random random(9);
+  const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
+  const Numbers g_rgb = asked(random, 3 * pixels), g_alpha = asked(random, pixels), g_depth = asked(random, pixels);
+
+  const int64_t scenes = int64_t(scene.gaussians.size());
+  const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(),
+                                   int64_t(count_of(scene)), scene.bases},
+                                  w2c.data(), intrinsics.data(), scenes,
+                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height, 0.05};
+  Left left = emptied(scene);
+  const cuda::emulated::Emulator device(seed);
+  const cuda::Frame frame(device, arguments, {left.rgb.data(), left.alpha.data(), left.depth.data()});
+  frame.backward(device, arguments, {left.rgb.data(), left.alpha.data(), left.depth.data()},
+                 {g_rgb.data(), g_alpha.data(), g_depth.data()},
+                 {left.means.data(), left.scales.data(), left.quaternions.data(), left.opacities.data(), left.sh.data()},
+                 left.w2c.data());
+  return left;
+}
+
+Left by_cpu(const Scene<float>& scene) {
+  const size_t pixels = size_t(scene.width) * size_t(scene.height), views = scene.views.size(), count = count_of(scene);
+  Random random(9);
+  const Numbers g_rgb = asked(random, 3 * pixels * views), g_alpha = asked(random, pixels * views);
+  const Numbers g_depth = asked(random, pixels * views);
+  Left left = emptied(scene);
+  std::vector<raster::Gaussians<float>> gaussians;
+  std::vector<raster::GaussianGradients<float>> out;
+  for (size_t b = 0; b < scene.gaussians.size(); ++b) {
+    const Arrays<float>& g = scene.gaussians[b];
+    gaussians.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), int64_t(count),
+                         scene.bases});
+    out.push_back({left.means.data() + 3 * count * b, left.scales.data() + 3 * count * b, left.quaternions.data() + 4 * count * b,
+                   left.opacities.data() + count * b, left.sh.data() + size_t(scene.bases) * 3 * count * b});
+  }
+  std::vector<raster::Pictures<float>> drawn;
+  std::vector<raster::Pictures<const float>> pictures, gradients;
+  for (size_t k = 0; k < views; ++k) {
+    drawn.push_back({left.rgb.data() + 3 * pixels * k, left.alpha.data() + pixels * k, left.depth.data() + pixels * k});
+    pictures.push_back({drawn[k].rgb, drawn[k].alpha, drawn[k].depth});
+    gradients.push_back({g_rgb.data() + 3 * pixels * k, g_alpha.data() + pixels * k, g_depth.data() + pixels * k});
+  }
+  raster::StageTimes times;
+  std::vector<raster::CameraGradient<float>> cameras(views);
+  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, {scene.width, scene.height, 0.05, 2}, drawn, times);
+  frame->backward(gaussians, pictures, gradients, out, cameras.data(), times);
+  for (size_t k = 0; k < views; ++k)
+    for (int number = 0; number < 16; ++number) {
+      const int row = number / 4, column = number % 4;
+      left.w2c[16 * k + size_t(number)] =
+          row == 3 ? 0 : cameras[k].numbers[column < 3 ? 3 * row + column : 9 + row];
+    }
+  return left;
+}
+
+bool same(const Numbers& a, const Numbers& b) {
+  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0);
+}
+
+double largest(const Numbers& numbers) {
+  double most = 0;
+  for (const float number : numbers) most = std::max(most, std::abs(double(number)));
+  return most;
+}
+
+double distance(const Numbers& a, const Numbers& b) {
+  double most = 0;
+  for (size_t k = 0; k < a.size(); ++k) most = std::max(most, std::abs(double(a[k]) - double(b[k])));
+  return most;
+}
+
+}  // namespace
+
+std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds) {
+  const char* const names[] = {"colours", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
+                               "spherical harmonics", "cameras"};
+  Left cpu = by_cpu(scene), first = by_kernels(scene, seeds[0]);
+  // What is infinite, or no number, makes pixels nearby so, too: on the CPU those of a block, here those of two.
+  const bool is_strange = scene.name.rfind("strange", 0) == 0;
+  double slope = 0;
+  for (size_t k = Left::kPictures; k < cpu.all().size(); ++k) slope = std::max(slope, largest(*cpu.all()[k]));
+  for (size_t k = 0; k < first.all().size() && !is_strange; ++k) {
+    const Numbers &ours = *first.all()[k], &theirs = *cpu.all()[k];
+    // Where nothing changes, as when a ball is turned, gradients are differences of larger ones.
+    const double off = distance(ours, theirs), most = k < Left::kPictures ? 0 : 1e-3 * largest(theirs) + 1e-5 * slope;
+    if (!(off <= most)) return std::string(names[k]) + " differ from the CPU's by " + std::to_string(off);
+  }
+  for (size_t n = 1; n < seeds.size(); ++n) {
+    Left other = by_kernels(scene, seeds[n]);
+    for (size_t k = 0; k < first.all().size(); ++k)
+      if (!same(*first.all()[k], *other.all()[k]))
+        return std::string(names[k]) + " change with the order of threads, seed " + std::to_string(seeds[n]);
+  }
+  return {};
+}
+
+std::string sums_differ(uint64_t seed) {
+  constexpr int rows = 3, length = 1500;
+  Random random(seed);
+  std::vector<uint32_t> counts, expected;
+  for (const double value : random.uniform(rows * length, 0, 100)) counts.push_back(uint32_t(value));
+  uint64_t totals[rows], expected_totals[rows];
+  for (int row = 0; row < rows; ++row) {
+    uint32_t sum = 0;
+    for (int k = 0; k < length; ++k) {
+      expected.push_back(sum);
+      sum += counts[size_t(row * length + k)];
+    }
+    expected_totals[row] = sum;
+  }
+  using cuda::gs_scan;
+  GS_LAUNCH(cuda::emulated::Emulator(seed), gs_scan, cuda::Blocks{rows}, 2 * cuda::kWarp, length, counts.data(), totals);
+  const bool right = counts == expected && std::equal(totals, totals + rows, expected_totals);
+  return right ? "" : "sums of what is before differ";
+}
+
+}  // namespace globalsplat::checks

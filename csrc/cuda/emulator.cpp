@@ -1,0 +1,230 @@
+#include "emulator.h"
+
+#include <ucontext.h>
+
+#include <algorithm>
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <random>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "emulated.h"
+
+// Sanitizers have to hear of stacks that change. ThreadSanitizer must not look at this file, but has to be told who met.
+#if defined(__SANITIZE_ADDRESS__)
+#include <sanitizer/common_interface_defs.h>
+#define GS_ASAN(call) call
+#else
+#define GS_ASAN(call)
+#endif
+#if defined(GS_UNDER_TSAN)
+#include <sanitizer/tsan_interface.h>
+#define GS_TSAN(call) call
+#else
+#define GS_TSAN(call)
+#endif
+
+namespace globalsplat::cuda::emulated {
+namespace {
+
+constexpr int kMostThreads = 1024;           // of a block
+constexpr size_t kStack = 256 << 10;        // bytes
+constexpr size_t kSharedMemory = 48 << 10;  // bytes of a block, as GPUs have at least
+constexpr size_t kLine = 64;                // between two arrays of it
+// ThreadSanitizer takes memory that two blocks use, one after the other, for shared.
+#if defined(GS_UNDER_TSAN)
+constexpr bool kReuse = false;
+#else
+constexpr bool kReuse = true;
+#endif
+
+// A stack, and what is needed to go on with it.
+struct Stack {
+  ucontext_t context;
+  void* bottom = nullptr;
+  size_t size = 0;
+  [[maybe_unused]] void* fake = nullptr;  // AddressSanitizer's
+  [[maybe_unused]] void* fiber = nullptr;  // ThreadSanitizer's
+};
+
+void go_on(Stack& from, Stack& to) {
+  GS_TSAN(__tsan_switch_to_fiber(to.fiber, __tsan_switch_to_fiber_no_sync));
+  GS_ASAN(__sanitizer_start_switch_fiber(&from.fake, to.bottom, to.size));
+  swapcontext(&from.context, &to.context);
+  GS_ASAN(__sanitizer_finish_switch_fiber(from.fake, nullptr, nullptr));
+}
+
+// Threads, by their number in the block. What stacks share is plain memory: templates that a file compiled with sanitizers has,
+// too, might be linked from there.
+struct Threads {
+  int numbers[kMostThreads];
+  int count = 0;
+  void add(int number) { numbers[count++] = number; }
+};
+
+struct Warp {
+  Threads waiting;  // for the rest of them
+  uint64_t given[2][32];
+};
+
+struct Thread {
+  Stack stack;
+  std::unique_ptr<char[]> memory;
+  unsigned exchanges = 0;  // so far; two in turn have a place each, so that nobody overwrites what is still to be read
+  size_t shared_used = 0;
+};
+
+// The block that this thread of the CPU runs.
+struct Block {
+  std::unique_ptr<Thread> threads[kMostThreads];  // as many as any block had yet
+  Stack scheduler;
+  const Kernel* kernel = nullptr;
+  void** arguments = nullptr;
+  Index index{}, size{}, grid{};
+  int current = 0, done = 0;
+  Threads ready, waiting;
+  Warp warps[kMostThreads / 32];
+  std::vector<std::unique_ptr<char[]>> shared;  // the last is this block's
+};
+thread_local Block block;
+
+int left_out = -1;  // the barrier that no thread heeds
+
+Thread& current() { return *block.threads[block.current].get(); }
+
+// Of one thread of the GPU after the other.
+void run_threads() {
+  GS_ASAN(__sanitizer_finish_switch_fiber(nullptr, const_cast<const void**>(&block.scheduler.bottom), &block.scheduler.size));
+  for (;;) {
+    GS_TSAN(__tsan_acquire(&block.kernel));
+    block.kernel->run(block.arguments);
+    GS_TSAN(__tsan_release(&block.arguments));
+    ++block.done;
+    go_on(current().stack, block.scheduler);
+  }
+}
+
+std::unique_ptr<Thread> new_thread() {
+  auto thread = std::make_unique<Thread>();
+  thread->memory.reset(new char[kStack]);
+  Stack& stack = thread->stack;
+  stack.bottom = thread->memory.get();
+  stack.size = kStack;
+  getcontext(&stack.context);
+  stack.context.uc_stack.ss_sp = stack.bottom;
+  stack.context.uc_stack.ss_size = stack.size;
+  makecontext(&stack.context, run_threads, 0);
+  GS_TSAN(stack.fiber = __tsan_create_fiber(0));
+  return thread;
+}
+
+// Waits until as many threads as `all` are here.
+void meet(Threads& waiting, int all) {
+  GS_TSAN(__tsan_release(&waiting));
+  if (waiting.count + 1 == all) {
+    for (int k = 0; k < waiting.count; ++k) block.ready.add(waiting.numbers[k]);
+    waiting.count = 0;
+  } else {
+    waiting.add(block.current);
+    go_on(current().stack, block.scheduler);
+  }
+}
+
+Warp& own_warp() { return block.warps[block.current / 32]; }
+
+void run_block(std::mt19937_64& order) {
+  const int threads = int(block.size.x);
+  if (block.shared.empty() || !kReuse) block.shared.emplace_back(new char[kSharedMemory]);
+  // What the block before left must be of no use.
+  std::memset(block.shared.back().get(), 0xFF, kSharedMemory);
+  GS_TSAN(__tsan_release(&block.kernel));
+  block.done = block.ready.count = block.waiting.count = 0;
+  for (int k = 0; k < threads; ++k) {
+    block.ready.add(k);
+    block.threads[k]->shared_used = 0;
+    block.warps[k / 32].waiting.count = 0;
+  }
+  while (block.ready.count > 0) {
+    int* const ready = block.ready.numbers;
+    std::swap(ready[order() % uint64_t(block.ready.count)], ready[block.ready.count - 1]);
+    block.current = ready[--block.ready.count];
+    go_on(block.scheduler, current().stack);
+  }
+  if (block.done < threads) {
+    for (auto& thread : block.threads) thread.reset();
+    throw std::logic_error(std::string(block.kernel->name) + ": threads wait for others that have ended");
+  }
+}
+
+}  // namespace
+
+Index thread_index() { return {unsigned(block.current), 0}; }
+Index block_index() { return block.index; }
+Index block_size() { return block.size; }
+Index grid_size() { return block.grid; }
+
+void meet_in_block(int place) {
+  if (place == left_out) return;
+  meet(block.waiting, int(block.size.x));
+  GS_TSAN(__tsan_acquire(&block.waiting));
+}
+
+void meet_in_warp(int place) {
+  if (place == left_out) return;
+  Warp& warp = own_warp();
+  meet(warp.waiting, 32);
+  GS_TSAN(__tsan_acquire(&warp.waiting));
+}
+
+void exchange(uint64_t given, uint64_t (&out)[32]) {
+  Warp& warp = own_warp();
+  uint64_t(&place)[32] = warp.given[current().exchanges++ % 2];
+  place[block.current % 32] = given;
+  meet(warp.waiting, 32);
+  for (int k = 0; k < 32; ++k) out[k] = place[k];
+}
+
+void* shared_memory(size_t bytes) {
+  size_t& used = current().shared_used;
+  void* const memory = block.shared.back().get() + used;
+  used += (bytes + kLine - 1) / kLine * kLine;
+  if (used > kSharedMemory) std::abort();
+  return memory;
+}
+
+void leave_out_barrier(int place) { left_out = place; }
+
+Memory Emulator::allocate(size_t bytes) const {
+  constexpr std::align_val_t alignment{256};
+  void* const memory = ::operator new(bytes, alignment);
+  std::memset(memory, 0xFF, bytes);
+  return Memory(memory, [alignment](void* p) { ::operator delete(p, alignment); });
+}
+
+void Emulator::launch(const char* kernel, Blocks blocks, int threads, void** arguments) const {
+  block.kernel = kernel_named(kernel);
+  if (block.kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
+  block.arguments = arguments;
+  block.size = {unsigned(threads), 1};
+  block.grid = {unsigned(blocks.x), unsigned(blocks.y)};
+  if (threads > kMostThreads || threads % 32 != 0) throw std::logic_error("a block of " + std::to_string(threads) + " threads");
+  for (int k = 0; k < threads; ++k)
+    if (!block.threads[k]) block.threads[k] = new_thread();
+  GS_TSAN(block.scheduler.fiber = __tsan_get_current_fiber());
+
+  std::mt19937_64 order(seed_++);
+  std::vector<uint64_t> turns(size_t(blocks.x * blocks.y));
+  for (size_t k = 0; k < turns.size(); ++k) turns[k] = k;
+  std::shuffle(turns.begin(), turns.end(), order);
+  for (const uint64_t turn : turns) {
+    block.index = {unsigned(turn % uint64_t(blocks.x)), unsigned(turn / uint64_t(blocks.x))};
+    run_block(order);
+  }
+  GS_TSAN(__tsan_acquire(&block.arguments));
+  block.shared.clear();
+}
+
+}  // namespace globalsplat::cuda::emulated

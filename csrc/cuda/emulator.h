@@ -1,0 +1,93 @@
+// CUDA's words for a C++ compiler: a CPU in a GPU's place. Every thread of a block has a stack of its own, blocks and threads take
+// turns in an order drawn from a seed, and a thread goes on until it waits for others. So each word means what CUDA says and no
+// more: threads of a warp are not in step unless they meet. Compiled under ThreadSanitizer, memory that two threads use without
+// having met by __syncthreads() or __syncwarp() is a race.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+
+#define GS_EMULATED
+#define __global__
+#define __launch_bounds__(threads)
+#define GS_SHARED(type, name, extents) type(&name) extents = ::globalsplat::cuda::emulated::shared<type extents>()
+#define threadIdx (::globalsplat::cuda::emulated::thread_index())
+#define blockIdx (::globalsplat::cuda::emulated::block_index())
+#define blockDim (::globalsplat::cuda::emulated::block_size())
+#define gridDim (::globalsplat::cuda::emulated::grid_size())
+#define __syncthreads() ::globalsplat::cuda::emulated::meet_in_block(__COUNTER__)
+#define __syncwarp() ::globalsplat::cuda::emulated::meet_in_warp(__COUNTER__)
+
+namespace globalsplat::cuda::emulated {
+
+struct Index {
+  unsigned x, y;
+};
+Index thread_index();
+Index block_index();
+Index block_size();
+Index grid_size();
+
+// Those of a block's, or of a warp's, threads that come here first wait for the last. `place` tells one word of the text from another.
+void meet_in_block(int place);
+void meet_in_warp(int place);
+// The threads of a warp give their numbers, and `out` receives all 32; says nothing about other memory.
+void exchange(uint64_t given, uint64_t (&out)[32]);
+// The same memory for all threads of a block, the n-th time that they ask.
+void* shared_memory(size_t bytes);
+
+template <class T>
+T& shared() {
+  return *static_cast<T*>(shared_memory(sizeof(T)));
+}
+
+template <class T>
+T from_lane(T given, int source) {
+  uint64_t bits = 0, all[32];
+  std::memcpy(&bits, &given, sizeof given);
+  exchange(bits, all);
+  std::memcpy(&given, &all[source], sizeof given);
+  return given;
+}
+
+}  // namespace globalsplat::cuda::emulated
+
+template <class T>
+T __shfl_sync(unsigned, T given, int source) {
+  return globalsplat::cuda::emulated::from_lane(given, source % 32);
+}
+template <class T>
+T __shfl_up_sync(unsigned, T given, int by) {
+  const int lane = int(threadIdx.x % 32);
+  return globalsplat::cuda::emulated::from_lane(given, lane >= by ? lane - by : lane);
+}
+template <class T>
+T __shfl_xor_sync(unsigned, T given, int mask) {
+  return globalsplat::cuda::emulated::from_lane(given, int(threadIdx.x % 32) ^ mask);
+}
+inline unsigned __match_any_sync(unsigned, int given) {
+  uint64_t all[32];
+  globalsplat::cuda::emulated::exchange(uint64_t(uint32_t(given)), all);
+  unsigned alike = 0;
+  for (int k = 0; k < 32; ++k) alike |= unsigned(all[k] == uint32_t(given)) << k;
+  return alike;
+}
+inline unsigned __ballot_sync(unsigned, bool given) {
+  uint64_t all[32];
+  globalsplat::cuda::emulated::exchange(given, all);
+  unsigned bits = 0;
+  for (int k = 0; k < 32; ++k) bits |= unsigned(all[k]) << k;
+  return bits;
+}
+inline bool __any_sync(unsigned mask, bool given) { return __ballot_sync(mask, given) != 0; }
+
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
+inline int __ffs(int bits) { return __builtin_ffs(bits); }
+inline uint32_t __float_as_uint(float number) {
+  uint32_t bits;
+  std::memcpy(&bits, &number, sizeof bits);
+  return bits;
+}
+inline void atomicAdd(uint32_t* to, uint32_t by) { __atomic_fetch_add(to, by, __ATOMIC_RELAXED); }

@@ -1,0 +1,183 @@
+#include "backend.h"
+
+#include <ATen/TensorOperators.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/cumsum.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/from_blob.h>
+#include <ATen/ops/stack.h>
+#include <ATen/ops/where.h>
+#include <ATen/ops/zeros.h>
+#include <ATen/ops/zeros_like.h>
+#include <c10/core/DeviceGuard.h>
+#include <c10/core/impl/VirtualGuardImpl.h>
+
+#include <cstdlib>
+#include <vector>
+
+#include "emulated.h"
+#include "frame.h"
+#include "globalsplat-csrc/src/cuda.rs.h"
+
+namespace globalsplat::cuda {
+namespace {
+
+// The GPU that holds a tensor: memory from torch's allocator, kernels in torch's current stream.
+class Gpu : public Device {
+ public:
+  explicit Gpu(const Tensor& on) : guard_(on.device()), options_(on.options()) {}
+
+  Memory allocate(size_t bytes) const override {
+    const Tensor held = at::empty({int64_t(bytes)}, options_.dtype(at::kByte));
+    return Memory(held.data_ptr(), [held](void*) {});
+  }
+
+  void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override {
+    const at::Device device = options_.device();
+    void* const stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device).native_handle();
+    launch_kernel(device.index(), reinterpret_cast<size_t>(stream), kernel, {uint32_t(blocks.x), uint32_t(blocks.y)},
+                  uint32_t(threads), reinterpret_cast<size_t>(arguments));
+  }
+
+  uint64_t read(const uint64_t* number) const override {
+    return uint64_t(at::for_blob(const_cast<uint64_t*>(number), {1})
+                        .options(options_.dtype(at::kLong))
+                        .target_device(options_.device())
+                        .make_tensor()
+                        .item<int64_t>());
+  }
+
+ private:
+  c10::DeviceGuard guard_;
+  at::TensorOptions options_;
+};
+
+class Emulated : public emulated::Emulator {
+ public:
+  explicit Emulated(const Tensor&) : Emulator(std::strtoull(std::getenv("GLOBALSPLAT_CUDA_ON_CPU"), nullptr, 10)) {}
+};
+
+template <class T>
+T* data(const Tensor& t) {
+  return t.data_ptr<std::remove_const_t<T>>();
+}
+
+Arguments arguments_of(const Inputs& in) {
+  const globalsplat::Gaussians& g = in.gaussians;
+  return {{data<float>(g.means), data<float>(g.scales), data<float>(g.quaternions), data<float>(g.opacities),
+           data<float>(g.sh), in.count(), int(g.sh.size(2))},
+          data<float>(in.w2c), data<float>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height), in.eps2d};
+}
+
+template <class Number>
+Pictures<Number> places_of(const globalsplat::Pictures& p) {
+  return {data<Number>(p.rgb), data<Number>(p.alpha), data<Number>(p.depth)};
+}
+
+// Not yet written.
+Gradients empty_gradients(const Inputs& in, bool of_cameras) {
+  const auto empty = [](const Tensor& t) { return at::empty_like(t); };
+  const globalsplat::Gaussians& g = in.gaussians;
+  return {{empty(g.means), empty(g.scales), empty(g.quaternions), empty(g.opacities), empty(g.sh)},
+          of_cameras ? empty(in.w2c) : Tensor()};
+}
+
+GaussianGradients<float> places_of(const globalsplat::Gaussians& g) {
+  return {data<float>(g.means), data<float>(g.scales), data<float>(g.quaternions), data<float>(g.opacities),
+          data<float>(g.sh)};
+}
+
+float* place_of_cameras(const Gradients& g) { return g.w2c.defined() ? data<float>(g.w2c) : nullptr; }
+
+struct KeptFrame : Kept {
+  KeptFrame(const Device& device, const Arguments& of, const Pictures<float>& out) : frame(device, of, out) {}
+  Frame frame;
+};
+
+template <class On>
+globalsplat::Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+  const On device(in.gaussians.means);
+  const auto options = in.gaussians.means.options();
+  const Tensor rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
+  const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
+  const globalsplat::Pictures out{rgb, alpha, at::empty_like(alpha)};
+  kept = std::make_unique<KeptFrame>(device, arguments_of(in), places_of<float>(out));
+  return out;
+}
+
+template <class On>
+Gradients splat_backward(const Inputs& in, const globalsplat::Pictures& drawn, const globalsplat::Pictures& gradients,
+                         const Kept& kept, bool of_cameras) {
+  const On device(in.gaussians.means);
+  const Gradients out = empty_gradients(in, of_cameras);
+  static_cast<const KeptFrame&>(kept).frame.backward(device, arguments_of(in), places_of<const float>(drawn),
+                                                     places_of<const float>(gradients), places_of(out.gaussians),
+                                                     place_of_cameras(out));
+  return out;
+}
+
+// The splats' numbers in Splat's order, each [B, C, N], as long as `seen` lives.
+std::vector<Tensor> numbers_of(const Seen& seen, const Inputs& in) {
+  const auto options = in.gaussians.means.options();
+  return at::for_blob(seen.splats.get(), {in.scenes(), in.cameras(), in.count(), 16})
+      .options(options)
+      .target_device(options.device())
+      .make_tensor()
+      .unbind(-1);
+}
+constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // places in it
+constexpr double kTwoLn2 = 2 / raster::kLog2E;
+
+// Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
+template <class On>
+Projected project(const Inputs& in) {
+  const On device(in.gaussians.means);
+  const Seen seen(device, arguments_of(in));
+  const std::vector<Tensor> s = numbers_of(seen, in);
+  const Tensor &a = s[kA], &b = s[kB], &c = s[kC], visible = s[kZ] > 0;
+  const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
+  return {visible.to(at::kLong), shown(at::stack({s[kU], s[kV]}, -1)),
+          shown(kTwoLn2 * at::stack({a * a, a * b, b * b + c * c}, -1)), shown(s[kZ]),
+          shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1))};
+}
+
+// A record per visible Gaussian, the sums over pixels that turn into just these gradients: ∂L/∂(u, v) = 2 ln 2·UᵀM, and
+// W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the one number xy stands for two entries.
+template <class On>
+Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
+  const On device(in.gaussians.means);
+  const Seen seen(device, arguments_of(in));
+  const std::vector<Tensor> s = numbers_of(seen, in);
+  const Tensor &a = s[kA], &b = s[kB], &c = s[kC];
+  const std::vector<Tensor> d_mean = gradients.mean2d.unbind(-1), d_conic = gradients.conic.unbind(-1);
+  const std::vector<Tensor> d_colour = gradients.colour.unbind(-1);
+  const Tensor p = d_mean[0] / (kTwoLn2 * a), r = (d_mean[1] - kTwoLn2 * b * p) / (kTwoLn2 * c);
+  const Tensor all = at::stack({at::zeros_like(p), p, r, 2 * (a * a * d_conic[0] + a * b * d_conic[1] + b * b * d_conic[2]),
+                                a * c * d_conic[1] + 2 * b * c * d_conic[2], 2 * c * c * d_conic[2], d_colour[0], d_colour[1],
+                                d_colour[2], gradients.depth},
+                               -1);
+  const Tensor visible = (s[kZ] > 0).flatten();
+  const Tensor records = all.flatten(0, 2).index_select(0, visible.nonzero().squeeze(1)).contiguous();
+  const Tensor first = at::cat({at::zeros({1}, visible.options().dtype(at::kInt)), visible.cumsum(0, at::kInt)});
+  const Gradients out = empty_gradients(in, of_cameras);
+  seen.backward(device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
+                reinterpret_cast<const uint32_t*>(data<int32_t>(first)), places_of(out.gaussians), place_of_cameras(out));
+  return out;
+}
+
+template <class On>
+constexpr Backend backend_on(at::DeviceType device) {
+  return {device, splat<On>, splat_backward<On>, project<On>, project_backward<On>};
+}
+
+}  // namespace
+
+const Backend backend = backend_on<Gpu>(at::kCUDA);
+
+const Backend* emulated_backend() {
+  static const Backend emulated = backend_on<Emulated>(at::kCPU);
+  return std::getenv("GLOBALSPLAT_CUDA_ON_CPU") == nullptr ? nullptr : &emulated;
+}
+
+}  // namespace globalsplat::cuda

@@ -1,0 +1,94 @@
+//! Compiled kernels on disk, so that they are compiled once for a machine and not at every start.
+
+use super::compile::{Form, Nvrtc, everything};
+use sha2::{Digest, Sha256};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Bytes of the digest that a file begins with.
+const DIGEST: usize = 32;
+
+/// Where compiled kernels are kept, where there is a home: $XDG_CACHE_HOME/globalsplat, or ~/.cache/globalsplat.
+pub fn cache_folder() -> Option<PathBuf> {
+    let named = |variable| std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from);
+    let caches = named("XDG_CACHE_HOME").or_else(|| named("HOME").map(|home| home.join(".cache")))?;
+    Some(caches.join("globalsplat"))
+}
+
+/// The file of the kernels' text as it is now, compiled so, for this driver.
+pub fn file_name(nvrtc: &Nvrtc, driver: i32, architecture: i32, form: Form) -> String {
+    let mut digest = Sha256::new();
+    for part in everything(architecture, form) {
+        digest.update((part.len() as u64).to_le_bytes());
+        digest.update(part);
+    }
+    digest.update(format!("{:?} {driver}", nvrtc.version));
+    let mut name = String::from("kernels-");
+    for byte in &digest.finalize()[..12] {
+        write!(name, "{byte:02x}").expect("a string takes all");
+    }
+    name
+}
+
+/// What was stored there, whole.
+pub fn read(file: &Path) -> Option<Vec<u8>> {
+    let mut bytes = std::fs::read(file).ok()?;
+    let image = bytes.split_off(DIGEST.min(bytes.len()));
+    (Sha256::digest(&image)[..] == bytes[..]).then_some(image)
+}
+
+/// Stores what was compiled. Where that fails, it will be compiled again.
+pub fn write(file: &Path, image: &[u8]) {
+    let Some(folder) = file.parent() else { return };
+    let part = file.with_extension(format!("{}.part", std::process::id()));
+    let bytes = [&Sha256::digest(image)[..], image].concat();
+    let stored = std::fs::create_dir_all(folder)
+        .and_then(|()| std::fs::write(&part, bytes))
+        .and_then(|()| std::fs::rename(&part, file));
+    if stored.is_err() {
+        let _ = std::fs::remove_file(part);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_stored_is_read_and_what_was_harmed_is_not() {
+        let folder = std::env::temp_dir().join(format!("globalsplat-cache-{}", std::process::id()));
+        let file = folder.join("deeper/kernels");
+        assert_eq!(read(&file), None);
+        write(&file, b"machine code");
+        assert_eq!(read(&file).as_deref(), Some(&b"machine code"[..]));
+        let whole = std::fs::read(&file).unwrap();
+        for length in 0..whole.len() {
+            std::fs::write(&file, &whole[..length]).unwrap();
+            assert_eq!(read(&file), None, "{length} bytes");
+        }
+        for place in 0..whole.len() {
+            let mut harmed = whole.clone();
+            harmed[place] ^= 1;
+            std::fs::write(&file, harmed).unwrap();
+            assert_eq!(read(&file), None, "byte {place}");
+        }
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn everything_that_matters_changes_the_name() {
+        let nvrtc = Nvrtc { version: (13, 0), architectures: vec![75, 90] };
+        let newer = Nvrtc { version: (13, 1), ..nvrtc.clone() };
+        let mut names = vec![
+            file_name(&nvrtc, 13000, 90, Form::Cubin),
+            file_name(&newer, 13000, 90, Form::Cubin),
+            file_name(&nvrtc, 13010, 90, Form::Cubin),
+            file_name(&nvrtc, 13000, 75, Form::Cubin),
+            file_name(&nvrtc, 13000, 90, Form::Ptx),
+        ];
+        assert_eq!(names[0], file_name(&nvrtc.clone(), 13000, 90, Form::Cubin));
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), 5);
+    }
+}
