@@ -36,10 +36,12 @@ checks: venv
 	$(CARGO) test --release --locked
 	@$(MAKE) --no-print-directory parity
 
-# Every module, loss and kernel against plain torch, and whether wrong answers would be noticed.
+# Every module, loss and kernel against plain torch, and whether wrong answers would be noticed. Then once more those that the
+# kernels for GPUs serve, which the CPU runs.
 parity: venv build
 	.venv/bin/python -m pytest -q parity
 	.venv/bin/python parity/run.py --self-test
+	.venv/bin/python parity/run.py --only '[pr][ra]*_float32' --cuda-on-cpu 1 --self-test
 
 # How fast this machine runs the rasterizer, how its time grows with Gaussians and pixels, and how fast training data load.
 bench: build

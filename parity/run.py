@@ -3,11 +3,13 @@
     python parity/run.py                         everything, about a minute
     python parity/run.py --only 'rasterizer*'    the cases of that name
     python parity/run.py --self-test             are wrong answers noticed?
+    python parity/run.py --only '*float32' --cuda-on-cpu 1    the kernels for GPUs, without a GPU
     python parity/run.py --self-test --markdown docs/parity.md    the same, written down
 """
 
 import argparse
 import json
+import os
 import shlex
 import shutil
 import sys
@@ -31,6 +33,12 @@ def arguments(argv):
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the random numbers (default: 0)")
     parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
     parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
+    parser.add_argument(
+        "--cuda-on-cpu",
+        metavar="N",
+        type=int,
+        help="draw float32 by the kernels for GPUs, which the CPU runs, blocks and threads in an order drawn from N",
+    )
     parser.add_argument("--self-test", action="store_true", help="disturb right answers and expect each to be noticed")
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write docs/parity.md, a line per case, to FILE")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write every number to FILE")
@@ -50,6 +58,7 @@ def command(options):
     for name, default in (("only", "*"), ("seed", 0), ("repeat", 1), ("device", "cpu")):
         value = getattr(options, name)
         words += [] if value == default else [f"--{name}", str(value)]
+    words += [] if options.cuda_on_cpu is None else ["--cuda-on-cpu", str(options.cuda_on_cpu)]
     words += ["--self-test"] if options.self_test else []
     path = options.markdown.resolve()
     words += ["--markdown", str(path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path.name)]
@@ -73,6 +82,8 @@ def main(argv=None):
         print(f"{options.binary} doesn't exist: run make build, or name another with --binary", file=sys.stderr)
         return WRONG_REQUEST
 
+    if options.cuda_on_cpu is not None:
+        os.environ["GLOBALSPLAT_CUDA_ON_CPU"] = str(options.cuda_on_cpu)
     started, results = time.perf_counter(), []
     answerer = program(options.binary, options.device)
     try:

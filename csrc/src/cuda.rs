@@ -5,10 +5,12 @@ mod cache;
 mod compile;
 mod gpu;
 mod libraries;
+mod usage;
 
 pub use cache::cache_folder;
 pub use compile::{Compiled, Form, Nvrtc};
 pub use gpu::{Driver, Gpu, Prepared, prepare};
+pub use usage::{KernelUse, usage};
 
 use gpu::launch_kernel;
 

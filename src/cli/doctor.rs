@@ -1,16 +1,22 @@
 use super::{device, print_json};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::reconstruct::SHIPPED_MODEL;
 use globalsplat::render::cpu::simd_level;
-use serde_json::json;
+use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
+use serde_json::{Value, json};
+use std::fmt::Display;
 
-/// Tell what this machine offers: libtorch, devices, SIMD level, threads, and the weights found.
+/// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights found.
 #[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat doctor")]
+#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels")]
 pub struct Doctor {
+    /// Compile the kernels for every kind of GPU that NVRTC knows, and tell what each takes of it
+    #[arg(long)]
+    kernels: bool,
     /// Print it as one JSON object
     #[arg(long)]
     json: bool,
@@ -18,14 +24,20 @@ pub struct Doctor {
 
 impl Doctor {
     pub fn run(self) -> Result<()> {
+        if self.kernels {
+            return Ok(kernels(self.json)?);
+        }
         device::load_cuda();
-        let devices: Vec<String> = std::iter::once("cpu".to_string())
-            .chain((0..tch::Cuda::device_count()).map(|i| format!("cuda:{i}")))
-            .collect();
+        let usable = tch::Cuda::device_count();
+        let devices: Vec<String> =
+            std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}"))).collect();
         let (simd, libtorch) = (simd_level()?, globalsplat::render::libtorch_version());
         let (threads, cores) = (tch::get_num_threads(), std::thread::available_parallelism()?.get());
         let weights =
             LpipsNetwork::ALL.map(|network| (network.metric(), find_pretrained(network.file_name())));
+        let (driver, nvrtc) = (Driver::find(), Nvrtc::find());
+        let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
+        let cache = cache_folder().map(|folder| folder.display().to_string());
         if self.json {
             let found: serde_json::Map<_, _> = weights
                 .into_iter()
@@ -38,28 +50,145 @@ impl Doctor {
                 "simd": simd,
                 "threads": threads,
                 "cores": cores,
+                "driver": or_error(&driver, |driver| json!(cuda_version(driver.version))),
+                "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared)),
+                "nvrtc": or_error(&nvrtc, |nvrtc| json!({
+                    "version": format!("{}.{}", nvrtc.version.0, nvrtc.version.1),
+                    "architectures": nvrtc.architectures,
+                })),
+                "kernels": cache,
                 "model": SHIPPED_MODEL,
                 "weights": found,
             }));
-        } else {
-            println!("globalsplat  {}", env!("CARGO_PKG_VERSION"));
-            println!("libtorch     {libtorch}");
-            println!("devices      {}", devices.join(", "));
-            println!("rasterizer   {simd} (GLOBALSPLAT_SIMD forces another)");
-            println!("threads      {threads} on {cores} cores (OMP_NUM_THREADS sets them)");
-            println!(
-                "model        {SHIPPED_MODEL}, inside the program (reconstruct --weights takes another)"
-            );
-            for (metric, path) in weights {
-                let found = match path {
-                    Some(path) => path.display().to_string(),
-                    None => {
-                        format!("absent (make weights makes them, {WEIGHTS_VARIABLE} names their folder)")
-                    }
-                };
-                println!("{metric:<12} {found}");
+            return Ok(());
+        }
+        let line = |name: &str, told: &dyn Display| println!("{name:<12} {told}");
+        line("globalsplat", &env!("CARGO_PKG_VERSION"));
+        line("libtorch", &libtorch);
+        line("devices", &devices.join(", "));
+        line("rasterizer", &format!("{simd} (GLOBALSPLAT_SIMD forces another)"));
+        line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
+        match &driver {
+            Err(why) => line("driver", &format!("absent: {why}")),
+            Ok(driver) => {
+                line("driver", &format!("NVIDIA's, for CUDA {}", cuda_version(driver.version)));
+                for (number, gpu) in driver.gpus.iter().enumerate() {
+                    let gigabytes = gpu.memory as f64 * 1e-9;
+                    let (name, capability) = (&gpu.name, capability(gpu.architecture));
+                    line(
+                        &format!("cuda:{number}"),
+                        &format!("{name}, compute capability {capability}, {gigabytes:.1} GB"),
+                    );
+                    line("", &state_of_kernels(prepared.get(number)));
+                }
+                if driver.gpus.is_empty() {
+                    line(
+                        "",
+                        &"it knows no GPU: nvidia-smi tells whether the system sees one, and CUDA_VISIBLE_DEVICES may hide it",
+                    );
+                }
             }
+        }
+        match &nvrtc {
+            Err(why) => line("nvrtc", &format!("absent: {why}")),
+            Ok(nvrtc) => {
+                let [least, most] = [nvrtc.architectures.first(), nvrtc.architectures.last()]
+                    .map(|of| of.map_or(String::new(), |&of| capability(of)));
+                let (major, minor) = nvrtc.version;
+                line("nvrtc", &format!("{major}.{minor}, for compute capability {least} to {most}"));
+            }
+        }
+        line("kernels", &cache.as_deref().unwrap_or("kept nowhere: neither XDG_CACHE_HOME nor HOME is set"));
+        line("model", &format!("{SHIPPED_MODEL}, inside the program (reconstruct --weights takes another)"));
+        for (metric, path) in weights {
+            let found = match path {
+                Some(path) => path.display().to_string(),
+                None => format!("absent (make weights makes them, {WEIGHTS_VARIABLE} names their folder)"),
+            };
+            line(&metric.to_string(), &found);
         }
         Ok(())
     }
+}
+
+/// As in 9.0, of 90.
+fn capability(architecture: i32) -> String {
+    format!("{}.{}", architecture / 10, architecture % 10)
+}
+
+/// As in 13.0, of 13000.
+fn cuda_version(version: i32) -> String {
+    format!("{}.{}", version / 1000, version % 1000 / 10)
+}
+
+fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Value {
+    match found {
+        Ok(found) => tell(found),
+        Err(why) => json!({ "absent": why }),
+    }
+}
+
+/// Of the driver's GPUs, those that torch can use come first, and have their kernels.
+fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>]) -> Value {
+    let told = driver.gpus.iter().enumerate().map(|(number, gpu)| {
+        json!({
+            "name": gpu.name,
+            "compute_capability": capability(gpu.architecture),
+            "memory_bytes": gpu.memory,
+            "multiprocessors": gpu.multiprocessors,
+            "kernels": state_of_kernels(prepared.get(number)),
+        })
+    });
+    told.collect()
+}
+
+fn state_of_kernels(prepared: Option<&Result<Prepared, String>>) -> String {
+    match prepared {
+        None => "this libtorch can't use it: it has no CUDA half, or one for other GPUs (setup.sh installs torch's default)".into(),
+        Some(Err(why)) => format!("its kernels are missing: {why}"),
+        Some(Ok(Prepared { architecture, file, was_kept })) => {
+            let how = if *was_kept { "read from" } else { "compiled just now, and kept in" };
+            let of = capability(*architecture);
+            match file {
+                Some(file) => format!("kernels for {of}, {how} {}", file.display()),
+                None => format!("kernels for {of}, compiled just now"),
+            }
+        }
+    }
+}
+
+/// A table, a row for each kernel and a column for each architecture.
+fn kernels(as_json: bool) -> globalsplat::Result<()> {
+    let nvrtc = Nvrtc::find().map_err(Error::Request)?;
+    let mut of_all: Vec<(i32, Vec<KernelUse>)> = vec![];
+    for &architecture in &nvrtc.architectures {
+        let compiled = nvrtc.compile(architecture, Form::Cubin).map_err(Error::Request)?;
+        let mut kernels = usage(&compiled.log);
+        kernels.sort_by(|a, b| a.name.cmp(&b.name));
+        of_all.push((architecture, kernels));
+    }
+    if as_json {
+        let told = of_all.iter().map(|(architecture, kernels)| {
+            let kernels: Vec<Value> = kernels
+                .iter()
+                .map(|k| json!({ "name": k.name, "registers": k.registers, "shared": k.shared, "stack": k.stack, "spills": k.spills }))
+                .collect();
+            json!({ "compute_capability": capability(*architecture), "kernels": kernels })
+        });
+        print_json(&told.collect());
+        return Ok(());
+    }
+    println!("Registers of a thread, shared bytes of a block, and bytes spilled, by compute capability\n");
+    print!("{:<22}", "");
+    of_all.iter().for_each(|(architecture, _)| print!("{:>14}", capability(*architecture)));
+    println!();
+    for (row, kernel) in of_all[0].1.iter().enumerate() {
+        print!("{:<22}", kernel.name);
+        for (_, kernels) in &of_all {
+            let KernelUse { registers, shared, spills, .. } = &kernels[row];
+            print!("{:>14}", format!("{registers}/{shared}/{spills}"));
+        }
+        println!();
+    }
+    Ok(())
 }

@@ -1,6 +1,7 @@
 //! The differentiable splat op (spec 6), safe and typed.
 
 pub mod cpu;
+pub mod cuda;
 mod handed_over;
 mod harmonics;
 mod transform;
@@ -56,11 +57,12 @@ pub struct Pictures {
     pub depth: Tensor,
 }
 
-/// Renders every scene from its cameras. Differentiable with respect to the Gaussians and to `w2c`, its
-/// entries taken as free numbers; float64 tensors are rendered in float64, all others in float32. Tensors on a device that can't render are moved to the host and the pictures back.
+/// Renders every scene from its cameras, where the Gaussians are: on the CPU or a CUDA device, to the same bits. Differentiable with
+/// respect to the Gaussians and to `w2c`, its entries taken as free numbers. float64 tensors are rendered in float64, on the host
+/// wherever they are, and all others in float32.
 ///
 /// # Errors
-/// Shapes that don't fit together, and a `GLOBALSPLAT_SIMD` that this machine doesn't have.
+/// Shapes that don't fit together, a `GLOBALSPLAT_SIMD` that this machine doesn't have, and GPUs without what compiles for them.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pictures> {
     let [rgb, alpha, depth] = call(ffi::splat, gaussians, cameras, eps2d)?;
     Ok(Pictures { rgb, alpha, depth })

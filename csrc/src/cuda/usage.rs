@@ -1,0 +1,71 @@
+//! What a kernel takes of a GPU, as the compiler says.
+
+/// Of one kernel on one architecture.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KernelUse {
+    /// Its name in the text.
+    pub name: String,
+    /// Of a thread, at most 255.
+    pub registers: u32,
+    /// Bytes that the threads of a block share.
+    pub shared: u32,
+    /// Bytes of memory that a thread's local arrays take, which lie in the caches.
+    pub stack: u32,
+    /// Bytes that a thread stores and loads for want of registers.
+    pub spills: u32,
+}
+
+/// Every kernel that a compiler's log speaks of, by ptxas' words:
+///
+/// ```text
+/// ptxas info    : Compiling entry function 'gs_blend' for 'sm_90'
+/// ptxas         .     0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
+/// ptxas info    : Used 40 registers, used 0 barriers, 16384 bytes smem
+/// ```
+pub fn usage(log: &str) -> Vec<KernelUse> {
+    let mut kernels: Vec<KernelUse> = vec![];
+    for line in log.lines() {
+        if let Some(name) = line.split_once("entry function '").and_then(|(_, rest)| rest.split('\'').next())
+        {
+            kernels.push(KernelUse { name: name.into(), registers: 0, shared: 0, stack: 0, spills: 0 });
+        }
+        let Some(kernel) = kernels.last_mut() else { continue };
+        let (_, line) = line.rsplit_once(" : ").unwrap_or(("", line));
+        for part in line.split(", ") {
+            let number = part.split_whitespace().find_map(|word| word.parse::<u32>().ok()).unwrap_or(0);
+            match part {
+                _ if part.ends_with("registers") => kernel.registers = number,
+                _ if part.ends_with("bytes smem") => kernel.shared = number,
+                _ if part.ends_with("bytes stack frame") => kernel.stack = number,
+                _ if part.contains("bytes spill") => kernel.spills += number,
+                _ => {}
+            }
+        }
+    }
+    kernels
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_log_is_understood() {
+        let log = "ptxas info    : 244 bytes gmem\n\
+                   ptxas info    : Compiling entry function 'gs_blend' for 'sm_90'\n\
+                   ptxas info    : Function properties for gs_blend\n\
+                   ptxas         .     608 bytes stack frame, 8 bytes spill stores, 12 bytes spill loads\n\
+                   ptxas info    : Used 40 registers, used 1 barriers, 16384 bytes smem\n\
+                   ptxas info    : Compile time = 17.077 ms\n\
+                   ptxas info    : Compiling entry function 'gs_list' for 'sm_90'\n\
+                   ptxas info    : Used 20 registers, used 0 barriers, 400 bytes cmem[0]\n";
+        let of = |name: &str, registers, shared, stack, spills| KernelUse {
+            name: name.into(),
+            registers,
+            shared,
+            stack,
+            spills,
+        };
+        assert_eq!(usage(log), [of("gs_blend", 40, 16384, 608, 20), of("gs_list", 20, 0, 0, 0)]);
+    }
+}
