@@ -356,6 +356,51 @@ fn instruction_sets_agree() {
 }
 
 #[test]
+fn kernels_for_gpus_draw_the_cpus_bits() {
+    // A variable of the process decides: this test runs itself again, to draw and save.
+    const OUT: &str = "GLOBALSPLAT_TEST_OUT";
+    let answer = || {
+        let (g, c) = (leaves(&gaussians(2, 700, 3, Kind::Float, 21)), cameras(2, 2, 75, 50, Kind::Float));
+        let c = Cameras { w2c: c.w2c.set_requires_grad(true), ..c };
+        let p = draw(&g, &c);
+        objective(&p).backward();
+        let drawn = [("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
+        let gradients = fields(&g).into_iter().chain([("w2c", &c.w2c)]).map(|(name, t)| (name, t.grad()));
+        drawn.into_iter().chain(gradients).collect::<Vec<_>>()
+    };
+    let was_cpu = || globalsplat::render::cpu::stage_times().blend_backward > 0.;
+    if let Some(out) = std::env::var_os(OUT) {
+        Tensor::write_safetensors(&answer(), out).expect("a writable file");
+        assert!(!was_cpu());
+        return;
+    }
+    let expected = answer();
+    assert!(was_cpu());
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut answers = vec![];
+    for order in ["1", "2"] {
+        let out = folder.path().join(order);
+        let passed = Command::new(std::env::current_exe().expect("this test's path"))
+            .args(["--exact", "kernels_for_gpus_draw_the_cpus_bits"])
+            .env("GLOBALSPLAT_CUDA_ON_CPU", order)
+            .env(OUT, &out)
+            .stdout(Stdio::null())
+            .status()
+            .expect("this test runs");
+        assert!(passed.success());
+        let tensors = Tensor::read_safetensors(&out).expect("what was written");
+        answers.push(tensors.into_iter().collect::<BTreeMap<_, _>>());
+    }
+    for (place, (name, expected)) in expected.iter().enumerate() {
+        let [found, other] = [&answers[0][*name], &answers[1][*name]];
+        assert!(found.equal(other), "{name} depends on the order");
+        let error = largest_error(found, expected) / expected.abs().max().double_value(&[]);
+        let is_picture = place < 3;
+        assert!(if is_picture { found.equal(expected) } else { error < 1e-5 }, "{name}: {error:.1e}");
+    }
+}
+
+#[test]
 fn bits_do_not_depend_on_threads() {
     let run = |threads: i32| {
         tch::set_num_threads(threads);

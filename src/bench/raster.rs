@@ -66,7 +66,7 @@ pub struct Rate {
     pub share_of_peak: f64,
 }
 
-/// Floating-point operations of a pair in `csrc/raster/blend.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1,
+/// Floating-point operations of a pair in `csrc/raster/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1,
 /// and A, C and D 9.
 const FORWARD_OPERATIONS: f64 = 38.;
 /// Up to T as forward, 28, w 1, q 8, what remains 2, ν with a reciprocal 8, and the ten sums 19.
