@@ -3,10 +3,12 @@
 # these scenes, on two CPU cores.
 #   CAPTURES  a capture, or a folder with captures up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else made-up worlds
 #   OUT       where everything goes; by default runs/demo
+#   DEVICE    what computes, cpu or cuda; by default cpu
 set -euo pipefail
 cd "$(dirname "$0")/.."
 globalsplat="target/release/globalsplat"
 out="${OUT:-runs/demo}"
+device="${DEVICE:-cpu}"
 captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-none}}"
 captures="${captures%/}"
 mkdir -p "$out"
@@ -38,8 +40,8 @@ show() {
     mkdir -p "$2"
     for scene in "${scenes[@]}"; do
         name="$(name_of "$scene")"
-        "$globalsplat" reconstruct --weights "$1" --scene "$scene" --holdout every:3+1 --out "$2/$name.ply"
-        "$globalsplat" eval --weights "$1" --scene "$scene" --holdout every:3+1 --views 12 --sheet "$2/${name}_held_out.png" >/dev/null
+        "$globalsplat" reconstruct --device "$device" --weights "$1" --scene "$scene" --holdout every:3+1 --out "$2/$name.ply"
+        "$globalsplat" eval --device "$device" --weights "$1" --scene "$scene" --holdout every:3+1 --views 12 --sheet "$2/${name}_held_out.png" >/dev/null
         "$globalsplat" render --splat "$2/$name.ply" --scene "$scene" --orbit --depth --size 256x256 --out "$2/${name}_orbit.gif" >/dev/null
     done
 }
@@ -55,7 +57,7 @@ if [ ${#scenes[@]} -eq 0 ]; then
     for number in 0 1 2 3; do scenes+=("$captures/000000.torch#7_00000$number"); done
     train_on=("$captures")
     # Judged over all of them, on one page.
-    "$globalsplat" eval --weights models/tiny.safetensors --data "$captures" --index "$captures/evaluation_index.json" \
+    "$globalsplat" eval --device "$device" --weights models/tiny.safetensors --data "$captures" --index "$captures/evaluation_index.json" \
         --name "weights that come with it" --out "$out/evaluation"
 fi
 show models/tiny.safetensors "$out/shipped"
@@ -70,7 +72,7 @@ echo "LOOK: $out/refined/${first}_held_out.png has the same views after 30 s tha
 
 echo "demo: the weights are trained on for some minutes, on two thirds of these photos" >&2
 list="$(printf ', "%s"' "${train_on[@]}")"
-"$globalsplat" train --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" --out "$out/training"
+"$globalsplat" train --device "$device" --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" --out "$out/training"
 "$globalsplat" export --run "$out/training" --out "$out/model.safetensors"
 show "$out/model.safetensors" "$out/trained"
 echo "LOOK: $out/training/curves.svg has both curves, in training and held out; $out/trained the same views as $out/shipped, after training"
