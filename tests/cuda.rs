@@ -2,8 +2,10 @@
 
 mod common;
 
-use common::skip;
-use globalsplat::render::cuda::{Form, Nvrtc, usage};
+use common::{again, skip};
+use globalsplat::render::cuda::{Driver, Form, Nvrtc, cache_folder, prepare, usage};
+use std::path::Path;
+use std::process::Command;
 
 /// The oldest and the newest that are promised.
 const OLDEST: i32 = 75;
@@ -50,4 +52,78 @@ fn newer_gpus_get_what_their_driver_compiles_and_older_ones_a_sentence() {
     assert!(ptx.ends_with(&[0]) && String::from_utf8_lossy(&ptx).contains(".entry gs_blend"));
     let refused = nvrtc.target(nvrtc.architectures[0] - 1).unwrap_err();
     assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
+}
+
+/// A folder with a driver in it, which loaders find by LD_LIBRARY_PATH.
+fn fake_driver() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let compiler = std::env::var("CXX").unwrap_or("c++".into());
+    let compiled = Command::new(compiler)
+        .args(["-x", "c", "-shared", "-fPIC", "tests/common/fake_driver.c", "-o"])
+        .arg(folder.path().join("libcuda.so.1"))
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .status()
+        .expect("the compiler that this was built with");
+    assert!(compiled.success());
+    folder
+}
+
+#[test]
+fn kernels_are_compiled_once() {
+    if nvrtc().is_none() {
+        return;
+    }
+    // The driver is looked for once in a process: this test runs itself again with one.
+    const EXPECTED: &str = "GLOBALSPLAT_TEST_EXPECTED";
+    if let Some(expected) = std::env::var_os(EXPECTED) {
+        let driver = Driver::find().unwrap();
+        let gpu = &driver.gpus[0];
+        assert_eq!((driver.version, gpu.name.as_str(), gpu.architecture), (13000, "Imaginary", 90));
+        assert_eq!((gpu.memory, gpu.multiprocessors), (8 << 30, 132));
+        let prepared = prepare(0).unwrap();
+        assert_eq!((prepared.architecture, prepared.was_kept), (90, expected == "kept"));
+        let file = prepared.file.expect("a place for it");
+        assert!(file.starts_with(cache_folder().unwrap()) && file.is_file());
+        assert!(prepare(1).unwrap_err().contains("1 GPUs"));
+        return;
+    }
+    let (driver, cache) = (fake_driver(), tempfile::tempdir().expect("a temporary folder"));
+    let run = |expected: &str| {
+        let variables = [
+            ("LD_LIBRARY_PATH", driver.path()),
+            ("XDG_CACHE_HOME", cache.path()),
+            (EXPECTED, Path::new(expected)),
+        ];
+        assert!(again("kernels_are_compiled_once", &variables).0, "{expected}");
+    };
+    run("compiled");
+    run("kept");
+    let kept = cache.path().join("globalsplat").read_dir().unwrap().next().unwrap().unwrap().path();
+    let image = std::fs::read(&kept).unwrap();
+    std::fs::write(&kept, &image[..image.len() / 2]).unwrap();
+    run("compiled");
+    assert_eq!(std::fs::read(&kept).unwrap(), image);
+}
+
+#[test]
+fn doctor_says_what_is_missing() {
+    let driver = fake_driver();
+    let doctor = |error: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+            .arg("doctor")
+            .envs([("LD_LIBRARY_PATH", driver.path()), ("XDG_CACHE_HOME", driver.path())])
+            .env("GLOBALSPLAT_FAKE_DRIVER", error)
+            .output()
+            .expect("a program that starts");
+        assert!(output.status.success());
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let found = doctor("");
+    assert!(
+        found.contains("CUDA 13.0") && found.contains("Imaginary, compute capability 9.0, 8.6 GB"),
+        "{found}"
+    );
+    assert!(found.contains("this libtorch can't use it"), "{found}");
+    assert!(doctor("no device").contains("it knows no GPU"));
+    assert!(doctor("mismatch").contains("unsupported display driver"));
 }

@@ -43,8 +43,10 @@ impl Driver {
                         NVIDIA's installer, and into a container by nvidia-container-toolkit"
                 .into());
         }
-        told(result::init())?;
-        let count = told(result::device::get_count())?;
+        let count = match result::init() {
+            Err(DriverError(sys::CUresult::CUDA_ERROR_NO_DEVICE)) => 0,
+            started => told(started.and_then(|()| result::device::get_count()))?,
+        };
         let gpus = (0..count).map(Gpu::find).collect::<Result<Vec<_>>>()?;
         Ok(Driver { version: driver_version()?, gpus })
     }
@@ -77,8 +79,9 @@ fn driver_version() -> Result<i32> {
 
 fn told<T>(result: std::result::Result<T, DriverError>) -> Result<T> {
     result.map_err(|error| {
-        let code = error.error_name().map_or("an unknown error".into(), |name| name.to_string_lossy());
-        format!("CUDA's driver fails: {code}")
+        let words = [error.error_string(), error.error_name()]
+            .map(|text| text.map_or("unknown".into(), |text| text.to_string_lossy().into_owned()));
+        format!("CUDA's driver fails: {}", words.join(", "))
     })
 }
 
