@@ -5,5 +5,6 @@
 #include "cpu/splat.cpp"
 #include "cuda/splat.cpp"
 #include "fit.cpp"
+#include "ops.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

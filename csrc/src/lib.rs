@@ -3,4 +3,5 @@
 pub mod chunk;
 pub mod cuda;
 pub mod fit;
+pub mod ops;
 pub mod render;

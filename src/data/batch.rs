@@ -62,9 +62,10 @@ impl ViewBatch {
 
     /// The views at `positions`, of every scene.
     pub fn select(&self, positions: &[usize]) -> Self {
-        let index: Vec<i64> = positions.iter().map(|&p| p as i64).collect();
-        let index = Tensor::from_slice(&index).to_device(self.images.device());
-        let select = |t: &Tensor| t.index_select(1, &index);
+        // Positions as a tensor would have to be sent to the device.
+        let select = |t: &Tensor| {
+            Tensor::stack(&positions.iter().map(|&view| t.select(1, view as i64)).collect::<Vec<_>>(), 1)
+        };
         ViewBatch {
             images: select(&self.images),
             c2w: select(&self.c2w),

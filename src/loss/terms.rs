@@ -1,8 +1,8 @@
 //! The terms of the loss. Each is named in one list: sums, logs and TensorBoard go through [`Term::ALL`].
 
 use super::config::LossConfig;
-use std::ops::{AddAssign, Index};
-use tch::Tensor;
+use std::ops::Index;
+use tch::{Kind, Tensor, no_grad};
 
 /// Declares [`Term`] from a list, so that each has its name and its place by being in it.
 macro_rules! terms {
@@ -78,12 +78,22 @@ impl Losses<Tensor> {
         let total = counted.reduce(|sum, term| sum + term).expect("terms that count");
         Losses { total, terms }
     }
+
+    /// Their values, the sum before the terms, in one tensor: to be added up over slices of a step, and read at once. In float64,
+    /// in which sums lose nothing.
+    pub fn packed(&self) -> Tensor {
+        let all: Vec<&Tensor> = std::iter::once(&self.total).chain(&self.terms).collect();
+        no_grad(|| Tensor::stack(&all, 0).to_kind(Kind::Double))
+    }
 }
 
-impl<T> Losses<T> {
-    /// Applies `f` to the sum and to every term.
-    pub fn map<U>(&self, f: impl Fn(&T) -> U) -> Losses<U> {
-        Losses { total: f(&self.total), terms: self.terms.each_ref().map(f) }
+impl Losses<f64> {
+    /// As many numbers as [`Losses::packed`] puts together.
+    pub const COUNT: usize = 1 + Term::ALL.len();
+
+    /// What [`Losses::packed`] put together.
+    pub fn unpacked(values: &[f64; Self::COUNT]) -> Self {
+        Losses { total: values[0], terms: std::array::from_fn(|term| values[1 + term]) }
     }
 }
 
@@ -92,15 +102,6 @@ impl<T> Index<Term> for Losses<T> {
 
     fn index(&self, term: Term) -> &T {
         &self.terms[term as usize]
-    }
-}
-
-impl AddAssign for Losses<f64> {
-    fn add_assign(&mut self, other: Self) {
-        self.total += other.total;
-        for (term, other) in self.terms.iter_mut().zip(other.terms) {
-            *term += other;
-        }
     }
 }
 
@@ -113,9 +114,10 @@ mod tests {
         let config =
             LossConfig { mse: 2., perceptual_factor: 3., frustum: 5., decoder: 7., ..Default::default() };
         let tensors = Losses::weighted(&config, |term| Tensor::from(term as usize as f64));
-        let mut sum = tensors.map(|t| t.double_value(&[]));
-        assert_eq!(sum.total, 2. * 0. + 3. * 1. + 2. + 5. * 3. + 7. * 4.);
-        sum += sum;
+        let twice = tensors.packed() * 2.;
+        let values = Vec::<f64>::try_from(twice).expect("numbers").try_into().expect("one of each");
+        let sum = Losses::unpacked(&values);
+        assert_eq!(sum.total, 2. * (2. * 0. + 3. * 1. + 2. + 5. * 3. + 7. * 4.));
         for (place, term) in Term::ALL.into_iter().enumerate() {
             assert_eq!((term as usize, sum[term]), (place, 2. * place as f64), "{}", term.name());
             assert_eq!(Term::ALL.iter().filter(|other| other.name() == term.name()).count(), 1);

@@ -173,9 +173,8 @@ impl Decoder {
 
     /// Residuals to two unit vectors, [B, N, 6].
     fn activate_rotations(&self, residuals: &Tensor) -> Tensor {
-        let identity = Tensor::from_slice(&[1f32, 0., 0., 0., 1., 0.]).to_device(residuals.device());
-        let vectors = (residuals + identity.to_kind(residuals.kind())).unflatten(-1, [2, 3]);
-        normalize(&vectors).flatten(-2, -1)
+        let identity = Tensor::eye_m(2, 3, (residuals.kind(), residuals.device()));
+        normalize(&(residuals.unflatten(-1, [2, 3]) + identity)).flatten(-2, -1)
     }
 }
 

@@ -50,6 +50,9 @@ impl Tokenizer {
 #[derive(Debug)]
 pub(crate) struct RgbTokens {
     patch_size: i64,
+    /// Of the photos that networks are mostly trained on, by channel, [3, 1, 1]; and their standard deviation.
+    mean: Tensor,
+    deviation: Tensor,
     project: nn::Linear,
 }
 
@@ -57,13 +60,14 @@ impl RgbTokens {
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         let inputs = 3 * config.patch_size * config.patch_size;
         let project = default_linear(vs / "rgb_patch_embeds" / "1", inputs, config.rgb_width, false);
-        RgbTokens { patch_size: config.patch_size, project }
+        let channels = |values: &[f32]| Tensor::from_slice(values).view([3, 1, 1]).to_device(vs.device());
+        let [mean, deviation] = [&IMAGENET_MEAN, &IMAGENET_STD].map(|values| channels(values));
+        RgbTokens { patch_size: config.patch_size, mean, deviation, project }
     }
 
     /// `images` [B, V, 3, H, W] in [0, 1]; the result is [B, V, P, RGB width].
     pub fn forward(&self, images: &Tensor) -> Tensor {
-        let channel = |values: &[f32]| Tensor::from_slice(values).view([3, 1, 1]).to_device(images.device());
-        let normalized = (images - channel(&IMAGENET_MEAN)) / channel(&IMAGENET_STD);
+        let normalized = (images - &self.mean) / &self.deviation;
         self.project.forward(&patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
     }
 }

@@ -111,7 +111,7 @@ impl AdamW {
     }
 
     /// The gradients that the last backward pass left, by the parameters' names and in their order. What is done to them in
-    /// place is done to what [`AdamW::clip_gradients`] and [`AdamW::step`] see.
+    /// place is done to what [`AdamW::gradient_norm`] and [`AdamW::step`] see.
     pub fn gradients(&self) -> impl Iterator<Item = (&str, Tensor)> {
         let gradients = self.parameters.iter().map(|p| (p.name.as_str(), p.value.grad()));
         gradients.filter(|(_, gradient)| gradient.defined())
@@ -122,18 +122,20 @@ impl AdamW {
         self.parameters.iter_mut().for_each(|p| p.value.zero_grad());
     }
 
-    /// Scales the gradients so that their common norm is at most `largest`, and returns what it was.
-    pub fn clip_gradients(&self, largest: f64) -> f64 {
-        let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
-        let norms: Vec<Tensor> = gradients.iter().map(Tensor::norm).collect();
-        let norm = Tensor::stack(&norms, 0).norm().double_value(&[]);
+    /// The norm of all gradients together, a scalar where they are.
+    pub fn gradient_norm(&self) -> Tensor {
+        let norms: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient.norm()).collect();
+        Tensor::stack(&norms, 0).norm()
+    }
+
+    /// Scales the gradients, whose common norm is `norm`, so that it is at most `largest`.
+    pub fn clip_gradients(&self, norm: f64, largest: f64) {
         if norm > largest {
             let factor = largest / (norm + CLIP_EPS);
-            gradients.into_iter().for_each(|mut g| {
+            self.gradients().for_each(|(_, mut g)| {
                 let _ = g.g_mul_scalar_(factor);
             });
         }
-        norm
     }
 
     /// One update from the gradients that are there, by the groups' learning rates; on the CPU in one pass over memory.
@@ -230,9 +232,11 @@ mod tests {
         let (a, b) = (leaf(&[0.]), leaf(&[0.]));
         let adamw = AdamW::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
         (&a * 3. + &b * 4.).sum(Kind::Float).backward();
-        assert!((adamw.clip_gradients(10.) - 5.).abs() < 1e-6);
+        let norm = adamw.gradient_norm().double_value(&[]);
+        assert!((norm - 5.).abs() < 1e-6);
+        adamw.clip_gradients(norm, 10.);
         assert_eq!(a.grad().double_value(&[0]), 3.);
-        adamw.clip_gradients(1.);
+        adamw.clip_gradients(norm, 1.);
         assert!((a.grad().double_value(&[0]) - 0.6).abs() < 1e-5);
     }
 
@@ -245,7 +249,7 @@ mod tests {
             // As an all-reduce would: in place.
             let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
         }
-        assert!((adamw.clip_gradients(10.) - 2.).abs() < 1e-6);
+        assert!((adamw.gradient_norm().double_value(&[]) - 2.).abs() < 1e-6);
         adamw.step();
         assert_eq!(a.double_value(&[0]), 1.);
         assert!((b.double_value(&[0]) - 0.9).abs() < 1e-6);

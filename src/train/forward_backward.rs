@@ -7,7 +7,7 @@
 use crate::config::Config;
 use crate::data::Sample;
 use crate::error::Result;
-use crate::loss::{Losses, PerceptualLoss, Share, depth_pixels, losses};
+use crate::loss::{PerceptualLoss, Share, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, leaf, pull_back};
 use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, Pictures, render};
@@ -23,8 +23,9 @@ pub(super) struct ForwardBackward<'a> {
 }
 
 impl ForwardBackward<'_> {
-    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own.
-    pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<Losses<f64>> {
+    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own. Returns the loss and its
+    /// terms, as [`Losses::packed`](crate::loss::Losses::packed) does.
+    pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<Tensor> {
         let context = &sample.context;
         let model = self.model;
         let tokens =
@@ -60,7 +61,7 @@ impl ForwardBackward<'_> {
             }
         });
         watch.time("tokens backward", || pull_back(&[(&tokens, &tokens_leaf)]));
-        Ok(losses.map(|t| t.double_value(&[])))
+        Ok(losses.packed())
     }
 
     /// Pixels of a paired sample whose depth L_con compares, a scalar.

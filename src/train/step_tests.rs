@@ -4,11 +4,12 @@ use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
-use crate::model::{ModelConfig, Stage, Streams};
+use crate::model::{ModelConfig, Precision, Stage, Streams};
 use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
+use globalsplat_csrc::ops::ops_of;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
@@ -72,7 +73,14 @@ type Step = (Losses<f64>, BTreeMap<String, Tensor>);
 
 /// By the trainer.
 fn gradients(config: &Config, sample: &Sample) -> Step {
-    of_model(config, |trainer| trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
+    of_model(config, |trainer| {
+        numbers(&trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
+    })
+}
+
+/// Packed losses as numbers.
+fn numbers(losses: &Tensor) -> Losses<f64> {
+    Losses::unpacked(&Vec::try_from(losses).expect("float64").try_into().expect("all terms"))
 }
 
 /// What `compute` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.
@@ -170,8 +178,60 @@ fn a_step_in_parts_is_the_plain_one() {
             let perceptual = trainer.perceptual.as_ref();
             let losses = losses(&config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE);
             losses.total.backward();
-            losses.map(|t| t.double_value(&[]))
+            numbers(&losses.packed())
         });
         assert_same(&gradients(&config, &sample), &plain, 1e-6);
+    }
+}
+
+/// Ops whose answer the host waits for: numbers that it reads, and sizes that depend on values.
+const WAITING: [&str; 7] = [
+    "aten::_local_scalar_dense",
+    "aten::equal",
+    "aten::nonzero",
+    "aten::masked_select",
+    "aten::_unique2",
+    "aten::linalg_pinv",
+    "aten::repeat_interleave.Tensor",
+];
+
+/// That no op of `ops` waits for a GPU, and how many tensors are sent to a device, be it the one where they are.
+fn moves(ops: &[String]) -> usize {
+    let waits = ops.iter().find(|op| WAITING.contains(&op.as_str()));
+    assert!(waits.is_none(), "{waits:?} waits");
+    ops.iter().filter(|op| *op == "aten::to.device").count()
+}
+
+#[test]
+fn a_step_moves_nothing_but_what_is_told() {
+    let sample = sample();
+    for (micro_batch, checkpoint_rounds, precision) in
+        [(0, false, Precision::F32), (2, false, Precision::Bf16), (1, true, Precision::F32)]
+    {
+        let train = TrainConfig { micro_batch, checkpoint_rounds, precision, ..Default::default() };
+        of_model(&config(small(), train), |trainer| {
+            let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
+            let (decoded, ops) = ops_of(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
+            assert_eq!((ops.is_empty(), moves(&ops)), (false, 0), "an inference");
+            let cameras = sample.target.cameras();
+            let (pictures, ops) = ops_of(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));
+            // Rendering brings pictures to where the Gaussians are.
+            let of_pictures = moves(&ops);
+            let pictures = pictures.expect("pictures");
+            let perceptual = trainer.perceptual.as_ref();
+            let (_, ops) = ops_of(|| {
+                losses(&trainer.config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE)
+            });
+            assert_eq!(moves(&ops), 0, "the losses");
+
+            let (report, ops) = ops_of(|| trainer.learn(&sample, &mut Stopwatch::default()));
+            let renders = match micro_batch {
+                0 => 1,
+                // Depths are compared over all slices, whose pixels are counted before.
+                count => 2 * sample.scenes().div_ceil(count),
+            };
+            assert_eq!(moves(&ops), 1 + renders * of_pictures, "a step in slices of {micro_batch}");
+            report.expect("a step").losses
+        });
     }
 }

@@ -96,14 +96,15 @@ impl Trainer {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
-        let (gradient_norm, skipped) = watch.time("optimizer", || {
-            let gradient_norm = self.optimizer.clip_gradients(self.config.train.gradient_clip);
+        let (losses, gradient_norm, skipped) = watch.time("optimizer", || {
+            let (losses, gradient_norm) = read(&losses, &self.optimizer.gradient_norm());
             let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());
             if !skipped {
+                self.optimizer.clip_gradients(gradient_norm, self.config.train.gradient_clip);
                 self.optimizer.set_learning_rate(learning_rate);
                 self.optimizer.step();
             }
-            (gradient_norm, skipped)
+            (losses, gradient_norm, skipped)
         });
         let report = StepReport {
             step: self.step,
@@ -119,13 +120,13 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Leaves the gradient of the sample's loss in the variables, and returns the loss.
+    /// Leaves the gradient of the sample's loss in the variables, and returns the loss, packed.
     pub(super) fn gradients(
         &mut self,
         sample: &Sample,
         stage: Stage,
         watch: &mut Stopwatch,
-    ) -> Result<Losses<f64>> {
+    ) -> Result<Tensor> {
         let perceptual = self.perceptual.as_ref();
         let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage };
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
@@ -152,13 +153,13 @@ impl Trainer {
                 Some(Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>));
         }
         watch.time("zero gradients", || self.optimizer.zero_grad());
-        let mut values = Losses::default();
+        let mut losses = Tensor::zeros([Losses::COUNT as i64], (Kind::Double, self.vs.device()));
         for first in (0..scenes).step_by(count) {
             share.scenes = count.min(scenes - first) as f64 / scenes as f64;
             let slice = watch.time("data", || slice(first));
-            values += part.gradients(&slice, &share, watch)?;
+            losses += part.gradients(&slice, &share, watch)?;
         }
-        Ok(values)
+        Ok(losses)
     }
 
     /// Where the next step's samples come from.
@@ -217,4 +218,13 @@ impl Trainer {
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
         Model { network, config, stage, device, input: Input::PLAIN }
     }
+}
+
+/// A step's packed losses and its gradient's norm, a scalar, as numbers. They come from a GPU together, as each time it is waited for
+/// until all that it was given is done: this is the only one of a step.
+fn read(losses: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, f64) {
+    let both = Tensor::cat(&[losses, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
+    let numbers = Vec::<f64>::try_from(both.to_device(Device::Cpu)).expect("float64");
+    let (losses, norm) = numbers.split_first_chunk().expect("all terms");
+    (Losses::unpacked(losses), norm[0])
 }

@@ -1,0 +1,22 @@
+//! Which ops libtorch is asked for.
+
+#[cxx::bridge(namespace = "globalsplat")]
+mod ffi {
+    unsafe extern "C++" {
+        include!("ops.h");
+
+        /// See `csrc/ops.h`.
+        fn note_ops();
+
+        /// See `csrc/ops.h`.
+        fn noted_ops() -> Vec<String>;
+    }
+}
+
+/// What `work` gives, and the ops that it had libtorch do on this thread, by the names that `csrc/ops.h` tells, in their order: those
+/// inside of others, and of backward passes on the CPU, too.
+pub fn ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
+    ffi::note_ops();
+    let done = work();
+    (done, ffi::noted_ops())
+}
