@@ -44,7 +44,7 @@ fn libtorch() -> PathBuf {
 fn main() {
     let libtorch = libtorch();
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
-    cxx_build::bridges(["src/chunk.rs", "src/cuda.rs", "src/fit.rs", "src/ops.rs", "src/render.rs"])
+    cxx_build::bridges(["src/chunk.rs", "src/cuda.rs", "src/fit.rs", "src/ops.rs", "src/optim.rs", "src/render.rs"])
         .std("c++17")
         // As libtorch is compiled: without it some of its classes have more fields than there.
         .define("NDEBUG", None)

@@ -6,5 +6,6 @@
 #include "cuda/splat.cpp"
 #include "fit.cpp"
 #include "ops.cpp"
+#include "optim.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

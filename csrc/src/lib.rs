@@ -4,4 +4,5 @@ pub mod chunk;
 pub mod cuda;
 pub mod fit;
 pub mod ops;
+pub mod optim;
 pub mod render;

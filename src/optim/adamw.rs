@@ -1,7 +1,9 @@
 //! AdamW (Loshchilov & Hutter 2019), with a state that can be saved (spec 8.5).
 
 use crate::error::{Error, Result};
+use crate::render::handed_over;
 use globalsplat_csrc::fit::{AdamArguments, adam};
+use globalsplat_csrc::optim::{AdamWNumbers, forget_gradients, fused_adamw, norm, scale};
 use std::collections::BTreeMap;
 use tch::{Device, Tensor};
 
@@ -35,7 +37,6 @@ struct Parameter {
 impl Parameter {
     /// One update on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, `root2` √(1 − β₂ᵗ).
     fn update(&mut self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
-        let address = |t: &Tensor| t.as_ptr() as usize;
         let arguments = AdamArguments {
             value: address(&self.value),
             gradient: address(gradient),
@@ -52,6 +53,16 @@ impl Parameter {
         let done = unsafe { adam(&arguments) };
         done.expect("a parameter, its gradient and its moments are alike");
     }
+}
+
+/// By which the C++ side knows a tensor, as long as it lives.
+fn address(t: &Tensor) -> usize {
+    t.as_ptr() as usize
+}
+
+/// The same for several.
+fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
+    tensors.into_iter().map(address).collect()
 }
 
 /// What a group's parameters have in common.
@@ -117,53 +128,78 @@ impl AdamW {
         gradients.filter(|(_, gradient)| gradient.defined())
     }
 
-    /// Forgets the gradients.
+    /// Forgets the gradients: what the next backward pass leaves takes their place, with nothing to be added to.
     pub fn zero_grad(&mut self) {
-        self.parameters.iter_mut().for_each(|p| p.value.zero_grad());
+        let values = addresses(self.parameters.iter().map(|p| &p.value));
+        // SAFETY: the tensors outlive the call.
+        unsafe { forget_gradients(&values) }.expect("leaves");
     }
 
     /// The norm of all gradients together, a scalar where they are.
     pub fn gradient_norm(&self) -> Tensor {
-        let norms: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient.norm()).collect();
-        Tensor::stack(&norms, 0).norm()
+        let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
+        // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+        let done = unsafe { handed_over(|out| norm(&addresses(&gradients), out)) };
+        let [norm] = done.expect("gradients of one device");
+        norm
     }
 
     /// Scales the gradients, whose common norm is `norm`, so that it is at most `largest`.
     pub fn clip_gradients(&self, norm: f64, largest: f64) {
         if norm > largest {
-            let factor = largest / (norm + CLIP_EPS);
-            self.gradients().for_each(|(_, mut g)| {
-                let _ = g.g_mul_scalar_(factor);
-            });
+            let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
+            // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
+            let done = unsafe { scale(&addresses(&gradients), largest / (norm + CLIP_EPS)) };
+            done.expect("gradients of one device");
         }
     }
 
-    /// One update from the gradients that are there, by the groups' learning rates; on the CPU in one pass over memory.
+    /// One update from the gradients that are there, by the groups' learning rates: on the CPU in one pass over memory, on a GPU in
+    /// one launch for many parameters.
     pub fn step(&mut self) {
         self.steps += 1;
+        match self.parameters.iter().all(|p| p.value.device() == Device::Cpu) {
+            true => self.update_on_the_cpu(),
+            false => self.update_fused(),
+        }
+    }
+
+    /// The step that [`AdamW::step`] has counted.
+    fn update_on_the_cpu(&mut self) {
         let correction1 = 1. - BETA1.powi(self.steps as i32);
         let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
-        tch::no_grad(|| {
-            for p in &mut self.parameters {
-                let gradient = p.value.grad();
-                if !gradient.defined() {
-                    continue;
-                }
+        for p in &mut self.parameters {
+            let gradient = p.value.grad();
+            if gradient.defined() {
                 let Settings { learning_rate, weight_decay } = self.groups[p.group];
                 let (rate, decay) = (learning_rate / correction1, learning_rate * weight_decay);
-                if p.value.device() == Device::Cpu {
-                    p.update(&gradient.contiguous(), rate, root2, decay, self.epsilon);
-                    continue;
-                }
-                if decay > 0. {
-                    let _ = p.value.g_mul_scalar_(1. - decay);
-                }
-                let _ = p.first.lerp_(&gradient, 1. - BETA1);
-                let _ = p.second.g_mul_scalar_(BETA2).addcmul_(&(&gradient * (1. - BETA2)), &gradient);
-                let denominator = p.second.sqrt().divide_scalar(root2) + self.epsilon;
-                let _ = p.value.addcdiv_(&(&p.first * -rate), &denominator);
+                p.update(&gradient.contiguous(), rate, root2, decay, self.epsilon);
             }
-        });
+        }
+    }
+
+    /// The same by libtorch's own kernel, group by group.
+    fn update_fused(&mut self) {
+        for (group, &Settings { learning_rate, weight_decay }) in self.groups.iter().enumerate() {
+            let of_group = self.parameters.iter().filter(|p| p.group == group);
+            let with_gradient = of_group.filter(|p| p.value.grad().defined());
+            let (parameters, gradients): (Vec<_>, Vec<_>) =
+                with_gradient.map(|p| (p, p.value.grad().contiguous())).unzip();
+            let values = addresses(parameters.iter().map(|p| &p.value));
+            let first = addresses(parameters.iter().map(|p| &p.first));
+            let second = addresses(parameters.iter().map(|p| &p.second));
+            let numbers = AdamWNumbers {
+                steps: self.steps,
+                learning_rate,
+                weight_decay,
+                beta1: BETA1,
+                beta2: BETA2,
+                epsilon: self.epsilon,
+            };
+            // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
+            let done = unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) };
+            done.expect("parameters, their gradients and their moments are alike");
+        }
     }
 
     /// Everything but the variables themselves.
@@ -197,6 +233,7 @@ impl AdamW {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use globalsplat_csrc::ops::ops_of;
     use tch::Kind;
 
     fn leaf(values: &[f32]) -> Tensor {
@@ -208,8 +245,20 @@ mod tests {
         ParameterGroup { parameters, learning_rate, weight_decay }
     }
 
+    /// The two ways to make a step, of which a machine without a GPU takes the first.
+    const WAYS: [fn(&mut AdamW); 2] = [AdamW::step, |adamw| {
+        adamw.steps += 1;
+        adamw.update_fused();
+    }];
+
     #[test]
     fn steps_are_those_of_the_equations() {
+        for step in WAYS {
+            steps_follow_the_equations(step);
+        }
+    }
+
+    fn steps_follow_the_equations(step: fn(&mut AdamW)) {
         let (weight, bias) = (leaf(&[2.]), leaf(&[2.]));
         let groups = vec![group(&[("weight", &weight)], 1e-2, 0.1), group(&[("bias", &bias)], 3e-2, 0.)];
         let mut adamw = AdamW::new(groups);
@@ -217,7 +266,7 @@ mod tests {
         for (i, gradient) in [0.5f64, -1.5, 0.25].into_iter().enumerate() {
             adamw.zero_grad();
             ((&weight + &bias).sum(Kind::Float) * gradient).backward();
-            adamw.step();
+            step(&mut adamw);
             let t = i as i32 + 1;
             (m, v) = (0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient * gradient);
             let update = (m / (1. - 0.9f64.powi(t))) / ((v / (1. - 0.999f64.powi(t))).sqrt() + 1e-8);
@@ -225,6 +274,54 @@ mod tests {
         }
         assert!((weight.double_value(&[0]) - expected[0]).abs() < 1e-6);
         assert!((bias.double_value(&[0]) - expected[1]).abs() < 1e-6);
+    }
+
+    /// Values and moments after steps with clipped gradients, one parameter having none at first.
+    #[test]
+    fn both_ways_to_make_a_step_agree() {
+        let sizes = [("a", 7), ("b", 1000), ("c", 1), ("d", 64)];
+        let states = WAYS.map(|step| {
+            let leaves = sizes.map(|(name, size)| {
+                let values = Tensor::linspace(-1., 1., size, (Kind::Float, Device::Cpu));
+                (name, (values * 3.).sin().set_requires_grad(true))
+            });
+            let named = leaves.each_ref().map(|(name, t)| (*name, t));
+            let mut adamw = AdamW::new(vec![group(&named[..2], 1e-2, 0.3), group(&named[2..], 3e-2, 0.)])
+                .with_epsilon(1e-6);
+            for i in 0..6 {
+                adamw.zero_grad();
+                let seen = if i < 2 { &named[..3] } else { &named[..] };
+                let objective = seen.iter().map(|(_, t)| (*t * (t.detach() + i).cos()).sum(Kind::Float));
+                objective.reduce(|a, b| a + b).expect("some").backward();
+                adamw.clip_gradients(adamw.gradient_norm().double_value(&[]), 2.);
+                step(&mut adamw);
+            }
+            let mut state = adamw.state();
+            state.extend(leaves.map(|(name, value)| (name.to_string(), value.detach())));
+            state
+        });
+        let [ours, fused] = states;
+        assert_eq!(ours.len(), 1 + 3 * sizes.len());
+        for (name, ours) in &ours {
+            let off = (ours - &fused[name]).abs().max().double_value(&[]);
+            let largest = ours.abs().max().double_value(&[]);
+            assert!(largest > 0. && off <= 1e-6 * largest, "{name} is off by {off:.1e} of {largest:.1e}");
+        }
+    }
+
+    #[test]
+    fn a_fused_step_is_one_op_for_each_group() {
+        let leaves: Vec<Tensor> = (0..40).map(|i| leaf(&[i as f32])).collect();
+        let named: Vec<(String, &Tensor)> =
+            leaves.iter().enumerate().map(|(i, t)| (format!("{i}"), t)).collect();
+        let named: Vec<(&str, &Tensor)> = named.iter().map(|(name, t)| (name.as_str(), *t)).collect();
+        let mut adamw = AdamW::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
+        leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
+        let (_, mut ops) = ops_of(|| WAYS[1](&mut adamw));
+        // On the CPU the op itself reads how many steps each parameter has done.
+        ops.retain(|op| op != "aten::item" && op != "aten::_local_scalar_dense");
+        let fused = ops.iter().filter(|op| *op == "aten::_fused_adamw_").count();
+        assert!(fused == 2 && ops.len() <= 8, "{ops:?}");
     }
 
     #[test]

@@ -1,0 +1,64 @@
+#include "optim.h"
+
+#include <ATen/ops/_foreach_mul.h>
+#include <ATen/ops/_foreach_norm.h>
+#include <ATen/ops/_fused_adamw.h>
+#include <ATen/ops/full.h>
+#include <ATen/ops/linalg_vector_norm.h>
+#include <ATen/ops/stack.h>
+
+#include <vector>
+
+#include "globalsplat-csrc/src/optim.rs.h"
+
+namespace globalsplat {
+namespace {
+
+using at::Tensor;
+
+std::vector<Tensor> borrowed(rust::Slice<const size_t> addresses) {
+  std::vector<Tensor> tensors;
+  tensors.reserve(addresses.size());
+  for (const size_t address : addresses) tensors.push_back(*reinterpret_cast<const Tensor*>(address));
+  return tensors;
+}
+
+}  // namespace
+
+void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out) {
+  const at::NoGradGuard no_grad;
+  const Tensor norms = at::stack(at::_foreach_norm(borrowed(tensors)));
+  out[0] = reinterpret_cast<size_t>(new Tensor(at::linalg_vector_norm(norms)));
+}
+
+void scale(rust::Slice<const size_t> tensors, double factor) {
+  const at::NoGradGuard no_grad;
+  at::_foreach_mul_(borrowed(tensors), factor);
+}
+
+void forget_gradients(rust::Slice<const size_t> tensors) {
+  for (const Tensor& t : borrowed(tensors)) t.mutable_grad().reset();
+}
+
+void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first,
+                 rust::Slice<const size_t> second, const AdamWNumbers& of) {
+  if (values.empty()) return;
+  const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first), v = borrowed(second);
+  // The kernel goes through memory as it lies, and looks at nothing but the type.
+  for (const auto* list : {&x, &g, &m, &v}) {
+    TORCH_CHECK(list->size() == x.size(), "every parameter must have a gradient and two moments");
+    for (size_t k = 0; k < x.size(); ++k) {
+      const Tensor& t = (*list)[k];
+      TORCH_CHECK(t.sizes() == x[k].sizes() && t.is_contiguous() && t.device() == x[0].device() &&
+                      t.scalar_type() == x[0].scalar_type(),
+                  "parameters, their gradients and their moments must be alike, contiguous, and all of one type on one device");
+    }
+  }
+  const at::NoGradGuard no_grad;
+  // All have done as many steps. Made on the device: to send a number there is to wait for it.
+  const Tensor steps = at::full({}, double(of.steps), x[0].options().dtype(at::kFloat));
+  at::_fused_adamw_(x, g, m, v, {}, std::vector<Tensor>(x.size(), steps), of.learning_rate, of.beta1, of.beta2, of.weight_decay,
+                    of.epsilon, /*amsgrad=*/false, /*maximize=*/false);
+}
+
+}  // namespace globalsplat
