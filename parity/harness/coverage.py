@@ -45,7 +45,7 @@ EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
     "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
-    "src/model/precision.rs": "every case of the encoder runs in float32; tests/model.rs holds bf16 against it",
+    "src/model/precision.rs": "every case of the encoder runs in float32; tests/model.rs and tests/perceptual.rs hold bf16 against it",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
     "src/model/shapes.rs": "a configuration read off shapes; parity/tests/test_checkpoints.py holds it against models made here",
     "src/loss/config.rs": "factors",

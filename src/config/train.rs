@@ -20,8 +20,8 @@ pub struct TrainConfig {
     /// Whether the encoder keeps nothing of a round but what it began with, and computes the round again in the backward
     /// pass: less memory, a fifth more time.
     pub checkpoint_rounds: bool,
-    /// `f32`, or `bf16` for the encoder's matrix products, which is faster for wide models where the machine has instructions
-    /// for it.
+    /// `f32`, or `bf16` for the encoder's matrix products and the network of L_perc, which is faster for wide models where the
+    /// machine has instructions for it.
     pub precision: Precision,
     /// Peak learning rate.
     pub learning_rate: f64,

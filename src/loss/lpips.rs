@@ -3,6 +3,7 @@
 
 use crate::error::Result;
 use crate::io::WeightsFile;
+use crate::model::Precision;
 use std::path::Path;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
@@ -112,10 +113,12 @@ impl LpipsNetwork {
     }
 }
 
-/// The distance, in float32; differentiable.
+/// The distance, differentiable; in float32 unless something else is asked for.
 #[derive(Debug)]
 pub struct Lpips {
     network: LpipsNetwork,
+    /// Of the convolutions; features are normalized and compared in float32.
+    precision: Precision,
     /// [1, 3, 1, 1].
     shift: Tensor,
     /// [1, 3, 1, 1].
@@ -156,7 +159,8 @@ impl Lpips {
         }
         let per_channel =
             |values: &[f32]| Tensor::from_slice(values).view([1, 3, 1, 1]).to_device(vs.device());
-        Lpips { network, shift: per_channel(&SHIFT), scale: per_channel(&SCALE), steps }
+        let precision = Precision::default();
+        Lpips { network, precision, shift: per_channel(&SHIFT), scale: per_channel(&SCALE), steps }
     }
 
     /// Reads the weights that `make weights` makes. They take no gradient; pictures do.
@@ -169,6 +173,12 @@ impl Lpips {
         WeightsFile::open(path)?.load_into(&vs)?;
         vs.freeze();
         Ok(lpips)
+    }
+
+    /// The distance, once its network has its weights, in `precision` from now on.
+    pub fn with_precision(mut self, precision: Precision) -> Self {
+        self.steps.iter_mut().for_each(|step| precision.convert(&mut step.convolution));
+        Lpips { precision, ..self }
     }
 
     /// Whose features are compared.
@@ -196,14 +206,14 @@ impl Lpips {
     pub fn features(&self, pictures: &Tensor) -> impl Iterator<Item = Tensor> {
         let size = pictures.size();
         let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
-        let mut xs = (pictures * 2. - 1. - &self.shift) / &self.scale;
+        let mut xs = self.precision.images(&((pictures * 2. - 1. - &self.shift) / &self.scale));
         self.steps.iter().filter_map(move |step| {
             if step.pooled {
                 let pool = self.network.pool();
                 xs = xs.max_pool2d([pool, pool], [2, 2], [0, 0], [1, 1], false);
             }
             xs = step.convolution.forward(&xs).relu();
-            step.linear.is_some().then(|| unit(&xs))
+            step.linear.is_some().then(|| unit(&xs.to_kind(Kind::Float)))
         })
     }
 

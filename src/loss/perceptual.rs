@@ -5,6 +5,7 @@ use super::lpips::{Lpips, LpipsNetwork};
 use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
+use crate::model::Precision;
 use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
@@ -56,6 +57,14 @@ impl PerceptualLoss {
             )));
         }
         Ok(Some(loss))
+    }
+
+    /// The network in `precision` from now on.
+    pub fn with_precision(self, precision: Precision) -> Self {
+        match self {
+            PerceptualLoss::Vgg19(network) => PerceptualLoss::Vgg19(network.with_precision(precision)),
+            PerceptualLoss::Lpips(lpips) => PerceptualLoss::Lpips(lpips.with_precision(precision)),
+        }
     }
 
     /// The file that `config` names, environment variables filled in; where it names none, the file that `make weights` makes, or

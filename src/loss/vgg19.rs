@@ -3,6 +3,7 @@
 
 use crate::error::Result;
 use crate::io::WeightsFile;
+use crate::model::Precision;
 use std::path::Path;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
@@ -32,9 +33,11 @@ const LAYERS: [(u32, i64, bool, Option<f64>); 14] = [
 /// What the sum of all differences is divided by.
 const RANGE: f64 = 255.;
 
-/// The network, in float32.
+/// The network, in float32 unless something else is asked for.
 #[derive(Debug)]
 pub struct Vgg19 {
+    /// Of the convolutions; features are compared in float32.
+    precision: Precision,
     /// [1, 3, 1, 1].
     means: Tensor,
     /// As in [`LAYERS`].
@@ -57,6 +60,7 @@ impl Vgg19 {
             built
         };
         Vgg19 {
+            precision: Precision::default(),
             convolutions: LAYERS.map(&mut convolution).into(),
             means: Tensor::from_slice(&MEANS).view([1, 3, 1, 1]).to_device(vs.device()),
         }
@@ -77,6 +81,12 @@ impl Vgg19 {
         Ok(network)
     }
 
+    /// The network, once it has its weights, in `precision` from now on.
+    pub fn with_precision(mut self, precision: Precision) -> Self {
+        self.convolutions.iter_mut().for_each(|convolution| precision.convert(convolution));
+        Vgg19 { precision, ..self }
+    }
+
     /// What [`Vgg19::compare`] compares: the input 255·x − mean, and the features after ReLU 1_2, 2_2, 3_2, 4_2 and 5_2.
     /// Pictures […, 3, H, W] in [0, 1], H and W at least [`Vgg19::SMALLEST_SIDE`].
     ///
@@ -87,6 +97,7 @@ impl Vgg19 {
         let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
         let mut xs = pictures * RANGE - &self.means;
         let mut features = vec![xs.shallow_clone()];
+        xs = self.precision.images(&xs);
         for ((.., pooled, counts), convolution) in LAYERS.iter().zip(&self.convolutions) {
             if *pooled {
                 xs = xs.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None);
@@ -103,7 +114,9 @@ impl Vgg19 {
     pub fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
         let divisors = std::iter::once(1.).chain(LAYERS.iter().filter_map(|(.., divisor)| *divisor));
         let differences = picture.iter().zip(truth).zip(divisors);
-        let differences = differences.map(|((a, b), divisor)| (a - b).abs().mean(None::<Kind>) / divisor);
+        let float = |features: &Tensor| features.to_kind(Kind::Float);
+        let differences =
+            differences.map(|((a, b), divisor)| (float(a) - float(b)).abs().mean(None::<Kind>) / divisor);
         differences.reduce(|sum, difference| sum + difference).expect("six terms") / RANGE
     }
 }

@@ -4,9 +4,10 @@ use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Of the encoder's linear layers and attention, and of the decoder's appearance head. All else is float32, whatever this
-/// says: weights and their gradients, norms, the sums inside of softmax and products, residual streams; tokens and geometry
-/// heads, whose products are few and which read and say where things are; geometry and rendering.
+/// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
+/// float32, whatever this says: weights and their gradients, norms, the sums inside of softmax and products, residual streams;
+/// tokens and geometry heads, whose products are few and which read and say where things are; geometry and rendering; the
+/// differences of features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
@@ -26,6 +27,29 @@ impl Precision {
                 let half = |t: &Tensor| t.to_kind(Kind::BFloat16);
                 half(xs).linear(&half(&layer.ws), layer.bs.as_ref().map(half).as_ref())
             }
+        }
+    }
+}
+
+/// For networks of convolutions that learn nothing.
+impl Precision {
+    /// Images [B, C, H, W], or kernels [O, I, k, k], as convolutions take them: in bf16 a pixel's channels lie side by side, as
+    /// tensor cores multiply them, and results do so, too. In float32 the same tensor.
+    pub(crate) fn images(self, xs: &Tensor) -> Tensor {
+        match self {
+            Precision::F32 => xs.shallow_clone(),
+            Precision::Bf16 => {
+                let channels_last = xs.to_kind(Kind::BFloat16).permute([0, 2, 3, 1]).contiguous();
+                channels_last.permute([0, 3, 1, 2])
+            }
+        }
+    }
+
+    /// Makes of a layer in float32 what [`Precision::images`] can go through. Its weights are converted once and for all.
+    pub(crate) fn convert(self, layer: &mut nn::Conv2D) {
+        layer.ws = self.images(&layer.ws);
+        if self == Precision::Bf16 {
+            layer.bs = layer.bs.as_ref().map(|bias| bias.to_kind(Kind::BFloat16));
         }
     }
 }

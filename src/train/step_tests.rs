@@ -184,6 +184,30 @@ fn a_step_in_parts_is_the_plain_one() {
     }
 }
 
+#[test]
+fn the_network_of_l_perc_has_the_model_s_precision() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("vgg19.safetensors");
+    let vs = nn::VarStore::new(Device::Cpu);
+    Vgg19::new(&vs.root());
+    vs.save(&file).expect("weights");
+    for (precision, kind) in [(Precision::F32, Kind::Float), (Precision::Bf16, Kind::BFloat16)] {
+        let mut config = config(small(), TrainConfig { precision, ..Default::default() });
+        config.loss.perceptual = PerceptualKind::Vgg19;
+        config.loss.perceptual_weights = file.display().to_string();
+        let scenes = Arc::new(Vec::<Capture>::new());
+        let trainer = Trainer::new(&config, scenes, Device::Cpu).expect("a trainer");
+        let Some(PerceptualLoss::Vgg19(network)) = trainer.perceptual else { panic!("a network") };
+        let features = network.features(&Tensor::zeros([1, 3, 16, 16], (Kind::Float, Device::Cpu)));
+        // The picture itself is compared as it is.
+        let kinds: Vec<Kind> = features.iter().map(Tensor::kind).collect();
+        assert_eq!(kinds, [Kind::Float, kind, kind, kind, kind, kind]);
+        assert_eq!(network.compare(&features, &features).kind(), Kind::Float);
+        let side_by_side = features[1..].iter().all(|layer| layer.stride()[1] == 1);
+        assert_eq!(side_by_side, precision == Precision::Bf16, "a pixel's channels");
+    }
+}
+
 /// Ops whose answer the host waits for: numbers that it reads, and sizes that depend on values.
 const WAITING: [&str; 7] = [
     "aten::_local_scalar_dense",

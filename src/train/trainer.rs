@@ -42,7 +42,8 @@ impl Trainer {
     /// # Errors
     /// A model that can't be built, or no weights for the perceptual loss.
     pub fn new(config: &Config, scenes: Arc<dyn SceneGroups>, device: Device) -> Result<Self> {
-        let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?;
+        let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?
+            .map(|network| network.with_precision(config.train.precision));
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
