@@ -2,6 +2,10 @@
 
 use std::{env, fs, path::PathBuf};
 
+/// What Rust and C++ know of each other.
+const BRIDGES: [&str; 6] =
+    ["src/chunk.rs", "src/device.rs", "src/fit.rs", "src/ops.rs", "src/optim.rs", "src/render.rs"];
+
 /// What every C++ file is compiled with.
 fn cpp() -> cc::Build {
     let mut build = cc::Build::new();

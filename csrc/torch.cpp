@@ -4,6 +4,7 @@
 #include "cpu/projection.cpp"
 #include "cpu/splat.cpp"
 #include "cuda/splat.cpp"
+#include "device.cpp"
 #include "fit.cpp"
 #include "ops.cpp"
 #include "optim.cpp"

@@ -27,6 +27,7 @@
 pub mod bench;
 pub mod config;
 pub mod data;
+mod device;
 pub mod error;
 pub mod eval;
 pub mod io;

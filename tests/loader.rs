@@ -3,7 +3,7 @@
 use glam::{DMat4, DVec3};
 use globalsplat::data::DataConfig;
 use globalsplat::data::{
-    Capture, JitterConfig, LoadedScene, Loader, SceneGroups, open_capture, write_cameras_json,
+    Capture, JitterConfig, LoadedScene, Loader, Sample, SceneGroups, open_capture, write_cameras_json,
 };
 use globalsplat::error::{Error, Result};
 use globalsplat::scene::{Camera, Intrinsics};
@@ -11,7 +11,7 @@ use image::{Rgb, RgbImage};
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
-use tch::Device;
+use tch::{Device, Tensor};
 
 /// Of the photos.
 const WIDTH: u32 = 48;
@@ -162,6 +162,55 @@ fn batches_are_what_the_scenes_are() {
             assert!((cx - scene.cameras[image].intrinsics.cx).abs() < 1e-5);
         }
     }
+}
+
+fn tensors(sample: &Sample) -> [&Tensor; 9] {
+    let Sample { context: a, target: b, far, .. } = sample;
+    [&a.images, &a.c2w, &a.w2c, &a.intrinsics, &b.images, &b.c2w, &b.w2c, &b.intrinsics, far]
+}
+
+/// On the CPU, where the same is done as for a GPU but for the copies.
+#[test]
+fn batches_that_are_sent_ahead_are_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(groups(folder.path(), &[4]));
+    let loader = |first| Loader::start(&config(), 0, data.clone(), 2, first).unwrap();
+    let (mut plain, mut ahead) = (loader(4), loader(4));
+    for step in 0..4 {
+        if step != 2 {
+            // Twice is once.
+            ahead.send_ahead(2, Device::Cpu);
+            ahead.send_ahead(2, Device::Cpu);
+        }
+        assert_eq!(ahead.position(), 4 + 2 * step, "what isn't handed out doesn't count");
+        let [expected, found] = [&mut plain, &mut ahead].map(|of| of.next_batch(2, Device::Cpu).unwrap());
+        assert_eq!(ahead.position(), plain.position());
+        assert_eq!(expected.names, found.names);
+        for (expected, found) in tensors(&expected).into_iter().zip(tensors(&found)) {
+            assert_eq!((expected.kind(), expected.size()), (found.kind(), found.size()));
+            assert!(expected.equal(found));
+        }
+    }
+}
+
+/// What is wrong with samples that were sent ahead is told at their turn, as it is without.
+#[test]
+fn errors_come_when_their_samples_would() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(with_bad_data(folder.path()));
+    let config = DataConfig { max_bad_share: 0.2, threads: 1, ..config() };
+    let errors = [false, true].map(|sends_ahead| {
+        let mut loader = Loader::start(&config, 0, data.clone(), 1, 0).unwrap();
+        let position = (0..24).find_map(|_| {
+            if sends_ahead {
+                loader.send_ahead(2, Device::Cpu);
+            }
+            let position = loader.position();
+            loader.next_batch(2, Device::Cpu).err().map(|error| (position, error.to_string()))
+        });
+        (position.expect("3 of 12 are too many"), loader.position())
+    });
+    assert_eq!(errors[0], errors[1]);
 }
 
 #[test]

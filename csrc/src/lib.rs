@@ -2,6 +2,7 @@
 
 pub mod chunk;
 pub mod cuda;
+pub mod device;
 pub mod fit;
 pub mod ops;
 pub mod optim;

@@ -49,6 +49,16 @@ impl ViewBatch {
         ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
+    /// All four, in the order in which [`ViewBatch::of_tensors`] takes them.
+    pub(super) fn tensors(&self) -> [&Tensor; 4] {
+        [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
+    }
+
+    /// From what [`ViewBatch::tensors`] gives.
+    pub(super) fn of_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4]) -> Self {
+        ViewBatch { images, c2w, w2c, intrinsics }
+    }
+
     /// The cameras that took the views.
     pub fn cameras(&self) -> Cameras {
         let size = self.images.size();

@@ -97,6 +97,10 @@ impl Trainer {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
+        // A GPU is still busy with that, and the next samples are on their way when it is done.
+        if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
+            loader.send_ahead(self.config.train.batch, device);
+        }
         let (losses, gradient_norm, skipped) = watch.time("optimizer", || {
             let (losses, gradient_norm) = read(&losses, &self.optimizer.gradient_norm());
             let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());

@@ -4,13 +4,14 @@
 use super::bad_data::{BadData, Fault, Ledger};
 use super::open_groups::{OpenGroups, Opened};
 use super::order::{Order, Place};
-use super::sample::Sample;
+use super::sample::{ComingSample, Sample};
 use super::sampler::{choose_views, context_views};
 use super::scene::{LoadTimes, LoadedScene};
 use super::scenes::SceneGroups;
 use crate::data::capture::Capture;
 use crate::data::config::DataConfig;
 use crate::data::pixels::{Augmentation, CHANNELS, Resampler};
+use crate::device::Upload;
 use crate::error::{Error, Result, panic_message};
 use crate::scene::{Camera, normalize};
 use glam::DVec3;
@@ -36,7 +37,19 @@ pub struct Loader {
     shared: Arc<Shared>,
     receivers: Vec<Receiver<Result<LoadedScene>>>,
     threads: Vec<JoinHandle<()>>,
+    /// The number of the sample that the threads give next.
     next: u64,
+    upload: Option<Upload>,
+    ahead: Option<Ahead>,
+}
+
+/// A batch that was sent ahead.
+#[derive(Debug)]
+struct Ahead {
+    /// The number of its first sample.
+    first: u64,
+    /// What could not be sent is told when its turn comes.
+    sample: Result<ComingSample>,
 }
 
 /// Decoded photos by place and view.
@@ -99,7 +112,8 @@ impl Loader {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
         };
-        let mut loader = Loader { shared, receivers: vec![], threads: vec![], next: first };
+        let mut loader =
+            Loader { shared, receivers: vec![], threads: vec![], next: first, upload: None, ahead: None };
         // A thread holds a sample in its hands while its queue is full.
         let queue = config.ahead.div_ceil(threads).saturating_sub(1).max(1);
         for thread in 0..threads as u64 {
@@ -137,16 +151,20 @@ impl Loader {
         self.threads.len()
     }
 
-    /// The number of the next sample.
+    /// The number of the next sample; one that was sent ahead is still to come.
     pub fn position(&self) -> u64 {
-        self.next
+        self.ahead.as_ref().map_or(self.next, |ahead| ahead.first)
     }
 
     /// The next sample.
     ///
     /// # Errors
     /// More bad data than the configuration allows.
+    ///
+    /// # Panics
+    /// It was sent ahead, for [`Loader::next_batch`] to hand out.
     pub fn next_scene(&mut self) -> Result<LoadedScene> {
+        assert!(self.ahead.is_none(), "the next samples were sent ahead");
         // Thread t made the t-th sample, whatever its number is.
         let turn = self.receivers.len();
         let receiver = &self.receivers[0];
@@ -156,13 +174,31 @@ impl Loader {
         Ok(scene)
     }
 
-    /// The next `batch` samples side by side.
+    /// The next `batch` samples side by side: those that were sent ahead, if any were.
     ///
     /// # Errors
     /// As [`Loader::next_scene`].
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
-        let scenes = (0..batch).map(|_| self.next_scene()).collect::<Result<Vec<_>>>()?;
-        Ok(Sample::of(&scenes, device))
+        match self.ahead.take() {
+            Some(ahead) => Ok(ahead.sample?.arrive()),
+            None => Ok(Sample::of(&self.next_scenes(batch)?, device)),
+        }
+    }
+
+    /// Begins to bring the next `batch` samples to `device`, for [`Loader::next_batch`] to hand out, which is asked for the same.
+    /// A GPU copies them while it works; to the CPU nothing has to be brought.
+    pub fn send_ahead(&mut self, batch: usize, device: Device) {
+        if self.ahead.is_none() {
+            let first = self.next;
+            let scenes = self.next_scenes(batch);
+            let upload = self.upload.get_or_insert_with(|| Upload::to(device));
+            self.ahead =
+                Some(Ahead { first, sample: scenes.map(|scenes| ComingSample::begin(&scenes, upload)) });
+        }
+    }
+
+    fn next_scenes(&mut self, count: usize) -> Result<Vec<LoadedScene>> {
+        (0..count).map(|_| self.next_scene()).collect()
     }
 
     /// What was skipped so far, with what is ready ahead.

@@ -3,6 +3,7 @@
 use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
 use crate::data::pixels::CHANNELS;
+use crate::device::{Upload, Uploading};
 use tch::{Device, Kind, Tensor};
 
 /// The largest value of a byte.
@@ -26,19 +27,28 @@ pub struct Sample {
 impl Sample {
     /// `scenes` with equally many views of one size, side by side.
     pub fn of(scenes: &[LoadedScene], device: Device) -> Self {
+        match device {
+            Device::Cpu => Sample::on_host(scenes, floats),
+            _ => ComingSample::begin(scenes, &Upload::to(device)).arrive(),
+        }
+    }
+
+    /// With the images that `images` makes of those that are chosen, of the shape that it is told.
+    fn on_host(scenes: &[LoadedScene], images: impl Fn(&[&[u8]], &[i64]) -> Tensor) -> Self {
         let far: Vec<f64> = scenes.iter().map(|scene| scene.far).collect();
         let batch = |chosen: fn(&LoadedScene) -> &[usize]| {
             let matrices = scenes.iter().map(|scene| {
                 let cameras: Vec<_> = chosen(scene).iter().map(|&position| scene.cameras[position]).collect();
-                view_matrices(&cameras, device)
+                view_matrices(&cameras, Device::Cpu)
             });
-            ViewBatch::with_images(images(scenes, chosen, device), &matrices.collect::<Vec<_>>())
+            let (chosen, shape) = chosen_images(scenes, chosen);
+            ViewBatch::with_images(images(&chosen, &shape), &matrices.collect::<Vec<_>>())
         };
         Sample {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
             context: batch(|scene| &scene.context),
             target: batch(|scene| &scene.target),
-            far: Tensor::from_slice(&far).to_kind(Kind::Float).to_device(device),
+            far: Tensor::from_slice(&far).to_kind(Kind::Float),
             paired: false,
         }
     }
@@ -80,30 +90,76 @@ impl Sample {
     }
 }
 
-/// The chosen images of all scenes, [B, V, 3, H, W] in [0, 1].
+/// A sample on its way to a device.
 ///
-/// To a GPU they travel as bytes. On the CPU they become floats in one pass into the tensor's own memory and without
-/// libtorch's threads, which would wait for each other, spinning, wherever loading keeps all cores busy.
-fn images<'a>(scenes: &'a [LoadedScene], chosen: fn(&LoadedScene) -> &[usize], device: Device) -> Tensor {
-    let (size, views) = (scenes[0].size, chosen(&scenes[0]).len());
-    let image_bytes = CHANNELS * size.height as usize * size.width as usize;
-    let image =
-        |scene: &'a LoadedScene, position: usize| &scene.images[position * image_bytes..][..image_bytes];
-    let of_scene = |scene| chosen(scene).iter().map(move |&position| image(scene, position));
-    let images: Vec<&[u8]> = scenes.iter().flat_map(of_scene).collect();
-    let shape = [scenes.len(), views, CHANNELS, size.height as usize, size.width as usize].map(|n| n as i64);
-    if device != Device::Cpu {
-        let bytes = Tensor::from_slice(&images.concat()).view(shape).to_device(device);
-        let mut floats = bytes.to_kind(Kind::Float);
-        let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
-        return floats;
+/// Images travel as bytes, and become floats where they arrive.
+#[derive(Debug)]
+pub(super) struct ComingSample {
+    names: Vec<String>,
+    tensors: Uploading<9>,
+}
+
+impl ComingSample {
+    /// What [`Sample::of`] makes of `scenes`.
+    pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Self {
+        let Sample { names, context, target, far, .. } =
+            Sample::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
+        let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
+        ComingSample { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
     }
-    let floats = Tensor::empty(shape, (Kind::Float, device));
+
+    /// The sample on the device.
+    pub fn arrive(self) -> Sample {
+        let [a, b, c, d, e, f, g, h, far] = self.tensors.arrive();
+        let in_floats = |bytes: Tensor| {
+            let mut floats = bytes.to_kind(Kind::Float);
+            let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
+            floats
+        };
+        let context = ViewBatch::of_tensors([in_floats(a), b, c, d]);
+        let target = ViewBatch::of_tensors([in_floats(e), f, g, h]);
+        Sample { names: self.names, context, target, far, paired: false }
+    }
+}
+
+/// The chosen images of all scenes, scene by scene, and the shape that they have together, [B, V, 3, H, W].
+fn chosen_images(scenes: &[LoadedScene], chosen: fn(&LoadedScene) -> &[usize]) -> (Vec<&[u8]>, [i64; 5]) {
+    let (size, views) = (scenes[0].size, chosen(&scenes[0]).len());
+    let shape = [scenes.len(), views, CHANNELS, size.height as usize, size.width as usize];
+    let bytes = shape[2..].iter().product();
+    let of_scene = |scene| chosen(scene).iter().map(move |&position| image(scene, position, bytes));
+    let images: Vec<&[u8]> = scenes.iter().flat_map(of_scene).collect();
+    assert_eq!(images.len(), scenes.len() * views, "scenes of one kind");
+    (images, shape.map(|n| n as i64))
+}
+
+/// The scene's image at `position`, of so many bytes.
+fn image(scene: &LoadedScene, position: usize, bytes: usize) -> &[u8] {
+    &scene.images[position * bytes..][..bytes]
+}
+
+/// `images` one after the other in `memory`, bytes of the host.
+fn bytes(images: &[&[u8]], memory: Tensor) -> Tensor {
+    let image_bytes = images[0].len();
+    assert_eq!(memory.numel(), images.len() * image_bytes, "scenes of one kind");
+    // SAFETY: a new contiguous tensor in the CPU's memory holds as many bytes, and nobody else knows it yet.
+    let places = unsafe { std::slice::from_raw_parts_mut(memory.data_ptr().cast::<u8>(), memory.numel()) };
+    for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
+        place.copy_from_slice(image);
+    }
+    memory
+}
+
+/// `images` in [0, 1], made in one pass into the tensor's own memory and without libtorch's threads, which would wait for each
+/// other, spinning, wherever loading keeps all cores busy.
+fn floats(images: &[&[u8]], shape: &[i64]) -> Tensor {
+    let image_bytes = images[0].len();
+    let floats = Tensor::empty(shape, (Kind::Float, Device::Cpu));
     assert_eq!(floats.numel(), images.len() * image_bytes, "scenes of one kind");
     // SAFETY: a new contiguous tensor in the CPU's memory holds as many float32s, and nobody else knows it yet.
-    let memory = unsafe { std::slice::from_raw_parts_mut(floats.data_ptr().cast::<f32>(), floats.numel()) };
-    for (floats, bytes) in memory.chunks_exact_mut(image_bytes).zip(images) {
-        for (float, &byte) in floats.iter_mut().zip(bytes) {
+    let places = unsafe { std::slice::from_raw_parts_mut(floats.data_ptr().cast::<f32>(), floats.numel()) };
+    for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
+        for (float, &byte) in place.iter_mut().zip(*image) {
             *float = f32::from(byte) / LEVELS;
         }
     }

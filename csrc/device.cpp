@@ -1,0 +1,53 @@
+#include "device.h"
+
+#include <ATen/ops/empty.h>
+#include <c10/core/StreamGuard.h>
+#include <c10/core/impl/VirtualGuardImpl.h>
+
+#include <utility>
+
+namespace globalsplat {
+namespace {
+
+c10::impl::VirtualGuardImpl driver() { return c10::impl::VirtualGuardImpl(c10::kCUDA); }
+
+c10::Device by_number(int32_t gpu) { return {c10::kCUDA, static_cast<c10::DeviceIndex>(gpu)}; }
+
+}  // namespace
+
+Copies::Copies(std::vector<at::Tensor> tensors, c10::Event done) : tensors_(std::move(tensors)), done_(std::move(done)) {}
+
+void Copies::hand_over(rust::Slice<size_t> out) const {
+  TORCH_CHECK(out.size() == tensors_.size(), "there are ", tensors_.size(), " copies, and places for ", out.size());
+  const c10::Stream current = driver().getStream(tensors_.at(0).device());
+  done_.block(current);
+  for (size_t k = 0; k < out.size(); ++k) {
+    // Freed, their memory isn't given to the next copies before this stream has done what it was given until then.
+    tensors_[k].record_stream(current);
+    out[k] = reinterpret_cast<size_t>(new at::Tensor(tensors_[k]));
+  }
+}
+
+CopyStream::CopyStream(int32_t gpu) : stream_(driver().getStreamFromGlobalPool(by_number(gpu))) {}
+
+std::unique_ptr<Copies> CopyStream::copy(rust::Slice<const size_t> tensors) const {
+  const c10::StreamGuard here(stream_);
+  std::vector<at::Tensor> copies;
+  for (const size_t address : tensors) {
+    const at::Tensor original = reinterpret_cast<const at::Tensor*>(address)->contiguous();
+    const at::Tensor locked = original.is_pinned() ? original : original.pin_memory();
+    copies.push_back(locked.to(stream_.device(), locked.scalar_type(), /*non_blocking=*/true));
+  }
+  c10::Event done(c10::kCUDA);
+  done.record(stream_);
+  return std::make_unique<Copies>(std::move(copies), std::move(done));
+}
+
+std::unique_ptr<CopyStream> copy_stream(int32_t gpu) { return std::make_unique<CopyStream>(gpu); }
+
+void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out) {
+  const auto options = at::TensorOptions(at::kByte).pinned_memory(true);
+  out[0] = reinterpret_cast<size_t>(new at::Tensor(at::empty(at::IntArrayRef(shape.data(), shape.size()), options)));
+}
+
+}  // namespace globalsplat
