@@ -1,5 +1,5 @@
-// What a GPU does beside its work: copies from the host on a stream of their own. In torch's words for any kind of device, so that
-// no header of CUDA is needed, and a libtorch without it will do.
+// What a GPU does beside its work: copies from the host on a stream of their own, and marks in a stream that tell when it came by. In
+// torch's words for any kind of device, so that no header of CUDA is needed, and a libtorch without it will do.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -14,6 +14,20 @@
 #include "rust/cxx.h"
 
 namespace globalsplat {
+
+// When a GPU was done with what had been given to its current stream.
+class Mark {
+ public:
+  explicit Mark(int32_t gpu);
+
+  // Milliseconds from `earlier` on. Waits until the GPU has come by both.
+  double since(const Mark& earlier) const;
+
+ private:
+  c10::Event event_;
+};
+
+std::unique_ptr<Mark> mark(int32_t gpu);
 
 // New tensors on a GPU, and when they hold what was copied.
 class Copies {

@@ -1,9 +1,11 @@
-//! What a GPU does beside its work: copies from the host on a stream of their own. On the CPU the same calls do the same at once.
+//! What a GPU does beside its work: copies from the host on a stream of their own, and marks that tell when it was where. On the CPU
+//! the same calls do the same at once.
 
 use crate::render::handed_over;
 use cxx::UniquePtr;
 use globalsplat_csrc::device as ffi;
 use std::fmt;
+use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};
 
 /// CUDA's number of a device, if it is one of CUDA's.
@@ -11,6 +13,40 @@ fn gpu(device: Device) -> Option<i32> {
     match device {
         Device::Cuda(number) => Some(number as i32),
         _ => None,
+    }
+}
+
+/// A moment in the work of a device: on a GPU, when it is done with what it was given until then.
+pub(crate) enum Moment {
+    Host(Instant),
+    Gpu(UniquePtr<ffi::Mark>),
+}
+
+impl Moment {
+    /// Now; a GPU isn't waited for.
+    pub fn now(device: Device) -> Self {
+        match gpu(device) {
+            Some(gpu) => Moment::Gpu(ffi::mark(gpu).expect("a GPU that works")),
+            None => Moment::Host(Instant::now()),
+        }
+    }
+
+    /// The time since `earlier`, of the same device. A GPU is waited for until it has come by both.
+    pub fn since(&self, earlier: &Moment) -> Duration {
+        match (self, earlier) {
+            (Moment::Gpu(mark), Moment::Gpu(earlier)) => {
+                let milliseconds = mark.since(earlier).expect("a GPU that works");
+                Duration::from_secs_f64(1e-3 * milliseconds.max(0.))
+            }
+            (Moment::Host(instant), Moment::Host(earlier)) => *instant - *earlier,
+            _ => panic!("moments of two devices"),
+        }
+    }
+}
+
+impl fmt::Debug for Moment {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("Moment")
     }
 }
 

@@ -11,6 +11,15 @@ mod ffi {
         include!("device.h");
 
         /// See `csrc/device.h`.
+        type Mark;
+
+        /// See `csrc/device.h`.
+        fn mark(gpu: i32) -> Result<UniquePtr<Mark>>;
+
+        /// See `csrc/device.h`.
+        fn since(self: &Mark, earlier: &Mark) -> Result<f64>;
+
+        /// See `csrc/device.h`.
         type Copies;
 
         /// See `csrc/device.h`.
@@ -33,7 +42,9 @@ mod ffi {
     }
 }
 
-// SAFETY: libtorch's streams and events belong to no thread, and its tensors go from thread to thread.
+// SAFETY: libtorch's streams and events belong to no thread.
+unsafe impl Send for Mark {}
+// SAFETY: as above, and tensors go from thread to thread.
 unsafe impl Send for Copies {}
 // SAFETY: as above.
 unsafe impl Send for CopyStream {}

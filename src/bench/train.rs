@@ -47,7 +47,8 @@ pub struct TrainReport {
 }
 
 /// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
-/// of noise, cameras on a short path. L_perc is left out where its weights aren't there.
+/// of noise, cameras on a short path. L_perc is left out where its weights aren't there. The parts of a step are told by the
+/// device's own clock.
 ///
 /// # Errors
 /// What [`Trainer`] fails with.
@@ -62,7 +63,7 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
         (0..config.train.batch as u64).map(|seed| made_up_scene(&config, seed)).collect();
     let (mut whole, mut sections) = (vec![], Vec::<(&'static str, Vec<f64>)>::new());
     for _ in 0..steps {
-        let mut watch = Stopwatch::waiting_for(device);
+        let mut watch = Stopwatch::of(device);
         let sample = watch.time("data", || Sample::of(&scenes, device));
         trainer.learn(&sample, &mut watch)?;
         let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
