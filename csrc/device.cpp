@@ -1,5 +1,6 @@
 #include "device.h"
 
+#include <ATen/Context.h>
 #include <ATen/ops/empty.h>
 #include <c10/core/StreamGuard.h>
 #include <c10/core/impl/VirtualGuardImpl.h>
@@ -60,5 +61,7 @@ void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out
   const auto options = at::TensorOptions(at::kByte).pinned_memory(true);
   out[0] = reinterpret_cast<size_t>(new at::Tensor(at::empty(at::IntArrayRef(shape.data(), shape.size()), options)));
 }
+
+void leave_out_tf32() { at::globalContext().setAllowTF32CuDNN(false); }
 
 }  // namespace globalsplat

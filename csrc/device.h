@@ -61,4 +61,7 @@ std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
 // A new tensor of bytes, uninitialized, in page-locked memory of the host: a GPU copies from there by itself. The caller owns it.
 void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
 
+// CUDA's convolutions of float32 round what they multiply to TF32's 11 bits unless they are told not to, as matrix products are.
+void leave_out_tf32();
+
 }  // namespace globalsplat

@@ -8,6 +8,8 @@ use std::fmt;
 use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};
 
+pub(crate) use ffi::leave_out_tf32;
+
 /// CUDA's number of a device, if it is one of CUDA's.
 fn gpu(device: Device) -> Option<i32> {
     match device {

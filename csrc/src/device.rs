@@ -39,6 +39,9 @@ mod ffi {
 
         /// See `csrc/device.h`.
         fn page_locked_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
+
+        /// See `csrc/device.h`.
+        fn leave_out_tf32();
     }
 }
 

@@ -1,6 +1,7 @@
 //! LPIPS, a distance of pictures as people see it: Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
 //! Perceptual Metric", 2018, equation 1. Version 0.1 of its linear weights, with which published numbers are made.
 
+use crate::device::leave_out_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
 use crate::model::Precision;
@@ -139,6 +140,7 @@ impl Lpips {
     /// Builds the network under `vs`: `conv….weight` [O, I, k, k] and `.bias` [O], `lin0.weight` to `lin4.weight`
     /// [1, C, 1, 1]. They are zero until they are loaded.
     pub(crate) fn new(vs: &nn::Path, network: LpipsNetwork) -> Self {
+        leave_out_tf32();
         let zero = nn::Init::Const(0.);
         let (mut inputs, mut compared, mut steps) = (3, 0, vec![]);
         for layer in network.layers() {

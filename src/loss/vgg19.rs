@@ -1,6 +1,7 @@
 //! L_perc of kind `vgg19` (spec 7.3): how far apart a picture's and its truth's features are in VGG-19 (Simonyan &
 //! Zisserman 2015) with average pooling.
 
+use crate::device::leave_out_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
 use crate::model::Precision;
@@ -51,6 +52,7 @@ impl Vgg19 {
     /// Builds the network under `vs`, with torchvision's names: `features.0.weight` [64, 3, 3, 3], `features.0.bias` [64], ….
     /// They are zero until they are loaded.
     pub(crate) fn new(vs: &nn::Path) -> Self {
+        leave_out_tf32();
         let zero = nn::Init::Const(0.);
         let config = nn::ConvConfig { padding: 1, ws_init: zero, bs_init: zero, ..Default::default() };
         let mut inputs = 3;

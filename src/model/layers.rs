@@ -92,6 +92,8 @@ pub(super) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
         let (b, n, d) = t.size3().expect("[B, n, d]");
         t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
     };
+    // Strided as the linear layers leave them, of one kind, without a mask: so libtorch's fused kernels take them as they are, as
+    // long as a head's width is a multiple of 8.
     Tensor::scaled_dot_product_attention(
         &split(q),
         &split(k),
