@@ -3,8 +3,15 @@
 use std::{env, fs, path::PathBuf};
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 6] =
-    ["src/chunk.rs", "src/device.rs", "src/fit.rs", "src/ops.rs", "src/optim.rs", "src/render.rs"];
+const BRIDGES: [&str; 7] = [
+    "src/chunk.rs",
+    "src/cuda.rs",
+    "src/device.rs",
+    "src/fit.rs",
+    "src/ops.rs",
+    "src/optim.rs",
+    "src/render.rs",
+];
 
 /// What every C++ file is compiled with.
 fn cpp() -> cc::Build {
@@ -48,7 +55,7 @@ fn libtorch() -> PathBuf {
 fn main() {
     let libtorch = libtorch();
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
-    cxx_build::bridges(["src/chunk.rs", "src/cuda.rs", "src/fit.rs", "src/ops.rs", "src/optim.rs", "src/render.rs"])
+    cxx_build::bridges(BRIDGES)
         .std("c++17")
         // As libtorch is compiled: without it some of its classes have more fields than there.
         .define("NDEBUG", None)
