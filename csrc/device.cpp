@@ -2,6 +2,7 @@
 
 #include <ATen/Context.h>
 #include <ATen/ops/empty.h>
+#include <c10/core/CachingDeviceAllocator.h>
 #include <c10/core/StreamGuard.h>
 #include <c10/core/impl/VirtualGuardImpl.h>
 
@@ -61,6 +62,13 @@ void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out
   const auto options = at::TensorOptions(at::kByte).pinned_memory(true);
   out[0] = reinterpret_cast<size_t>(new at::Tensor(at::empty(at::IntArrayRef(shape.data(), shape.size()), options)));
 }
+
+uint64_t peak_bytes(int32_t gpu) {
+  const auto stats = at::getDeviceAllocator(c10::kCUDA)->getDeviceStats(by_number(gpu).index());
+  return uint64_t(stats.allocated_bytes[size_t(c10::CachingAllocator::StatType::AGGREGATE)].peak);
+}
+
+void forget_peak_bytes(int32_t gpu) { at::getDeviceAllocator(c10::kCUDA)->resetPeakStats(by_number(gpu).index()); }
 
 void leave_out_tf32() { at::globalContext().setAllowTF32CuDNN(false); }
 

@@ -61,6 +61,10 @@ std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
 // A new tensor of bytes, uninitialized, in page-locked memory of the host: a GPU copies from there by itself. The caller owns it.
 void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
 
+// Bytes that tensors on a GPU took at the most, since the program began or since that was forgotten.
+uint64_t peak_bytes(int32_t gpu);
+void forget_peak_bytes(int32_t gpu);
+
 // CUDA's convolutions of float32 round what they multiply to TF32's 11 bits unless they are told not to, as matrix products are.
 void leave_out_tf32();
 

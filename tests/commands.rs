@@ -176,7 +176,29 @@ fn bench_tells_where_time_goes() {
     assert!(0. < pairs["contributing"].as_f64().unwrap());
     assert!(pairs["contributing"].as_f64() <= pairs["evaluated"].as_f64());
     assert!(report["forward_backward"]["median"].as_f64() > report["forward"]["least"].as_f64());
-    assert!(report["peak_gflops"].as_f64().unwrap() > 1.);
+    assert!(report["rates"]["peak_gflops"].as_f64().unwrap() > 1.);
+    assert!(report["rates"]["blend"]["share_of_peak"].as_f64().unwrap() > 0.);
+    assert_eq!(report["device"], "cpu");
+}
+
+#[test]
+fn bench_model_tells_where_a_pass_goes() {
+    let bench = |options: &[&str]| {
+        let shape = ["model.latents=16", "model.width=32", "data.image_size=[32,32]", "model.patch_size=16"];
+        let shape: Vec<&str> = shape.iter().flat_map(|key| ["--set", key]).collect();
+        json(&[&["bench", "model", "--repeats", "2", "--json"], &shape[..], options].concat())
+    };
+    let two = bench(&["--views", "2", "--precision", "bf16"]);
+    let names: Vec<&str> =
+        two["sections"].as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["tokens", "encoder", "decoder"]);
+    assert_eq!(
+        (&two["views"], &two["precision"], &two["gaussians"]),
+        (&2.into(), &"bf16".into(), &128.into())
+    );
+    assert!(two["peak_bytes"].as_u64().unwrap() > 10_000_000);
+    let many = bench(&["--views", "200"]);
+    assert!(many["milliseconds"]["least"].as_f64() > two["milliseconds"]["least"].as_f64());
 }
 
 #[test]

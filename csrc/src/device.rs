@@ -41,6 +41,12 @@ mod ffi {
         fn page_locked_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
 
         /// See `csrc/device.h`.
+        fn peak_bytes(gpu: i32) -> Result<u64>;
+
+        /// See `csrc/device.h`.
+        fn forget_peak_bytes(gpu: i32) -> Result<()>;
+
+        /// See `csrc/device.h`.
         fn leave_out_tf32();
     }
 }

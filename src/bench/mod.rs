@@ -1,6 +1,7 @@
 //! How fast things are: measured by commands that anyone can run, never by tests.
 
 mod loader;
+mod model;
 mod raster;
 mod refine;
 mod synth;
@@ -8,11 +9,13 @@ mod train;
 mod video;
 
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
+pub use model::{ModelReport, bench_model};
 pub use raster::{RasterReport, bench_raster, made_up_scene};
 pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
 pub use train::{TrainReport, bench_train};
 
+use crate::optim::Stopwatch;
 use serde::Serialize;
 
 /// Of several measurements of the same thing, in milliseconds: the middle one and how far the others lie apart.
@@ -33,6 +36,33 @@ pub struct Section {
     pub name: &'static str,
     /// Of a view, or of a step.
     pub milliseconds: Spread,
+}
+
+/// Milliseconds that work took, and its sections, each time that it was done.
+#[derive(Debug, Default)]
+struct Measured {
+    whole: Vec<f64>,
+    sections: Vec<(&'static str, Vec<f64>)>,
+}
+
+impl Measured {
+    /// What `watch` has seen of it this time.
+    fn add(&mut self, watch: &mut Stopwatch) {
+        let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
+        self.whole.push(times.clone().map(|(_, milliseconds)| milliseconds).sum());
+        for (name, milliseconds) in times {
+            match self.sections.iter_mut().find(|(known, _)| *known == name) {
+                Some((_, all)) => all.push(milliseconds),
+                None => self.sections.push((name, vec![milliseconds])),
+            }
+        }
+    }
+
+    /// Of at least one time.
+    fn told(self) -> (Spread, Vec<Section>) {
+        let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
+        (Spread::of(self.whole), self.sections.into_iter().map(section).collect())
+    }
 }
 
 impl Spread {

@@ -2,7 +2,8 @@
 
 use super::{Section, Spread};
 use crate::error::Result;
-use crate::eval::{forget_peak_memory, peak_memory_bytes, resident_memory_bytes};
+use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
+use crate::optim::Stopwatch;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::{Cameras, DEFAULT_EPS2D, render};
 use crate::scene::{Gaussians, ImageSize};
@@ -10,14 +11,15 @@ use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
-use std::time::Instant;
-use tch::{Kind, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, no_grad};
 
 /// What [`bench_raster`] measured. All times are milliseconds per view.
 #[derive(Debug, Serialize)]
 pub struct RasterReport {
-    /// Instruction set of the kernels.
+    /// Instruction set of the CPU's kernels.
     pub simd: String,
+    /// Where the Gaussians are: cpu, or cuda and its number.
+    pub device: String,
     /// Threads that shared the work.
     pub threads: i32,
     /// Of the scene.
@@ -32,17 +34,13 @@ pub struct RasterReport {
     pub forward: Spread,
     /// A call that records gradients, and its backward pass.
     pub forward_backward: Spread,
-    /// In the order of the work.
+    /// In the order of the work, on the CPU.
     pub stages: Vec<Section>,
     /// What there is to blend, per view.
     pub pairs: Pairs,
-    /// What the threads together reach with multiply-adds alone, in 10⁹ floating-point operations per second.
-    pub peak_gflops: f64,
-    /// Blending.
-    pub blend: Rate,
-    /// Its backward pass.
-    pub blend_backward: Rate,
-    /// Largest resident memory during the calls less that before them, pictures and gradients included.
+    /// Of the CPU.
+    pub rates: Option<Rates>,
+    /// Largest memory of a GPU's tensors, or resident memory, during the calls less that before them, pictures and gradients included.
     pub working_bytes: u64,
 }
 
@@ -55,6 +53,17 @@ pub struct Pairs {
     pub evaluated: f64,
     /// (pixel, splat) pairs that are blended.
     pub contributing: f64,
+}
+
+/// How fast pairs are blended, beside what the machine can do.
+#[derive(Debug, Serialize)]
+pub struct Rates {
+    /// What the threads together reach with multiply-adds alone, in 10⁹ floating-point operations per second.
+    pub peak_gflops: f64,
+    /// Blending.
+    pub blend: Rate,
+    /// Its backward pass.
+    pub blend_backward: Rate,
 }
 
 /// How fast contributing pairs are dealt with.
@@ -80,62 +89,56 @@ const PEAK_SECONDS: f64 = 0.2;
 /// # Errors
 /// What [`render()`] refuses.
 pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
+    let device = gaussians.means.device();
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
     let per_view = |seconds: f64| seconds * 1e3 / views as f64;
-    forget_peak_memory();
-    let memory_before = resident_memory_bytes();
+    forget_peak_memory(device);
+    let memory_before = match device {
+        Device::Cpu => resident_memory_bytes(),
+        _ => peak_memory_bytes_on(device),
+    };
     let (mut forward, mut forward_backward) = (vec![], vec![]);
     let mut stages: Vec<StageTimes> = vec![];
     // The first round warms caches and threads up.
     for round in 0..=repeats {
-        let start = Instant::now();
-        no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D))?;
-        let without = start.elapsed().as_secs_f64();
-
+        let mut watch = Stopwatch::of(device);
+        watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
         let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
-        let start = Instant::now();
-        let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
-        let drawn = start.elapsed().as_secs_f64();
+        let pictures = watch.time("with gradients", || render(&leaves, cameras, DEFAULT_EPS2D))?;
         let objective = [&pictures.rgb, &pictures.alpha, &pictures.depth]
             .map(|t| t.sum(Kind::Float))
             .into_iter()
             .reduce(|a, b| a + b)
             .expect("three");
-        let start = Instant::now();
-        objective.backward();
-        let with = drawn + start.elapsed().as_secs_f64();
+        watch.time("with gradients", || objective.backward());
         if round > 0 {
+            let [without, with] = [0, 1].map(|section| watch.sections()[section].1.as_secs_f64());
             forward.push(per_view(without));
             forward_backward.push(per_view(with));
             stages.push(stage_times());
         }
     }
-    let stage = |name, seconds: fn(&StageTimes) -> f64| Section {
-        name,
-        milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
-    };
-    let working_bytes = peak_memory_bytes().saturating_sub(memory_before);
+    let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
     let counts = count_pairs(gaussians, cameras, DEFAULT_EPS2D)?;
     let pairs = Pairs {
         tile_entries: counts.tile_entries as f64 / views as f64,
         evaluated: counts.evaluated as f64 / views as f64,
         contributing: counts.contributing as f64 / views as f64,
     };
-    let peak = multiply_add_peak(PEAK_SECONDS);
-    let rate = |stage: &Section, operations: f64| {
-        let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
-        Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
+    let (stages, rates) = match device {
+        Device::Cpu => {
+            let stages = sections(&stages, per_view);
+            let rates = rates(&stages, &pairs);
+            (stages, Some(rates))
+        }
+        _ => (vec![], None),
     };
-    let stages = [
-        stage("project", |t| t.project),
-        stage("sort", |t| t.sort),
-        stage("bin", |t| t.bin),
-        stage("blend", |t| t.blend),
-        stage("blend backward", |t| t.blend_backward),
-        stage("project backward", |t| t.project_backward),
-    ];
     Ok(RasterReport {
         simd: simd_level()?,
+        device: match device {
+            Device::Cuda(number) => format!("cuda:{number}"),
+            _ => "cpu".into(),
+        },
         threads: tch::get_num_threads(),
         gaussians: gaussians.count(),
         views,
@@ -143,13 +146,39 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         height: cameras.height,
         forward: Spread::of(forward),
         forward_backward: Spread::of(forward_backward),
+        stages,
+        pairs,
+        rates,
+        working_bytes,
+    })
+}
+
+fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section> {
+    let stage = |name, seconds: fn(&StageTimes) -> f64| Section {
+        name,
+        milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
+    };
+    vec![
+        stage("project", |t| t.project),
+        stage("sort", |t| t.sort),
+        stage("bin", |t| t.bin),
+        stage("blend", |t| t.blend),
+        stage("blend backward", |t| t.blend_backward),
+        stage("project backward", |t| t.project_backward),
+    ]
+}
+
+fn rates(stages: &[Section], pairs: &Pairs) -> Rates {
+    let peak = multiply_add_peak(PEAK_SECONDS);
+    let rate = |stage: &Section, operations: f64| {
+        let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
+        Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
+    };
+    Rates {
         peak_gflops: peak * 1e-9,
         blend: rate(&stages[3], FORWARD_OPERATIONS),
         blend_backward: rate(&stages[4], BACKWARD_OPERATIONS),
-        stages: stages.into(),
-        pairs,
-        working_bytes,
-    })
+    }
 }
 
 /// A scene shaped like a trained one, and `views` cameras that walk past it, made from a fixed seed. Sizes in the picture,

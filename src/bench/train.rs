@@ -1,10 +1,10 @@
 //! A training step: how long its parts take, and how much memory it needs.
 
-use super::{Section, Spread};
+use super::{Measured, Section, Spread};
 use crate::config::Config;
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
 use crate::error::Result;
-use crate::eval::peak_memory_bytes;
+use crate::eval::peak_memory_bytes_on;
 use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::optim::Stopwatch;
 use crate::scene::{Camera, ImageSize, Intrinsics};
@@ -42,8 +42,8 @@ pub struct TrainReport {
     pub milliseconds: Spread,
     /// In the order of the work.
     pub sections: Vec<Section>,
-    /// Resident bytes of the process at the most.
-    pub resident_peak: u64,
+    /// Bytes that tensors on a GPU, or the process, took at the most.
+    pub peak_bytes: u64,
 }
 
 /// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
@@ -61,21 +61,14 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
     let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
     let scenes: Vec<LoadedScene> =
         (0..config.train.batch as u64).map(|seed| made_up_scene(&config, seed)).collect();
-    let (mut whole, mut sections) = (vec![], Vec::<(&'static str, Vec<f64>)>::new());
+    let mut measured = Measured::default();
     for _ in 0..steps {
         let mut watch = Stopwatch::of(device);
         let sample = watch.time("data", || Sample::of(&scenes, device));
         trainer.learn(&sample, &mut watch)?;
-        let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
-        whole.push(times.clone().map(|(_, milliseconds)| milliseconds).sum());
-        for (name, milliseconds) in times {
-            match sections.iter_mut().find(|(known, _)| *known == name) {
-                Some((_, all)) => all.push(milliseconds),
-                None => sections.push((name, vec![milliseconds])),
-            }
-        }
+        measured.add(&mut watch);
     }
-    let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
+    let (milliseconds, sections) = measured.told();
     Ok(TrainReport {
         scenes: scenes.len(),
         context_views: config.data.context_views,
@@ -85,14 +78,14 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
         perceptual: config.loss.perceptual,
         threads: tch::get_num_threads(),
         steps,
-        milliseconds: Spread::of(whole),
-        sections: sections.into_iter().map(section).collect(),
-        resident_peak: peak_memory_bytes(),
+        milliseconds,
+        sections,
+        peak_bytes: peak_memory_bytes_on(device),
     })
 }
 
 /// As many views as a step takes, context and target apart.
-fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
+pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
     let data = &config.data;
     let views = data.context_views + data.target_views;
     let size @ ImageSize { height, width } = data.image_size;

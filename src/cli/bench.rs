@@ -1,16 +1,18 @@
+use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
-use super::{parse_size, print_json, progress};
+use super::{device, parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    RasterReport, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
+    RasterReport, Section, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
 };
+use globalsplat::config::Config;
 use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
 use globalsplat::scene::ImageSize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tch::Device;
 
@@ -25,6 +27,7 @@ pub struct Bench {
 enum Part {
     Raster(Raster),
     Loader(Loader),
+    Model(Model),
     Refine(Refine),
     Synth(Synth),
     Train(Train),
@@ -35,11 +38,31 @@ impl Bench {
         match self.part {
             Part::Raster(raster) => raster.run(),
             Part::Loader(loader) => loader.run(),
+            Part::Model(model) => model.run(),
             Part::Refine(refine) => refine.run(),
             Part::Synth(synth) => synth.run(),
             Part::Train(train) => train.run(),
         }
     }
+}
+
+/// The configuration that a measurement is of; without a file, the defaults, which are the paper's main model.
+pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
+    Ok(match file {
+        Some(file) => Config::read(file, set)?,
+        None => Config::parse("", set, "the defaults".as_ref())?,
+    })
+}
+
+/// A line for each section, with its share, and one for the whole.
+pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
+    println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "least", "3 of 4", "share");
+    let row = |name: &str, s: &Spread| {
+        let share = 1e2 * s.median / whole.median;
+        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
+    };
+    sections.iter().for_each(|section| row(section.name, &section.milliseconds));
+    row(name, whole);
 }
 
 /// The splat op, forward and backward, stage by stage.
@@ -67,6 +90,9 @@ pub struct Raster {
     /// A table instead: made-up scenes of 16K to 1M Gaussians, one camera of 256x256 to 1920x1080
     #[arg(long, conflicts_with_all = ["splat", "gaussians", "cameras", "size"])]
     scaling: bool,
+    /// cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu", conflicts_with = "scaling")]
+    device: String,
     /// Threads that share the work; by default all cores
     #[arg(long, value_name = "N")]
     threads: Option<u16>,
@@ -103,6 +129,9 @@ impl Raster {
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
+        let device = device::parse(&self.device)?;
+        let gaussians = gaussians.to_device(device);
+        let cameras = cameras.to_device(device);
         let report = bench_raster(&gaussians, &cameras, self.repeats as usize)?;
         if self.json {
             print_json(&serde_json::to_value(&report)?);
@@ -231,8 +260,8 @@ const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 108
 
 fn print_report(r: &RasterReport) {
     println!(
-        "{} Gaussians, {} views of {}x{} in one call, {} threads, {}",
-        r.gaussians, r.views, r.width, r.height, r.threads, r.simd
+        "{} Gaussians, {} views of {}x{} in one call, {}, {} threads, {}",
+        r.gaussians, r.views, r.width, r.height, r.device, r.threads, r.simd
     );
     println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "least", "3 of 4");
     let row = |name: &str, s: &Spread| {
@@ -250,12 +279,18 @@ fn print_report(r: &RasterReport) {
         millions(r.pairs.evaluated),
         r.pairs.tile_entries
     );
-    println!(
-        "multiply-adds alone reach {:.0} GFLOP/s; of it, by what contributing pairs ask for:",
-        r.peak_gflops
-    );
-    for (name, rate) in [("blend", &r.blend), ("blend backward", &r.blend_backward)] {
-        println!("  {name:<16} {:>6.2} Gpairs/s {:>6.1} %", rate.gpairs_per_second, 1e2 * rate.share_of_peak);
+    if let Some(rates) = &r.rates {
+        println!(
+            "multiply-adds alone reach {:.0} GFLOP/s; of it, by what contributing pairs ask for:",
+            rates.peak_gflops
+        );
+        for (name, rate) in [("blend", &rates.blend), ("blend backward", &rates.blend_backward)] {
+            println!(
+                "  {name:<16} {:>6.2} Gpairs/s {:>6.1} %",
+                rate.gpairs_per_second,
+                1e2 * rate.share_of_peak
+            );
+        }
     }
     println!("working memory {:.0} MB", r.working_bytes as f64 * 1e-6);
 }

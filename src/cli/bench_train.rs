@@ -1,8 +1,8 @@
+use super::bench::{print_sections, read_config};
 use super::{device, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{Spread, TrainReport, bench_train};
-use globalsplat::config::Config;
+use globalsplat::bench::{TrainReport, bench_train};
 use globalsplat::error::Error;
 use serde_json::json;
 use std::path::PathBuf;
@@ -39,10 +39,7 @@ pub struct Train {
 impl Train {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
-        let mut config = match &self.config {
-            Some(file) => Config::read(file, &self.set)?,
-            None => Config::parse("", &self.set, "the defaults".as_ref())?,
-        };
+        let mut config = read_config(self.config.as_deref(), &self.set)?;
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
         }
@@ -69,14 +66,6 @@ fn print_report(r: &TrainReport) {
         r.threads,
         r.steps
     );
-    println!("{:<18} {:>10} {:>10} {:>10} {:>7}", "ms per step", "median", "least", "3 of 4", "share");
-    let row = |name: &str, s: &Spread| {
-        let share = 1e2 * s.median / r.milliseconds.median;
-        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
-    };
-    for section in &r.sections {
-        row(section.name, &section.milliseconds);
-    }
-    row("step", &r.milliseconds);
-    println!("resident memory {:.2} GB at the most", r.resident_peak as f64 * 1e-9);
+    print_sections("ms per step", &r.sections, ("step", &r.milliseconds));
+    println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
 }

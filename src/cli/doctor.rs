@@ -105,7 +105,7 @@ impl Doctor {
                 Some(path) => path.display().to_string(),
                 None => format!("absent (make weights makes them, {WEIGHTS_VARIABLE} names their folder)"),
             };
-            line(&metric.to_string(), &found);
+            line(metric, &found);
         }
         Ok(())
     }

@@ -1,6 +1,6 @@
-//! How much memory the process has taken.
+//! How much memory the process has taken, and its tensors on a GPU.
 
-use std::process::Command;
+use globalsplat_csrc::device as ffi;
 use tch::Device;
 
 /// The resident size now, in bytes; where the system doesn't tell, the largest so far.
@@ -14,29 +14,27 @@ pub fn resident_memory_bytes() -> u64 {
     from_linux().unwrap_or_else(peak_memory_bytes)
 }
 
-/// The memory of `device` that this process holds, in bytes; none for the CPU, and where `nvidia-smi` doesn't tell. libtorch keeps
-/// what it once took, so it is also the largest amount so far.
+/// Bytes that tensors on `device` took at the most, since the program began or since [`forget_peak_memory`]; none for the CPU.
 pub fn device_memory_bytes(device: Device) -> Option<u64> {
-    if !matches!(device, Device::Cuda(_)) {
-        return None;
+    match device {
+        Device::Cuda(number) => ffi::peak_bytes(number as i32).ok(),
+        _ => None,
     }
-    let query = ["--query-compute-apps=pid,used_gpu_memory", "--format=csv,noheader,nounits"];
-    let told = Command::new("nvidia-smi").args(query).output().ok()?;
-    of_process(&String::from_utf8_lossy(&told.stdout), std::process::id())
 }
 
-/// From lines of a process's number and its MiB.
-fn of_process(table: &str, process: u32) -> Option<u64> {
-    table.lines().find_map(|line| {
-        let (pid, mebibytes) = line.split_once(',')?;
-        (pid.trim().parse() == Ok(process)).then(|| Some(mebibytes.trim().parse::<u64>().ok()? << 20))?
-    })
+/// The largest memory that work on `device` took: of tensors on it, or of the process.
+pub fn peak_memory_bytes_on(device: Device) -> u64 {
+    device_memory_bytes(device).unwrap_or_else(peak_memory_bytes)
 }
 
-/// Forgets the largest resident size so far: [`peak_memory_bytes`] is of what comes from now on. Only Linux can.
-pub fn forget_peak_memory() {
+/// Forgets the largest memory so far, of the process and on `device`: what is told is of what comes from now on. Of the process only
+/// Linux can.
+pub fn forget_peak_memory(device: Device) {
     // Where it can't be, the peak stays what it was.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
+    if let Device::Cuda(number) = device {
+        let _ = ffi::forget_peak_bytes(number as i32);
+    }
 }
 
 /// The largest resident size so far, in bytes.
@@ -62,16 +60,9 @@ mod tests {
         const BYTES: usize = 300_000_000;
         drop(std::hint::black_box(vec![1u8; BYTES]));
         let with = peak_memory_bytes();
-        forget_peak_memory();
+        forget_peak_memory(Device::Cpu);
         // Other tests take memory meanwhile, but less.
         assert!(peak_memory_bytes() + (BYTES as u64) / 2 < with);
-    }
-
-    #[test]
-    fn a_process_is_found_in_what_nvidia_smi_tells() {
-        let table = "812, 1500\n4711, 1832\n9, [N/A]\n";
-        assert_eq!(of_process(table, 4711), Some(1832 << 20));
-        assert_eq!((of_process(table, 47), of_process(table, 9), of_process("", 1)), (None, None, None));
         assert_eq!(device_memory_bytes(Device::Cpu), None);
     }
 }

@@ -26,7 +26,7 @@ pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use machine::machine;
 pub use memory::peak_memory_bytes;
-pub(crate) use memory::{forget_peak_memory, resident_memory_bytes};
+pub(crate) use memory::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 pub use method::{Method, Synthesis, judge, judge_pictures};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;

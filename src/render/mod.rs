@@ -15,7 +15,7 @@ pub use views::{Rendered, render_views};
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Pixels² added to the diagonal of every projected covariance.
 pub const DEFAULT_EPS2D: f64 = 0.05;
@@ -43,6 +43,12 @@ impl Cameras {
             width: i64::from(camera.width),
             height: i64::from(camera.height),
         }
+    }
+
+    /// The same on `device`.
+    pub fn to_device(&self, device: Device) -> Self {
+        let to = |t: &Tensor| t.to_device(device);
+        Cameras { w2c: to(&self.w2c), intrinsics: to(&self.intrinsics), ..*self }
     }
 }
 

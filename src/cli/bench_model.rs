@@ -1,0 +1,64 @@
+use super::bench::{print_sections, read_config};
+use super::{device, print_json};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::bench::{ModelReport, bench_model};
+use globalsplat::error::Error;
+use std::path::PathBuf;
+
+/// A forward pass, photos to Gaussians, part by part, over photos of noise and with fresh weights.
+///
+/// Without --config it is the paper's main model, 256x256 pixels.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat bench model\n  \
+    globalsplat bench model --config configs/tiny.toml --views 12\n  \
+    globalsplat bench model --device cuda --precision bf16 --repeats 50 --json")]
+pub struct Model {
+    /// Configuration file; see configs/
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of it
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Photos that the model sees
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(1..))]
+    views: u16,
+    /// Passes that are measured
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    repeats: u32,
+    /// Matrix products in f32 or bf16
+    #[arg(long, default_value = "f32")]
+    precision: String,
+    /// cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Print the measurements as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Model {
+    pub fn run(self) -> Result<()> {
+        let device = device::parse(&self.device)?;
+        let precision = self.precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
+        let mut config = read_config(self.config.as_deref(), &self.set)?;
+        config.data.context_views = self.views.into();
+        let report = bench_model(&config, precision, self.repeats as usize, device)?;
+        if self.json {
+            print_json(&serde_json::to_value(&report)?);
+        } else {
+            print_report(&report, &self);
+        }
+        Ok(())
+    }
+}
+
+fn print_report(r: &ModelReport, asked: &Model) {
+    let [height, width] = r.size;
+    println!(
+        "{} photos of {width}x{height}, {} Gaussians, {}, {}, {} threads, {} passes",
+        r.views, r.gaussians, asked.precision, asked.device, r.threads, r.repeats
+    );
+    print_sections("ms per pass", &r.sections, ("pass", &r.milliseconds));
+    println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
+}
