@@ -49,12 +49,21 @@ fn line(bar: &ProgressBar, unit: &str) -> String {
     let (done, of) = (bar.position(), bar.length().unwrap_or(0));
     let mut line = format!("{done} of {of} {unit}");
     if done > 0 {
-        line += &format!(", {:.1} a second, {} left", bar.per_sec(), duration(bar.eta()));
+        line += &rate(bar.per_sec(), bar.eta());
     }
     if !bar.message().is_empty() {
         line += &format!(", {}", bar.message());
     }
     line
+}
+
+/// How fast the work is, and how long it will take; nobody knows that of work that stands still.
+fn rate(per_second: f64, left: Duration) -> String {
+    const FOR_EVER: Duration = Duration::from_secs(365 * 24 * 3600);
+    if left > FOR_EVER {
+        return ", none for a while".into();
+    }
+    format!(", {per_second:.1} a second, {} left", duration(left))
 }
 
 /// In words, to the precision that anybody needs.
@@ -80,6 +89,12 @@ mod tests {
         bar.set_message("loss 0.5");
         let line = line(&bar, "scenes");
         assert!(line.starts_with("4 of 10 scenes, ") && line.ends_with(" left, loss 0.5"), "{line}");
+    }
+
+    #[test]
+    fn work_that_stands_still_has_no_end() {
+        assert_eq!(rate(2., Duration::from_secs(5)), ", 2.0 a second, 5 seconds left");
+        assert_eq!(rate(1e-9, Duration::from_secs(1 << 40)), ", none for a while");
     }
 
     #[test]
