@@ -5,7 +5,7 @@
 
 namespace globalsplat::cuda::emulated {
 
-// Memory is the CPU's own, aligned as a GPU's. Blocks, and the threads of a block, take turns in an order drawn from `seed`, another
+// Memory is the CPU's own, aligned as a GPU's, and begins as anything. Blocks, and the threads of a block, take turns in an order drawn from `seed`, another
 // one in every launch.
 class Emulator : public Device {
  public:

@@ -3,6 +3,7 @@
 #include <ucontext.h>
 
 #include <algorithm>
+#include <cstdio>
 #include <cstdlib>
 #include <memory>
 #include <new>
@@ -67,13 +68,15 @@ struct Threads {
 
 struct Warp {
   Threads waiting;  // for the rest of them
+  int place = -1;   // in the text, where they meet
   uint64_t given[2][32];
 };
 
 struct Thread {
   Stack stack;
   std::unique_ptr<char[]> memory;
-  unsigned exchanges = 0;  // so far; two in turn have a place each, so that nobody overwrites what is still to be read
+  // So far; two in turn have a place each, so that nobody overwrites what is still to be read.
+  unsigned exchanges = 0, votes = 0;
   size_t shared_used = 0;
 };
 
@@ -85,6 +88,7 @@ struct Block {
   void** arguments = nullptr;
   Index index{}, size{}, grid{};
   int current = 0, done = 0;
+  bool votes[2] = {};  // of this meeting and the next
   Threads ready, waiting;
   Warp warps[kMostThreads / 32];
   std::vector<std::unique_ptr<char[]>> shared;  // the last is this block's
@@ -92,6 +96,15 @@ struct Block {
 thread_local Block block;
 
 int left_out = -1;  // the barrier that no thread heeds
+
+// What is in memory that nobody has filled: other numbers every time, of which many are no numbers.
+void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
+  for (size_t k = 0; k < bytes; k += 8) {
+    uint64_t word = random();
+    if (word % 2 == 0) word |= 0x7FC00000'7FC00000u;
+    std::memcpy(static_cast<char*>(memory) + k, &word, std::min<size_t>(8, bytes - k));
+  }
+}
 
 Thread& current() { return *block.threads[block.current].get(); }
 
@@ -139,12 +152,14 @@ void run_block(std::mt19937_64& order) {
   const int threads = int(block.size.x);
   if (block.shared.empty() || !kReuse) block.shared.emplace_back(new char[kSharedMemory]);
   // What the block before left must be of no use.
-  std::memset(block.shared.back().get(), 0xFF, kSharedMemory);
+  fill_with_anything(block.shared.back().get(), kSharedMemory, order);
   GS_TSAN(__tsan_release(&block.kernel));
   block.done = block.ready.count = block.waiting.count = 0;
+  block.votes[0] = block.votes[1] = false;
   for (int k = 0; k < threads; ++k) {
     block.ready.add(k);
     block.threads[k]->shared_used = 0;
+    block.threads[k]->votes = 0;
     block.warps[k / 32].waiting.count = 0;
   }
   while (block.ready.count > 0) {
@@ -175,12 +190,26 @@ void meet_in_block(int place) {
 void meet_in_warp(int place) {
   if (place == left_out) return;
   Warp& warp = own_warp();
+  warp.place = -1;
   meet(warp.waiting, 32);
   GS_TSAN(__tsan_acquire(&warp.waiting));
 }
 
-void exchange(uint64_t given, uint64_t (&out)[32]) {
+bool vote_in_block(int place, bool given) {
+  const unsigned turn = current().votes++ % 2;
+  block.votes[turn] |= given;
+  if (block.waiting.count + 1 == int(block.size.x)) block.votes[1 - turn] = false;  // which all have read
+  meet_in_block(place);
+  return block.votes[turn];
+}
+
+void exchange(int line, uint64_t given, uint64_t (&out)[32]) {
   Warp& warp = own_warp();
+  if (warp.waiting.count > 0 && warp.place != line) {
+    std::fprintf(stderr, "%s: threads of a warp meet in lines %d and %d\n", block.kernel->name, warp.place, line);
+    std::abort();
+  }
+  warp.place = line;
   uint64_t(&place)[32] = warp.given[current().exchanges++ % 2];
   place[block.current % 32] = given;
   meet(warp.waiting, 32);
@@ -198,9 +227,11 @@ void* shared_memory(size_t bytes) {
 void leave_out_barrier(int place) { left_out = place; }
 
 Memory Emulator::allocate(size_t bytes) const {
+  if (bytes == 0) return Memory();  // as an empty tensor's
   constexpr std::align_val_t alignment{256};
   void* const memory = ::operator new(bytes, alignment);
-  std::memset(memory, 0xFF, bytes);
+  std::mt19937_64 random(seed_++);
+  fill_with_anything(memory, bytes, random);
   return Memory(memory, [alignment](void* p) { ::operator delete(p, alignment); });
 }
 

@@ -33,8 +33,10 @@ Index grid_size();
 // Those of a block's, or of a warp's, threads that come here first wait for the last. `place` tells one word of the text from another.
 void meet_in_block(int place);
 void meet_in_warp(int place);
-// The threads of a warp give their numbers, and `out` receives all 32; says nothing about other memory.
-void exchange(uint64_t given, uint64_t (&out)[32]);
+// And whether any of a block's gave true.
+bool vote_in_block(int place, bool given);
+// The threads of a warp give their numbers, and `out` receives all 32; says nothing about other memory. All come from one line.
+void exchange(int line, uint64_t given, uint64_t (&out)[32]);
 // The same memory for all threads of a block, the n-th time that they ask.
 void* shared_memory(size_t bytes);
 
@@ -44,44 +46,41 @@ T& shared() {
 }
 
 template <class T>
-T from_lane(T given, int source) {
+T from_lane(int line, T given, int source) {
   uint64_t bits = 0, all[32];
   std::memcpy(&bits, &given, sizeof given);
-  exchange(bits, all);
+  exchange(line, bits, all);
   std::memcpy(&given, &all[source], sizeof given);
   return given;
 }
 
-}  // namespace globalsplat::cuda::emulated
-
-template <class T>
-T __shfl_sync(unsigned, T given, int source) {
-  return globalsplat::cuda::emulated::from_lane(given, source % 32);
-}
-template <class T>
-T __shfl_up_sync(unsigned, T given, int by) {
-  const int lane = int(threadIdx.x % 32);
-  return globalsplat::cuda::emulated::from_lane(given, lane >= by ? lane - by : lane);
-}
-template <class T>
-T __shfl_xor_sync(unsigned, T given, int mask) {
-  return globalsplat::cuda::emulated::from_lane(given, int(threadIdx.x % 32) ^ mask);
-}
-inline unsigned __match_any_sync(unsigned, int given) {
+inline unsigned ballot(int line, bool given) {
   uint64_t all[32];
-  globalsplat::cuda::emulated::exchange(uint64_t(uint32_t(given)), all);
-  unsigned alike = 0;
-  for (int k = 0; k < 32; ++k) alike |= unsigned(all[k] == uint32_t(given)) << k;
-  return alike;
-}
-inline unsigned __ballot_sync(unsigned, bool given) {
-  uint64_t all[32];
-  globalsplat::cuda::emulated::exchange(given, all);
+  exchange(line, given, all);
   unsigned bits = 0;
   for (int k = 0; k < 32; ++k) bits |= unsigned(all[k]) << k;
   return bits;
 }
-inline bool __any_sync(unsigned mask, bool given) { return __ballot_sync(mask, given) != 0; }
+inline unsigned alike(int line, int given) {
+  uint64_t all[32];
+  exchange(line, uint64_t(uint32_t(given)), all);
+  unsigned bits = 0;
+  for (int k = 0; k < 32; ++k) bits |= unsigned(all[k] == uint32_t(given)) << k;
+  return bits;
+}
+inline int own_lane() { return int(thread_index().x % 32); }
+
+}  // namespace globalsplat::cuda::emulated
+
+#define GS_FROM_LANE(given, source) ::globalsplat::cuda::emulated::from_lane(__LINE__, given, source)
+#define GS_OWN_LANE ::globalsplat::cuda::emulated::own_lane()
+#define __shfl_sync(mask, given, source) GS_FROM_LANE(given, (source) % 32)
+#define __shfl_up_sync(mask, given, by) GS_FROM_LANE(given, GS_OWN_LANE >= (by) ? GS_OWN_LANE - (by) : GS_OWN_LANE)
+#define __shfl_xor_sync(mask, given, by) GS_FROM_LANE(given, GS_OWN_LANE ^ (by))
+#define __ballot_sync(mask, given) ::globalsplat::cuda::emulated::ballot(__LINE__, given)
+#define __any_sync(mask, given) (__ballot_sync(mask, given) != 0)
+#define __match_any_sync(mask, given) ::globalsplat::cuda::emulated::alike(__LINE__, given)
+#define __syncthreads_or(given) ::globalsplat::cuda::emulated::vote_in_block(__COUNTER__, given)
 
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(int bits) { return __builtin_ffs(bits); }

@@ -51,10 +51,15 @@ __global__ void __launch_bounds__(kGaussianThreads)
     gs_project(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, Splat<float>* splats) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x, view = blockIdx.y;
   if (i >= call.count) return;
-  Splat<float>* const of_view = splats + view * call.count;
-  with_bases(scene_of(gaussians, view / call.cameras), [&](const Gaussians<float>& scene) {
-    raster::lane::project(scene, i, i + 1, lenses + view, 1, &of_view);
+  // Written in one piece, four numbers at a time.
+  Splat<float> own;
+  with_bases(scene_of(gaussians, view / call.cameras), [&](const Gaussians<float>& g) {
+    Splat<float>* const place = &own;
+    raster::lane::project({g.means + 3 * i, g.scales + 3 * i, g.quaternions + 4 * i, g.opacities + i, g.sh + 3 * g.bases * i,
+                           1, g.bases},
+                          0, 1, lenses + view, 1, &place);
   });
+  splats[view * call.count + i] = own;
 }
 
 // A row of blocks a scene. The records of Gaussian i in a view are first[view·N + i] … first[view·N + i + 1] − 1. Where `asked`

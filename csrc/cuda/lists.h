@@ -8,7 +8,7 @@ namespace globalsplat::cuda {
 extern "C" {
 
 // A warp takes 32 splats of a view, a group, and deals the tiles in their boxes to its lanes: most have a few tiles, and some
-// hundreds. In the first pass, where `keys` is null, it tells in group_pairs [views, groups] how many tiles its splats reach. In the
+// hundreds. In the first pass, where `first` is null, it tells in group_pairs [views, groups] how many tiles its splats reach. In the
 // second, group_pairs tells how many are before it, and every (splat, tile) pair gets its place in pairs, keys and values (of the
 // sort): pairs of a splat are neighbours. first[view·N + i] is where those of Gaussian i begin, first[views·N] where all end.
 __global__ void __launch_bounds__(kGaussianThreads)
@@ -20,7 +20,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
   const Splat<float>* of_group = splats + int64_t(view) * call.count + group * kWarp;
   const int i = group * kWarp + lane();
   uint32_t& place = group_pairs[int64_t(view) * groups + group];
-  const uint32_t pairs_before = keys == nullptr ? 0 : place;
+  const uint32_t pairs_before = first == nullptr ? 0 : place;
 
   raster::lane::Box box{0, 0, 0, 0};
   const bool any = i < call.count && raster::lane::box_of(of_group[lane()], call.grid, box);
@@ -41,7 +41,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
 
     const unsigned reaching = __ballot_sync(kAll, blocks != 0);
     if (begin >= base) own_first = reached + uint32_t(__popc(begin - base < kWarp ? reaching & ((1u << (begin - base)) - 1) : reaching));
-    if (keys != nullptr && blocks != 0) {
+    if (first != nullptr && blocks != 0) {
       const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & before()));
       const uint64_t tile = uint64_t(view) * uint64_t(call.grid.tiles()) + uint64_t(y * call.grid.columns + x);
       keys[record] = key_of(tile) | __float_as_uint(splat.z);
@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
     reached += uint32_t(__popc(reaching));
   }
 
-  if (keys == nullptr) {
+  if (first == nullptr) {
     if (lane() == 0) place = reached;
     return;
   }

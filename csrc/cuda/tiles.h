@@ -110,7 +110,12 @@ __global__ void __launch_bounds__(kTileThreads)
     const uint32_t count = end - begin < kBatch ? end - begin : kBatch;
     for (int k = int(threadIdx.x); k < int(count) * 16; k += kTileThreads)
       (&batch[k / 16].u)[k % 16] = (&splats[entries[begin + uint32_t(k / 16)].splat].u)[k % 16];
-    __syncthreads();
+    // Behind what ended all pixels nothing is asked.
+    if (!__syncthreads_or(state.transmittance > 0)) {
+      for (uint64_t k = uint64_t(begin) * kNumbers + threadIdx.x; k < uint64_t(end) * kNumbers; k += kTileThreads)
+        (&records[entries[k / kNumbers].record].power)[k % kNumbers] = 0;
+      return;
+    }
 
     const bool goes_on = __any_sync(kAll, state.transmittance > 0);
     const uint32_t own = uint32_t(lane()) < count ? entries[begin + uint32_t(lane())].blocks & own_blocks() : 0;

@@ -46,8 +46,8 @@ inline Folded fold(const float (&numbers)[count], int first = 0, int left = coun
       const float low = numbers[k], high = k + half < count ? numbers[k + half] : 0;
       kept[k] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, distance);
     }
-    if (upper) return fold<half, distance / 2>(kept, first + half, left - half);
-    return fold<half, distance / 2>(kept, first, left < half ? left : half);
+    // One call for both halves, or the compiler makes lanes take turns.
+    return fold<half, distance / 2>(kept, upper ? first + half : first, upper ? left - half : left < half ? left : half);
   }
 }
 

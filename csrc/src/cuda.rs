@@ -8,7 +8,7 @@ mod libraries;
 mod usage;
 
 pub use cache::cache_folder;
-pub use compile::{Compiled, Form, Nvrtc};
+pub use compile::{Compiled, Form, Nvrtc, OLDEST};
 pub use gpu::{Driver, Gpu, Prepared, prepare};
 pub use usage::{KernelUse, usage};
 

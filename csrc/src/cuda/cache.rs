@@ -37,9 +37,9 @@ pub fn read(file: &Path) -> Option<Vec<u8>> {
     (Sha256::digest(&image)[..] == bytes[..]).then_some(image)
 }
 
-/// Stores what was compiled. Where that fails, it will be compiled again.
-pub fn write(file: &Path, image: &[u8]) {
-    let Some(folder) = file.parent() else { return };
+/// Stores what was compiled, and tells whether that worked. Where it fails, it will be compiled again.
+pub fn write(file: &Path, image: &[u8]) -> bool {
+    let Some(folder) = file.parent() else { return false };
     let part = file.with_extension(format!("{}.part", std::process::id()));
     let bytes = [&Sha256::digest(image)[..], image].concat();
     let stored = std::fs::create_dir_all(folder)
@@ -48,6 +48,7 @@ pub fn write(file: &Path, image: &[u8]) {
     if stored.is_err() {
         let _ = std::fs::remove_file(part);
     }
+    stored.is_ok()
 }
 
 #[cfg(test)]
@@ -59,7 +60,7 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("globalsplat-cache-{}", std::process::id()));
         let file = folder.join("deeper/kernels");
         assert_eq!(read(&file), None);
-        write(&file, b"machine code");
+        assert!(write(&file, b"machine code"));
         assert_eq!(read(&file).as_deref(), Some(&b"machine code"[..]));
         let whole = std::fs::read(&file).unwrap();
         for length in 0..whole.len() {

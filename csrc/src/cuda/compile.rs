@@ -1,7 +1,9 @@
 //! The kernels' text to machine code, by NVRTC.
 
-use super::{Result, libraries::load_nvrtc};
-use cudarc::nvrtc::{result::NvrtcError, sys};
+use super::{
+    Result,
+    libraries::{Functions, Program, nvrtc},
+};
 use std::ffi::{CStr, CString, c_char, c_int};
 use std::ptr;
 
@@ -42,6 +44,9 @@ const OPTIONS: &[&str] = &[
     "--prec-sqrt=true",
 ];
 
+/// The least compute capability that the kernels are for, as in 75 for 7.5.
+pub const OLDEST: i32 = 75;
+
 /// What NVRTC makes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
@@ -75,14 +80,16 @@ impl Nvrtc {
     /// # Errors
     /// It isn't there, or isn't what it seems.
     pub fn find() -> Result<Self> {
-        load_nvrtc()?;
+        let nvrtc = nvrtc()?;
         let (mut major, mut minor, mut count) = (0, 0, 0);
-        // SAFETY: the library is there, and the second list has room for as many as it said.
+        // SAFETY: the list has room for as many as were told.
         unsafe {
-            told(sys::nvrtcVersion(&mut major, &mut minor).result())?;
-            told(sys::nvrtcGetNumSupportedArchs(&mut count).result())?;
+            nvrtc.told((nvrtc.nvrtcVersion)(&mut major, &mut minor))?;
+            nvrtc.told((nvrtc.nvrtcGetNumSupportedArchs)(&mut count))?;
             let mut architectures = vec![0; count as usize];
-            told(sys::nvrtcGetSupportedArchs(architectures.as_mut_ptr()).result())?;
+            nvrtc.told((nvrtc.nvrtcGetSupportedArchs)(architectures.as_mut_ptr()))?;
+            // Warps of older GPUs can't do what the kernels ask of them.
+            architectures.retain(|&of| of >= OLDEST);
             architectures.sort_unstable();
             Ok(Nvrtc { version: (major, minor), architectures })
         }
@@ -98,13 +105,11 @@ impl Nvrtc {
             Some(&known) if known == of => Ok((of, Form::Cubin)),
             Some(&known) => Ok((known, Form::Ptx)),
             None => Err(format!(
-                "the GPU has compute capability {}.{}, expected {}.{} or more, the least that NVRTC {}.{} compiles for",
+                "the GPU has compute capability {}.{}, expected {}.{} or more",
                 of / 10,
                 of % 10,
-                self.architectures[0] / 10,
-                self.architectures[0] % 10,
-                self.version.0,
-                self.version.1
+                OLDEST / 10,
+                OLDEST % 10
             )),
         }
     }
@@ -122,69 +127,74 @@ impl Nvrtc {
         let (name_addresses, header_addresses) = (addresses(&names), addresses(&headers));
         let options: Vec<CString> = options(architecture, form).iter().map(|o| terminated(o)).collect();
 
+        let nvrtc = nvrtc()?;
         let mut program = ptr::null_mut();
         // SAFETY: all texts are terminated, and live until the program is destroyed.
         unsafe {
-            let created = sys::nvrtcCreateProgram(
+            nvrtc.told((nvrtc.nvrtcCreateProgram)(
                 &mut program,
                 text.as_ptr(),
                 c"kernels.cu".as_ptr(),
                 HEADERS.len() as c_int,
                 header_addresses.as_ptr(),
                 name_addresses.as_ptr(),
-            );
-            told(created.result())?;
-            let compiled = compile_program(program, &addresses(&options), form);
-            told(sys::nvrtcDestroyProgram(&mut program).result())?;
+            ))?;
+            let compiled = nvrtc.compile(program, &addresses(&options), form);
+            nvrtc.told((nvrtc.nvrtcDestroyProgram)(&mut program))?;
             compiled
         }
     }
 }
 
-/// # Safety
-/// A program, and terminated texts.
-unsafe fn compile_program(
-    program: sys::nvrtcProgram,
-    options: &[*const c_char],
-    form: Form,
-) -> Result<Compiled> {
-    // SAFETY: the caller's promise; what is asked for has the size that was told.
-    unsafe {
-        let done = sys::nvrtcCompileProgram(program, options.len() as c_int, options.as_ptr());
-        let log = filled(program, sys::nvrtcGetProgramLogSize, sys::nvrtcGetProgramLog)?;
-        let log = CStr::from_bytes_until_nul(&log).unwrap_or_default().to_string_lossy().into_owned();
-        if let Err(error) = done.result() {
-            return Err(format!("NVRTC can't compile the kernels ({error}): {log}"));
+impl Functions {
+    /// # Safety
+    /// A program, and terminated texts.
+    unsafe fn compile(&self, program: Program, options: &[*const c_char], form: Form) -> Result<Compiled> {
+        // SAFETY: the caller's promise; what is asked for has the size that was told.
+        unsafe {
+            let done = (self.nvrtcCompileProgram)(program, options.len() as c_int, options.as_ptr());
+            let log = self.filled(program, self.nvrtcGetProgramLogSize, self.nvrtcGetProgramLog)?;
+            let log = CStr::from_bytes_until_nul(&log).unwrap_or_default().to_string_lossy().into_owned();
+            if let Err(error) = self.told(done) {
+                return Err(format!("{error}: {log}"));
+            }
+            let image = match form {
+                Form::Cubin => self.filled(program, self.nvrtcGetCUBINSize, self.nvrtcGetCUBIN)?,
+                Form::Ptx => self.filled(program, self.nvrtcGetPTXSize, self.nvrtcGetPTX)?,
+            };
+            Ok(Compiled { image, log })
         }
-        let image = match form {
-            Form::Cubin => filled(program, sys::nvrtcGetCUBINSize, sys::nvrtcGetCUBIN)?,
-            Form::Ptx => filled(program, sys::nvrtcGetPTXSize, sys::nvrtcGetPTX)?,
-        };
-        Ok(Compiled { image, log })
     }
-}
 
-/// What NVRTC has of a program, by the two functions that tell its size and fill in that much.
-///
-/// # Safety
-/// A program, and two functions that belong together.
-unsafe fn filled(
-    program: sys::nvrtcProgram,
-    size: unsafe fn(sys::nvrtcProgram, *mut usize) -> sys::nvrtcResult,
-    fill: unsafe fn(sys::nvrtcProgram, *mut c_char) -> sys::nvrtcResult,
-) -> Result<Vec<u8>> {
-    let mut bytes = 0;
-    // SAFETY: the caller's promise.
-    unsafe {
-        told(size(program, &mut bytes).result())?;
-        let mut out = vec![0; bytes];
-        told(fill(program, out.as_mut_ptr().cast()).result())?;
-        Ok(out)
+    /// What NVRTC has of a program, by the two functions that tell its size and fill in that much.
+    ///
+    /// # Safety
+    /// A program, and two functions that belong together.
+    unsafe fn filled(
+        &self,
+        program: Program,
+        size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
+        fill: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+    ) -> Result<Vec<u8>> {
+        let mut bytes = 0;
+        // SAFETY: the caller's promise.
+        unsafe {
+            self.told(size(program, &mut bytes))?;
+            let mut out = vec![0; bytes];
+            self.told(fill(program, out.as_mut_ptr().cast()))?;
+            Ok(out)
+        }
     }
-}
 
-fn told(result: std::result::Result<(), NvrtcError>) -> Result<()> {
-    result.map_err(|error| format!("NVRTC fails: {error}"))
+    /// What a function's result means.
+    fn told(&self, result: c_int) -> Result<()> {
+        if result == 0 {
+            return Ok(());
+        }
+        // SAFETY: it gives a text for any number.
+        let words = unsafe { CStr::from_ptr((self.nvrtcGetErrorString)(result)) };
+        Err(format!("NVRTC can't compile the kernels: {}", words.to_string_lossy()))
+    }
 }
 
 fn options(architecture: i32, form: Form) -> Vec<String> {

@@ -1,6 +1,11 @@
 //! GPUs, by the driver, and launches on them.
 
-use super::{Result, cache, compile::Nvrtc, ffi::BlockCounts, libraries::has_driver};
+use super::{
+    Result, cache,
+    compile::{Form, Nvrtc},
+    ffi::BlockCounts,
+    libraries::has_driver,
+};
 use cudarc::driver::{
     result::{self, DriverError},
     sys,
@@ -101,7 +106,7 @@ unsafe impl Send for Loaded {}
 pub struct Prepared {
     /// The architecture that they were compiled for, as in 90.
     pub architecture: i32,
-    /// The file that keeps them, if there is a place for one.
+    /// The file that keeps them, if one does.
     pub file: Option<PathBuf>,
     /// Whether they were read from it.
     pub was_kept: bool,
@@ -130,15 +135,17 @@ impl Loaded {
         let load = |image: &[u8]| told(unsafe { result::module::load_data(image.as_ptr().cast()) });
         let kept = file.as_deref().and_then(cache::read).and_then(|image| load(&image).ok());
         let was_kept = kept.is_some();
-        let module = match kept {
-            Some(module) => module,
+        let (module, file) = match kept {
+            Some(module) => (module, file),
             None => {
-                let image = nvrtc.compile(architecture, form)?.image;
-                let module = load(&image)?;
-                if let Some(file) = &file {
-                    cache::write(file, &image);
+                let mut image = nvrtc.compile(architecture, form)?.image;
+                let mut module = load(&image);
+                // A driver that is older than NVRTC may refuse its machine code, and compile for itself.
+                if module.is_err() && form == Form::Cubin {
+                    image = nvrtc.compile(architecture, Form::Ptx)?.image;
+                    module = load(&image);
                 }
-                module
+                (module?, file.filter(|file| cache::write(file, &image)))
             }
         };
         let functions = HashMap::new();

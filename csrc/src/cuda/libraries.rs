@@ -1,10 +1,8 @@
 //! Where the driver and NVRTC are.
-//!
-//! Loaders find a library by its name if it is on their path, or loaded already. NVRTC rarely is on the path, but it comes with torch:
-//! it is loaded from there by its path, after the library that it loads itself, and then goes by its name.
 
 use super::Result;
-use std::ffi::{CStr, CString, c_void};
+use libloading::os::unix::{Library, RTLD_GLOBAL, RTLD_LAZY};
+use std::ffi::{CStr, c_char, c_int, c_void};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -15,41 +13,84 @@ pub fn has_driver() -> bool {
     unsafe { cudarc::driver::sys::is_culib_present() }
 }
 
-/// Makes sure that NVRTC can be called.
-///
-/// # Errors
-/// It isn't there.
-pub fn load_nvrtc() -> Result<()> {
-    static LOADED: OnceLock<bool> = OnceLock::new();
-    // SAFETY: neither library has initializers that need anything.
-    let is_there = || unsafe { cudarc::nvrtc::sys::is_culib_present() };
-    let loaded = LOADED
-        .get_or_init(|| is_there() || { folders().iter().any(|folder| load_from(folder)) && is_there() });
-    if *loaded {
-        return Ok(());
-    }
-    let folders: Vec<String> = folders().iter().map(|folder| folder.display().to_string()).collect();
-    Err(format!(
-        "NVRTC, which compiles for GPUs, is not on the loader's path and not in {}; a torch for CUDA brings it, or \
-         `pip install nvidia-cuda-nvrtc`, or LD_LIBRARY_PATH names the folder of another",
-        folders.join(", ")
-    ))
+/// A program that NVRTC compiles.
+pub type Program = *mut c_void;
+
+/// Declares NVRTC's functions, and how they are looked up by their names.
+macro_rules! nvrtc {
+    ($($name:ident ( $($parameter:ty),* ) -> $result:ty;)*) => {
+        /// NVRTC's functions, as in its manual.
+        #[allow(non_snake_case)]
+        pub struct Functions {
+            $(pub $name: unsafe extern "C" fn($($parameter),*) -> $result,)*
+        }
+
+        impl Functions {
+            /// For good.
+            fn of(library: Library) -> Result<Self> {
+                // SAFETY: the functions have these parameters, and the library is never unloaded.
+                let functions = unsafe {
+                    Functions {
+                        $($name: *library
+                            .get(concat!(stringify!($name), "\0").as_bytes())
+                            .map_err(|e| format!("NVRTC is too old: {e}"))?,)*
+                    }
+                };
+                std::mem::forget(library);
+                Ok(functions)
+            }
+        }
+    };
+}
+nvrtc! {
+    nvrtcVersion(*mut c_int, *mut c_int) -> c_int;
+    nvrtcGetNumSupportedArchs(*mut c_int) -> c_int;
+    nvrtcGetSupportedArchs(*mut c_int) -> c_int;
+    nvrtcGetErrorString(c_int) -> *const c_char;
+    nvrtcCreateProgram(*mut Program, *const c_char, *const c_char, c_int, *const *const c_char, *const *const c_char) -> c_int;
+    nvrtcCompileProgram(Program, c_int, *const *const c_char) -> c_int;
+    nvrtcDestroyProgram(*mut Program) -> c_int;
+    nvrtcGetProgramLogSize(Program, *mut usize) -> c_int;
+    nvrtcGetProgramLog(Program, *mut c_char) -> c_int;
+    nvrtcGetCUBINSize(Program, *mut usize) -> c_int;
+    nvrtcGetCUBIN(Program, *mut c_char) -> c_int;
+    nvrtcGetPTXSize(Program, *mut usize) -> c_int;
+    nvrtcGetPTX(Program, *mut c_char) -> c_int;
 }
 
-/// Where torch, pip and NVIDIA's own packages put NVRTC.
+/// NVRTC, loaded once: torch's own, which is of its CUDA, else the one on the loader's path.
+///
+/// # Errors
+/// It isn't there, or lacks a function.
+pub fn nvrtc() -> Result<&'static Functions> {
+    static LOADED: OnceLock<Result<Functions>> = OnceLock::new();
+    LOADED.get_or_init(|| Functions::of(load_nvrtc()?)).as_ref().map_err(String::clone)
+}
+
+fn load_nvrtc() -> Result<Library> {
+    let folders = folders();
+    let by_name = ["libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"].map(Path::new);
+    let found = folders.iter().find_map(|folder| load_from(folder));
+    found.or_else(|| by_name.into_iter().find_map(load)).ok_or_else(|| {
+        let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
+        format!(
+            "NVRTC, which compiles for GPUs, is not in {} and not on the loader's path; a torch for CUDA brings it, or `pip install \
+             nvidia-cuda-nvrtc`, or LD_LIBRARY_PATH names the folder of another",
+            folders.join(", ")
+        )
+    })
+}
+
+/// Where torch and pip put NVRTC.
 fn folders() -> Vec<PathBuf> {
-    let mut folders = vec![];
-    if let Some(torch) = libtorch_folder() {
-        // As in Python: site-packages/torch/lib and site-packages/nvidia/*/lib.
-        if let Some(packages) = torch.ancestors().nth(2) {
-            let entries = std::fs::read_dir(packages.join("nvidia")).into_iter().flatten().flatten();
-            let mut beside: Vec<PathBuf> = entries.map(|entry| entry.path().join("lib")).collect();
-            beside.sort();
-            folders.extend(beside);
-        }
-        folders.push(torch);
-    }
-    folders.push("/usr/local/cuda/lib64".into());
+    let Some(torch) = libtorch_folder() else { return vec![] };
+    // As in Python: site-packages/torch/lib and site-packages/nvidia/*/lib.
+    let packages = torch.ancestors().nth(2).map(|packages| packages.join("nvidia"));
+    let entries =
+        packages.and_then(|packages| std::fs::read_dir(packages).ok()).into_iter().flatten().flatten();
+    let mut folders: Vec<PathBuf> = entries.map(|entry| entry.path().join("lib")).collect();
+    folders.sort();
+    folders.insert(0, torch);
     folders
 }
 
@@ -69,26 +110,24 @@ fn libtorch_folder() -> Option<PathBuf> {
         .flatten()
 }
 
-/// Loads NVRTC for good; false if it isn't there.
-fn load_from(folder: &Path) -> bool {
-    let named = |start: &str| {
-        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-        let mut found: Vec<PathBuf> = entries
-            .filter(|path| {
-                let name = path.file_name().unwrap_or_default().to_string_lossy();
-                name.starts_with(start) && !name.contains(".alt.")
-            })
-            .collect();
-        found.sort();
-        found
-    };
-    let load = |path: &PathBuf| {
-        let path = CString::new(path.as_os_str().as_bytes()).expect("a path holds no 0");
-        // SAFETY: as in `load_nvrtc`.
-        !unsafe { libc::dlopen(path.as_ptr(), libc::RTLD_LAZY | libc::RTLD_GLOBAL) }.is_null()
-    };
-    named("libnvrtc-builtins.so").iter().for_each(|path| {
-        load(path);
-    });
-    named("libnvrtc.so").iter().any(load)
+/// NVRTC of a folder, after the library that it asks for by name alone. In wheels it is called libnvrtc.so.13, in libtorch's archives
+/// libnvrtc-<digits>.so.13.
+fn load_from(folder: &Path) -> Option<Library> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut names: Vec<String> = entries
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .filter(|name| !name.contains(".alt."))
+        .collect();
+    names.sort();
+    let (builtins, others): (Vec<_>, Vec<_>) = names
+        .iter()
+        .filter(|name| name.starts_with("libnvrtc") && name.contains(".so"))
+        .partition(|name| name.starts_with("libnvrtc-builtins"));
+    builtins.iter().filter_map(|name| load(&folder.join(name))).for_each(std::mem::forget);
+    others.iter().find_map(|name| load(&folder.join(name)))
+}
+
+fn load(path: &Path) -> Option<Library> {
+    // SAFETY: these libraries have no initializers that need anything.
+    unsafe { Library::open(Some(path), RTLD_LAZY | RTLD_GLOBAL) }.ok()
 }
