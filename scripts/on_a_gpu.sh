@@ -29,20 +29,24 @@ else
     views=(12 24 36)
     small=()
     batch=16 steps=10 train=(--set train.steps=300)
-    demo=(env DEVICE="$device" CAPTURES=none scripts/demo.sh)
+    demo=(env DEVICE="$device" CAPTURES=none OUT="$out/demo" scripts/demo.sh)
 fi
 
+# Runs of an earlier report would be gone on with.
+rm -rf "$out/first_light" "$out/tiny" "$out/demo"
 mkdir -p "$out"
 report="$out/report.md"
 failed=0
 began=$(date +%s)
+limit=580 # seconds, of all parts together
 
 # A part of the report: what a command says, within so many seconds.
 part() { # TITLE SECONDS COMMAND…
-    local title=$1 seconds=$2 from status
+    local title=$1 seconds=$2 from left status
     shift 2
     from=$(date +%s)
-    timeout "$seconds" "$@" >"$out/part.log" 2>&1
+    left=$((began + limit - from))
+    timeout "$((seconds < left ? seconds : left > 1 ? left : 1))" "$@" >"$out/part.log" 2>&1
     status=$?
     {
         echo "## $title"

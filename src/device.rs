@@ -65,6 +65,11 @@ impl Upload {
         Upload { device, stream }
     }
 
+    /// Where it leads.
+    pub fn device(&self) -> Device {
+        self.device
+    }
+
     /// Bytes of the host, zeros or anything else, in memory from which they are copied without another copy before.
     pub fn bytes(&self, shape: &[i64]) -> Tensor {
         if self.stream.is_none() {

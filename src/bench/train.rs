@@ -3,6 +3,7 @@
 use super::{Measured, Section, Spread};
 use crate::config::Config;
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
+use crate::device::Upload;
 use crate::error::Result;
 use crate::eval::peak_memory_bytes_on;
 use crate::loss::{PerceptualKind, PerceptualLoss};
@@ -61,12 +62,15 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
     let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
     let scenes: Vec<LoadedScene> =
         (0..config.train.batch as u64).map(|seed| made_up_scene(&config, seed)).collect();
-    let mut measured = Measured::default();
-    for _ in 0..steps {
+    let (mut measured, upload) = (Measured::default(), Upload::to(device));
+    // The first step warms caches, threads and the GPU's libraries up.
+    for step in 0..=steps {
         let mut watch = Stopwatch::of(device);
-        let sample = watch.time("data", || Sample::of(&scenes, device));
+        let sample = watch.time("data", || Sample::by(&scenes, &upload));
         trainer.learn(&sample, &mut watch)?;
-        measured.add(&mut watch);
+        if step > 0 {
+            measured.add(&mut watch);
+        }
     }
     let (milliseconds, sections) = measured.told();
     Ok(TrainReport {

@@ -1,6 +1,7 @@
 //! `--device cpu|cuda[:N]`.
 
 use globalsplat::{Error, Result};
+use std::ffi::CStr;
 use tch::{Cuda, Device};
 
 /// Parses a device and makes sure that it is there.
@@ -14,20 +15,23 @@ pub fn parse(name: &str) -> Result<Device> {
         }
         _ => return Err(refused("expected cpu, cuda or cuda:N")),
     };
-    load_cuda();
+    let why = load_cuda().err().unwrap_or("globalsplat doctor tells what was found".into());
     let count = Cuda::device_count();
     if !Cuda::is_available() || index as i64 >= count {
-        return Err(refused(&format!("there are {count} CUDA devices that this libtorch can use")));
+        return Err(refused(&format!("there are {count} CUDA devices that this libtorch can use ({why})")));
     }
     Ok(Device::Cuda(index))
 }
 
-/// Loads libtorch's CUDA half where there is one. The program isn't linked to it: loading it takes longer than a small job
-/// on the CPU, and machines without a GPU may not have it.
-pub fn load_cuda() {
-    #[cfg(unix)]
+/// Loads libtorch's CUDA half where there is one, or tells why it can't be. The program isn't linked to it: loading it takes longer
+/// than a small job on the CPU, and machines without a GPU may not have it.
+pub fn load_cuda() -> std::result::Result<(), String> {
     // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
-    unsafe {
-        libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL);
+    let loaded = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
+    if !loaded.is_null() {
+        return Ok(());
     }
+    // SAFETY: an error's words, which nothing else asks for before they are copied.
+    let words = unsafe { CStr::from_ptr(libc::dlerror()) };
+    Err(format!("its half for CUDA can't be loaded: {}", words.to_string_lossy()))
 }

@@ -27,7 +27,7 @@ impl Doctor {
         if self.kernels {
             return Ok(kernels(self.json)?);
         }
-        device::load_cuda();
+        let unusable = device::load_cuda().err().unwrap_or("it is for other GPUs, or another driver".into());
         let usable = tch::Cuda::device_count();
         let devices: Vec<String> =
             std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}"))).collect();
@@ -51,7 +51,7 @@ impl Doctor {
                 "threads": threads,
                 "cores": cores,
                 "driver": or_error(&driver, |driver| json!(cuda_version(driver.version))),
-                "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared)),
+                "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared, &unusable)),
                 "nvrtc": or_error(&nvrtc, |nvrtc| json!({
                     "version": format!("{}.{}", nvrtc.version.0, nvrtc.version.1),
                     "architectures": nvrtc.architectures,
@@ -79,7 +79,7 @@ impl Doctor {
                         &format!("cuda:{number}"),
                         &format!("{name}, compute capability {capability}, {gigabytes:.1} GB"),
                     );
-                    line("", &state_of_kernels(prepared.get(number)));
+                    line("", &state_of_kernels(prepared.get(number), &unusable));
                 }
                 if driver.gpus.is_empty() {
                     line(
@@ -129,22 +129,22 @@ fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Val
 }
 
 /// Of the driver's GPUs, those that torch can use come first, and have their kernels.
-fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>]) -> Value {
+fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) -> Value {
     let told = driver.gpus.iter().enumerate().map(|(number, gpu)| {
         json!({
             "name": gpu.name,
             "compute_capability": capability(gpu.architecture),
             "memory_bytes": gpu.memory,
             "multiprocessors": gpu.multiprocessors,
-            "kernels": state_of_kernels(prepared.get(number)),
+            "kernels": state_of_kernels(prepared.get(number), unusable),
         })
     });
     told.collect()
 }
 
-fn state_of_kernels(prepared: Option<&Result<Prepared, String>>) -> String {
+fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str) -> String {
     match prepared {
-        None => "this libtorch can't use it: it has no CUDA half, or one for other GPUs (setup.sh installs torch's default)".into(),
+        None => format!("this libtorch can't use it: {unusable}"),
         Some(Err(why)) => format!("its kernels are missing: {why}"),
         Some(Ok(Prepared { architecture, file, was_kept })) => {
             let how = if *was_kept { "read from" } else { "compiled just now, and kept in" };

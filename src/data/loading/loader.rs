@@ -181,7 +181,10 @@ impl Loader {
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
         match self.ahead.take() {
             Some(ahead) => Ok(ahead.sample?.arrive()),
-            None => Ok(Sample::of(&self.next_scenes(batch)?, device)),
+            None => {
+                let scenes = self.next_scenes(batch)?;
+                Ok(Sample::by(&scenes, self.upload.get_or_insert_with(|| Upload::to(device))))
+            }
         }
     }
 

@@ -27,9 +27,14 @@ pub struct Sample {
 impl Sample {
     /// `scenes` with equally many views of one size, side by side.
     pub fn of(scenes: &[LoadedScene], device: Device) -> Self {
-        match device {
+        Sample::by(scenes, &Upload::to(device))
+    }
+
+    /// The same by a way that is kept for more of them.
+    pub(crate) fn by(scenes: &[LoadedScene], upload: &Upload) -> Self {
+        match upload.device() {
             Device::Cpu => Sample::on_host(scenes, floats),
-            _ => ComingSample::begin(scenes, &Upload::to(device)).arrive(),
+            _ => ComingSample::begin(scenes, upload).arrive(),
         }
     }
 
