@@ -31,7 +31,7 @@
 namespace globalsplat::cuda::emulated {
 namespace {
 
-constexpr int kMostThreads = 1024;           // of a block
+constexpr int kMostThreads = 1024;          // of a block
 constexpr size_t kStack = 256 << 10;        // bytes
 constexpr size_t kSharedMemory = 48 << 10;  // bytes of a block, as GPUs have at least
 constexpr size_t kLine = 64;                // between two arrays of it
@@ -93,7 +93,11 @@ struct Block {
   Warp warps[kMostThreads / 32];
   std::vector<std::unique_ptr<char[]>> shared;  // the last is this block's
 };
-thread_local Block block;
+Block& block() {
+  thread_local std::unique_ptr<Block> own;
+  if (!own) own = std::make_unique<Block>();
+  return *own;
+}
 
 int left_out = -1;  // the barrier that no thread heeds
 
@@ -106,17 +110,17 @@ void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
   }
 }
 
-Thread& current() { return *block.threads[block.current].get(); }
+Thread& current() { return *block().threads[block().current]; }
 
 // Of one thread of the GPU after the other.
 void run_threads() {
-  GS_ASAN(__sanitizer_finish_switch_fiber(nullptr, const_cast<const void**>(&block.scheduler.bottom), &block.scheduler.size));
+  GS_ASAN(__sanitizer_finish_switch_fiber(nullptr, const_cast<const void**>(&block().scheduler.bottom), &block().scheduler.size));
   for (;;) {
-    GS_TSAN(__tsan_acquire(&block.kernel));
-    block.kernel->run(block.arguments);
-    GS_TSAN(__tsan_release(&block.arguments));
-    ++block.done;
-    go_on(current().stack, block.scheduler);
+    GS_TSAN(__tsan_acquire(&block().kernel));
+    block().kernel->run(block().arguments);
+    GS_TSAN(__tsan_release(&block().arguments));
+    ++block().done;
+    go_on(current().stack, block().scheduler);
   }
 }
 
@@ -138,53 +142,53 @@ std::unique_ptr<Thread> new_thread() {
 void meet(Threads& waiting, int all) {
   GS_TSAN(__tsan_release(&waiting));
   if (waiting.count + 1 == all) {
-    for (int k = 0; k < waiting.count; ++k) block.ready.add(waiting.numbers[k]);
+    for (int k = 0; k < waiting.count; ++k) block().ready.add(waiting.numbers[k]);
     waiting.count = 0;
   } else {
-    waiting.add(block.current);
-    go_on(current().stack, block.scheduler);
+    waiting.add(block().current);
+    go_on(current().stack, block().scheduler);
   }
 }
 
-Warp& own_warp() { return block.warps[block.current / 32]; }
+Warp& own_warp() { return block().warps[block().current / 32]; }
 
 void run_block(std::mt19937_64& order) {
-  const int threads = int(block.size.x);
-  if (block.shared.empty() || !kReuse) block.shared.emplace_back(new char[kSharedMemory]);
+  const int threads = int(block().size.x);
+  if (block().shared.empty() || !kReuse) block().shared.emplace_back(new char[kSharedMemory]);
   // What the block before left must be of no use.
-  fill_with_anything(block.shared.back().get(), kSharedMemory, order);
-  GS_TSAN(__tsan_release(&block.kernel));
-  block.done = block.ready.count = block.waiting.count = 0;
-  block.votes[0] = block.votes[1] = false;
+  fill_with_anything(block().shared.back().get(), kSharedMemory, order);
+  GS_TSAN(__tsan_release(&block().kernel));
+  block().done = block().ready.count = block().waiting.count = 0;
+  block().votes[0] = block().votes[1] = false;
   for (int k = 0; k < threads; ++k) {
-    block.ready.add(k);
-    block.threads[k]->shared_used = 0;
-    block.threads[k]->votes = 0;
-    block.warps[k / 32].waiting.count = 0;
+    block().ready.add(k);
+    block().threads[k]->shared_used = 0;
+    block().threads[k]->votes = 0;
+    block().warps[k / 32].waiting.count = 0;
   }
-  while (block.ready.count > 0) {
-    int* const ready = block.ready.numbers;
-    std::swap(ready[order() % uint64_t(block.ready.count)], ready[block.ready.count - 1]);
-    block.current = ready[--block.ready.count];
-    go_on(block.scheduler, current().stack);
+  while (block().ready.count > 0) {
+    int* const ready = block().ready.numbers;
+    std::swap(ready[order() % uint64_t(block().ready.count)], ready[block().ready.count - 1]);
+    block().current = ready[--block().ready.count];
+    go_on(block().scheduler, current().stack);
   }
-  if (block.done < threads) {
-    for (auto& thread : block.threads) thread.reset();
-    throw std::logic_error(std::string(block.kernel->name) + ": threads wait for others that have ended");
+  if (block().done < threads) {
+    for (auto& thread : block().threads) thread.reset();
+    throw std::logic_error(std::string(block().kernel->name) + ": threads wait for others that have ended");
   }
 }
 
 }  // namespace
 
-Index thread_index() { return {unsigned(block.current), 0}; }
-Index block_index() { return block.index; }
-Index block_size() { return block.size; }
-Index grid_size() { return block.grid; }
+Index thread_index() { return {unsigned(block().current), 0}; }
+Index block_index() { return block().index; }
+Index block_size() { return block().size; }
+Index grid_size() { return block().grid; }
 
 void meet_in_block(int place) {
   if (place == left_out) return;
-  meet(block.waiting, int(block.size.x));
-  GS_TSAN(__tsan_acquire(&block.waiting));
+  meet(block().waiting, int(block().size.x));
+  GS_TSAN(__tsan_acquire(&block().waiting));
 }
 
 void meet_in_warp(int place) {
@@ -197,28 +201,28 @@ void meet_in_warp(int place) {
 
 bool vote_in_block(int place, bool given) {
   const unsigned turn = current().votes++ % 2;
-  block.votes[turn] |= given;
-  if (block.waiting.count + 1 == int(block.size.x)) block.votes[1 - turn] = false;  // which all have read
+  block().votes[turn] |= given;
+  if (block().waiting.count + 1 == int(block().size.x)) block().votes[1 - turn] = false;  // which all have read
   meet_in_block(place);
-  return block.votes[turn];
+  return block().votes[turn];
 }
 
 void exchange(int line, uint64_t given, uint64_t (&out)[32]) {
   Warp& warp = own_warp();
   if (warp.waiting.count > 0 && warp.place != line) {
-    std::fprintf(stderr, "%s: threads of a warp meet in lines %d and %d\n", block.kernel->name, warp.place, line);
+    std::fprintf(stderr, "%s: threads of a warp meet in lines %d and %d\n", block().kernel->name, warp.place, line);
     std::abort();
   }
   warp.place = line;
   uint64_t(&place)[32] = warp.given[current().exchanges++ % 2];
-  place[block.current % 32] = given;
+  place[block().current % 32] = given;
   meet(warp.waiting, 32);
   for (int k = 0; k < 32; ++k) out[k] = place[k];
 }
 
 void* shared_memory(size_t bytes) {
   size_t& used = current().shared_used;
-  void* const memory = block.shared.back().get() + used;
+  void* const memory = block().shared.back().get() + used;
   used += (bytes + kLine - 1) / kLine * kLine;
   if (used > kSharedMemory) std::abort();
   return memory;
@@ -236,26 +240,26 @@ Memory Emulator::allocate(size_t bytes) const {
 }
 
 void Emulator::launch(const char* kernel, Blocks blocks, int threads, void** arguments) const {
-  block.kernel = kernel_named(kernel);
-  if (block.kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
-  block.arguments = arguments;
-  block.size = {unsigned(threads), 1};
-  block.grid = {unsigned(blocks.x), unsigned(blocks.y)};
+  block().kernel = kernel_named(kernel);
+  if (block().kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
+  block().arguments = arguments;
+  block().size = {unsigned(threads), 1};
+  block().grid = {unsigned(blocks.x), unsigned(blocks.y)};
   if (threads > kMostThreads || threads % 32 != 0) throw std::logic_error("a block of " + std::to_string(threads) + " threads");
   for (int k = 0; k < threads; ++k)
-    if (!block.threads[k]) block.threads[k] = new_thread();
-  GS_TSAN(block.scheduler.fiber = __tsan_get_current_fiber());
+    if (!block().threads[k]) block().threads[k] = new_thread();
+  GS_TSAN(block().scheduler.fiber = __tsan_get_current_fiber());
 
   std::mt19937_64 order(seed_++);
   std::vector<uint64_t> turns(size_t(blocks.x * blocks.y));
   for (size_t k = 0; k < turns.size(); ++k) turns[k] = k;
   std::shuffle(turns.begin(), turns.end(), order);
   for (const uint64_t turn : turns) {
-    block.index = {unsigned(turn % uint64_t(blocks.x)), unsigned(turn / uint64_t(blocks.x))};
+    block().index = {unsigned(turn % uint64_t(blocks.x)), unsigned(turn / uint64_t(blocks.x))};
     run_block(order);
   }
-  GS_TSAN(__tsan_acquire(&block.arguments));
-  block.shared.clear();
+  GS_TSAN(__tsan_acquire(&block().arguments));
+  block().shared.clear();
 }
 
 }  // namespace globalsplat::cuda::emulated
