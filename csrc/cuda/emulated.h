@@ -5,8 +5,8 @@
 
 namespace globalsplat::cuda::emulated {
 
-// Memory is the CPU's own, aligned as a GPU's, and begins as anything. Blocks, and the threads of a block, take turns in an order drawn from `seed`, another
-// one in every launch.
+// Memory is the CPU's own, aligned as a GPU's, and begins as anything. Blocks, and the threads of a block, take turns in an
+// order drawn from `seed`, another one in every launch.
 class Emulator : public Device {
  public:
   explicit Emulator(uint64_t seed) : seed_(seed) {}

@@ -37,10 +37,16 @@ __global__ void __launch_bounds__(kGaussianThreads)
     const int x = __shfl_sync(kAll, box.x0, owner) + int(within % uint32_t(width));
     const int y = __shfl_sync(kAll, box.y0, owner) + int(within / uint32_t(width));
     const Splat<float>& splat = of_group[owner];
-    const uint32_t blocks = candidate < total ? raster::lane::reached_cells(splat, x * raster::kTile, y * raster::kTile, raster::kBlock) : 0;
+    const uint32_t blocks =
+        candidate < total
+            ? raster::lane::reached_cells(splat, x * raster::kTile, y * raster::kTile, raster::kBlock)
+            : 0;
 
     const unsigned reaching = __ballot_sync(kAll, blocks != 0);
-    if (begin >= base) own_first = reached + uint32_t(__popc(begin - base < kWarp ? reaching & ((1u << (begin - base)) - 1) : reaching));
+    if (begin >= base) {
+      const uint32_t earlier = begin - base;  // of these candidates
+      own_first = reached + uint32_t(__popc(earlier < kWarp ? reaching & ((1u << earlier) - 1) : reaching));
+    }
     if (first != nullptr && blocks != 0) {
       const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & before()));
       const uint64_t tile = uint64_t(view) * uint64_t(call.grid.tiles()) + uint64_t(y * call.grid.columns + x);
