@@ -1,15 +1,19 @@
 //! Compiles the C++ beside it against the libtorch that `LIBTORCH` names, and links that.
 
-use std::{env, fs, path::PathBuf};
+use std::{
+    env, fs,
+    path::{Path, PathBuf},
+};
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 7] = [
+const BRIDGES: [&str; 8] = [
     "src/chunk.rs",
     "src/cuda.rs",
     "src/device.rs",
     "src/fit.rs",
     "src/ops.rs",
     "src/optim.rs",
+    "src/ranks.rs",
     "src/render.rs",
 ];
 
@@ -52,10 +56,24 @@ fn libtorch() -> PathBuf {
     folder.canonicalize().expect("it was there a moment ago")
 }
 
+/// Folders of NVIDIA's headers, which wheels put beside that of torch.
+fn nvidia(libtorch: &Path) -> Vec<PathBuf> {
+    let wheels = fs::read_dir(libtorch.join("../nvidia")).into_iter().flatten();
+    let mut folders: Vec<_> = wheels.flatten().map(|wheel| wheel.path().join("include")).collect();
+    folders.retain(|folder| folder.is_dir());
+    folders.sort();
+    folders
+}
+
 fn main() {
     let libtorch = libtorch();
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
-    cxx_build::bridges(BRIDGES)
+    let mut torch = cxx_build::bridges(BRIDGES);
+    // Of CUDA and NCCL, where libtorch's wheel came with them.
+    for folder in nvidia(&libtorch) {
+        torch.flag("-isystem").flag(folder);
+    }
+    torch
         .std("c++17")
         // As libtorch is compiled: without it some of its classes have more fields than there.
         .define("NDEBUG", None)
@@ -66,7 +84,7 @@ fn main() {
         .flag("-isystem")
         .flag(format!("{include}/torch/csrc/api/include"))
         .includes([".", "raster"])
-        .file("torch.cpp")
+        .files(["torch.cpp", "nccl.cpp"])
         .compile("globalsplat_torch");
 
     cpp()

@@ -8,5 +8,6 @@
 #include "fit.cpp"
 #include "ops.cpp"
 #include "optim.cpp"
+#include "ranks.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

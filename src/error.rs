@@ -56,6 +56,9 @@ pub enum Error {
     /// Work that was under way failed.
     #[error("{0}")]
     Failed(String),
+    /// Processes that work together can't any more: almost always because one of them is gone.
+    #[error("the processes have lost each other ({0}); started again, they go on from what was saved")]
+    Ranks(String),
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

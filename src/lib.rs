@@ -21,7 +21,7 @@
 //! Modules, from what a person touches down to the ground; each uses those below it and [`scene`]:
 //! [`eval`] judges, [`train`] trains, [`refine`] makes splats sharp, [`reconstruct`] makes them of photos, [`config`] has what a
 //! run depends on, [`optim`] and [`loss`] are what learning needs, [`data`] reads captures, [`synth`] makes them up, [`io`] has
-//! files, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] camera maths.
+//! files, [`ranks`] processes that train together, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] camera maths.
 
 #[doc(hidden)]
 pub mod bench;
@@ -36,6 +36,7 @@ pub mod model;
 pub mod optim;
 #[doc(hidden)]
 pub mod parity;
+pub mod ranks;
 pub mod reconstruct;
 pub mod refine;
 pub mod render;

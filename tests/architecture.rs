@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// From what a person touches down to the ground: a module uses those after it, and those on the ground.
-const FLOORS: [&str; 16] = [
+const FLOORS: [&str; 17] = [
     "parity",
     "bench",
     "eval",
@@ -17,6 +17,7 @@ const FLOORS: [&str; 16] = [
     "data",
     "synth",
     "io",
+    "ranks",
     "device",
     "render",
     "model",

@@ -90,7 +90,7 @@ fn every_configuration_trains() {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &SHRUNKEN.map(String::from)).unwrap_or_else(|e| panic!("{e}"));
         let mut trainer = Trainer::new(&config, scenes.clone(), Device::Cpu).expect("a trainer");
-        let reports: Vec<_> = (0..3).map(|_| trainer.step().expect("a step")).collect();
+        let reports: Vec<_> = (0..3).map(|_| trainer.step(&mut || true).expect("a step")).collect();
         let name = path.display();
         assert!(
             reports.iter().all(|r| !r.skipped && r.losses.total.is_finite() && r.gradient_norm > 0.),

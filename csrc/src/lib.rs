@@ -6,4 +6,5 @@ pub mod device;
 pub mod fit;
 pub mod ops;
 pub mod optim;
+pub mod ranks;
 pub mod render;

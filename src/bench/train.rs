@@ -67,7 +67,7 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
     for step in 0..=steps {
         let mut watch = Stopwatch::of(device);
         let sample = watch.time("data", || Sample::by(&scenes, &upload));
-        trainer.learn(&sample, &mut watch)?;
+        trainer.learn(&sample, &mut watch, &mut || true)?;
         if step > 0 {
             measured.add(&mut watch);
         }

@@ -44,6 +44,11 @@ impl Bench {
             Part::Train(train) => train.run(),
         }
     }
+
+    /// Whether processes share it out.
+    pub fn is_shared(&self) -> bool {
+        matches!(self.part, Part::Train(_))
+    }
 }
 
 /// The configuration that a measurement is of; without a file, the defaults, which are the paper's main model.

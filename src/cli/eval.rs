@@ -1,4 +1,4 @@
-use super::{device, model, print_json, progress, stop_flag};
+use super::{device, model, print_json, progress, ranks, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
@@ -24,7 +24,8 @@ use tch::Device;
 /// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
 /// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
 /// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
-/// anybody's pictures DIR/SCENE/000012.png, named by the frame.
+/// anybody's pictures DIR/SCENE/000012.png, named by the frame. Started by torchrun, many processes share the scenes out:
+/// docs/distributed.md.
 #[derive(Args)]
 #[command(group(ArgGroup::new("subject").required(true)))]
 #[command(group(ArgGroup::new("photos").required(true)))]
@@ -94,11 +95,15 @@ pub struct Eval {
 
 impl Eval {
     pub fn run(self) -> Result<()> {
-        let device = device::parse(&self.device)?;
         match &self.scene {
-            Some(scene) => self.run_scene(scene, device),
-            None => self.run_dataset(device),
+            Some(scene) => self.run_scene(scene, device::parse(&self.device)?),
+            None => self.run_dataset(),
         }
+    }
+
+    /// Whether processes share it out.
+    pub fn is_shared(&self) -> bool {
+        self.data.is_some()
     }
 
     fn run_scene(&self, scene: &Path, device: Device) -> Result<()> {
@@ -239,7 +244,8 @@ impl Eval {
 
 /// The data set's side of the command.
 impl Eval {
-    fn run_dataset(&self, device: Device) -> Result<()> {
+    fn run_dataset(&self) -> Result<()> {
+        let (group, device) = ranks::join(&self.device)?;
         let (Some(data), Some(out)) = (&self.data, &self.out) else { unreachable!("clap asks for both") };
         let indices =
             self.index.iter().map(|file| EvaluationIndex::read(file)).collect::<Result<Vec<_>, _>>()?;
@@ -281,8 +287,9 @@ impl Eval {
                 picture_size,
                 machine: machine(device)?,
                 out: &folder,
+                group: &group,
             };
-            let bar = progress::bar(0, "scenes");
+            let bar = progress::of_first(group.is_first(), 0, "scenes");
             let evaluation = sweep.run(
                 || Perceptual::find(device),
                 |done, of| {
@@ -292,6 +299,9 @@ impl Eval {
                 },
             )?;
             bar.finish_and_clear();
+            if !group.is_first() {
+                continue;
+            }
             if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
                 let perceptual = Perceptual::find(device)?;
                 let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
@@ -304,6 +314,9 @@ impl Eval {
             write_evaluation(&folder, &evaluation)?;
             write_csv(&folder.join("scores.csv"), &evaluation)?;
             evaluations.push((folder, evaluation));
+        }
+        if !group.is_first() {
+            return Ok(());
         }
         let report = out.join("report.html");
         write_report(&report, &evaluations)?;

@@ -21,6 +21,7 @@ mod neighbours;
 mod pack;
 mod parity;
 mod progress;
+mod ranks;
 mod reconstruct;
 mod refine;
 mod render;
@@ -70,6 +71,38 @@ enum Command {
     Parity(parity::Parity),
 }
 
+impl Command {
+    fn run(self) -> anyhow::Result<()> {
+        match self {
+            Command::Train(command) => command.run(),
+            Command::Eval(command) => command.run(),
+            Command::Report(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
+            Command::Refine(command) => command.run(),
+            Command::Render(command) => command.run(),
+            Command::Convert(command) => command.run(),
+            Command::Export(command) => command.run(),
+            Command::Import(command) => command.run(),
+            Command::Synth(command) => command.run(),
+            Command::Pack(command) => command.run(),
+            Command::Inspect(command) => command.run(),
+            Command::Bench(command) => command.run(),
+            Command::Doctor(command) => command.run(),
+            Command::Parity(command) => command.run(),
+        }
+    }
+
+    /// Whether processes that `torchrun` started share the work out.
+    fn is_shared(&self) -> bool {
+        match self {
+            Command::Train(_) => true,
+            Command::Eval(command) => command.is_shared(),
+            Command::Bench(command) => command.is_shared(),
+            _ => false,
+        }
+    }
+}
+
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -85,39 +118,31 @@ pub fn main() -> ExitCode {
     let _heeding = neighbours::heed();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
     panic::set_hook(Box::new(|_| {}));
-    let result = panic::catch_unwind(|| match cli.command {
-        Command::Train(command) => command.run(),
-        Command::Eval(command) => command.run(),
-        Command::Report(command) => command.run(),
-        Command::Reconstruct(command) => command.run(),
-        Command::Refine(command) => command.run(),
-        Command::Render(command) => command.run(),
-        Command::Convert(command) => command.run(),
-        Command::Export(command) => command.run(),
-        Command::Import(command) => command.run(),
-        Command::Synth(command) => command.run(),
-        Command::Pack(command) => command.run(),
-        Command::Inspect(command) => command.run(),
-        Command::Bench(command) => command.run(),
-        Command::Doctor(command) => command.run(),
-        Command::Parity(command) => command.run(),
+    let result = panic::catch_unwind(|| {
+        if !cli.command.is_shared() {
+            ranks::refuse()?;
+        }
+        cli.command.run()
     });
-    match result {
-        Ok(Ok(())) => ExitCode::from(DONE),
+    let code = match result {
+        Ok(Ok(())) => DONE,
         Ok(Err(error)) => {
-            tell(&error.to_string());
-            let request = error.downcast_ref::<Error>().is_some_and(Error::is_request);
-            ExitCode::from(if request { WRONG_REQUEST } else { FAILED })
+            let error_of_ours = error.downcast_ref::<Error>();
+            tell(&error.to_string(), matches!(error_of_ours, Some(Error::Ranks(_))));
+            if error_of_ours.is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
         }
         Err(panic) => {
-            tell(&format!("the work failed inside: {}", panic_message(&*panic)));
-            ExitCode::from(FAILED)
+            tell(&format!("the work failed inside: {}", panic_message(&*panic)), false);
+            FAILED
         }
-    }
+    };
+    ranks::leave();
+    ExitCode::from(code)
 }
 
 /// Says what went wrong. What comes from below the program's own checks is told as a person would.
-fn tell(message: &str) {
+fn tell(message: &str, others_are_lost: bool) {
+    let Some(message) = ranks::what_to_tell(message, others_are_lost) else { return };
     const PRINTING: &str = "failed printing to stdout: ";
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: the system refuses memory");

@@ -26,6 +26,14 @@ pub fn bar(length: u64, unit: &'static str) -> Progress {
     Progress { bar, _lines: lines }
 }
 
+/// The same where this is the first of the processes that share the work; nothing where it isn't.
+pub fn of_first(is_first: bool, length: u64, unit: &'static str) -> Progress {
+    match is_first {
+        true => bar(length, unit),
+        false => Progress { bar: ProgressBar::hidden(), _lines: None },
+    }
+}
+
 impl Deref for Progress {
     type Target = ProgressBar;
 

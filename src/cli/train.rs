@@ -1,4 +1,4 @@
-use super::{device, print_json, progress, stop_flag};
+use super::{print_json, progress, ranks, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -19,10 +19,14 @@ use std::time::Instant;
 /// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command goes on from there. Now and then, and at the end, views
 /// and scenes that are held out are rendered and scored, beside the answer "the nearest photo that was shown"; RUN/best is
 /// the checkpoint that did best. RUN/curves.svg shows how it went, and TensorBoard RUN/tensorboard.
+///
+/// Started by torchrun, many processes train together, each on a GPU of its own (--device cuda) or on threads of the CPU:
+/// docs/distributed.md.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  globalsplat train --config configs/first_light.toml --out runs/first_light\n  \
-    globalsplat train --config configs/tiny.toml --from models/tiny.safetensors --out runs/tuned --set 'data.captures=[\"mine\"]'"
+    globalsplat train --config configs/tiny.toml --from models/tiny.safetensors --out runs/tuned --set 'data.captures=[\"mine\"]'\n  \
+    torchrun --no-python --nproc-per-node=8 target/release/globalsplat train --config configs/re10k_16k.toml --out runs/re10k --device cuda"
 )]
 pub struct Train {
     /// Configuration file; see configs/
@@ -50,8 +54,9 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
+        let (group, device) = ranks::join(&self.device)?;
+        let (is_first, count) = (group.is_first(), group.ranks());
         let config = Config::read(&self.config, &self.set)?;
-        let device = device::parse(&self.device)?;
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,
             "never" => Resume::Never,
@@ -67,9 +72,11 @@ impl Train {
             )
             .into());
         }
-        check_writable_dir(&self.out)?;
+        if is_first {
+            check_writable_dir(&self.out)?;
+        }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
-        if let [first, others @ ..] = held_out.trained_on() {
+        if let ([first, others @ ..], true) = (held_out.trained_on(), is_first) {
             let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
             eprintln!(
                 "{first}{more} of data.validation is trained on, too: its score tells nothing of unseen scenes"
@@ -80,10 +87,18 @@ impl Train {
             trainer.begin_with(weights)?;
         }
 
+        let mut trainer = trainer.with_ranks(group);
+        if count > 1 && is_first {
+            eprintln!("{count} processes train together: {} scenes in a step", trainer.batch());
+        }
+
         let start = Instant::now();
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
+        if !is_first {
+            return Ok(());
+        }
         if outcome.skipped > 0 {
             eprintln!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
         }
@@ -109,7 +124,8 @@ impl Train {
         resume: &Resume,
     ) -> Result<Outcome> {
         let stop = stop_flag()?;
-        let bar = progress::bar(config.train.steps, "steps");
+        let is_first = trainer.group().is_first();
+        let bar = progress::of_first(is_first, config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut validation = String::new();
         let mut first = true;
@@ -123,7 +139,9 @@ impl Train {
                     return go_on;
                 }
                 Event::Notice(text) => {
-                    bar.suspend(|| eprintln!("{text}"));
+                    if is_first {
+                        bar.suspend(|| eprintln!("{text}"));
+                    }
                     return go_on;
                 }
                 Event::Waiting => return go_on,

@@ -21,11 +21,13 @@ pub use formats::{
     write_cameras_json,
 };
 pub use holdout::Holdout;
-pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Sample, SceneGroups, TrainingScenes};
+pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};
 pub use made_up::{MadeUp, read_pictures};
 pub use pixels::{Planes, fit};
 pub use polyphase::polyphase;
 pub use room::write_room;
 
+// For processes that tell each other.
+pub(crate) use loading::News;
 // For the parity checks, which run every part by itself.
 pub(crate) use pixels::{Jitter, Region, Resampler};

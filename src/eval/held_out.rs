@@ -7,6 +7,7 @@ use crate::data::{Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, Trai
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -32,7 +33,7 @@ enum HeldOutScene {
 }
 
 /// A scene's scores.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct HeldOutScores {
     /// The model's.
     pub ours: CaptureScores,
@@ -122,32 +123,77 @@ impl HeldOutScene {
     }
 }
 
-impl Validator for HeldOut {
-    fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
-        self.scores.clear();
-        let (mut scores, mut left_out, mut unusable) = (vec![], vec![], vec![]);
-        for (i, scene) in self.scenes.iter().enumerate() {
+/// What a rank found in its share of the scenes, each by its number.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct Found {
+    scores: Vec<(usize, HeldOutScores)>,
+    /// What is wrong with those that can't be used.
+    unusable: Vec<(usize, String)>,
+    /// Why the model can't be judged.
+    failed: Option<String>,
+    /// Whether somebody asked to stop.
+    stopped: bool,
+}
+
+impl HeldOut {
+    /// Looks at the scenes whose turn it is among the trainer's ranks.
+    fn judge_share(&self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Found {
+        let (mut found, group) = (Found::default(), trainer.group());
+        for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.ranks()) {
             if !go_on() {
-                return Ok(None);
+                found.stopped = true;
+                break;
             }
             let (name, context, target) = match scene.load(&self.config) {
                 Ok(views) => views,
                 Err(e) => {
-                    left_out.push(e.to_string());
-                    unusable.push(i);
+                    found.unusable.push((i, e.to_string()));
                     continue;
                 }
             };
-            let (reconstruction, rendered) = synthesize_views(trainer.as_model(), &context, &target)?;
-            let count = reconstruction.gaussians.count();
-            scores.push(HeldOutScores {
-                ours: score(&name, &colours(&rendered), &target, Some(count))?,
-                nearest: nearest_context_baseline(&name, &context, &target)?,
-            });
+            match judge_views(trainer, &name, &context, &target) {
+                Ok(scores) => found.scores.push((i, scores)),
+                Err(e) => {
+                    found.failed = Some(e.to_string());
+                    break;
+                }
+            }
         }
-        for i in unusable.into_iter().rev() {
-            self.scenes.remove(i);
+        found
+    }
+}
+
+/// What the model makes of the views `context` of scene `name`, held against `target`.
+fn judge_views(trainer: &Trainer, name: &str, context: &[View], target: &[View]) -> Result<HeldOutScores> {
+    let (reconstruction, rendered) = synthesize_views(trainer.as_model(), context, target)?;
+    let count = reconstruction.gaussians.count();
+    Ok(HeldOutScores {
+        ours: score(name, &colours(&rendered), target, Some(count))?,
+        nearest: nearest_context_baseline(name, context, target)?,
+    })
+}
+
+impl Validator for HeldOut {
+    fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
+        self.scores.clear();
+        let (mut scores, mut unusable) = (vec![], vec![]);
+        for found in trainer.group().gather(self.judge_share(trainer, go_on))? {
+            if let Some(why) = found.failed {
+                return Err(Error::Failed(why));
+            }
+            if found.stopped {
+                return Ok(None);
+            }
+            scores.extend(found.scores);
+            unusable.extend(found.unusable);
         }
+        scores.sort_by_key(|(i, _)| *i);
+        unusable.sort_by_key(|(i, _)| *i);
+        let scores: Vec<HeldOutScores> = scores.into_iter().map(|(_, scores)| scores).collect();
+        for (i, _) in unusable.iter().rev() {
+            self.scenes.remove(*i);
+        }
+        let left_out: Vec<String> = unusable.into_iter().map(|(_, why)| why).collect();
         if scores.is_empty() {
             let why = left_out.first().map(|why| format!(": {why}")).unwrap_or_default();
             return Err(Error::Failed(format!("no held-out scene can be used{why}")));

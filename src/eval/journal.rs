@@ -44,9 +44,8 @@ impl Journal {
             let found = format!("a folder with a {name} that no evaluation wrote");
             return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
         }
-        let scenes = out.join("scenes");
-        std::fs::create_dir_all(&scenes).map_err(Error::write(&scenes))?;
-        let journal = Journal { scenes };
+        let journal = Journal::of(out);
+        std::fs::create_dir_all(&journal.scenes).map_err(Error::write(&journal.scenes))?;
         // Where nothing was scored yet, there is nothing to mix up.
         let mut entries = std::fs::read_dir(&journal.scenes).map_err(Error::read(&journal.scenes))?;
         if entries.next().is_some()
@@ -72,6 +71,11 @@ impl Journal {
         }
         write_json(&file, identity)?;
         Ok(journal)
+    }
+
+    /// In the folder `out`, where it was opened.
+    pub fn of(out: &Path) -> Self {
+        Journal { scenes: out.join("scenes") }
     }
 
     /// Scores of scene `key` from before, of the same `files`. What can't be read is none.

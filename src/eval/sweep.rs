@@ -13,7 +13,9 @@ use super::scores_file::comparison_path;
 use crate::data::{Dataset, SceneGroup};
 use crate::error::{Error, Result};
 use crate::io::write_jpeg;
+use crate::ranks::Group;
 use crate::scene::ImageSize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::mpsc::sync_channel;
@@ -41,6 +43,17 @@ pub struct Sweep<'a> {
     pub machine: String,
     /// The folder for `scenes/`.
     pub out: &'a Path,
+    /// The processes that share the scenes out. All of them see `out`.
+    pub group: &'a Group,
+}
+
+/// What a rank did of its share.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct Share {
+    scenes: Vec<SceneScores>,
+    failures: Vec<Failure>,
+    /// Whether somebody asked to stop.
+    stopped: bool,
 }
 
 /// Scenes that are loaded while others are judged.
@@ -73,76 +86,33 @@ impl Sweep<'_> {
     }
 
     /// Runs over the scenes that the index and the data set share. `observe` hears how many of how many are done, and says
-    /// whether to go on.
+    /// whether to go on. Of several ranks each does its share, and is told the whole.
     ///
     /// # Errors
-    /// No scene in common, scores of another method in `out`, every scene failing, or having been told to stop. A scene that
-    /// fails is kept in [`Evaluation::failures`].
+    /// No scene in common, scores of another method in `out`, every scene failing, another rank that is gone, or having been told to
+    /// stop. A scene that fails is kept in [`Evaluation::failures`].
     pub fn run(
         &self,
         judges: impl FnOnce() -> Result<Perceptual>,
         mut observe: impl FnMut(usize, usize) -> bool,
     ) -> Result<Evaluation> {
-        let journal = Journal::open(self.out, &self.identity()?)?;
-        let wanted = self.wanted()?;
-        let total: usize = wanted.iter().map(|(_, keys)| keys.len()).sum();
-        let (mut scenes, mut missing) = (vec![], vec![]);
-        for (group, keys) in wanted {
-            let (done, rest): (Vec<_>, Vec<_>) = keys
-                .into_iter()
-                .map(|key| (self.kept(&journal, &key), key))
-                .partition(|(kept, _)| kept.is_some());
-            scenes.extend(done.into_iter().filter_map(|(kept, _)| kept));
-            missing.push((group, rest.into_iter().map(|(_, key)| key).collect::<Vec<_>>()));
+        let begun = self.group.is_first().then(|| self.begin()).transpose()?;
+        let (kept, missing) = self.group.from_first(begun)?;
+        let share = self.run_share(self.share(&missing), kept.len(), judges, &mut observe)?;
+        let (mut scenes, mut failures, mut stopped) = (kept, vec![], false);
+        for share in self.group.gather(share)? {
+            scenes.extend(share.scenes);
+            failures.extend(share.failures);
+            stopped |= share.stopped;
         }
-        let mut failures = vec![];
-        let mut go_on = observe(scenes.len(), total);
-        // Loading the judges' networks would count as the method's memory, so they come after the first scene of which pictures
-        // were made, whatever failed before it.
-        let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
-        let (picture_size, photo_size) = (self.picture_size, self.method.photo_size());
-        let loader = SceneLoader { index: self.index, picture_size, photo_size };
-        std::thread::scope(|scope| -> Result<()> {
-            let (sender, receiver) = sync_channel(LOADED_AHEAD);
-            scope.spawn(move || loader.send(missing, &sender));
-            while go_on && let Ok((key, loaded)) = receiver.recv() {
-                let method = self.method.of_scene(&key);
-                let made = loaded.and_then(|scene| Ok((method.synthesize(&scene)?, scene)));
-                let first = made.is_ok().then(|| judges.take()).flatten();
-                let warm_up = first.is_some();
-                if let Some(judges) = first {
-                    memory = method.memory();
-                    perceptual = Some(judges()?);
-                }
-                let judged = made.and_then(|(made, scene)| {
-                    let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    let mut scores = self.judge(&scene, &made, perceptual)?;
-                    scores.warm_up = warm_up && made.forward_seconds.is_some();
-                    scores.peak_memory_bytes = memory.map(|memory| memory.host);
-                    scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
-                    journal.keep(&key, &scores, method.files())?;
-                    Ok(scores)
-                });
-                match judged {
-                    Ok(scene) => {
-                        memory = None;
-                        scenes.push(scene);
-                    }
-                    // What can't be written now can't be written for the next scene.
-                    Err(e @ Error::Write { .. }) => return Err(e),
-                    Err(e) => failures.push(Failure { scene: key, error: e.to_string() }),
-                }
-                go_on = observe(scenes.len() + failures.len(), total);
-            }
-            Ok(())
-        })?;
-        if !go_on {
-            let done = scenes.len();
+        if stopped {
+            let (done, total) = (scenes.len(), missing.len() + scenes.len());
             return Err(Error::Failed(format!(
                 "stopped after {done} of {total} scenes; {} holds their scores, and the same command goes on",
                 self.out.display()
             )));
         }
+        failures.sort_by_key(|failure| missing.iter().position(|key| *key == failure.scene));
         if let (Some(failure), true) = (failures.first(), scenes.is_empty()) {
             let count = failures.len();
             return Err(Error::Failed(format!(
@@ -165,6 +135,83 @@ impl Sweep<'_> {
             scenes,
             failures,
         })
+    }
+
+    /// Opens the journal: scores that are in it, and the scenes that have none, group after group.
+    fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
+        let journal = Journal::open(self.out, &self.identity()?)?;
+        let (mut kept, mut missing) = (vec![], vec![]);
+        for key in self.wanted()?.into_iter().flat_map(|(_, keys)| keys) {
+            match self.kept(&journal, &key) {
+                Some(scores) => kept.push(scores),
+                None => missing.push(key),
+            }
+        }
+        Ok((kept, missing))
+    }
+
+    /// This rank's of the scenes `missing`, with the groups that hold them.
+    fn share(&self, missing: &[String]) -> Vec<(&SceneGroup, Vec<String>)> {
+        let own: BTreeSet<&String> =
+            missing.iter().skip(self.group.rank()).step_by(self.group.ranks()).collect();
+        let of_group =
+            |group: &SceneGroup| group.keys.iter().filter(|key| own.contains(key)).cloned().collect();
+        self.dataset.groups().iter().map(|group| (group, of_group(group))).collect()
+    }
+
+    /// Scores `own` scenes; `kept` ones have been.
+    fn run_share(
+        &self,
+        own: Vec<(&SceneGroup, Vec<String>)>,
+        kept: usize,
+        judges: impl FnOnce() -> Result<Perceptual>,
+        observe: &mut impl FnMut(usize, usize) -> bool,
+    ) -> Result<Share> {
+        let journal = Journal::of(self.out);
+        let total = kept + own.iter().map(|(_, keys)| keys.len()).sum::<usize>();
+        let mut share = Share::default();
+        let mut go_on = observe(kept, total);
+        // Loading the judges' networks would count as the method's memory, so they come after the first scene of which pictures
+        // were made, whatever failed before it.
+        let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
+        let (picture_size, photo_size) = (self.picture_size, self.method.photo_size());
+        let loader = SceneLoader { index: self.index, picture_size, photo_size };
+        std::thread::scope(|scope| -> Result<()> {
+            let (sender, receiver) = sync_channel(LOADED_AHEAD);
+            scope.spawn(move || loader.send(own, &sender));
+            while go_on && let Ok((key, loaded)) = receiver.recv() {
+                let method = self.method.of_scene(&key);
+                let made = loaded.and_then(|scene| Ok((method.synthesize(&scene)?, scene)));
+                let first = made.is_ok().then(|| judges.take()).flatten();
+                let warm_up = first.is_some();
+                if let Some(judges) = first {
+                    memory = method.memory();
+                    perceptual = Some(judges()?);
+                }
+                let judged = made.and_then(|(made, scene)| {
+                    let perceptual = perceptual.as_ref().expect("loaded for the first scene");
+                    let mut scores = self.judge(&scene, &made, perceptual)?;
+                    scores.warm_up = warm_up && made.forward_seconds.is_some();
+                    scores.peak_memory_bytes = memory.map(|memory| memory.host);
+                    scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
+                    journal.keep(&key, &scores, method.files())?;
+                    Ok(scores)
+                });
+                match judged {
+                    Ok(scene) => {
+                        memory = None;
+                        share.scenes.push(scene);
+                    }
+                    // What can't be written now can't be written for the next scene.
+                    Err(e @ Error::Write { .. }) => return Err(e),
+                    Err(e) => share.failures.push(Failure { scene: key, error: e.to_string() }),
+                }
+                go_on = observe(kept + share.scenes.len() + share.failures.len(), total);
+            }
+            Ok(())
+        })?;
+        share.stopped = !go_on;
+        Ok(share)
     }
 
     /// By which a sweep that goes on is recognized.

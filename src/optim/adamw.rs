@@ -202,6 +202,16 @@ impl AdamW {
         }
     }
 
+    /// Updates that were done.
+    pub fn steps(&self) -> i64 {
+        self.steps
+    }
+
+    /// As if so many updates had been done.
+    pub fn set_steps(&mut self, steps: i64) {
+        self.steps = steps;
+    }
+
     /// Everything but the variables themselves.
     pub fn state(&self) -> BTreeMap<String, Tensor> {
         let mut state = BTreeMap::from([("steps".to_string(), Tensor::from_slice(&[self.steps]))]);

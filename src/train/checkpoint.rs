@@ -152,12 +152,17 @@ pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -
 }
 
 impl Trainer {
+    /// Where [`Trainer::save`] puts the state as it is.
+    pub(super) fn checkpoint(&self, run: &Path) -> PathBuf {
+        run.join(FOLDER).join(folder_name(self.step))
+    }
+
     /// Saves a checkpoint under `run`, drops the oldest beyond those to keep, and returns where it is.
     ///
     /// # Errors
     /// The system's refusal to write; older checkpoints are left whole.
     pub fn save(&self, run: &Path) -> Result<PathBuf> {
-        let path = run.join(FOLDER).join(folder_name(self.step));
+        let path = self.checkpoint(run);
         replace_dir(&path, &FILES, |folder| {
             save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
             write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;

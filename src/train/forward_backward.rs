@@ -10,6 +10,7 @@ use crate::error::Result;
 use crate::loss::{PerceptualLoss, Share, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, leaf, pull_back};
 use crate::optim::Stopwatch;
+use crate::ranks::Group;
 use crate::render::{DEFAULT_EPS2D, Pictures, render};
 use tch::{Tensor, no_grad};
 
@@ -20,6 +21,8 @@ pub(super) struct ForwardBackward<'a> {
     pub model: &'a GlobalSplat,
     pub perceptual: Option<&'a PerceptualLoss>,
     pub stage: Stage,
+    /// Those that make the step together.
+    pub group: &'a Group,
 }
 
 impl ForwardBackward<'_> {
@@ -45,8 +48,9 @@ impl ForwardBackward<'_> {
         let Pictures { rgb, alpha, depth } =
             watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
         let pictures = Pictures { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+        let share = self.counted(sample, &pictures.alpha, share)?;
         let losses = watch.time("losses", || {
-            losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, share)
+            losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, &share)
         });
 
         watch.time("losses backward", || losses.total.backward());
@@ -62,6 +66,19 @@ impl ForwardBackward<'_> {
         });
         watch.time("tokens backward", || pull_back(&[(&tokens, &tokens_leaf)]));
         Ok(losses.packed())
+    }
+
+    /// `share` with the pixels that L_con compares on all ranks. A rank that is alone counts its own as it compares them.
+    fn counted(&self, sample: &Sample, alpha: &Tensor, share: &Share) -> Result<Share> {
+        let mut pixels = share.depth_pixels.as_ref().map(Tensor::shallow_clone);
+        let compares = sample.paired && self.config.loss.consistency_depth > 0.;
+        if pixels.is_none() && compares && self.group.ranks() > 1 {
+            let alpha = alpha.detach().chunk(2, 0);
+            let counted = depth_pixels([&alpha[0], &alpha[1]]);
+            self.group.sum(&counted)?;
+            pixels = Some(counted);
+        }
+        Ok(Share { depth_pixels: pixels, ..*share })
     }
 
     /// Pixels of a paired sample whose depth L_con compares, a scalar.

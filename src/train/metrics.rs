@@ -6,7 +6,6 @@ use crate::error::{Error, Result};
 use crate::io::{AppendFile, write_atomically};
 use crate::loss::Term;
 use serde_json::{Value, json};
-use std::collections::BTreeSet;
 use std::path::Path;
 
 /// A line for every step and every validation.
@@ -34,15 +33,15 @@ pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL
 #[derive(Debug)]
 pub(super) struct Metrics {
     file: AppendFile,
-    /// The last steps before the validations that it has.
-    validated: BTreeSet<u64>,
+    /// The step before the last validation that it has.
+    validated: Option<u64>,
 }
 
 impl Metrics {
     /// Opens the file and takes away what a run that was stopped wrote after the checkpoint it goes on from, before which
     /// `step` steps were done.
     pub fn open(path: &Path, step: u64) -> Result<Self> {
-        let mut validated = BTreeSet::new();
+        let mut validated = None;
         if path.is_file() {
             let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
             let mut kept = String::new();
@@ -51,7 +50,7 @@ impl Metrics {
                 if let Some(of) = line_value["step"].as_u64().filter(|of| *of < step) {
                     kept.extend([line, "\n"]);
                     if line_value["validation"].is_object() {
-                        validated.insert(of);
+                        validated = validated.max(Some(of));
                     }
                 }
             }
@@ -83,13 +82,13 @@ impl Metrics {
             "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
         });
         self.append(&json!({ "step": step, "validation": validation }))?;
-        self.validated.insert(step);
+        self.validated = Some(step);
         Ok(())
     }
 
-    /// Whether it has a validation after step `step`.
-    pub fn has_validation(&self, step: u64) -> bool {
-        self.validated.contains(&step)
+    /// The step before the last validation that it has.
+    pub fn last_validation(&self) -> Option<u64> {
+        self.validated
     }
 
     fn append(&mut self, line: &Value) -> Result<()> {

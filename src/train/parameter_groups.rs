@@ -18,6 +18,25 @@ pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<Paramete
     vec![group(decaying, config.weight_decay), group(others, 0.)]
 }
 
+/// The trained variables of `vs` in the order in which the backward pass gives their gradients, about: of the decoder, of the encoder's
+/// rounds from the last to the first, and of what comes before them. By the names alone, so it is the same in every process.
+pub fn in_backward_order(vs: &nn::VarStore) -> Vec<(String, Tensor)> {
+    let mut trained: Vec<_> = vs.variables().into_iter().filter(|(_, value)| value.requires_grad()).collect();
+    trained.sort_by_cached_key(|(name, _)| (turn(name), name.clone()));
+    trained
+}
+
+/// The lower, the earlier.
+fn turn(name: &str) -> i64 {
+    let mut words = name.split('.');
+    match (words.next(), words.next(), words.next().and_then(|word| word.parse::<i64>().ok())) {
+        (Some("gaussian_decoder"), ..) => i64::MIN,
+        (Some("slot_encoder"), Some("geo_rounds" | "tex_rounds" | "pair_adapters"), Some(round)) => -round,
+        (Some("slot_encoder"), ..) => 1,
+        _ => 2,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

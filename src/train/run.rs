@@ -62,9 +62,11 @@ pub struct Outcome {
 /// Trains into the folder `out`, which nobody else may train into meanwhile. `observe` hears what happens and says whether to
 /// go on: a stopped run is saved first. `validator` scores the model now and then, and at the end.
 ///
+/// Of ranks that train together, all call this. The first one reads and writes `out`, and the others follow it.
+///
 /// # Errors
-/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, or whatever a step or a
-/// save fails with. A full disk is waited for, and a validation that fails is left out.
+/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, another rank that is gone, or
+/// whatever a step or a save fails with. A full disk is waited for, and a validation that fails is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -72,32 +74,15 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    check_books(out)?;
-    let _lock = RunLock::take(out)?;
-    recover(out)?;
-    let begun = begin(trainer, out, resume, &mut observe)?;
-    let config = out.join(CONFIG_FILE);
-    let toml = trainer.config.to_toml();
-    let changes = match std::fs::read_to_string(&config) {
-        Ok(before) if trainer.step > 0 => changed_keys(&before, &toml),
-        _ => vec![],
-    };
-    if !changes.is_empty() {
-        observe(Event::Notice(format!("the run goes on with another configuration: {}", changes.join(", "))));
-    }
-    patiently(&mut observe, || {
-        write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))
-    })?;
-    let metrics = patiently(&mut observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
-    let mut tensorboard =
-        patiently(&mut observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
-    patiently(&mut observe, || tensorboard.start(trainer.step))?;
-    let settings = trainer.config.data.validation_settings();
-    let best = best_score(out, &settings).unwrap_or_else(|e| {
-        observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
-        None
-    });
-    Run { trainer, out, validator, observe, metrics, tensorboard, best, settings }.train(begun)
+    let writes = trainer.group.is_first();
+    let begun = writes.then(|| Books::open(trainer, out, resume, &mut observe)).transpose()?;
+    trainer.follow_first()?;
+    let validated = begun.as_ref().map(|(books, _)| books.metrics.last_validation());
+    let validated = trainer.group.from_first(validated)?;
+    let saved = begun.as_ref().map(|(_, saved)| saved.clone());
+    let saved = trainer.group.from_first(saved)?;
+    let books = begun.map(|(books, _)| books);
+    Run { trainer, out, validator, observe, books, validated, asked_to_stop: false }.train(saved)
 }
 
 /// That a run may keep its books in `out`: it did before, or there are none of somebody else's.
@@ -119,12 +104,9 @@ fn check_books(out: &Path) -> Result<()> {
     }
 }
 
-/// A run that goes on.
-struct Run<'a, 'v, O> {
-    trainer: &'a mut Trainer,
-    out: &'a Path,
-    validator: Option<&'v mut dyn Validator>,
-    observe: O,
+/// What a run writes beside checkpoints.
+struct Books {
+    _lock: RunLock,
     metrics: Metrics,
     tensorboard: TensorBoard,
     /// Of the best checkpoint, in dB.
@@ -133,23 +115,99 @@ struct Run<'a, 'v, O> {
     settings: String,
 }
 
+impl Books {
+    /// Brings the trainer to where the run begins, and opens its books there. Also returns the run's own checkpoint of that.
+    fn open(
+        trainer: &mut Trainer,
+        out: &Path,
+        resume: &Resume,
+        observe: &mut impl FnMut(Event) -> bool,
+    ) -> Result<(Self, Option<PathBuf>)> {
+        check_books(out)?;
+        let lock = RunLock::take(out)?;
+        recover(out)?;
+        let begun = begin(trainer, out, resume, observe)?;
+        let config = out.join(CONFIG_FILE);
+        let toml = trainer.config.to_toml();
+        let changes = match std::fs::read_to_string(&config) {
+            Ok(before) if trainer.step > 0 => changed_keys(&before, &toml),
+            _ => vec![],
+        };
+        if !changes.is_empty() {
+            let changes = changes.join(", ");
+            observe(Event::Notice(format!("the run goes on with another configuration: {changes}")));
+        }
+        patiently(observe, || {
+            write_atomically(&config, |writer| {
+                writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
+            })
+        })?;
+        let metrics = patiently(observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
+        let mut tensorboard =
+            patiently(observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
+        patiently(observe, || tensorboard.start(trainer.step))?;
+        let settings = trainer.config.data.validation_settings();
+        let best = best_score(out, &settings).unwrap_or_else(|e| {
+            observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
+            None
+        });
+        Ok((Books { _lock: lock, metrics, tensorboard, best, settings }, begun))
+    }
+
+    fn log_step(
+        &mut self,
+        observe: &mut impl FnMut(Event) -> bool,
+        report: &StepReport,
+        samples_per_second: f64,
+    ) -> Result<()> {
+        patiently(observe, || self.metrics.log_step(report, samples_per_second))?;
+        patiently(observe, || self.tensorboard.log_step(report, samples_per_second))?;
+        patiently(observe, || self.tensorboard.log_picture(report))
+    }
+
+    fn log_validation(
+        &mut self,
+        observe: &mut impl FnMut(Event) -> bool,
+        step: u64,
+        score: &Score,
+    ) -> Result<()> {
+        patiently(observe, || self.tensorboard.log_validation(step, score))?;
+        patiently(observe, || self.metrics.log_validation(step, score))
+    }
+}
+
+/// A run that goes on. All ranks take the same way through it.
+struct Run<'a, 'v, O> {
+    trainer: &'a mut Trainer,
+    out: &'a Path,
+    validator: Option<&'v mut dyn Validator>,
+    observe: O,
+    /// The first rank's.
+    books: Option<Books>,
+    /// The step before the last validation that is in the books.
+    validated: Option<u64>,
+    /// Whether somebody asked this rank to stop; the others hear of it with the next step.
+    asked_to_stop: bool,
+}
+
 impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// `saved` is the run's own checkpoint of the state as it is, if there is one.
     fn train(mut self, mut saved: Option<PathBuf>) -> Result<Outcome> {
-        let TrainConfig { steps, batch, checkpoint_every, validate_every, max_skipped, .. } =
+        let TrainConfig { steps, checkpoint_every, validate_every, max_skipped, .. } =
             self.trainer.config.train;
+        let batch = self.trainer.batch() as f64;
         let (mut skipped, mut go_on) = (0, true);
         // Steps that were skipped since the last one that wasn't.
         let mut skipped_in_a_row = 0;
         while self.trainer.step < steps {
             let step = self.trainer.step;
             let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
-            if validates && skipped_in_a_row == 0 && !self.metrics.has_validation(step - 1) {
+            if validates && skipped_in_a_row == 0 && self.validated != Some(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 go_on = match self.validate(&checkpoint) {
                     // What can't be written is no matter of what is held out.
-                    Err(e @ Error::Write { .. }) => return Err(e),
-                    Err(e) => (self.observe)(Event::Notice(format!("a validation is left out: {e}"))),
+                    Err(e @ (Error::Write { .. } | Error::Ranks(_))) => return Err(e),
+                    Err(e) => self.tell(Event::Notice(format!("a validation is left out: {e}"))),
                     go_on => go_on?,
                 };
                 saved = Some(checkpoint);
@@ -159,13 +217,17 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             }
 
             let start = Instant::now();
-            let report = self.trainer.step()?;
-            let samples_per_second = batch as f64 / start.elapsed().as_secs_f64();
+            let Run { trainer, observe, asked_to_stop, .. } = &mut self;
+            let report = trainer.step(&mut || {
+                *asked_to_stop |= !observe(Event::Waiting);
+                !*asked_to_stop
+            })?;
+            let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
-            patiently(&mut self.observe, || self.metrics.log_step(&report, samples_per_second))?;
-            patiently(&mut self.observe, || self.tensorboard.log_step(&report, samples_per_second))?;
-            patiently(&mut self.observe, || self.tensorboard.log_picture(&report))?;
-            go_on = (self.observe)(Event::Step { report: &report, samples_per_second });
+            if let Some(books) = &mut self.books {
+                books.log_step(&mut self.observe, &report, samples_per_second)?;
+            }
+            go_on = self.tell(Event::Step { report: &report, samples_per_second }) && report.go_on;
             if report.skipped {
                 skipped += 1;
                 skipped_in_a_row += 1;
@@ -186,23 +248,36 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
         self.trainer.take_back(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
-        // What a save couldn't remove is tried again.
-        drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
+        if self.books.is_some() {
+            // What a save couldn't remove is tried again.
+            drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
+        }
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
-                Err(e @ Error::Write { .. }) => return Err(e),
+                Err(e @ (Error::Write { .. } | Error::Ranks(_))) => return Err(e),
                 Err(e) => {
-                    (self.observe)(Event::Notice(format!("the last validation is left out: {e}")));
+                    self.tell(Event::Notice(format!("the last validation is left out: {e}")));
                 }
                 // Stopped before the end, the same command does it again.
-                Ok(_) => complete = self.metrics.has_validation(self.trainer.step.saturating_sub(1)),
+                Ok(_) => complete = self.validated == Some(self.trainer.step.saturating_sub(1)),
             }
         }
         Ok(Outcome { checkpoint, complete, skipped })
     }
 
+    /// Returns whether to go on. Of several ranks each is told only what all of them agree on: what one was asked, the others
+    /// learn with the next step.
+    fn tell(&mut self, event: Event) -> bool {
+        self.asked_to_stop |= !(self.observe)(event);
+        self.trainer.group.ranks() > 1 || !self.asked_to_stop
+    }
+
+    /// Returns where the checkpoint is that the first rank has saved, or is about to.
     fn save(&mut self) -> Result<PathBuf> {
-        patiently(&mut self.observe, || self.trainer.save(self.out))
+        match &self.books {
+            Some(_) => patiently(&mut self.observe, || self.trainer.save(self.out)),
+            None => Ok(self.trainer.checkpoint(self.out)),
+        }
     }
 
     /// Has the state that `checkpoint` holds judged. It is told last of all, so that a run that is killed meanwhile repeats
@@ -216,17 +291,19 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         for why in &score.left_out {
             observe(Event::Notice(format!("a held-out scene is left out: {why}")));
         }
-        if score.psnr > self.best.unwrap_or(f64::NEG_INFINITY) {
-            let found = || Validation { psnr: score.psnr, settings: self.settings.clone() };
-            patiently(observe, || keep_best(self.out, checkpoint, found()))?;
-            self.best = Some(score.psnr);
-        }
         let step = self.trainer.step.saturating_sub(1);
-        if !self.metrics.has_validation(step) {
-            patiently(observe, || self.tensorboard.log_validation(step, &score))?;
-            patiently(observe, || self.metrics.log_validation(step, &score))?;
+        if let Some(books) = &mut self.books {
+            if score.psnr > books.best.unwrap_or(f64::NEG_INFINITY) {
+                let found = || Validation { psnr: score.psnr, settings: books.settings.clone() };
+                patiently(observe, || keep_best(self.out, checkpoint, found()))?;
+                books.best = Some(score.psnr);
+            }
+            if self.validated != Some(step) {
+                books.log_validation(observe, step, &score)?;
+            }
         }
-        Ok(observe(Event::Validation(&score)))
+        self.validated = Some(step);
+        Ok(self.tell(Event::Validation(&score)))
     }
 
     /// Why nothing is learned any more.
@@ -302,7 +379,7 @@ fn begin(
 }
 
 /// How long a full disk is left alone.
-const PATIENCE: Duration = Duration::from_millis(500);
+const PAUSE: Duration = Duration::from_millis(500);
 
 /// Does `write`, and again as long as there is no room on the disk and `observe` wants to go on.
 fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut() -> Result<T>) -> Result<T> {
@@ -317,7 +394,7 @@ fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut()
                 if !observe(Event::Waiting) {
                     return Err(e);
                 }
-                std::thread::sleep(PATIENCE);
+                std::thread::sleep(PAUSE);
             }
             result => {
                 if waited && result.is_ok() {

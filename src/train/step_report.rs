@@ -19,10 +19,12 @@ pub struct StepReport {
     pub gradient_norm: f64,
     /// Loss or gradient wasn't finite, so nothing was changed.
     pub skipped: bool,
-    /// Names of the scenes it looked at.
+    /// Names of the scenes that this rank looked at; of a skipped step, those of all ranks.
     pub scenes: Vec<String>,
     /// What the first of them looked like before the step, at the steps that `train.pictures_every` chooses, [3, H, W].
     pub picture: Option<Tensor>,
+    /// Whether no rank was asked to stop.
+    pub go_on: bool,
 }
 
 impl StepReport {

@@ -251,7 +251,7 @@ fn a_step_moves_nothing_but_what_is_told() {
             });
             assert_eq!(moves(&ops), 0, "the losses");
 
-            let (report, ops) = ops_of(|| trainer.learn(&sample, &mut Stopwatch::default()));
+            let (report, ops) = ops_of(|| trainer.learn(&sample, &mut Stopwatch::default(), &mut || true));
             let renders = match micro_batch {
                 0 => 1,
                 // Depths are compared over all slices, whose pixels are counted before.

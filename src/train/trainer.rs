@@ -3,17 +3,18 @@
 use super::curriculum::stage_at;
 use super::forward_backward::ForwardBackward;
 use super::is_due;
-use super::parameter_groups::parameter_groups;
+use super::parameter_groups::{in_backward_order, parameter_groups};
 use super::preview::preview;
 use super::schedule::learning_rate;
 use super::step_report::StepReport;
 use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
-use crate::data::{BadData, Loader, Sample, SceneGroups};
+use crate::data::{BadData, Loader, News, Part, Sample, SceneGroups};
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Stage};
 use crate::optim::{AdamW, Stopwatch};
+use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::path::Path;
 use std::sync::Arc;
@@ -34,6 +35,31 @@ pub struct Trainer {
     scenes: Arc<dyn SceneGroups>,
     /// Begins with the first step that is done, wherever that is.
     loader: Option<Loader>,
+    /// Those that make every step together, each with samples of its own.
+    pub(super) group: Group,
+    buckets: Buckets,
+}
+
+/// What ranks tell each other in every step, beside gradients: numbers, which are added up.
+struct Word {
+    /// Ranks that were asked to stop.
+    asked_to_stop: f64,
+    /// Ranks that found bad data.
+    found_bad_data: f64,
+    /// Gradients that there are, and their square: ranks that have as many have a sum of squares that says so.
+    gradients: [f64; 2],
+}
+
+impl Word {
+    const COUNT: usize = 4;
+
+    fn packed(&self) -> [f64; Self::COUNT] {
+        [self.asked_to_stop, self.found_bad_data, self.gradients[0], self.gradients[1]]
+    }
+
+    fn unpacked([asked_to_stop, found_bad_data, sum, squares]: [f64; Self::COUNT]) -> Self {
+        Word { asked_to_stop, found_bad_data, gradients: [sum, squares] }
+    }
 }
 
 impl Trainer {
@@ -50,7 +76,31 @@ impl Trainer {
         model.set_precision(config.train.precision);
         let optimizer = AdamW::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
-        Ok(Trainer { config, vs, model, optimizer, perceptual, step: 0, samples: 0, scenes, loader: None })
+        let group = Group::alone();
+        let buckets = Buckets::new(&group, &[]);
+        let (step, samples, loader) = (0, 0, None);
+        Ok(Trainer {
+            config,
+            vs,
+            model,
+            optimizer,
+            perceptual,
+            step,
+            samples,
+            scenes,
+            loader,
+            group,
+            buckets,
+        })
+    }
+
+    /// Together with other processes: `train.batch` is of each of them, and a step is that of one alone with as many samples as
+    /// all have.
+    pub fn with_ranks(self, group: Group) -> Self {
+        let parameters: Vec<Tensor> =
+            in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
+        let buckets = Buckets::new(&group, &parameters);
+        Trainer { group, buckets, ..self }
     }
 
     /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. All Gaussians are shown from
@@ -73,44 +123,75 @@ impl Trainer {
         file.load_into(&self.vs)
     }
 
-    /// Draws a sample and follows its gradient.
+    /// Draws a sample and follows its gradient. `go_on` is asked before other ranks are told whether to.
     ///
     /// # Errors
-    /// A sample or a picture that can't be made.
-    pub fn step(&mut self) -> Result<StepReport> {
+    /// A sample or a picture that can't be made, or another rank that is gone.
+    pub fn step(&mut self, go_on: &mut dyn FnMut() -> bool) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
-        self.samples += batch as u64;
+        self.samples += self.batch();
         let stage = stage_at(&self.config.curriculum, self.step);
-        let picture = is_due(self.config.train.pictures_every, self.step)
+        let picture = (self.group.is_first() && is_due(self.config.train.pictures_every, self.step))
             .then(|| preview(&self.model, &sample, stage))
             .transpose()?;
-        Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default())? })
+        Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default(), go_on)? })
+    }
+
+    /// Samples of a step, those of all ranks.
+    pub fn batch(&self) -> u64 {
+        self.part().of_step()
+    }
+
+    fn part(&self) -> Part {
+        Part { batch: self.config.train.batch, number: self.group.rank(), parts: self.group.ranks() }
     }
 
     /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient. `watch` hears of
     /// every part of the step.
     ///
     /// # Errors
-    /// A picture that can't be made.
-    pub(crate) fn learn(&mut self, sample: &Sample, watch: &mut Stopwatch) -> Result<StepReport> {
+    /// A picture that can't be made, or another rank that is gone.
+    pub(crate) fn learn(
+        &mut self,
+        sample: &Sample,
+        watch: &mut Stopwatch,
+        go_on: &mut dyn FnMut() -> bool,
+    ) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
+        let told = match self.group.ranks() {
+            1 => self.add_up(losses, go_on)?,
+            _ => watch.time("communication", || self.add_up(losses, go_on))?,
+        };
         // A GPU is still busy with that, and the next samples are on their way when it is done.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
             loader.send_ahead(self.config.train.batch, device);
         }
-        let (losses, gradient_norm, skipped) = watch.time("optimizer", || {
-            let (losses, gradient_norm) = read(&losses, &self.optimizer.gradient_norm());
+        let (losses, word, gradient_norm, skipped) = watch.time("optimizer", || {
+            let (losses, word, gradient_norm) = read(&told, &self.optimizer.gradient_norm());
             let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());
             if !skipped {
                 self.optimizer.clip_gradients(gradient_norm, self.config.train.gradient_clip);
                 self.optimizer.set_learning_rate(learning_rate);
                 self.optimizer.step();
             }
-            (losses, gradient_norm, skipped)
+            (losses, word, gradient_norm, skipped)
         });
+        let [gradients, squares] = word.gradients;
+        if gradients * gradients != squares * self.group.ranks() as f64 {
+            return Err(Error::Failed(
+                "ranks have different parameters: were they started with the same program?".into(),
+            ));
+        }
+        if word.found_bad_data > 0. {
+            self.tell_bad_data()?;
+        }
+        let scenes = match skipped {
+            true => self.group.gather(sample.names.clone())?.concat(),
+            false => sample.names.clone(),
+        };
         let report = StepReport {
             step: self.step,
             stage,
@@ -118,11 +199,56 @@ impl Trainer {
             losses,
             gradient_norm,
             skipped,
-            scenes: sample.names.clone(),
+            scenes,
             picture: None,
+            go_on: word.asked_to_stop == 0.,
         };
         self.step += 1;
         Ok(report)
+    }
+
+    /// Has the gradients of all ranks summed, and returns the sums of `losses` and of what ranks tell each other, packed.
+    fn add_up(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
+        let gradients = self.buckets.finish()? as f64;
+        let word = Word {
+            asked_to_stop: f64::from(!go_on()),
+            found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_news)),
+            gradients: [gradients, gradients * gradients],
+        };
+        // A GPU gets a new tensor's numbers without being waited for.
+        let numbers = word.packed().map(|number| Tensor::full([1], number, (Kind::Double, losses.device())));
+        let told = Tensor::cat(&std::iter::once(losses).chain(numbers).collect::<Vec<_>>(), 0);
+        self.group.sum(&told)?;
+        Ok(told)
+    }
+
+    /// Every rank counts the bad data that any of them found.
+    fn tell_bad_data(&self) -> Result<()> {
+        let Some(loader) = &self.loader else { return Ok(()) };
+        if self.group.ranks() > 1 {
+            let news: Vec<Vec<News>> = self.group.gather(loader.take_news())?;
+            let others = news.into_iter().enumerate().filter(|(rank, _)| *rank != self.group.rank());
+            others.map(|(_, news)| news).try_for_each(|news| loader.hear(news))?;
+        }
+        Ok(())
+    }
+
+    /// Brings all ranks to where the first one is: its weights, moments and position.
+    ///
+    /// # Errors
+    /// Another rank that is gone.
+    pub(super) fn follow_first(&mut self) -> Result<()> {
+        let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
+        let (step, samples, updates) = self.group.from_first(position)?;
+        (self.step, self.samples) = (step, samples);
+        self.optimizer.set_steps(updates);
+        let parameters = in_backward_order(&self.vs);
+        let moments = self.optimizer.moments();
+        parameters
+            .iter()
+            .map(|(_, value)| value)
+            .chain(moments)
+            .try_for_each(|t| self.group.copy_from_first(t))
     }
 
     /// Leaves the gradient of the sample's loss in the variables, and returns the loss, packed.
@@ -133,7 +259,8 @@ impl Trainer {
         watch: &mut Stopwatch,
     ) -> Result<Tensor> {
         let perceptual = self.perceptual.as_ref();
-        let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage };
+        let group = &self.group;
+        let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage, group };
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
         let halves = pair.then(|| subsets(sample.context_views(), self.step));
         let scenes = sample.scenes();
@@ -154,13 +281,17 @@ impl Trainer {
                 let slice = watch.time("data", || slice(first));
                 watch.time("depth pixels", || part.depth_pixels(&slice))
             });
-            share.depth_pixels =
-                Some(Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>));
+            let pixels = Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>);
+            group.sum(&pixels)?;
+            share.depth_pixels = Some(pixels);
         }
         watch.time("zero gradients", || self.optimizer.zero_grad());
         let mut losses = Tensor::zeros([Losses::COUNT as i64], (Kind::Double, self.vs.device()));
         for first in (0..scenes).step_by(count) {
-            share.scenes = count.min(scenes - first) as f64 / scenes as f64;
+            share.scenes = count.min(scenes - first) as f64 / (scenes * group.ranks()) as f64;
+            if first + count >= scenes {
+                self.buckets.begin();
+            }
             let slice = watch.time("data", || slice(first));
             losses += part.gradients(&slice, &share, watch)?;
         }
@@ -172,13 +303,15 @@ impl Trainer {
         let first = self.samples;
         let loader = match self.loader.take() {
             Some(loader) if loader.position() == first => loader,
-            _ => Loader::start(
-                &self.config.data,
-                self.config.train.seed,
-                self.scenes.clone(),
-                self.config.train.batch,
-                first,
-            )?,
+            _ => {
+                let mut config = self.config.data.clone();
+                if config.threads == 0 {
+                    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+                    config.threads = (cores / self.group.local_ranks()).max(1);
+                }
+                let (seed, scenes) = (self.config.train.seed, self.scenes.clone());
+                Loader::start(&config, seed, scenes, self.part(), first)?
+            }
         };
         Ok(self.loader.insert(loader))
     }
@@ -186,7 +319,7 @@ impl Trainer {
     /// Takes back the last `steps` steps, which were all skipped and so changed nothing but where the run stands.
     pub(super) fn take_back(&mut self, steps: u64) {
         self.step -= steps;
-        self.samples -= steps * self.config.train.batch as u64;
+        self.samples -= steps * self.batch();
     }
 
     /// Scenes that were skipped since the run was begun or resumed.
@@ -197,6 +330,11 @@ impl Trainer {
     /// What it was made from.
     pub fn config(&self) -> &Config {
         &self.config
+    }
+
+    /// Those that it trains with.
+    pub fn group(&self) -> &Group {
+        &self.group
     }
 
     /// The model as it is now.
@@ -225,11 +363,12 @@ impl Trainer {
     }
 }
 
-/// A step's packed losses and its gradient's norm, a scalar, as numbers. They come from a GPU together, as each time it is waited for
-/// until all that it was given is done: this is the only one of a step.
-fn read(losses: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, f64) {
-    let both = Tensor::cat(&[losses, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
-    let numbers = Vec::<f64>::try_from(both.to_device(Device::Cpu)).expect("float64");
-    let (losses, norm) = numbers.split_first_chunk().expect("all terms");
-    (Losses::unpacked(losses), norm[0])
+/// A step's packed losses, what ranks tell each other, and the gradient's norm, a scalar, as numbers. They come from a GPU together,
+/// as each time it is waited for until all that it was given is done: this is the only one of a step.
+fn read(told: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, Word, f64) {
+    let all = Tensor::cat(&[told, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
+    let numbers = Vec::<f64>::try_from(all.to_device(Device::Cpu)).expect("float64");
+    let (losses, others) = numbers.split_first_chunk().expect("all terms");
+    let (word, norm) = others.split_first_chunk().expect("all words");
+    (Losses::unpacked(losses), Word::unpacked(*word), norm[0])
 }

@@ -2,13 +2,13 @@
 
 use super::order::Place;
 use crate::error::{Error, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Mutex;
 
 /// What is wrong with a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Fault {
     /// The file that it lies in, together with others.
     Group,
@@ -63,18 +63,34 @@ impl fmt::Display for BadData {
     }
 }
 
+/// Scenes that were found bad together, for other processes to count.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct News {
+    fault: Fault,
+    places: Vec<Place>,
+    why: String,
+}
+
 /// Keeps [`BadData`] for all threads.
 #[derive(Debug)]
 pub(super) struct Ledger {
     largest_share: f64,
-    entries: Mutex<(BadData, BTreeSet<Place>)>,
+    entries: Mutex<Entries>,
+}
+
+#[derive(Debug, Default)]
+struct Entries {
+    counts: BadData,
+    seen: BTreeSet<Place>,
+    /// What was found here since somebody asked.
+    news: Vec<News>,
 }
 
 impl Ledger {
     /// For `scenes`, of which `largest_share` may be bad.
     pub fn new(scenes: u64, largest_share: f64) -> Self {
         let counts = BadData { scenes, ..Default::default() };
-        Ledger { largest_share, entries: Mutex::new((counts, BTreeSet::new())) }
+        Ledger { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
     }
 
     /// Counts `places`, once each.
@@ -88,8 +104,27 @@ impl Ledger {
         why: impl fmt::Display,
     ) -> Result<()> {
         let mut entries = self.entries.lock().expect("no thread panics here");
-        let (counts, seen) = &mut *entries;
-        let new = places.filter(|&place| seen.insert(place)).count() as u64;
+        let places: Vec<Place> = places.filter(|place| !entries.seen.contains(place)).collect();
+        if places.is_empty() {
+            return Ok(());
+        }
+        // Decoders break lines.
+        let news = News { fault, places, why: why.to_string().replace('\n', " ") };
+        entries.news.push(news.clone());
+        self.count(&mut entries, news)
+    }
+
+    /// Counts what another process has found.
+    ///
+    /// # Errors
+    /// Too many.
+    pub fn hear(&self, news: News) -> Result<()> {
+        self.count(&mut self.entries.lock().expect("no thread panics here"), news)
+    }
+
+    fn count(&self, entries: &mut Entries, News { fault, places, why }: News) -> Result<()> {
+        let Entries { counts, seen, .. } = entries;
+        let new = places.into_iter().filter(|&place| seen.insert(place)).count() as u64;
         if new == 0 {
             return Ok(());
         }
@@ -100,8 +135,7 @@ impl Ledger {
             Fault::Image => &mut counts.with_broken_images,
         } += new;
         if fault != Fault::Short {
-            // Decoders break lines.
-            counts.first.get_or_insert_with(|| why.to_string().replace('\n', " "));
+            counts.first.get_or_insert_with(|| why.clone());
         }
         if counts.total() as f64 > self.largest_share * counts.scenes as f64 {
             let last = if counts.first.is_none() { format!("; the last: {why}") } else { String::new() };
@@ -113,7 +147,15 @@ impl Ledger {
         Ok(())
     }
 
+    pub fn has_news(&self) -> bool {
+        !self.entries.lock().expect("no thread panics here").news.is_empty()
+    }
+
+    pub fn take_news(&self) -> Vec<News> {
+        std::mem::take(&mut self.entries.lock().expect("no thread panics here").news)
+    }
+
     pub fn counts(&self) -> BadData {
-        self.entries.lock().expect("no thread panics here").0.clone()
+        self.entries.lock().expect("no thread panics here").counts.clone()
     }
 }

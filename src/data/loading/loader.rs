@@ -1,9 +1,10 @@
 //! Threads that read, decode, resize and augment ahead of training. Sample i depends on the seed and i alone: every thread
 //! makes each T-th sample, and they are taken from the threads by turns.
 
-use super::bad_data::{BadData, Fault, Ledger};
+use super::bad_data::{BadData, Fault, Ledger, News};
 use super::open_groups::{OpenGroups, Opened};
 use super::order::{Order, Place};
+use super::part::Part;
 use super::sample::{ComingSample, Sample};
 use super::sampler::{choose_views, context_views};
 use super::scene::{LoadTimes, LoadedScene};
@@ -37,8 +38,11 @@ pub struct Loader {
     shared: Arc<Shared>,
     receivers: Vec<Receiver<Result<LoadedScene>>>,
     threads: Vec<JoinHandle<()>>,
-    /// The number of the sample that the threads give next.
-    next: u64,
+    part: Part,
+    /// The number of the sample that all others come after.
+    first: u64,
+    /// How many the threads have given.
+    taken: u64,
     upload: Option<Upload>,
     ahead: Option<Ahead>,
 }
@@ -60,8 +64,7 @@ type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
 struct Shared {
     config: DataConfig,
     seed: u64,
-    /// Samples of a step.
-    batch: u64,
+    part: Part,
     order: Order,
     groups: OpenGroups,
     ledger: Ledger,
@@ -79,7 +82,8 @@ struct Tools {
 }
 
 impl Loader {
-    /// Begins to load `scenes` for steps of `batch` samples, sample `first` before all others.
+    /// Begins to load `scenes`: of every step `part`, of which a number stands for whole steps of so many samples. The first step
+    /// begins with sample `first`.
     ///
     /// # Errors
     /// No scenes, or threads that can't be had.
@@ -87,9 +91,10 @@ impl Loader {
         config: &DataConfig,
         seed: u64,
         scenes: Arc<dyn SceneGroups>,
-        batch: usize,
+        part: impl Into<Part>,
         first: u64,
     ) -> Result<Self> {
+        let part = part.into();
         let sizes = scenes.sizes();
         if sizes.iter().all(|&size| size == 0) {
             return Err(Error::Request("there are no scenes to train on".into()));
@@ -101,7 +106,7 @@ impl Loader {
         let shared = Arc::new(Shared {
             config: config.clone(),
             seed,
-            batch: batch as u64,
+            part,
             ledger: Ledger::new(order.scenes(), config.max_bad_share),
             order,
             groups: OpenGroups::new(scenes),
@@ -112,14 +117,15 @@ impl Loader {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
         };
+        let (receivers, spawned) = (vec![], vec![]);
         let mut loader =
-            Loader { shared, receivers: vec![], threads: vec![], next: first, upload: None, ahead: None };
+            Loader { shared, receivers, threads: spawned, part, first, taken: 0, upload: None, ahead: None };
         // A thread holds a sample in its hands while its queue is full.
         let queue = config.ahead.div_ceil(threads).saturating_sub(1).max(1);
         for thread in 0..threads as u64 {
             let (sender, receiver) = sync_channel(queue);
             let shared = loader.shared.clone();
-            let turns = (first + thread..).step_by(threads);
+            let turns = (thread..).step_by(threads).map(move |turn| part.sample(first, turn));
             let work = move || {
                 let mut tools = Tools::default();
                 for sample in turns {
@@ -153,7 +159,12 @@ impl Loader {
 
     /// The number of the next sample; one that was sent ahead is still to come.
     pub fn position(&self) -> u64 {
-        self.ahead.as_ref().map_or(self.next, |ahead| ahead.first)
+        self.ahead.as_ref().map_or(self.next(), |ahead| ahead.first)
+    }
+
+    /// The number of the sample that the threads give next.
+    fn next(&self) -> u64 {
+        self.part.sample(self.first, self.taken)
     }
 
     /// The next sample.
@@ -170,7 +181,7 @@ impl Loader {
         let receiver = &self.receivers[0];
         let scene = receiver.recv().map_err(|_| Error::Failed("a loading thread has ended".into()))??;
         self.receivers.rotate_left(1 % turn);
-        self.next += 1;
+        self.taken += 1;
         Ok(scene)
     }
 
@@ -192,7 +203,7 @@ impl Loader {
     /// A GPU copies them while it works; to the CPU nothing has to be brought.
     pub fn send_ahead(&mut self, batch: usize, device: Device) {
         if self.ahead.is_none() {
-            let first = self.next;
+            let first = self.next();
             let scenes = self.next_scenes(batch);
             let upload = self.upload.get_or_insert_with(|| Upload::to(device));
             self.ahead =
@@ -207,6 +218,24 @@ impl Loader {
     /// What was skipped so far, with what is ready ahead.
     pub fn bad_data(&self) -> BadData {
         self.shared.ledger.counts()
+    }
+
+    /// What was skipped since this was asked last, for those that load other parts of the same steps.
+    pub(crate) fn take_news(&self) -> Vec<News> {
+        self.shared.ledger.take_news()
+    }
+
+    /// Whether there is something to be told by [`Loader::take_news`].
+    pub(crate) fn has_news(&self) -> bool {
+        self.shared.ledger.has_news()
+    }
+
+    /// Counts what others have skipped.
+    ///
+    /// # Errors
+    /// More bad data, with theirs, than the configuration allows.
+    pub(crate) fn hear(&self, news: Vec<News>) -> Result<()> {
+        news.into_iter().try_for_each(|news| self.shared.ledger.hear(news))
     }
 }
 
@@ -228,7 +257,7 @@ impl Shared {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
         tools.times = LoadTimes::default();
-        let views = context_views(&self.config, self.seed, sample / self.batch);
+        let views = context_views(&self.config, self.seed, sample / self.part.of_step());
         let (first, groups) = self.order.turn(sample);
         for group in groups {
             let start = Instant::now();

@@ -4,12 +4,13 @@
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 /// Sets the order's random numbers apart from those of the samples.
 const ORDER_KEY: u64 = 0x6f72_6465_725f_6f66;
 
 /// A scene's place in the data: its group, and its position in that.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Place {
     /// The group.
     pub group: usize,

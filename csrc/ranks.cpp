@@ -1,0 +1,230 @@
+#include "ranks.h"
+
+#include <ATen/core/grad_mode.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/zeros.h>
+#include <torch/csrc/autograd/function_hook.h>
+#include <torch/csrc/autograd/variable.h>
+#include <torch/csrc/distributed/c10d/PrefixStore.hpp>
+#include <torch/csrc/distributed/c10d/TCPStore.hpp>
+#include <torch/csrc/distributed/c10d/Types.hpp>
+
+#include <chrono>
+#include <cstdlib>
+#include <string>
+#include <utility>
+
+#if __has_include(<gloo/rendezvous/store.h>)
+#define GLOBALSPLAT_GLOO 1
+#define USE_C10D_GLOO
+#include <torch/csrc/distributed/c10d/ProcessGroupGloo.hpp>
+#else
+#define GLOBALSPLAT_GLOO 0
+#endif
+
+namespace globalsplat {
+namespace {
+
+std::string string(rust::Str s) { return {s.data(), s.size()}; }
+
+const at::Tensor& borrowed_tensor(size_t address) { return *reinterpret_cast<const at::Tensor*>(address); }
+
+}  // namespace
+
+Store::Store(c10::intrusive_ptr<c10d::Store> store) : store_(std::move(store)) {}
+
+std::unique_ptr<Store> Store::another() const { return std::make_unique<Store>(store_->clone()); }
+
+int64_t Store::add(rust::Str key, int64_t amount) const { return store_->add(string(key), amount); }
+
+void Store::set(rust::Str key, rust::Slice<const uint8_t> value) const {
+  store_->set(string(key), std::vector<uint8_t>(value.begin(), value.end()));
+}
+
+rust::Vec<uint8_t> Store::get(rust::Str key) const {
+  rust::Vec<uint8_t> value;
+  for (const uint8_t byte : store_->get(string(key))) value.push_back(byte);
+  return value;
+}
+
+std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust::Str prefix, int64_t seconds) {
+  c10d::TCPStoreOptions options;
+  options.port = port;
+  options.isServer = serves;
+  options.waitWorkers = false;
+  options.timeout = std::chrono::seconds(seconds);
+  auto store = c10::make_intrusive<c10d::TCPStore>(string(host), options);
+  return std::make_unique<Store>(c10::make_intrusive<c10d::PrefixStore>(string(prefix), std::move(store)));
+}
+
+bool has_gloo() { return GLOBALSPLAT_GLOO; }
+
+std::unique_ptr<Group> gloo([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank, [[maybe_unused]] int32_t ranks,
+                            [[maybe_unused]] int64_t seconds) {
+#if GLOBALSPLAT_GLOO
+  using c10d::ProcessGroupGloo;
+  auto options = ProcessGroupGloo::Options::create(std::chrono::seconds(seconds));
+  // As in PyTorch: the network that a person names, or that of this machine's name.
+  const char* const interface = std::getenv("GLOO_SOCKET_IFNAME");
+  const bool named = interface && *interface;
+  options->devices.push_back(named ? ProcessGroupGloo::createDeviceForInterface(interface) : ProcessGroupGloo::createDefaultDevice());
+  auto inner = c10::make_intrusive<c10d::PrefixStore>("gloo", store.inner());
+  return std::make_unique<Group>(c10::make_intrusive<ProcessGroupGloo>(std::move(inner), rank, ranks, std::move(options)));
+#else
+  throw std::runtime_error("built without Gloo");
+#endif
+}
+
+Group::Group(Ranks ranks) : ranks_(std::move(ranks)) {}
+
+void Group::all_reduce(size_t tensor) const {
+  const at::NoGradGuard no_grad;
+  std::vector<at::Tensor> tensors{borrowed_tensor(tensor)};
+  ranks_->allreduce(tensors)->wait();
+}
+
+void Group::broadcast(size_t tensor, int32_t from) const {
+  const at::NoGradGuard no_grad;
+  std::vector<at::Tensor> tensors{borrowed_tensor(tensor).detach()};
+  c10d::BroadcastOptions options;
+  options.rootRank = from;
+  ranks_->broadcast(tensors, options)->wait();
+}
+
+void Group::all_gather(size_t tensor, rust::Slice<size_t> out) const {
+  const at::NoGradGuard no_grad;
+  std::vector<at::Tensor> inputs{borrowed_tensor(tensor).contiguous()};
+  auto sizes = inputs[0].sizes().vec();
+  sizes.insert(sizes.begin(), ranks_->getSize());
+  const at::Tensor all = at::empty(sizes, inputs[0].options());
+  std::vector<std::vector<at::Tensor>> outputs{all.unbind(0)};
+  ranks_->allgather(outputs, inputs)->wait();
+  out[0] = reinterpret_cast<size_t>(new at::Tensor(all));
+}
+
+// What the parameters' hooks share. Backward passes of one step come one after the other, each in one thread.
+struct Buckets::State {
+  struct Bucket {
+    size_t first, end;  // of the parameters
+    size_t missing;     // gradients that haven't come yet
+  };
+
+  Ranks ranks;
+  std::vector<at::Tensor> parameters;
+  std::vector<size_t> bucket_of;
+  std::vector<Bucket> buckets;
+  bool waiting = false;  // for gradients
+  size_t sent = 0;       // buckets
+  std::vector<bool> came;
+  std::vector<c10::intrusive_ptr<c10d::Work>> works;
+  std::exception_ptr error;
+
+  void arrived(size_t parameter);
+  void send(const Bucket& bucket);
+};
+
+namespace {
+
+// Tells a state that a parameter has its gradient.
+template <class State>
+struct Arrival final : torch::autograd::PostAccumulateGradHook {
+  Arrival(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
+
+  void operator()(const at::Tensor&) override { state->arrived(parameter); }
+
+  std::shared_ptr<State> state;
+  size_t parameter;
+};
+
+}  // namespace
+
+void Buckets::State::arrived(size_t parameter) {
+  if (!waiting || error) return;
+  // What is thrown here would end in the middle of the backward pass.
+  try {
+    TORCH_CHECK(!came[parameter], "a parameter has had its gradient twice in a step");
+    came[parameter] = true;
+    --buckets[bucket_of[parameter]].missing;
+    while (sent < buckets.size() && buckets[sent].missing == 0) send(buckets[sent]);
+  } catch (...) {
+    error = std::current_exception();
+  }
+}
+
+void Buckets::State::send(const Bucket& bucket) {
+  const at::NoGradGuard no_grad;
+  std::vector<at::Tensor> pieces;
+  for (size_t i = bucket.first; i < bucket.end; ++i) {
+    const at::Tensor& gradient = parameters[i].grad();
+    // All ranks send as much, whoever has no gradient.
+    pieces.push_back(gradient.defined() ? gradient.reshape(-1) : at::zeros({parameters[i].numel()}, parameters[i].options()));
+  }
+  const at::Tensor flat = at::cat(pieces);
+  pieces.clear();
+  int64_t offset = 0;
+  for (size_t i = bucket.first; i < bucket.end; ++i) {
+    const at::Tensor& parameter = parameters[i];
+    // The sum comes to lie where the optimizer looks for it.
+    if (parameter.grad().defined()) parameter.mutable_grad() = flat.narrow(0, offset, parameter.numel()).view(parameter.sizes());
+    offset += parameter.numel();
+  }
+  std::vector<at::Tensor> tensors{flat};
+  works.push_back(ranks->allreduce(tensors));
+  ++sent;
+}
+
+Buckets::Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes) : state_(std::make_shared<State>()) {
+  State& state = *state_;
+  state.ranks = std::move(ranks);
+  state.parameters = std::move(parameters);
+  state.came.resize(state.parameters.size());
+  int64_t size = 0;
+  for (size_t i = 0; i < state.parameters.size(); ++i) {
+    const at::Tensor& parameter = state.parameters[i];
+    TORCH_CHECK(parameter.is_leaf() && parameter.requires_grad() && parameter.options().type_equal(state.parameters[0].options()),
+                "parameters must be leaves of one type");
+    if (state.buckets.empty() || size >= bytes) {
+      state.buckets.push_back({i, i, 0});
+      size = 0;
+    }
+    state.buckets.back().end = i + 1;
+    state.bucket_of.push_back(state.buckets.size() - 1);
+    size += int64_t(parameter.nbytes());
+    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<Arrival<State>>(state_, i));
+  }
+}
+
+Buckets::~Buckets() {
+  for (const at::Tensor& parameter : state_->parameters) torch::autograd::impl::set_post_acc_grad_hooks(parameter, nullptr);
+}
+
+void Buckets::begin() const {
+  State& state = *state_;
+  for (auto& bucket : state.buckets) bucket.missing = bucket.end - bucket.first;
+  state.came.assign(state.parameters.size(), false);
+  state.sent = 0;
+  state.works.clear();
+  state.error = nullptr;
+  state.waiting = true;
+}
+
+size_t Buckets::finish() const {
+  State& state = *state_;
+  state.waiting = false;
+  if (state.error) std::rethrow_exception(state.error);
+  while (state.sent < state.buckets.size()) state.send(state.buckets[state.sent]);
+  for (const auto& work : state.works) work->wait();
+  state.works.clear();
+  size_t gradients = 0;
+  for (const at::Tensor& parameter : state.parameters) gradients += parameter.grad().defined();
+  return gradients;
+}
+
+std::unique_ptr<Buckets> buckets(const Group& group, rust::Slice<const size_t> parameters, int64_t bytes) {
+  std::vector<at::Tensor> tensors;
+  for (const size_t address : parameters) tensors.push_back(borrowed_tensor(address));
+  return std::make_unique<Buckets>(group.ranks(), std::move(tensors), bytes);
+}
+
+}  // namespace globalsplat

@@ -1,0 +1,53 @@
+//! Which samples of every step a process loads.
+
+/// One of equal parts of every step. The parts of a step together are the samples that a process alone would load.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part {
+    /// Samples of a step in this part.
+    pub batch: usize,
+    /// Which part it is, from 0.
+    pub number: usize,
+    /// Of so many.
+    pub parts: usize,
+}
+
+impl Part {
+    /// Samples of a step in all parts.
+    pub fn of_step(self) -> u64 {
+        (self.batch * self.parts) as u64
+    }
+
+    /// The number of the sample that comes in this part's turn `turn`, of steps from sample `first` on.
+    pub(super) fn sample(self, first: u64, turn: u64) -> u64 {
+        let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
+        first + step * self.of_step() + (self.batch * self.number) as u64 + within
+    }
+}
+
+/// Whole steps of so many samples.
+impl From<usize> for Part {
+    fn from(batch: usize) -> Self {
+        Part { batch, number: 0, parts: 1 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_share_the_samples_of_every_step_out() {
+        let whole: Vec<u64> = (0..24).map(|turn| Part::from(6).sample(5, turn)).collect();
+        assert_eq!(whole, (5..29).collect::<Vec<_>>());
+        for parts in [2, 3, 6] {
+            let batch = 6 / parts;
+            let of = |number: usize| Part { batch, number, parts };
+            for step in 0..4 {
+                let turns = (step * batch as u64)..((step + 1) * batch as u64);
+                let of_step =
+                    (0..parts).flat_map(|number| turns.clone().map(move |turn| of(number).sample(5, turn)));
+                assert_eq!(of_step.collect::<Vec<_>>(), whole[step as usize * 6..][..6], "{parts} parts");
+            }
+        }
+    }
+}
