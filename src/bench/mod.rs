@@ -13,7 +13,7 @@ pub use model::{ModelReport, bench_model};
 pub use raster::{RasterReport, bench_raster, made_up_scene};
 pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
-pub use train::{TrainReport, bench_train};
+pub use train::{Together, TrainReport, bench_train};
 
 use crate::optim::Stopwatch;
 use serde::Serialize;

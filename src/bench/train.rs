@@ -8,6 +8,7 @@ use crate::error::Result;
 use crate::eval::peak_memory_bytes_on;
 use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::optim::Stopwatch;
+use crate::ranks::Group;
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::Trainer;
 use glam::{DMat4, DVec3};
@@ -45,34 +46,70 @@ pub struct TrainReport {
     pub sections: Vec<Section>,
     /// Bytes that tensors on a GPU, or the process, took at the most.
     pub peak_bytes: u64,
+    /// What working together costs, where there are several processes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub together: Option<Together>,
+}
+
+/// What it costs processes to make a step together.
+#[derive(Debug, Serialize)]
+pub struct Together {
+    /// How many there are.
+    pub ranks: usize,
+    /// Scenes that all of them make in a second.
+    pub scenes_per_second: f64,
+    /// Of a step that each of them makes by itself, all at the same time.
+    pub apart_milliseconds: Spread,
+    /// Of adding all gradients up with nothing else to do meanwhile.
+    pub communication_milliseconds: Spread,
+    /// Bytes of the gradients.
+    pub gradient_bytes: u64,
+}
+
+impl Together {
+    /// The share of the communication that a step of `milliseconds` hides behind its backward pass.
+    pub fn hidden(&self, milliseconds: f64) -> f64 {
+        let added = milliseconds - self.apart_milliseconds.median;
+        (1. - added / self.communication_milliseconds.median).clamp(0., 1.)
+    }
 }
 
 /// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
 /// of noise, cameras on a short path. L_perc is left out where its weights aren't there. The parts of a step are told by the
-/// device's own clock.
+/// device's own clock. Of several ranks, all call this, each with scenes of its own.
 ///
 /// # Errors
-/// What [`Trainer`] fails with.
-pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<TrainReport> {
+/// What [`Trainer`] fails with, or another rank that is gone.
+pub fn bench_train(
+    config: &Config,
+    steps: usize,
+    device: Device,
+    group: Group,
+    shards_optimizer: bool,
+) -> Result<TrainReport> {
     let mut config = config.clone();
     config.curriculum.full_capacity = true;
     if !PerceptualLoss::weights_file(&config.loss)?.is_file() {
         config.loss.perceptual = PerceptualKind::None;
     }
-    let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
+    let (rank, ranks) = (group.rank(), group.ranks());
+    let trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
+    let mut trainer = match shards_optimizer {
+        true => trainer.with_ranks(group).with_sharded_optimizer(),
+        false => trainer.with_ranks(group),
+    };
+    trainer.follow_first()?;
+    let seeds = (rank * config.train.batch) as u64..;
     let scenes: Vec<LoadedScene> =
-        (0..config.train.batch as u64).map(|seed| made_up_scene(&config, seed)).collect();
-    let (mut measured, upload) = (Measured::default(), Upload::to(device));
-    // The first step warms caches, threads and the GPU's libraries up.
-    for step in 0..=steps {
-        let mut watch = Stopwatch::of(device);
-        let sample = watch.time("data", || Sample::by(&scenes, &upload));
-        trainer.learn(&sample, &mut watch, &mut || true)?;
-        if step > 0 {
-            measured.add(&mut watch);
-        }
-    }
+        seeds.take(config.train.batch).map(|seed| made_up_scene(&config, seed)).collect();
+    let upload = Upload::to(device);
+    let measured = measure(&mut trainer, &scenes, steps, &upload)?;
+    let peak_bytes = peak_memory_bytes_on(device);
     let (milliseconds, sections) = measured.told();
+    let together = (ranks > 1).then(|| {
+        let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
+        together(trainer, &scenes, steps, &upload, scenes_per_second)
+    });
     Ok(TrainReport {
         scenes: scenes.len(),
         context_views: config.data.context_views,
@@ -84,7 +121,50 @@ pub fn bench_train(config: &Config, steps: usize, device: Device) -> Result<Trai
         steps,
         milliseconds,
         sections,
-        peak_bytes: peak_memory_bytes_on(device),
+        peak_bytes,
+        together: together.transpose()?,
+    })
+}
+
+/// `steps` steps, after one that warms caches, threads and the GPU's libraries up.
+fn measure(trainer: &mut Trainer, scenes: &[LoadedScene], steps: usize, upload: &Upload) -> Result<Measured> {
+    let mut measured = Measured::default();
+    for step in 0..=steps {
+        let mut watch = Stopwatch::of(upload.device());
+        let sample = watch.time("data", || Sample::by(scenes, upload));
+        trainer.learn(&sample, &mut watch, &mut || true)?;
+        if step > 0 {
+            measured.add(&mut watch);
+        }
+    }
+    Ok(measured)
+}
+
+/// What is left of ranks' steps without communication, and of communication without steps.
+fn together(
+    trainer: Trainer,
+    scenes: &[LoadedScene],
+    steps: usize,
+    upload: &Upload,
+    scenes_per_second: f64,
+) -> Result<Together> {
+    let ranks = trainer.group().ranks();
+    let mut communication = Measured::default();
+    for step in 0..=steps {
+        let mut watch = Stopwatch::of(upload.device());
+        watch.time("communication", || trainer.add_gradients_up())?;
+        if step > 0 {
+            communication.add(&mut watch);
+        }
+    }
+    let gradient_bytes = trainer.gradient_bytes();
+    let mut apart = trainer.with_ranks(Group::alone());
+    Ok(Together {
+        ranks,
+        scenes_per_second,
+        apart_milliseconds: measure(&mut apart, scenes, steps, upload)?.told().0,
+        communication_milliseconds: communication.told().0,
+        gradient_bytes,
     })
 }
 

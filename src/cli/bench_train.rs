@@ -1,8 +1,8 @@
 use super::bench::{print_sections, read_config};
-use super::{device, print_json};
+use super::{print_json, ranks};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{TrainReport, bench_train};
+use globalsplat::bench::{Spread, Together, TrainReport, bench_train};
 use globalsplat::error::Error;
 use serde_json::json;
 use std::path::PathBuf;
@@ -10,11 +10,13 @@ use std::path::PathBuf;
 /// A training step, part by part, on made-up scenes: pictures of noise, all Gaussians shown.
 ///
 /// Without --config it is the paper's main model, 24 context and 12 target views of 256x256. L_perc takes part where its
-/// weights are there.
+/// weights are there. Under torchrun it also tells what working together costs: time of a step apart, of communication by itself, and
+/// how much of that the backward pass hides.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench train\n  \
     globalsplat bench train --config configs/first_light.toml --steps 20\n  \
-    globalsplat bench train --set train.checkpoint_rounds=true --json")]
+    globalsplat bench train --set train.checkpoint_rounds=true --json\n  \
+    torchrun --no-python --nproc-per-node=2 target/release/globalsplat bench train --config configs/tiny.toml")]
 pub struct Train {
     /// Configuration file; see configs/
     #[arg(long, value_name = "FILE")]
@@ -31,6 +33,9 @@ pub struct Train {
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Share the optimizer's moments out over the processes that torchrun started
+    #[arg(long)]
+    shard_optimizer: bool,
     /// Print the measurements as one JSON object
     #[arg(long)]
     json: bool,
@@ -38,13 +43,17 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        let device = device::parse(&self.device)?;
+        let (group, device) = ranks::join(&self.device)?;
+        let is_first = group.is_first();
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
         }
         config.train.batch = self.batch.into();
-        let report = bench_train(&config, self.steps as usize, device)?;
+        let report = bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?;
+        if !is_first {
+            return Ok(());
+        }
         if self.json {
             print_json(&serde_json::to_value(&report)?);
         } else {
@@ -68,4 +77,19 @@ fn print_report(r: &TrainReport) {
     );
     print_sections("ms per step", &r.sections, ("step", &r.milliseconds));
     println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
+    if let Some(together) = &r.together {
+        print_together(together, &r.milliseconds);
+    }
+}
+
+fn print_together(together: &Together, step: &Spread) {
+    let Together { ranks, scenes_per_second, apart_milliseconds, communication_milliseconds, .. } = together;
+    println!("{ranks} processes make {scenes_per_second:.2} scenes a second together");
+    println!(
+        "a step apart takes {:.1} ms, adding up {:.1} MB of gradients {:.1} ms, of which {:.0} % is hidden",
+        apart_milliseconds.median,
+        together.gradient_bytes as f64 * 1e-6,
+        communication_milliseconds.median,
+        1e2 * together.hidden(step.median)
+    );
 }

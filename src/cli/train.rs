@@ -47,6 +47,9 @@ pub struct Train {
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Share the optimizer's moments out over the processes that torchrun started, for less memory; checkpoints are the same
+    #[arg(long)]
+    shard_optimizer: bool,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -88,6 +91,9 @@ impl Train {
         }
 
         let mut trainer = trainer.with_ranks(group);
+        if self.shard_optimizer {
+            trainer = trainer.with_sharded_optimizer();
+        }
         if count > 1 && is_first {
             eprintln!("{count} processes train together: {} scenes in a step", trainer.batch());
         }

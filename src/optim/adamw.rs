@@ -29,9 +29,12 @@ pub struct ParameterGroup {
 struct Parameter {
     name: String,
     value: Tensor,
+    /// No numbers where another part of the optimizer has them.
     first: Tensor,
     second: Tensor,
     group: usize,
+    /// The part of the optimizer that updates it.
+    part: usize,
 }
 
 impl Parameter {
@@ -79,6 +82,8 @@ pub struct AdamW {
     groups: Vec<Settings>,
     epsilon: f64,
     steps: i64,
+    /// The one of the parts that this is.
+    part: usize,
 }
 
 impl AdamW {
@@ -91,12 +96,13 @@ impl AdamW {
         for (group, of) in groups.into_iter().enumerate() {
             for (name, value) in of.parameters {
                 let (first, second) = (value.zeros_like().detach(), value.zeros_like().detach());
-                let parameter = Parameter { name: name.clone(), value, first, second, group };
+                let parameter = Parameter { name: name.clone(), value, first, second, group, part: 0 };
                 assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
             }
             settings.push(Settings { learning_rate: of.learning_rate, weight_decay: of.weight_decay });
         }
-        AdamW { parameters: parameters.into_values().collect(), groups: settings, epsilon: EPS, steps: 0 }
+        let parameters = parameters.into_values().collect();
+        AdamW { parameters, groups: settings, epsilon: EPS, steps: 0, part: 0 }
     }
 
     /// With `epsilon` in place of 1e-8 added to the root of the second moments.
@@ -109,6 +115,35 @@ impl AdamW {
         for (group, &learning_rate) in self.groups.iter_mut().zip(learning_rates) {
             group.learning_rate = learning_rate;
         }
+    }
+
+    /// Makes this the part `part` of `parts`: it updates its share of the parameters, and forgets the others' moments. Parameters go
+    /// to parts whole, the largest first, each to the part that has least (ZeRO's first stage, Rajbhandari et al. 2020, by tensors).
+    pub fn become_part(&mut self, part: usize, parts: usize) {
+        self.part = part;
+        let mut order: Vec<usize> = (0..self.parameters.len()).collect();
+        order.sort_by_key(|&i| std::cmp::Reverse(self.parameters[i].value.numel()));
+        let mut sizes = vec![0; parts];
+        for i in order {
+            let least = (0..parts).min_by_key(|&part| sizes[part]).expect("a part");
+            let p = &mut self.parameters[i];
+            sizes[least] += p.value.numel();
+            p.part = least;
+            if least != part {
+                let none = || Tensor::empty([0], (p.value.kind(), p.value.device()));
+                (p.first, p.second) = (none(), none());
+            }
+        }
+    }
+
+    /// The parameters of part `part`, which it alone updates.
+    pub fn of_part(&self, part: usize) -> impl Iterator<Item = &Tensor> {
+        self.parameters.iter().filter(move |p| p.part == part).map(|p| &p.value)
+    }
+
+    /// Whether all parameters are updated here.
+    pub fn is_whole(&self) -> bool {
+        self.parameters.iter().all(|p| p.part == self.part)
     }
 
     /// Running means of the gradients and of their squares, to be changed in place.
@@ -168,7 +203,7 @@ impl AdamW {
     fn update_on_the_cpu(&mut self) {
         let correction1 = 1. - BETA1.powi(self.steps as i32);
         let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
-        for p in &mut self.parameters {
+        for p in self.parameters.iter_mut().filter(|p| p.part == self.part) {
             let gradient = p.value.grad();
             if gradient.defined() {
                 let Settings { learning_rate, weight_decay } = self.groups[p.group];
@@ -181,7 +216,7 @@ impl AdamW {
     /// The same by libtorch's own kernel, group by group.
     fn update_fused(&mut self) {
         for (group, &Settings { learning_rate, weight_decay }) in self.groups.iter().enumerate() {
-            let of_group = self.parameters.iter().filter(|p| p.group == group);
+            let of_group = self.parameters.iter().filter(|p| p.group == group && p.part == self.part);
             let with_gradient = of_group.filter(|p| p.value.grad().defined());
             let (parameters, gradients): (Vec<_>, Vec<_>) =
                 with_gradient.map(|p| (p, p.value.grad().contiguous())).unzip();
@@ -214,12 +249,24 @@ impl AdamW {
 
     /// Everything but the variables themselves.
     pub fn state(&self) -> BTreeMap<String, Tensor> {
+        self.state_by(|moment, _, _| Ok(moment.shallow_clone())).expect("all is here")
+    }
+
+    /// The same with moments that `of` makes of those here, of the parameter's shape and of the part that has them.
+    ///
+    /// # Errors
+    /// Those of `of`.
+    pub fn state_by(
+        &self,
+        of: impl Fn(&Tensor, &[i64], usize) -> Result<Tensor>,
+    ) -> Result<BTreeMap<String, Tensor>> {
         let mut state = BTreeMap::from([("steps".to_string(), Tensor::from_slice(&[self.steps]))]);
         for p in &self.parameters {
-            state.insert(format!("first.{}", p.name), p.first.shallow_clone());
-            state.insert(format!("second.{}", p.name), p.second.shallow_clone());
+            for (name, moment) in [("first", &p.first), ("second", &p.second)] {
+                state.insert(format!("{name}.{}", p.name), of(moment, &p.value.size(), p.part)?);
+            }
         }
-        state
+        Ok(state)
     }
 
     /// Takes a state back that [`AdamW::state`] gave for the same model.

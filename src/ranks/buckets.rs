@@ -32,7 +32,7 @@ impl Buckets {
         Buckets::of_bytes(group, parameters, BYTES)
     }
 
-    fn of_bytes(group: &Group, parameters: &[Tensor], bytes: i64) -> Self {
+    pub(super) fn of_bytes(group: &Group, parameters: &[Tensor], bytes: i64) -> Self {
         let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
         // SAFETY: the tensors outlive the call; the C++ side keeps what they refer to.
         let inner = group.inner().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });

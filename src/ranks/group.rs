@@ -108,14 +108,14 @@ impl Group {
         }
     }
 
-    /// Puts what the first rank has in place of `tensor`, which has the same shape and kind everywhere.
+    /// Puts what rank `from` has in place of `tensor`, which has the same shape and kind everywhere.
     ///
     /// # Errors
     /// Another rank that is gone.
-    pub fn copy_from_first(&self, tensor: &Tensor) -> Result<()> {
+    pub fn copy_from(&self, from: usize, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor lives, and its holder waits.
-            Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize, 0) }.map_err(lost),
+            Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(lost),
             None => Ok(()),
         }
     }

@@ -10,3 +10,158 @@ pub use buckets::Buckets;
 pub use group::Group;
 pub use place::Place;
 pub use watch::Watch;
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use globalsplat_csrc::ranks as ffi;
+    use tch::{Device, Kind, Tensor};
+
+    /// What every one of `ranks` ranks makes of its group, each in a thread of its own.
+    pub(crate) fn together<T: Send>(ranks: usize, work: impl Fn(Group) -> T + Sync) -> Vec<T> {
+        let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
+        std::thread::scope(|scope| {
+            let rank = |rank| {
+                let (store, work) = (store.another().expect("a connection"), &work);
+                scope.spawn(move || {
+                    let place = Place {
+                        rank,
+                        ranks,
+                        local_rank: rank,
+                        local_ranks: ranks,
+                        restarts: 0,
+                        host: "127.0.0.1".into(),
+                        port: 0,
+                        store_is_kept: true,
+                    };
+                    work(Group::join(&place, &store, Device::Cpu).expect("a group"))
+                })
+            };
+            let threads: Vec<_> = (0..ranks).map(rank).collect();
+            threads.into_iter().map(|thread| thread.join().expect("a rank")).collect()
+        })
+    }
+
+    /// Whether ranks can meet in this build; tells what is skipped where they can't.
+    pub(crate) fn can_meet() -> bool {
+        if !ffi::has_gloo() {
+            assert!(std::env::var_os("GLOBALSPLAT_NO_SKIPS").is_none(), "built without Gloo");
+            eprintln!("skipped: what ranks do together: built without Gloo (libgloo-dev)");
+        }
+        ffi::has_gloo()
+    }
+
+    #[test]
+    fn ranks_add_copy_and_tell() {
+        if !can_meet() {
+            return;
+        }
+        for ranks in [2, 3] {
+            let found = together(ranks, |group| {
+                let number = group.rank() as f32 + 1.;
+                let sum = Tensor::full([2, 3], f64::from(number), (Kind::Float, Device::Cpu));
+                group.sum(&sum).expect("a sum");
+                let copy = Tensor::from_slice(&[number]);
+                group.copy_from(ranks - 1, &copy).expect("a copy");
+                // Longer from rank to rank, and what JSON has no words for.
+                let said = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
+                let heard = group.gather(said).expect("words");
+                let first = group.from_first(group.is_first().then_some(None::<u64>)).expect("a word");
+                (Vec::<f32>::try_from(sum.view(-1)).unwrap(), copy.double_value(&[0]), heard, first)
+            });
+            let expected = (1..=ranks).sum::<usize>() as f32;
+            for (sum, copy, heard, first) in found {
+                assert_eq!(sum, vec![expected; 6]);
+                assert_eq!(copy, ranks as f64);
+                assert_eq!(first, None);
+                for (rank, (list, number, _)) in heard.iter().enumerate() {
+                    assert!(*list == vec![rank; rank] && number.is_nan(), "{heard:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_rank_that_is_gone_is_an_error() {
+        if !can_meet() {
+            return;
+        }
+        let found = together(2, |group| match group.rank() {
+            0 => Some(group.sum(&Tensor::from_slice(&[1f32]))),
+            _ => None,
+        });
+        let error = found[0].as_ref().unwrap().as_ref().unwrap_err();
+        assert!(error.to_string().starts_with("the processes have lost each other ("), "{error}");
+    }
+
+    /// Gradients of leaves that are used once, in two backward passes of a step, or not at all.
+    #[test]
+    fn gradients_are_added_up_in_buckets() {
+        if !can_meet() {
+            return;
+        }
+        let found = together(3, |group| {
+            let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
+            let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
+            // A bucket for each of the first two, and one for the others.
+            let buckets = Buckets::of_bytes(&group, &leaves, 4 * 5);
+            let mut steps = vec![];
+            for step in 1..3 {
+                for leaf in &leaves {
+                    leaf.grad().defined().then(|| leaf.grad().zero_());
+                }
+                let factor = (step * (group.rank() + 1)) as f64;
+                let pass = |leaf: &Tensor, factor: f64| (leaf * factor).sum(Kind::Float).backward();
+                // Of a slice before the last one: it stays here until the step's end.
+                pass(&leaves[0], factor);
+                buckets.begin();
+                // The other way round than buckets leave.
+                pass(&leaves[1], 10. * factor);
+                pass(&leaves[0], factor);
+                pass(&leaves[2], 100. * factor);
+                let defined = buckets.finish().expect("sums");
+                let sums = leaves[..3].iter().map(|leaf| Vec::<f32>::try_from(leaf.grad()).unwrap());
+                steps.push((defined, sums.collect::<Vec<_>>(), leaves[3].grad().defined()));
+            }
+            steps
+        });
+        for steps in found {
+            for (step, (defined, sums, unused)) in steps.into_iter().enumerate() {
+                let all = 6. * (step + 1) as f32;
+                assert_eq!((defined, unused), (3, false), "a leaf that is not used has no gradient");
+                assert_eq!(sums, [vec![2. * all; 5], vec![10. * all; 3], vec![100. * all; 7]]);
+            }
+        }
+    }
+
+    #[test]
+    fn a_gradient_that_comes_twice_is_refused() {
+        if !can_meet() {
+            return;
+        }
+        let found = together(2, |group| {
+            let leaf = Tensor::from_slice(&[1f32]).set_requires_grad(true);
+            let buckets = Buckets::new(&group, &[leaf.shallow_clone()]);
+            buckets.begin();
+            (&leaf * 1.).backward();
+            (&leaf * 1.).backward();
+            buckets.finish().map_err(|e| e.to_string())
+        });
+        assert!(found.iter().all(|e| e.as_ref().unwrap_err().contains("twice")), "{found:?}");
+    }
+
+    #[test]
+    fn nccl_is_found_in_libtorch() {
+        // It is where libtorch's half for CUDA is, with or without a GPU.
+        // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
+        let cuda = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
+        if cuda.is_null() || !ffi::has_nccl() || tch::Cuda::device_count() > 0 {
+            eprintln!("skipped: NCCL without a GPU: not in this build, or there is one");
+            return;
+        }
+        let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
+        // The constructor itself says so: it has been found and called, and what it throws comes through.
+        let error = ffi::nccl(&store, 0, 1, 60).err().expect("no GPU").to_string();
+        assert!(error.contains("no GPUs found"), "{error}");
+    }
+}

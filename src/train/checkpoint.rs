@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use tch::Tensor;
 
 const FOLDER: &str = "checkpoints";
 const BEST: &str = "best";
@@ -157,15 +158,15 @@ impl Trainer {
         run.join(FOLDER).join(folder_name(self.step))
     }
 
-    /// Saves a checkpoint under `run`, drops the oldest beyond those to keep, and returns where it is.
+    /// Saves a checkpoint under `run`, with the state of `optimizer`, drops the oldest beyond those to keep, and returns where it is.
     ///
     /// # Errors
     /// The system's refusal to write; older checkpoints are left whole.
-    pub fn save(&self, run: &Path) -> Result<PathBuf> {
+    pub(super) fn save(&self, run: &Path, optimizer: &BTreeMap<String, Tensor>) -> Result<PathBuf> {
         let path = self.checkpoint(run);
         replace_dir(&path, &FILES, |folder| {
             save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
-            write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
+            write_weights(&folder.join(OPTIMIZER_FILE), optimizer, Default::default())?;
             let files =
                 [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;

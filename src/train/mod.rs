@@ -7,6 +7,8 @@ mod lock;
 mod metrics;
 mod parameter_groups;
 mod preview;
+#[cfg(test)]
+mod rank_tests;
 mod run;
 mod schedule;
 mod step_report;

@@ -274,8 +274,9 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
 
     /// Returns where the checkpoint is that the first rank has saved, or is about to.
     fn save(&mut self) -> Result<PathBuf> {
+        let optimizer = self.trainer.optimizer_state()?;
         match &self.books {
-            Some(_) => patiently(&mut self.observe, || self.trainer.save(self.out)),
+            Some(_) => patiently(&mut self.observe, || self.trainer.save(self.out, &optimizer)),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }

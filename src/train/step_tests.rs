@@ -19,16 +19,21 @@ use tch::{Device, Kind, Tensor, nn};
 const SIZE: u32 = 32;
 const STAGE: Stage = Stage { index: 2, mix: 0.4 };
 
-/// Three scenes of five context and two target views, pictures of noise.
+/// Three scenes.
 fn sample() -> Sample {
+    Sample::of(&scenes(3), Device::Cpu)
+}
+
+/// Of five context and two target views, pictures of noise.
+pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let intrinsics = Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. };
-    let mut scene = |number: usize| {
+    let scene = |number: usize| {
         let at = |view: usize| DVec3::new(0.1 * view as f64 - 0.2 + 0.3 * number as f64, 0., 0.);
         let camera =
             |view| Camera { intrinsics, c2w: DMat4::from_translation(at(view)), width: SIZE, height: SIZE };
         LoadedScene {
-            name: String::new(),
+            name: format!("noise_{number}"),
             images: (0..5 * 3 * SIZE * SIZE).map(|_| random.random()).collect(),
             size: [SIZE, SIZE].into(),
             cameras: (0..5).map(camera).collect(),
@@ -38,10 +43,10 @@ fn sample() -> Sample {
             times: LoadTimes::default(),
         }
     };
-    Sample::of(&[scene(0), scene(1), scene(2)], Device::Cpu)
+    (0..count).map(scene).collect()
 }
 
-fn config(model: ModelConfig, train: TrainConfig) -> Config {
+pub(super) fn config(model: ModelConfig, train: TrainConfig) -> Config {
     // Factors that let every term count.
     let loss = LossConfig {
         perceptual: PerceptualKind::None,
@@ -54,7 +59,7 @@ fn config(model: ModelConfig, train: TrainConfig) -> Config {
     Config { model, train, loss, ..Default::default() }
 }
 
-fn small() -> ModelConfig {
+pub(super) fn small() -> ModelConfig {
     ModelConfig {
         latents: 12,
         width: 32,
@@ -83,13 +88,27 @@ fn numbers(losses: &Tensor) -> Losses<f64> {
     Losses::unpacked(&Vec::try_from(losses).expect("float64").try_into().expect("all terms"))
 }
 
-/// What `compute` says of, and leaves in, a model whose weights are far enough from the start for its parts to matter.
+/// What `compute` says of, and leaves in, a model that is [`far_from_the_start`].
 fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) -> Step {
+    let mut trainer = far_from_the_start(config);
+    let values = compute(&mut trainer);
+    let variables = trained(&trainer);
+    (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
+}
+
+/// A trainer's variables by their names.
+pub(super) fn trained(trainer: &Trainer) -> BTreeMap<String, Tensor> {
+    let mut variables: BTreeMap<String, Tensor> = trainer.vs.variables().into_iter().collect();
+    variables.retain(|_, variable| variable.requires_grad());
+    variables
+}
+
+/// A trainer of a model whose weights are far enough from the start for its parts to matter; always the same.
+pub(super) fn far_from_the_start(config: &Config) -> Trainer {
     let scenes = Arc::new(Vec::<Capture>::new());
     let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
     let mut random = ChaCha8Rng::seed_from_u64(2);
-    let mut variables: BTreeMap<String, Tensor> = trainer.vs.variables().into_iter().collect();
-    variables.retain(|_, variable| variable.requires_grad());
+    let mut variables = trained(&trainer);
     for (name, variable) in &mut variables {
         let noise: Vec<f32> = (0..variable.numel()).map(|_| random.random_range(-0.15..0.15)).collect();
         let noise = Tensor::from_slice(&noise).view(variable.size().as_slice());
@@ -116,8 +135,7 @@ fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) 
     }
     let mut opacities = variables["gaussian_decoder.geo_param_readout.bias"].view([-1, 10]).select(1, 9);
     let _ = tch::no_grad(|| opacities.g_add_scalar_(4.));
-    let values = compute(&mut trainer);
-    (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
+    trainer
 }
 
 /// Holds losses and gradients against those of another way to compute them; key biases, whose gradient is zero in exact

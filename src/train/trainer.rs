@@ -16,6 +16,7 @@ use crate::model::{GlobalSplat, Stage};
 use crate::optim::{AdamW, Stopwatch};
 use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
@@ -38,6 +39,8 @@ pub struct Trainer {
     /// Those that make every step together, each with samples of its own.
     pub(super) group: Group,
     buckets: Buckets,
+    /// Whether each rank has moments of its share of the parameters alone.
+    shards_optimizer: bool,
 }
 
 /// What ranks tell each other in every step, beside gradients: numbers, which are added up.
@@ -91,6 +94,7 @@ impl Trainer {
             loader,
             group,
             buckets,
+            shards_optimizer: false,
         })
     }
 
@@ -101,6 +105,11 @@ impl Trainer {
             in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
         let buckets = Buckets::new(&group, &parameters);
         Trainer { group, buckets, ..self }
+    }
+
+    /// With the optimizer's moments shared out over the ranks from where the run begins. Checkpoints have all of them.
+    pub fn with_sharded_optimizer(self) -> Self {
+        Trainer { shards_optimizer: true, ..self }
     }
 
     /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. All Gaussians are shown from
@@ -179,6 +188,9 @@ impl Trainer {
             }
             (losses, word, gradient_norm, skipped)
         });
+        if !skipped && !self.optimizer.is_whole() {
+            watch.time("parameters", || self.spread_parameters())?;
+        }
         let [gradients, squares] = word.gradients;
         if gradients * gradients != squares * self.group.ranks() as f64 {
             return Err(Error::Failed(
@@ -222,6 +234,42 @@ impl Trainer {
         Ok(told)
     }
 
+    /// Every rank gets the parameters that others have updated.
+    fn spread_parameters(&self) -> Result<()> {
+        for part in 0..self.group.ranks() {
+            let parameters: Vec<&Tensor> = self.optimizer.of_part(part).collect();
+            let flat = Tensor::cat(&parameters.iter().map(|t| t.detach().view(-1)).collect::<Vec<_>>(), 0);
+            self.group.copy_from(part, &flat)?;
+            if part != self.group.rank() {
+                let sizes: Vec<i64> = parameters.iter().map(|t| t.numel() as i64).collect();
+                for (parameter, value) in parameters.into_iter().zip(flat.split_with_sizes(sizes, 0)) {
+                    parameter.detach().copy_(&value.view_as(parameter));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The optimizer's state, whoever has its parts. All ranks call this; those but the first get nothing to keep.
+    ///
+    /// # Errors
+    /// Another rank that is gone.
+    pub(super) fn optimizer_state(&self) -> Result<BTreeMap<String, Tensor>> {
+        if self.optimizer.is_whole() {
+            return Ok(self.optimizer.state());
+        }
+        self.optimizer.state_by(|moment, shape, part| {
+            let own = part == self.group.rank();
+            let moment = if own {
+                moment.shallow_clone()
+            } else {
+                Tensor::empty(shape, (Kind::Float, self.vs.device()))
+            };
+            self.group.copy_from(part, &moment)?;
+            Ok(if self.group.is_first() { moment.to_device(Device::Cpu) } else { Tensor::new() })
+        })
+    }
+
     /// Every rank counts the bad data that any of them found.
     fn tell_bad_data(&self) -> Result<()> {
         let Some(loader) = &self.loader else { return Ok(()) };
@@ -233,11 +281,25 @@ impl Trainer {
         Ok(())
     }
 
+    /// Has the gradients as they are added up once more, with nothing else to do meanwhile. For benchmarks.
+    ///
+    /// # Errors
+    /// Another rank that is gone.
+    pub(crate) fn add_gradients_up(&self) -> Result<()> {
+        self.buckets.begin();
+        self.buckets.finish().map(|_| ())
+    }
+
+    /// Bytes of the gradients that the last step has left.
+    pub(crate) fn gradient_bytes(&self) -> u64 {
+        self.optimizer.gradients().map(|(_, t)| (t.numel() * t.kind().elt_size_in_bytes()) as u64).sum()
+    }
+
     /// Brings all ranks to where the first one is: its weights, moments and position.
     ///
     /// # Errors
     /// Another rank that is gone.
-    pub(super) fn follow_first(&mut self) -> Result<()> {
+    pub(crate) fn follow_first(&mut self) -> Result<()> {
         let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
         let (step, samples, updates) = self.group.from_first(position)?;
         (self.step, self.samples) = (step, samples);
@@ -248,7 +310,11 @@ impl Trainer {
             .iter()
             .map(|(_, value)| value)
             .chain(moments)
-            .try_for_each(|t| self.group.copy_from_first(t))
+            .try_for_each(|t| self.group.copy_from(0, t))?;
+        if self.shards_optimizer {
+            self.optimizer.become_part(self.group.rank(), self.group.ranks());
+        }
+        Ok(())
     }
 
     /// Leaves the gradient of the sample's loss in the variables, and returns the loss, packed.
