@@ -10,7 +10,7 @@ use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::optim::Stopwatch;
 use crate::ranks::Group;
 use crate::scene::{Camera, ImageSize, Intrinsics};
-use crate::train::Trainer;
+use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -62,16 +62,10 @@ pub struct Together {
     pub apart_milliseconds: Spread,
     /// Of adding all gradients up with nothing else to do meanwhile.
     pub communication_milliseconds: Spread,
+    /// The share of it that was over when the backward pass was, in the step that waited least: others wait for slower ranks, too.
+    pub hidden: f64,
     /// Bytes of the gradients.
     pub gradient_bytes: u64,
-}
-
-impl Together {
-    /// The share of the communication that a step of `milliseconds` hides behind its backward pass.
-    pub fn hidden(&self, milliseconds: f64) -> f64 {
-        let added = milliseconds - self.apart_milliseconds.median;
-        (1. - added / self.communication_milliseconds.median).clamp(0., 1.)
-    }
 }
 
 /// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
@@ -106,9 +100,10 @@ pub fn bench_train(
     let measured = measure(&mut trainer, &scenes, steps, &upload)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let (milliseconds, sections) = measured.told();
-    let together = (ranks > 1).then(|| {
+    let waited = sections.iter().find(|section| section.name == COMMUNICATION);
+    let together = waited.map(|waited| {
         let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
-        together(trainer, &scenes, steps, &upload, scenes_per_second)
+        together(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.least)
     });
     Ok(TrainReport {
         scenes: scenes.len(),
@@ -147,23 +142,26 @@ fn together(
     steps: usize,
     upload: &Upload,
     scenes_per_second: f64,
+    waited: f64,
 ) -> Result<Together> {
     let ranks = trainer.group().ranks();
     let mut communication = Measured::default();
     for step in 0..=steps {
         let mut watch = Stopwatch::of(upload.device());
-        watch.time("communication", || trainer.add_gradients_up())?;
+        watch.time(COMMUNICATION, || trainer.add_gradients_up())?;
         if step > 0 {
             communication.add(&mut watch);
         }
     }
+    let communication = communication.told().0;
     let gradient_bytes = trainer.gradient_bytes();
     let mut apart = trainer.with_ranks(Group::alone());
     Ok(Together {
         ranks,
         scenes_per_second,
         apart_milliseconds: measure(&mut apart, scenes, steps, upload)?.told().0,
-        communication_milliseconds: communication.told().0,
+        communication_milliseconds: communication,
+        hidden: (1. - waited / communication.median).clamp(0., 1.),
         gradient_bytes,
     })
 }

@@ -2,7 +2,7 @@ use super::bench::{print_sections, read_config};
 use super::{print_json, ranks};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{Spread, Together, TrainReport, bench_train};
+use globalsplat::bench::{Together, TrainReport, bench_train};
 use globalsplat::error::Error;
 use serde_json::json;
 use std::path::PathBuf;
@@ -78,11 +78,11 @@ fn print_report(r: &TrainReport) {
     print_sections("ms per step", &r.sections, ("step", &r.milliseconds));
     println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
     if let Some(together) = &r.together {
-        print_together(together, &r.milliseconds);
+        print_together(together);
     }
 }
 
-fn print_together(together: &Together, step: &Spread) {
+fn print_together(together: &Together) {
     let Together { ranks, scenes_per_second, apart_milliseconds, communication_milliseconds, .. } = together;
     println!("{ranks} processes make {scenes_per_second:.2} scenes a second together");
     println!(
@@ -90,6 +90,6 @@ fn print_together(together: &Together, step: &Spread) {
         apart_milliseconds.median,
         together.gradient_bytes as f64 * 1e-6,
         communication_milliseconds.median,
-        1e2 * together.hidden(step.median)
+        1e2 * together.hidden
     );
 }

@@ -7,8 +7,12 @@ use globalsplat_csrc::ranks as ffi;
 use std::fmt;
 use tch::Tensor;
 
-/// Of a bucket: as much as torch's DistributedDataParallel takes at a time.
-const BYTES: i64 = 25 << 20;
+/// Of a bucket at the most: as much as torch's DistributedDataParallel takes at a time.
+const MOST_BYTES: i64 = 25 << 20;
+/// At the least: less takes longer to begin than to send.
+const LEAST_BYTES: i64 = 1 << 20;
+/// Buckets of a small network, so that all but the last can leave while the backward pass goes on.
+const FEW: i64 = 8;
 
 /// The buckets of a network's parameters.
 pub struct Buckets {
@@ -29,7 +33,8 @@ impl Buckets {
     /// # Panics
     /// Parameters that aren't alike, or no leaves.
     pub fn new(group: &Group, parameters: &[Tensor]) -> Self {
-        Buckets::of_bytes(group, parameters, BYTES)
+        let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
+        Buckets::of_bytes(group, parameters, (bytes as i64 / FEW).clamp(LEAST_BYTES, MOST_BYTES))
     }
 
     pub(super) fn of_bytes(group: &Group, parameters: &[Tensor], bytes: i64) -> Self {

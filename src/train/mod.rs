@@ -31,6 +31,8 @@ pub(crate) use curriculum::stage_at;
 pub(crate) use parameter_groups::parameter_groups;
 pub(crate) use schedule::learning_rate;
 pub(crate) use subsets::subsets;
+// For benchmarks.
+pub(crate) use trainer::COMMUNICATION;
 
 /// Whether something that is done every so many steps, or never (0), is done at `step`.
 fn is_due(every: u64, step: u64) -> bool {

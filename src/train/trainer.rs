@@ -21,6 +21,9 @@ use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn};
 
+/// The part of a step in which ranks wait for each other.
+pub(crate) const COMMUNICATION: &str = "communication";
+
 /// Model, optimizer and data of a run.
 #[derive(Debug)]
 pub struct Trainer {
@@ -172,7 +175,7 @@ impl Trainer {
         let losses = self.gradients(sample, stage, watch)?;
         let told = match self.group.ranks() {
             1 => self.add_up(losses, go_on)?,
-            _ => watch.time("communication", || self.add_up(losses, go_on))?,
+            _ => watch.time(COMMUNICATION, || self.add_up(losses, go_on))?,
         };
         // A GPU is still busy with that, and the next samples are on their way when it is done.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
