@@ -371,7 +371,8 @@ impl Trainer {
     fn loader(&mut self) -> Result<&mut Loader> {
         let first = self.samples;
         let loader = match self.loader.take() {
-            Some(loader) if loader.position() == first => loader,
+            // A step's first samples may be another rank's.
+            Some(loader) if loader.position() == self.part().sample(first, 0) => loader,
             _ => {
                 let mut config = self.config.data.clone();
                 if config.threads == 0 {

@@ -18,7 +18,7 @@ impl Part {
     }
 
     /// The number of the sample that comes in this part's turn `turn`, of steps from sample `first` on.
-    pub(super) fn sample(self, first: u64, turn: u64) -> u64 {
+    pub fn sample(self, first: u64, turn: u64) -> u64 {
         let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
         first + step * self.of_step() + (self.batch * self.number) as u64 + within
     }
