@@ -1,7 +1,7 @@
 # globalsplat for any CPU.  docker build -f docker/cpu.Dockerfile -t globalsplat:cpu .
 #   docker run --rm -v "$PWD:/work" -w /work globalsplat:cpu reconstruct --weights model.safetensors --scene capture --out scene.ply
 FROM rust:1-bookworm
-RUN apt-get update && apt-get install -y --no-install-recommends make g++ python3 python3-venv ffmpeg && rm -rf /var/lib/apt/lists/*
+RUN apt-get update && apt-get install -y --no-install-recommends make g++ libgloo-dev python3 python3-venv ffmpeg && rm -rf /var/lib/apt/lists/*
 RUN rustup component add clippy rustfmt
 WORKDIR /opt/globalsplat
 COPY . .

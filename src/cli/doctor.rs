@@ -4,6 +4,7 @@ use clap::Args;
 use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
+use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::SHIPPED_MODEL;
 use globalsplat::render::cpu::simd_level;
 use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
@@ -38,6 +39,7 @@ impl Doctor {
         let (driver, nvrtc) = (Driver::find(), Nvrtc::find());
         let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
+        let together = Backends::built_in();
         if self.json {
             let found: serde_json::Map<_, _> = weights
                 .into_iter()
@@ -59,6 +61,7 @@ impl Doctor {
                 "kernels": cache,
                 "model": SHIPPED_MODEL,
                 "weights": found,
+                "together": { "gloo": together.gloo, "nccl": together.nccl },
             }));
             return Ok(());
         }
@@ -68,6 +71,21 @@ impl Doctor {
         line("devices", &devices.join(", "));
         line("rasterizer", &format!("{simd} (GLOBALSPLAT_SIMD forces another)"));
         line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
+        let of = |built: bool, without: &'static str| if built { "built in" } else { without };
+        line(
+            "torchrun",
+            &format!(
+                "on CPUs Gloo: {}; on GPUs NCCL: {}",
+                of(
+                    together.gloo,
+                    "absent (Debian and Ubuntu: apt install libgloo-dev, touch csrc/build.rs, build again)"
+                ),
+                of(
+                    together.nccl,
+                    "absent (its headers and CUDA's come with libtorch's wheel and requirements.txt)"
+                )
+            ),
+        );
         match &driver {
             Err(why) => line("driver", &format!("absent: {why}")),
             Ok(driver) => {

@@ -35,6 +35,22 @@ fn lost(why: cxx::Exception) -> Error {
     Error::Ranks(why.what().lines().next().unwrap_or_default().to_string())
 }
 
+/// By what ranks can work together in this build.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Backends {
+    /// On CPUs.
+    pub gloo: bool,
+    /// On GPUs.
+    pub nccl: bool,
+}
+
+impl Backends {
+    /// Those whose headers were there when the program was built.
+    pub fn built_in() -> Self {
+        Backends { gloo: ffi::has_gloo(), nccl: ffi::has_nccl() }
+    }
+}
+
 impl Group {
     /// Of a process that has no others.
     pub fn alone() -> Self {
@@ -54,13 +70,14 @@ impl Group {
             ))
         };
         let (rank, ranks) = (place.rank as i32, place.ranks as i32);
+        let Backends { gloo, nccl } = Backends::built_in();
         let inner = match device {
-            Device::Cuda(_) if !ffi::has_nccl() => {
+            Device::Cuda(_) if !nccl => {
                 let install = "install what requirements.txt pins beside libtorch's wheel, or CUDA's and NCCL's headers";
                 return Err(without("NCCL", install));
             }
             Device::Cuda(_) => ffi::nccl(store, rank, ranks, PATIENCE_SECONDS),
-            _ if !ffi::has_gloo() => {
+            _ if !gloo => {
                 return Err(without(
                     "Gloo",
                     "install its headers (Debian and Ubuntu: apt install libgloo-dev)",

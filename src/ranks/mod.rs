@@ -7,7 +7,7 @@ mod place;
 mod watch;
 
 pub use buckets::Buckets;
-pub use group::Group;
+pub use group::{Backends, Group};
 pub use place::Place;
 pub use watch::Watch;
 
