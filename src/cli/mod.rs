@@ -108,7 +108,9 @@ pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            let _ = e.print();
+            if ranks::speaks_before_all_meet() {
+                let _ = e.print();
+            }
             // --help and --version come as errors too, with exit code 0.
             return ExitCode::from(e.exit_code() as u8);
         }

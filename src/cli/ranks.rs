@@ -34,18 +34,22 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
     Ok((Group::join(&place, watch.store(), device)?, device))
 }
 
+/// Whether what concerns all processes alike is this one's to say.
+pub fn speaks_before_all_meet() -> bool {
+    !matches!(Place::of_process(), Ok(Some(Place { rank: 1.., .. })))
+}
+
 /// That torchrun didn't start several of this process, whose work isn't shared out.
 pub fn refuse() -> Result<()> {
-    match Place::of_process() {
-        Ok(Some(Place { ranks, rank: 0, .. })) if std::env::var_os("TORCHELASTIC_RUN_ID").is_some() => {
-            Err(Error::Request(format!(
-                "this is work for one process, and torchrun started {ranks}: expected train, eval --data or bench train"
-            )))
-        }
-        Ok(Some(_)) if std::env::var_os("TORCHELASTIC_RUN_ID").is_some() => {
-            std::process::exit(super::WRONG_REQUEST.into())
-        }
-        _ => Ok(()),
+    let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
+    let Ok(Some(Place { rank, ranks, .. })) = Place::of_process() else { return Ok(()) };
+    match (by_torchrun, rank) {
+        (false, _) => Ok(()),
+        (true, 0) => Err(Error::Request(format!(
+            "this is work for one process, and torchrun started {ranks}: expected train, eval --data or bench train"
+        ))),
+        // The first one says so.
+        (true, _) => std::process::exit(super::WRONG_REQUEST.into()),
     }
 }
 
