@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::net::TcpListener;
+use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -645,4 +646,40 @@ fn bad_data_are_told_of_whichever_rank_finds_them() {
             .collect()
     };
     assert_eq!((judged(&two), judged(&two).len()), (judged(&one), 5));
+}
+
+/// The script for Slurm with a Slurm of one node, this machine, which starts two processes.
+#[test]
+fn slurm_s_script_trains() {
+    let (Some(_turn), Some(torchrun)) = (turn(), torchrun()) else { return };
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/slurm_train.sh");
+    assert!(Command::new("bash").args(["-n", arg(&script)]).status().unwrap().success());
+    let (folder, config) = data(1);
+    let run = folder.path().join("run");
+    let tools = folder.path().join("bin");
+    fs::create_dir(&tools).unwrap();
+    for (name, does) in
+        [("scontrol", "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1"), ("srun", "exec \"$@\"")]
+    {
+        let tool = tools.join(name);
+        fs::write(&tool, format!("#!/bin/sh\n{does}\n")).unwrap();
+        fs::set_permissions(&tool, fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    // Where it is submitted there is a program.
+    let checkout = folder.path().join("checkout");
+    fs::create_dir_all(checkout.join("target/release")).unwrap();
+    symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();
+    let path = format!("{}:{}", tools.display(), std::env::var("PATH").unwrap());
+    let mut job = Command::new(&script);
+    job.args([&config, &run]).args(["--set", "train.steps=2"]).env("PATH", path).env("OMP_NUM_THREADS", "1");
+    for (name, value) in
+        [("JOB_ID", "4321"), ("JOB_NODELIST", "here"), ("NNODES", "1"), ("SUBMIT_DIR", arg(&checkout))]
+    {
+        job.env(format!("SLURM_{name}"), value);
+    }
+    job.env("PROCESSES", "2").env("DEVICE", "cpu").env("TORCHRUN", torchrun);
+    let ended = Started::start(vec![job]).end().remove(0);
+    assert_eq!(ended.code, Some(0), "{}", ended.err);
+    assert!(ended.err.contains("2 processes train together"), "{}", ended.err);
+    assert_eq!(checkpoints(&run).last(), Some(&2));
 }
