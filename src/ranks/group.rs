@@ -8,7 +8,7 @@ use globalsplat_csrc::ranks as ffi;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt;
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Tensor};
 
 /// How long a rank may let the others wait, as it does with a disk that is full.
 pub(super) const PATIENCE_SECONDS: i64 = 30 * 60;
@@ -178,15 +178,5 @@ impl Group {
         let [all] =
             unsafe { handed_over(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }.map_err(lost)?;
         Ok(all.to_device(Device::Cpu))
-    }
-
-    /// The sum of a number over all ranks.
-    ///
-    /// # Errors
-    /// Another rank that is gone.
-    pub fn sum_of(&self, number: f64) -> Result<f64> {
-        let sum = Tensor::from_slice(&[number]).to_device(self.device);
-        self.sum(&sum)?;
-        Ok(sum.to_kind(Kind::Double).double_value(&[0]))
     }
 }

@@ -12,9 +12,10 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Between signs of life.
-const BEAT: Duration = Duration::from_secs(5);
-/// After which a rank is taken for lost.
-const SILENCE: Duration = Duration::from_secs(40);
+const BEAT: Duration = Duration::from_secs(2);
+/// After which a rank is taken for lost. Where torchrun sees one of its processes die it ends the others within 30 seconds, whatever a
+/// GPU keeps them waiting for; this comes before.
+const SILENCE: Duration = Duration::from_secs(25);
 /// For the others to come and meet at all.
 const MEETING_SECONDS: i64 = 300;
 /// A rank that fails says why before its connections close; who only sees them close gives it this much time.

@@ -3,12 +3,13 @@
 use super::step_tests::{config, far_from_the_start, scenes, small, trained};
 use super::{StepReport, Trainer};
 use crate::config::{Config, TrainConfig};
-use crate::data::{LoadedScene, Sample};
+use crate::data::{LoadedScene, Sample, TrainingScenes};
 use crate::loss::Term;
 use crate::optim::Stopwatch;
 use crate::ranks::Group;
 use crate::ranks::tests::{can_meet, together};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use tch::{Device, Tensor};
 
 /// Scenes of a step, all ranks together.
@@ -244,4 +245,32 @@ fn ranks_follow_the_first() {
         "moments that say something"
     );
     assert_eq!((second.2, second.3, second.4), (1, 1, 7));
+}
+
+#[test]
+fn ranks_of_other_configurations_or_scenes_are_refused() {
+    if !can_meet() {
+        return;
+    }
+    // What the second of two ranks says.
+    let refused = |second: fn(Config) -> Trainer| {
+        let mut found = together(2, |group| {
+            let config = training(TrainConfig::default());
+            let trainer = if group.is_first() { far_from_the_start(&config) } else { second(config) };
+            trainer.with_ranks(group).follow_first().map_err(|e| e.to_string())
+        });
+        found.remove(1).expect_err("the second rank goes on")
+    };
+    let other = refused(|mut config| {
+        config.train.learning_rate = 0.5;
+        // Where data lie may differ.
+        config.data.captures = vec!["elsewhere".into()];
+        far_from_the_start(&config)
+    });
+    assert_eq!(other, "this rank's configuration isn't the first one's: train.learning_rate 0.00003 → 0.5");
+    let scenes = refused(|config| {
+        let scenes = TrainingScenes::find(&["synth:seed=1,scenes=3,size=32".into()]).expect("worlds");
+        Trainer::new(&config, Arc::new(scenes), Device::Cpu).expect("a trainer")
+    });
+    assert!(scenes.starts_with("this rank's training scenes aren't the first one's: 3 of"), "{scenes}");
 }

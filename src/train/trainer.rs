@@ -301,8 +301,9 @@ impl Trainer {
     /// Brings all ranks to where the first one is: its weights, moments and position.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Another configuration than the first rank's, other scenes, or another rank that is gone.
     pub(crate) fn follow_first(&mut self) -> Result<()> {
+        self.agree_with_first()?;
         let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
         let (step, samples, updates) = self.group.from_first(position)?;
         (self.step, self.samples) = (step, samples);
@@ -316,6 +317,29 @@ impl Trainer {
             .try_for_each(|t| self.group.copy_from(0, t))?;
         if self.shards_optimizer {
             self.optimizer.become_part(self.group.rank(), self.group.ranks());
+        }
+        Ok(())
+    }
+
+    /// That this rank does what the first one does. Where data lie may differ from machine to machine.
+    fn agree_with_first(&self) -> Result<()> {
+        let own = (self.config.to_toml(), self.scenes.sizes());
+        let (config, scenes) = self.group.from_first(self.group.is_first().then(|| own.clone()))?;
+        let mut changed = changed_keys(&config, &own.0);
+        changed
+            .retain(|change| !change.starts_with("data.captures") && !change.starts_with("data.validation"));
+        if !changed.is_empty() {
+            let changed = changed.join(", ");
+            return Err(Error::Failed(format!("this rank's configuration isn't the first one's: {changed}")));
+        }
+        if scenes != own.1 {
+            let count = |sizes: &[usize]| sizes.iter().sum::<usize>();
+            let (own, first) = (count(&own.1), count(&scenes));
+            return Err(Error::Failed(format!(
+                "this rank's training scenes aren't the first one's: {own} of {} groups, expected {first} of {}",
+                self.scenes.sizes().len(),
+                scenes.len()
+            )));
         }
         Ok(())
     }
