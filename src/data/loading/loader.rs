@@ -64,7 +64,6 @@ type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
 struct Shared {
     config: DataConfig,
     seed: u64,
-    part: Part,
     order: Order,
     groups: OpenGroups,
     ledger: Ledger,
@@ -106,7 +105,6 @@ impl Loader {
         let shared = Arc::new(Shared {
             config: config.clone(),
             seed,
-            part,
             ledger: Ledger::new(order.scenes(), config.max_bad_share),
             order,
             groups: OpenGroups::new(scenes),
@@ -125,15 +123,17 @@ impl Loader {
         for thread in 0..threads as u64 {
             let (sender, receiver) = sync_channel(queue);
             let shared = loader.shared.clone();
-            let turns = (thread..).step_by(threads).map(move |turn| part.sample(first, turn));
+            let turns = (thread..)
+                .step_by(threads)
+                .map(move |turn| (part.sample(first, turn), part.step(first, turn)));
             let work = move || {
                 let mut tools = Tools::default();
-                for sample in turns {
+                for (sample, step) in turns {
                     // Nobody listens any more when the loader is gone.
                     if shared.stopped.load(Ordering::Relaxed) {
                         return;
                     }
-                    let load = AssertUnwindSafe(|| shared.load(sample, &mut tools));
+                    let load = AssertUnwindSafe(|| shared.load(sample, step, &mut tools));
                     let scene = catch_unwind(load).unwrap_or_else(|panic| {
                         let why = panic_message(&*panic);
                         Err(Error::Failed(format!("loading sample {sample} failed inside: {why}")))
@@ -251,13 +251,13 @@ impl Drop for Loader {
 }
 
 impl Shared {
-    /// Sample number `sample`: the scene whose turn it is. In place of one that is bad stands another of its group, or else
+    /// Sample number `sample`, of step `step`: the scene whose turn it is. In place of one that is bad stands another of its group, or else
     /// of the groups that come next.
-    fn load(&self, sample: u64, tools: &mut Tools) -> Result<LoadedScene> {
+    fn load(&self, sample: u64, step: u64, tools: &mut Tools) -> Result<LoadedScene> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
         tools.times = LoadTimes::default();
-        let views = context_views(&self.config, self.seed, sample / self.part.of_step());
+        let views = context_views(&self.config, self.seed, step);
         let (first, groups) = self.order.turn(sample);
         for group in groups {
             let start = Instant::now();

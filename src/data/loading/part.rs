@@ -22,6 +22,12 @@ impl Part {
         let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
         first + step * self.of_step() + (self.batch * self.number) as u64 + within
     }
+
+    /// The number of that turn's step, by the sample that it begins with: the same for all of its samples, wherever a run goes on with
+    /// another number of them.
+    pub(super) fn step(self, first: u64, turn: u64) -> u64 {
+        (first + turn / self.batch as u64 * self.of_step()) / self.of_step()
+    }
 }
 
 /// Whole steps of so many samples.
@@ -34,6 +40,18 @@ impl From<usize> for Part {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn all_samples_of_a_step_know_it() {
+        let whole = Part::from(6);
+        assert_eq!((0..12).map(|turn| whole.step(12, turn)).collect::<Vec<_>>(), [[2; 6], [3; 6]].concat());
+        // Begun where steps of 4 ended.
+        assert_eq!((0..12).map(|turn| whole.step(8, turn)).collect::<Vec<_>>(), [[1; 6], [2; 6]].concat());
+        for number in 0..3 {
+            let part = Part { batch: 2, number, parts: 3 };
+            assert_eq!((0..4).map(|turn| part.step(8, turn)).collect::<Vec<_>>(), [1, 1, 2, 2]);
+        }
+    }
 
     #[test]
     fn parts_share_the_samples_of_every_step_out() {
