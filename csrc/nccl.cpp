@@ -52,6 +52,10 @@ c10::intrusive_ptr<T> constructed(void (*constructor)(void*, Arguments...), std:
 }  // namespace
 
 std::unique_ptr<Group> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
+  // Options have a struct of NCCL's inside, which grows from version to version.
+  int version = 0;
+  loaded<int(int*)>("ncclGetVersion")(&version);
+  TORCH_CHECK(version == NCCL_VERSION_CODE, "built for NCCL ", NCCL_VERSION_CODE, ", libtorch has ", version);
   auto options = constructed<Options>(loaded<void(void*, bool)>("_ZN4c10d16ProcessGroupNCCL7OptionsC1Eb"), false);
   options->timeout = std::chrono::seconds(seconds);
   using Constructor = void(void*, c10::intrusive_ptr<c10d::Store>, int, int, c10::intrusive_ptr<Options>);

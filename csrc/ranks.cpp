@@ -38,16 +38,6 @@ std::unique_ptr<Store> Store::another() const { return std::make_unique<Store>(s
 
 int64_t Store::add(rust::Str key, int64_t amount) const { return store_->add(string(key), amount); }
 
-void Store::set(rust::Str key, rust::Slice<const uint8_t> value) const {
-  store_->set(string(key), std::vector<uint8_t>(value.begin(), value.end()));
-}
-
-rust::Vec<uint8_t> Store::get(rust::Str key) const {
-  rust::Vec<uint8_t> value;
-  for (const uint8_t byte : store_->get(string(key))) value.push_back(byte);
-  return value;
-}
-
 std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust::Str prefix, int64_t seconds) {
   c10d::TCPStoreOptions options;
   options.port = port;

@@ -23,14 +23,11 @@ class Store {
  public:
   explicit Store(c10::intrusive_ptr<c10d::Store> store);
 
-  // A connection of its own, for another thread: an answer that one waits for holds up what else is asked.
+  // A connection of its own, for another thread.
   std::unique_ptr<Store> another() const;
 
   // Adds to a number, at first 0, and returns the sum.
   int64_t add(rust::Str key, int64_t amount) const;
-  void set(rust::Str key, rust::Slice<const uint8_t> value) const;
-  // Waits until somebody has set it.
-  rust::Vec<uint8_t> get(rust::Str key) const;
 
   const c10::intrusive_ptr<c10d::Store>& inner() const { return store_; }
 
@@ -57,6 +54,9 @@ class Group {
   void broadcast(size_t tensor, int32_t from) const;
   // `out` receives a new tensor that the caller owns: what every rank has, one after the other along a new first dimension.
   void all_gather(size_t tensor, rust::Slice<size_t> out) const;
+
+  // After the last call, on all ranks, where all went well: waits for what is under way. Without it NCCL breaks off.
+  void shut_down() const { ranks_->shutdown(); }
 
   const Ranks& ranks() const { return ranks_; }
 

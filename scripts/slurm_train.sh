@@ -30,7 +30,8 @@ first=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 port=$((20000 + SLURM_JOB_ID % 20000))
 
 # Two minutes before its time is over, Slurm sends TERM: the run saves a checkpoint and ends. A process that dies otherwise is started
-# again with all others, which go on from the last checkpoint.
+# again with all others, which meet anew, at a port of their own, and go on from the last checkpoint.
+export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1
 exec srun "${TORCHRUN:-.venv/bin/torchrun}" \
     --nnodes="$SLURM_NNODES" --nproc-per-node="${PROCESSES:-${SLURM_GPUS_ON_NODE:-8}}" \
     --rdzv-backend=c10d --rdzv-endpoint="$first:$port" --rdzv-id="$SLURM_JOB_ID" --max-restarts=3 \

@@ -77,11 +77,32 @@ impl Started {
         Started::start(vec![command])
     }
 
+    /// One rank on each of two machines, which are this one, by torchruns that meet; all are started again once.
+    fn by_two_torchruns(torchrun: &Path, arguments: &[&str]) -> Self {
+        let port = free_port();
+        let machine = || {
+            let mut command = Command::new(torchrun);
+            command.args(["--no-python", "--nnodes=2", "--nproc-per-node=1", "--max-restarts=1"]);
+            command.args(["--rdzv-backend=c10d", "--rdzv-id=test", "--local-addr=127.0.0.1"]);
+            command.arg(format!("--rdzv-endpoint=127.0.0.1:{port}"));
+            // As in scripts/slurm_train.sh.
+            command.env("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1").env("OMP_NUM_THREADS", "1");
+            command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments);
+            command
+        };
+        Started::start(vec![machine(), machine()])
+    }
+
     /// `count` ranks by what all who start processes tell them, and no more.
     fn by_environment(count: usize, arguments: &[&str]) -> Self {
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        Started::by_environment_of(&vec![arguments.to_vec(); count])
+    }
+
+    /// As many ranks as there are lists of arguments.
+    fn by_environment_of(arguments: &[Vec<&str>]) -> Self {
+        let (port, count) = (free_port(), arguments.len());
         let rank = |rank: usize| {
-            let mut command = command(arguments);
+            let mut command = command(&arguments[rank]);
             for (name, value) in [("WORLD_SIZE", count), ("RANK", rank), ("MASTER_PORT", port.into())] {
                 command.env(name, value.to_string());
             }
@@ -130,16 +151,16 @@ impl Started {
         codes.into_iter().enumerate().map(ended).collect()
     }
 
-    /// Waits for the process that torchrun has as rank `rank` since it started all for the `restarts`-th time again.
+    /// Waits for the process that a torchrun has as rank `rank` since it started all for the `restarts`-th time again.
     fn rank(&mut self, rank: usize, restarts: usize) -> u32 {
-        let torchrun = self.processes[0].id();
+        let torchruns: Vec<u32> = self.processes.iter().map(Child::id).collect();
         let variables = [format!("RANK={rank}"), format!("TORCHELASTIC_RESTART_COUNT={restarts}")];
         let is_it = |child: &u32| {
             let environment = fs::read(format!("/proc/{child}/environ")).unwrap_or_default();
             let set: BTreeSet<&[u8]> = environment.split(|byte| *byte == 0).collect();
             variables.iter().all(|variable| set.contains(variable.as_bytes()))
         };
-        self.wait_for("a rank", || children(torchrun).into_iter().find(is_it))
+        self.wait_for("a rank", || torchruns.iter().flat_map(|&of| children(of)).find(is_it))
     }
 }
 
@@ -154,6 +175,10 @@ impl Drop for Started {
             }
         }
     }
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
 /// A process's state and its parent.
@@ -398,6 +423,26 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
     );
 }
 
+#[test]
+fn ranks_of_two_machines_are_started_again() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(4);
+    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
+    let settings = ["train.steps=30", "train.checkpoint_every=4"];
+    succeed_together(2, &text(&train(&config, &whole, &settings)));
+    let mut started = Started::by_two_torchruns(&torchrun, &text(&train(&config, &run, &settings)));
+    started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
+    // Of the first, which keeps the store, everything has to be made anew.
+    let first = started.rank(0, 0);
+    signal(first, libc::SIGKILL);
+    for (machine, ended) in started.end().into_iter().enumerate() {
+        assert_eq!(ended.code, Some(0), "machine {machine}: {}", ended.err);
+    }
+    assert_same_bits(&run, &whole);
+    assert_eq!(numbers(&metrics(&run).0), (0..30).collect::<Vec<_>>(), "every step once");
+}
+
 /// That a checkpoint is being written that is newer than all that are whole.
 fn unfinished_save(run: &Path) -> Option<()> {
     let entries = fs::read_dir(run.join("checkpoints")).ok()?;
@@ -531,6 +576,30 @@ fn a_mistake_is_told_once() {
         let err: String = ended.iter().map(|of| of.err.as_str()).collect();
         let [sentence] = sentences(&err)[..] else { panic!("{setting}: one sentence: {err}") };
         assert!(sentence.contains(expected) && !sentence.contains("lost each other"), "{sentence}");
+    }
+}
+
+#[test]
+fn ranks_that_train_something_else_are_refused() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(2);
+    let (_more, more) = data(3);
+    let run = folder.path().join("run");
+    let mut shards = train(&config, &run, &[]);
+    shards.push("--shard-optimizer".into());
+    let others = [
+        (train(&config, &run, &["train.seed=5"]), "configuration isn't the first one's: train.seed 0 → 5"),
+        (train(&config, &run, &["data.flip=true"]), "data.flip false → true"),
+        (shards, "--shard-optimizer false → true"),
+        (train(&more, &run, &[]), "this rank's training scenes aren't the first one's: 3 of 3"),
+    ];
+    let first = train(&config, &run, &[]);
+    for (other, expected) in others {
+        let ended = Started::by_environment_of(&[text(&first), text(&other)]).end();
+        assert!(ended.iter().all(|of| of.code != Some(0)), "{expected}");
+        let err: String = ended.iter().map(|of| of.err.as_str()).collect();
+        let [sentence] = sentences(&err)[..] else { panic!("{expected}: one sentence: {err}") };
+        assert!(sentence.starts_with("rank 1 of 2: ") && sentence.contains(expected), "{sentence}");
     }
 }
 

@@ -409,6 +409,10 @@ fn a_damaged_checkpoint_is_not_exported() {
 struct Stopped;
 
 impl Validator for Stopped {
+    fn scenes(&self) -> usize {
+        1
+    }
+
     fn validate(&mut self, _: &Trainer, _: &mut dyn FnMut() -> bool) -> Result<Option<Score>, Error> {
         Ok(None)
     }

@@ -28,12 +28,6 @@ mod ffi {
         fn add(self: &Store, key: &str, amount: i64) -> Result<i64>;
 
         /// See `csrc/ranks.h`.
-        fn set(self: &Store, key: &str, value: &[u8]) -> Result<()>;
-
-        /// See `csrc/ranks.h`.
-        fn get(self: &Store, key: &str) -> Result<Vec<u8>>;
-
-        /// See `csrc/ranks.h`.
         fn has_gloo() -> bool;
 
         /// See `csrc/ranks.h`.
@@ -65,6 +59,9 @@ mod ffi {
         /// # Safety
         /// The address of a live tensor.
         unsafe fn all_gather(self: &Group, tensor: usize, out: &mut [usize]) -> Result<()>;
+
+        /// See `csrc/ranks.h`.
+        fn shut_down(self: &Group) -> Result<()>;
 
         /// See `csrc/ranks.h`.
         type Buckets;

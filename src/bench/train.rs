@@ -155,6 +155,7 @@ fn together(
     }
     let communication = communication.told().0;
     let gradient_bytes = trainer.gradient_bytes();
+    trainer.group().leave()?;
     let mut apart = trainer.with_ranks(Group::alone());
     Ok(Together {
         ranks,

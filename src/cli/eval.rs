@@ -221,7 +221,7 @@ impl Eval {
             Some(height) => Input::at(height, self.views_as, trained)?,
             None => Input::PLAIN,
         };
-        if !input.is_plain() {
+        if !input.is_plain() && ranks::is_first() {
             eprintln!("photos are cut and resized to {}", model::shown_as(input, trained));
         }
         Ok(Some(Model { input, ..loaded.into() }))
@@ -315,6 +315,7 @@ impl Eval {
             write_csv(&folder.join("scores.csv"), &evaluation)?;
             evaluations.push((folder, evaluation));
         }
+        group.leave()?;
         if !group.is_first() {
             return Ok(());
         }

@@ -108,7 +108,7 @@ pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            if ranks::speaks_before_all_meet() {
+            if ranks::is_first() {
                 let _ = e.print();
             }
             // --help and --version come as errors too, with exit code 0.
@@ -138,7 +138,7 @@ pub fn main() -> ExitCode {
             FAILED
         }
     };
-    ranks::leave();
+    ranks::leave(code != DONE);
     ExitCode::from(code)
 }
 

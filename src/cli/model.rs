@@ -1,5 +1,6 @@
 //! `--weights`, `--precision f32|bf16` and `--views-at`.
 
+use super::ranks;
 use globalsplat::config::Config;
 use globalsplat::model::Stage;
 use globalsplat::reconstruct::{Input, LoadedModel, SHIPPED_MODEL, ViewsAs, load_model, shipped_model};
@@ -16,6 +17,9 @@ pub fn load(weights: Option<&Path>, precision: &str, device: Device) -> Result<L
         None => shipped_model(device)?,
     };
     loaded.model.set_precision(precision);
+    if !ranks::is_first() {
+        return Ok(loaded);
+    }
     if let Some(assumed) = &loaded.assumed {
         eprintln!("{}: taken for {assumed}; `globalsplat import` can say otherwise", name(weights).display());
     }

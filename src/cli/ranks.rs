@@ -29,13 +29,20 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
         .expect("nothing has used threads yet");
     let device = match name {
         "cuda" => device::parse(&format!("cuda:{}", place.local_rank))?,
+        one if one.starts_with("cuda:") && place.local_ranks > 1 => {
+            let why = format!(
+                "{} processes of this machine can't share a GPU, expected --device cuda",
+                place.local_ranks
+            );
+            return Err(Error::Request(format!("--device {one}: {why}")));
+        }
         name => device::parse(name)?,
     };
     Ok((Group::join(&place, watch.store(), device)?, device))
 }
 
 /// Whether what concerns all processes alike is this one's to say.
-pub fn speaks_before_all_meet() -> bool {
+pub fn is_first() -> bool {
     !matches!(Place::of_process(), Ok(Some(Place { rank: 1.., .. })))
 }
 
@@ -62,8 +69,8 @@ pub fn what_to_tell(message: &str, others_are_lost: bool) -> Option<String> {
 }
 
 /// The last that a process does.
-pub fn leave() {
+pub fn leave(failed: bool) {
     if let Some(watch) = WATCH.get() {
-        watch.leave();
+        watch.leave(failed);
     }
 }

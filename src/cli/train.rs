@@ -102,6 +102,7 @@ impl Train {
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
+        trainer.group().leave()?;
         if !is_first {
             return Ok(());
         }

@@ -174,6 +174,10 @@ fn judge_views(trainer: &Trainer, name: &str, context: &[View], target: &[View])
 }
 
 impl Validator for HeldOut {
+    fn scenes(&self) -> usize {
+        self.scenes.len()
+    }
+
     fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
         self.scores.clear();
         let (mut scores, mut unusable) = (vec![], vec![]);

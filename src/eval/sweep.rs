@@ -112,6 +112,15 @@ impl Sweep<'_> {
                 self.out.display()
             )));
         }
+        for key in &missing {
+            let is_it = |scene: &String| scene == key;
+            if !scenes.iter().any(|scene| is_it(&scene.scores.scene))
+                && !failures.iter().any(|of| is_it(&of.scene))
+            {
+                let error = "the process whose turn it was doesn't have it".into();
+                failures.push(Failure { scene: key.clone(), error });
+            }
+        }
         failures.sort_by_key(|failure| missing.iter().position(|key| *key == failure.scene));
         if let (Some(failure), true) = (failures.first(), scenes.is_empty()) {
             let count = failures.len();

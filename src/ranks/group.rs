@@ -73,7 +73,7 @@ impl Group {
         let Backends { gloo, nccl } = Backends::built_in();
         let inner = match device {
             Device::Cuda(_) if !nccl => {
-                let install = "install what requirements.txt pins beside libtorch's wheel, or CUDA's and NCCL's headers";
+                let install = "install what requirements.txt pins beside libtorch's wheel";
                 return Err(without("NCCL", install));
             }
             Device::Cuda(_) => ffi::nccl(store, rank, ranks, PATIENCE_SECONDS),
@@ -85,7 +85,10 @@ impl Group {
             }
             _ => ffi::gloo(store, rank, ranks, PATIENCE_SECONDS),
         };
-        let inner = Some(inner.map_err(lost)?);
+        let inner = Some(inner.map_err(|e| {
+            let why = e.what().lines().next().unwrap_or_default().to_string();
+            Error::Failed(format!("rank {rank} of {ranks} can't meet the others: {why}"))
+        })?);
         Ok(Group { inner, rank: place.rank, ranks: place.ranks, local_ranks: place.local_ranks, device })
     }
 
@@ -111,6 +114,14 @@ impl Group {
 
     pub(super) fn inner(&self) -> Option<&ffi::Group> {
         self.inner.as_deref()
+    }
+
+    /// After all that ranks do together, where all went well.
+    ///
+    /// # Errors
+    /// Another rank that is gone.
+    pub fn leave(&self) -> Result<()> {
+        self.inner.as_ref().map_or(Ok(()), |inner| inner.shut_down().map_err(lost))
     }
 
     /// Puts the sum over all ranks in place of `tensor`, which has the same shape and kind everywhere.

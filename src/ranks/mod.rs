@@ -155,6 +155,8 @@ pub(crate) mod tests {
         // It is where libtorch's half for CUDA is, with or without a GPU.
         // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
         let cuda = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
+        let without = !cuda.is_null() && !ffi::has_nccl();
+        assert!(!without || std::env::var_os("GLOBALSPLAT_NO_SKIPS").is_none(), "built without NCCL");
         if cuda.is_null() || !ffi::has_nccl() || tch::Cuda::device_count() > 0 {
             eprintln!("skipped: NCCL without a GPU: not in this build, or there is one");
             return;

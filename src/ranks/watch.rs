@@ -6,9 +6,8 @@ use super::place::Place;
 use crate::error::{Error, Result};
 use cxx::UniquePtr;
 use globalsplat_csrc::ranks as ffi;
-use std::sync::Mutex;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
-use std::thread::JoinHandle;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Between signs of life.
@@ -25,13 +24,17 @@ const GRACE: Duration = Duration::from_secs(2);
 pub struct Watch {
     store: UniquePtr<ffi::Store>,
     place: Place,
-    thread: Mutex<Option<(Sender<()>, JoinHandle<()>)>>,
+    /// Dropped, it ends what listens.
+    listening: Mutex<Option<Sender<()>>>,
 }
 
 /// The words that ranks leave for each other.
 mod key {
+    /// How often a rank wanted to say what went wrong.
     pub const SPOKEN: &str = "spoken";
-    /// The number of a rank that is lost, plus 1.
+    /// Ranks that have ended with a failure.
+    pub const FAILED: &str = "failed";
+    /// The number of a rank that gives no sign of life, plus 1.
     pub const LOST: &str = "lost";
 
     pub fn beats(rank: usize) -> String {
@@ -44,33 +47,61 @@ mod key {
 }
 
 impl Watch {
-    /// Connects this rank with the others. `end` is called in another thread, at most once, when a rank gives no sign of life any
-    /// more, with a sentence on that if this rank is to say it.
+    /// Connects this rank with the others. `end` is called in another thread when the others can't be worked with any more, with a
+    /// sentence on why if this rank is to say it; it doesn't return.
     ///
     /// # Errors
     /// A store that can't be reached.
-    pub fn begin(place: &Place, end: impl FnOnce(Option<String>) + Send + 'static) -> Result<Self> {
+    pub fn begin(place: &Place, end: fn(Option<String>)) -> Result<Self> {
         let serves = !place.store_is_kept && place.rank == 0;
-        let prefix = format!("globalsplat/{}", place.restarts);
-        let store = ffi::connect(&place.host, place.port, serves, &prefix, MEETING_SECONDS);
+        // A store that torchrun keeps is the same after a restart.
+        let round = if place.store_is_kept { place.restarts } else { 0 };
+        let store =
+            ffi::connect(&place.host, place.port, serves, &format!("globalsplat/{round}"), MEETING_SECONDS);
         let store = store.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
             let Place { rank, ranks, host, port, .. } = place;
             Error::Failed(format!("rank {rank} of {ranks} can't reach the others at {host}:{port}: {why}"))
         })?;
         let (sender, receiver) = channel();
-        let own = Watch { store: store.another()?, place: place.clone(), thread: Mutex::default() };
+        let listening = Mutex::new(Some(sender));
+        let own = Watch { store: store.another()?, place: place.clone(), listening: Mutex::default() };
+        // A store whose machine is gone leaves who asks it waiting, so another thread looks at when it last answered.
+        let answered = Arc::new(Mutex::new(Some(Instant::now())));
+        let last = answered.clone();
         let listen = move || {
             let mut others = Others::of(&own.place);
-            while receiver.recv_timeout(BEAT) == Err(RecvTimeoutError::Timeout) {
-                if let Some(why) = others.lost(&own.store) {
-                    return end(own.speak(&why));
+            loop {
+                match others.lost(&own.store) {
+                    Some(why) => return end(own.speak(&why)),
+                    None => *last.lock().expect("no thread panics here") = Some(Instant::now()),
+                }
+                if receiver.recv_timeout(BEAT) != Err(RecvTimeoutError::Timeout) {
+                    break;
                 }
             }
+            *last.lock().expect("no thread panics here") = None;
         };
-        let thread = std::thread::Builder::new().name("watch".into()).spawn(listen);
-        let thread = thread.map_err(|e| Error::Failed(format!("a thread can't be started: {e}")))?;
-        Ok(Watch { store, place: place.clone(), thread: Mutex::new(Some((sender, thread))) })
+        let says = place.local_rank == 0;
+        let check = move || {
+            while let Some(last) = { *answered.lock().expect("no thread panics here") } {
+                if last.elapsed() > SILENCE {
+                    let seconds = SILENCE.as_secs();
+                    let why = format!(
+                        "the store through which the processes meet has not answered for {seconds} seconds"
+                    );
+                    return end(says.then_some(why));
+                }
+                std::thread::sleep(BEAT);
+            }
+        };
+        for (name, work) in
+            [("listen", Box::new(listen) as Box<dyn FnOnce() + Send>), ("check", Box::new(check))]
+        {
+            let thread = std::thread::Builder::new().name(name.into()).spawn(work);
+            thread.map_err(|e| Error::Failed(format!("a thread can't be started: {e}")))?;
+        }
+        Ok(Watch { store, place: place.clone(), listening })
     }
 
     /// Through which ranks meet.
@@ -87,27 +118,29 @@ impl Watch {
     }
 
     fn speak(&self, why: &str) -> Option<String> {
-        // A store that is gone can't tell who spoke.
-        let spoken = self.store.add(key::SPOKEN, 1).is_ok_and(|times| times > 1);
+        let speaks = match self.store.add(key::SPOKEN, 1) {
+            Ok(times) => times == 1,
+            // A store that is gone can't tell who spoke.
+            Err(_) => self.place.local_rank == 0,
+        };
         let who = match self.place.rank {
             0 => String::new(),
             rank => format!("rank {rank} of {}: ", self.place.ranks),
         };
-        (!spoken).then(|| who + why)
+        speaks.then(|| who + why)
     }
 
-    /// This rank's silence means nothing from here on. Whoever keeps the store waits until the others have left, too.
-    pub fn leave(&self) {
-        let Some((sender, thread)) = self.thread.lock().expect("no thread panics here").take() else {
-            return;
-        };
-        drop(sender);
-        let _ = thread.join();
-        let _ = self.store.add(&key::left(self.place.rank), 1);
+    /// The last that this rank does: from here on its silence means nothing, or that it `failed`, and then the others end, too. Whoever
+    /// keeps the store waits until they have heard.
+    pub fn leave(&self, failed: bool) {
+        let Some(_listening) = self.listening.lock().expect("no thread panics here").take() else { return };
+        let left = key::left(self.place.rank);
+        let _ = self.store.add(if failed { key::FAILED } else { &left }, 1);
         if !self.place.store_is_kept && self.place.rank == 0 {
+            let patience = if failed { 2 * BEAT } else { SILENCE };
             let has_left = |rank| !matches!(self.store.add(&key::left(rank), 0), Ok(0));
             let since = Instant::now();
-            while since.elapsed() < SILENCE && !(1..self.place.ranks).all(has_left) {
+            while since.elapsed() < patience && !(1..self.place.ranks).all(has_left) {
                 std::thread::sleep(Duration::from_millis(20));
             }
         }
@@ -129,30 +162,36 @@ impl Others {
         Others { rank: place.rank, ranks: place.ranks, heard }
     }
 
-    /// Gives a sign of life, and tells of a rank that gives none.
+    /// Gives a sign of life, and tells why the others can't be worked with any more, if so.
     fn lost(&mut self, store: &ffi::Store) -> Option<String> {
         match self.listen(store) {
-            Ok(None) => None,
-            Ok(Some(rank)) => {
-                let seconds = SILENCE.as_secs();
-                Some(format!("rank {rank} of {} gave no sign of life for {seconds} seconds", self.ranks))
-            }
-            Err(_) => Some("the store through which the processes meet is gone, and torchrun with it".into()),
+            Ok(found) => found,
+            Err(_) => Some("the store through which the processes meet is gone, and who kept it, too".into()),
         }
     }
 
-    fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<usize>, cxx::Exception> {
+    fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<String>, cxx::Exception> {
         store.add(&key::beats(self.rank), 1)?;
+        if store.add(key::FAILED, 0)? > 0 {
+            // It has spoken before.
+            return Ok(Some("another process has failed".into()));
+        }
+        let silent = |rank: usize| {
+            let (ranks, seconds) = (self.ranks, SILENCE.as_secs());
+            Some(format!("rank {rank} of {ranks} gave no sign of life for {seconds} seconds"))
+        };
         if let rank @ 1.. = store.add(key::LOST, 0)? {
-            return Ok(Some(rank as usize - 1));
+            return Ok(silent(rank as usize - 1));
         }
         for (rank, beats, last) in &mut self.heard {
             let now = store.add(&key::beats(*rank), 0)?;
+            // Machines don't start at the same time.
+            let patience = if *beats == 0 { Duration::from_secs(MEETING_SECONDS as u64) } else { SILENCE };
             if now != *beats || store.add(&key::left(*rank), 0)? > 0 {
                 (*beats, *last) = (now, Instant::now());
-            } else if last.elapsed() > SILENCE {
+            } else if last.elapsed() > patience {
                 store.add(key::LOST, *rank as i64 + 1)?;
-                return Ok(Some(*rank));
+                return Ok(silent(*rank));
             }
         }
         Ok(None)

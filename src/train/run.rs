@@ -77,6 +77,15 @@ pub fn run(
     let writes = trainer.group.is_first();
     let begun = writes.then(|| Books::open(trainer, out, resume, &mut observe)).transpose()?;
     trainer.follow_first()?;
+    let held_out = validator.as_ref().map(|validator| validator.scenes());
+    let expected = trainer.group.from_first(writes.then_some(held_out))?;
+    if held_out != expected {
+        let count = |scenes: Option<usize>| scenes.unwrap_or(0);
+        let (found, expected) = (count(held_out), count(expected));
+        return Err(Error::Failed(format!(
+            "this rank has {found} held-out scenes, expected {expected}, as the first one"
+        )));
+    }
     let validated = begun.as_ref().map(|(books, _)| books.metrics.last_validation());
     let validated = trainer.group.from_first(validated)?;
     let saved = begun.as_ref().map(|(_, saved)| saved.clone());

@@ -103,7 +103,9 @@ impl Trainer {
 
     /// Together with other processes: `train.batch` is of each of them, and a step is that of one alone with as many samples as
     /// all have.
-    pub fn with_ranks(self, group: Group) -> Self {
+    pub fn with_ranks(mut self, group: Group) -> Self {
+        // Parameters tell one set of buckets alone.
+        self.buckets = Buckets::new(&Group::alone(), &[]);
         let parameters: Vec<Tensor> =
             in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
         let buckets = Buckets::new(&group, &parameters);
@@ -241,6 +243,9 @@ impl Trainer {
     fn spread_parameters(&self) -> Result<()> {
         for part in 0..self.group.ranks() {
             let parameters: Vec<&Tensor> = self.optimizer.of_part(part).collect();
+            if parameters.is_empty() {
+                continue;
+            }
             let flat = Tensor::cat(&parameters.iter().map(|t| t.detach().view(-1)).collect::<Vec<_>>(), 0);
             self.group.copy_from(part, &flat)?;
             if part != self.group.rank() {
@@ -323,11 +328,16 @@ impl Trainer {
 
     /// That this rank does what the first one does. Where data lie may differ from machine to machine.
     fn agree_with_first(&self) -> Result<()> {
-        let own = (self.config.to_toml(), self.scenes.sizes());
-        let (config, scenes) = self.group.from_first(self.group.is_first().then(|| own.clone()))?;
+        let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
+        let (config, scenes, shards) = self.group.from_first(self.group.is_first().then(|| own.clone()))?;
         let mut changed = changed_keys(&config, &own.0);
-        changed
-            .retain(|change| !change.starts_with("data.captures") && !change.starts_with("data.validation"));
+        // A change reads `key first → own`.
+        changed.retain(|change| {
+            !["data.captures ", "data.validation "].iter().any(|key| change.starts_with(key))
+        });
+        if shards != own.2 {
+            changed.push(format!("--shard-optimizer {shards} → {}", own.2));
+        }
         if !changed.is_empty() {
             let changed = changed.join(", ");
             return Err(Error::Failed(format!("this rank's configuration isn't the first one's: {changed}")));

@@ -21,6 +21,9 @@ pub struct Score {
 
 /// Judges a model by what training never shows.
 pub trait Validator {
+    /// How many scenes it looks at, by which ranks see that they look at the same.
+    fn scenes(&self) -> usize;
+
     /// The score of the model as it is now; none where `go_on`, which is called now and then, says no.
     ///
     /// # Errors
