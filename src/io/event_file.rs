@@ -135,7 +135,7 @@ fn record(message: &Message) -> Vec<u8> {
 }
 
 /// A checksum of data that may hold checksums themselves.
-fn masked_crc32c(bytes: &[u8]) -> u32 {
+pub(super) fn masked_crc32c(bytes: &[u8]) -> u32 {
     crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 

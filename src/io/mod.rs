@@ -4,6 +4,7 @@ mod append;
 mod atomic;
 mod environment;
 mod event_file;
+mod event_reader;
 mod film;
 mod images;
 mod npy;
@@ -38,6 +39,7 @@ pub(crate) use append::AppendFile;
 pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
+pub(crate) use event_reader::{EventReader, read_picture};
 pub(crate) use images::{
     PHOTO_EXTENSIONS, encode_photo, encoded_image_size, enlarge, read_image_size, rgb_from_tensor, write_jpeg,
 };

@@ -107,6 +107,40 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
     }
 }
 
+/// A checkpoint as it is told to people.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Kept {
+    /// Its folder in the run's.
+    pub name: String,
+    /// Steps done.
+    pub step: u64,
+    /// Of its files together.
+    pub bytes: u64,
+    /// Seconds since it was saved.
+    pub age: u64,
+    /// Of the best checkpoint: what validation found, in dB.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr: Option<f64>,
+}
+
+/// The run's checkpoints, oldest first, and its best one. What is being replaced meanwhile is left out.
+pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
+    let told = |path: &PathBuf| {
+        let state = read_state(path).ok()?;
+        let saved = fs::metadata(path.join(STATE_FILE)).and_then(|file| file.modified()).ok()?;
+        Some(Kept {
+            name: path.strip_prefix(run).unwrap_or(path).display().to_string(),
+            step: state.step,
+            bytes: state.files.values().map(|(bytes, _)| bytes).sum(),
+            // A clock that was set back.
+            age: saved.elapsed().unwrap_or_default().as_secs(),
+            psnr: state.validation.map(|validation| validation.psnr),
+        })
+    };
+    let checkpoints = list_checkpoints(run).unwrap_or_default();
+    (checkpoints.iter().filter_map(told).collect(), told(&run.join(BEST)))
+}
+
 /// Puts right what a run that was killed within a save left.
 ///
 /// # Errors

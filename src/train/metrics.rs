@@ -5,6 +5,7 @@ use super::validator::Score;
 use crate::error::{Error, Result};
 use crate::io::{AppendFile, write_atomically};
 use crate::loss::Term;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -27,6 +28,31 @@ pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'stat
 /// The terms of a step's loss, by name.
 pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL.len()] {
     Term::ALL.map(|term| (term.name(), report.losses[term]))
+}
+
+/// What is read of a line: of a step, or, with `validation`, of what was found after it. A number that wasn't finite is absent.
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Line {
+    pub step: u64,
+    #[serde(default)]
+    pub skipped: bool,
+    pub loss: Option<f64>,
+    pub psnr: Option<f64>,
+    pub learning_rate: Option<f64>,
+    #[serde(default)]
+    pub stage: u32,
+    pub mix: Option<f64>,
+    pub samples_per_second: Option<f64>,
+    /// Of a step that was skipped: what it showed.
+    #[serde(default)]
+    pub scenes: Vec<String>,
+    pub validation: Option<ValidationLine>,
+}
+
+/// What validation found.
+#[derive(Debug, Deserialize)]
+pub(super) struct ValidationLine {
+    pub psnr: Option<f64>,
 }
 
 /// `metrics.jsonl`, which steps and validations are added to.
@@ -113,14 +139,12 @@ impl Curves {
     pub fn read(run: &Path, parts: u64) -> Result<Self> {
         let path = run.join(METRICS_FILE);
         let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
-        let lines = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
         let (mut steps, mut held_out) = (vec![], vec![]);
         for line in lines {
-            let Some(step) = line["step"].as_u64() else { continue };
-            match (line["validation"]["psnr"].as_f64(), line["psnr"].as_f64()) {
-                (Some(psnr), _) => held_out.push((step, psnr)),
-                (None, Some(psnr)) => steps.push((step, psnr)),
-                (None, None) => {}
+            match line.validation {
+                Some(validation) => held_out.extend(validation.psnr.map(|psnr| (line.step, psnr))),
+                None => steps.extend(line.psnr.map(|psnr| (line.step, psnr))),
             }
         }
         if steps.is_empty() {

@@ -18,13 +18,15 @@ mod subsets;
 mod tensorboard;
 mod trainer;
 mod validator;
+mod watch;
 
-pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use checkpoint::{Kept, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use metrics::Curves;
 pub use run::{Event, Outcome, Resume, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};
+pub use watch::{RunCurves, RunState, WatchedRun};
 
 // For the parity checks, which run every part by itself.
 pub(crate) use curriculum::stage_at;

@@ -6,11 +6,25 @@ use super::step_report::StepReport;
 use super::validator::Score;
 use crate::error::{Error, Result};
 use crate::io::EventFile;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "tensorboard";
 /// TensorBoard reads a folder's files in the order of their names, so each has its number.
 const PREFIX: &str = "events.out.tfevents.";
+
+/// The number in the name of one of our files.
+fn number_of(file: &Path) -> Option<u64> {
+    file.file_name()?.to_str()?.strip_prefix(PREFIX)?.parse().ok()
+}
+
+/// The files in the folder `run`, oldest first; none where there is none, or where they can't be listed.
+pub(super) fn event_files(run: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(run.join(FOLDER)).into_iter().flatten().flatten();
+    let mut files: Vec<_> =
+        entries.filter_map(|entry| Some((number_of(&entry.path())?, entry.path()))).collect();
+    files.sort();
+    files.into_iter().map(|(_, file)| file).collect()
+}
 
 /// The file of this start.
 #[derive(Debug)]
@@ -27,8 +41,7 @@ impl TensorBoard {
         std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
         let mut number = 0;
         for entry in std::fs::read_dir(&folder).map_err(Error::read(&folder))? {
-            let name = entry.map_err(Error::read(&folder))?.file_name();
-            let of: Option<u64> = name.to_str().and_then(|name| name.strip_prefix(PREFIX)?.parse().ok());
+            let of = number_of(&entry.map_err(Error::read(&folder))?.path());
             number = number.max(of.map_or(0, |of| of + 1));
         }
         Ok(TensorBoard { file: EventFile::create(&folder.join(format!("{PREFIX}{number:010}")))?, every })

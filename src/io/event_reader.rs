@@ -1,0 +1,228 @@
+//! Event files from behind: what another process has written so far, and its pictures.
+
+use super::event_file::masked_crc32c;
+use crate::error::{Error, Result};
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// A longer record isn't one of ours: it is stepped over.
+const LONGEST: u64 = 64 << 20;
+/// Of a record, before its message: the length, and the checksum of that.
+const HEAD: usize = 12;
+/// Of a record, after its message: a checksum.
+const TAIL: u64 = 4;
+const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
+
+/// Something that an event file tells.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SeenEvent {
+    pub step: u64,
+    /// When it was written, in seconds since 1970.
+    pub wall_time: f64,
+    /// Whether the run begins here: what was told before of this step and later ones is void.
+    pub is_start: bool,
+    /// Where in the file it begins, if it has a picture.
+    pub picture: Option<u64>,
+}
+
+/// A file that may still grow, read from where it was left.
+#[derive(Debug)]
+pub struct EventReader {
+    path: PathBuf,
+    position: u64,
+}
+
+impl EventReader {
+    /// Of the file at `path`, which is opened when it is read.
+    pub fn new(path: &Path) -> Self {
+        EventReader { path: path.to_owned(), position: 0 }
+    }
+
+    /// Whether the file is no longer the one that was read: gone, or shorter.
+    pub fn is_void(&self) -> bool {
+        std::fs::metadata(&self.path).map_or(true, |file| file.len() < self.position)
+    }
+
+    /// What was added since the last time. Half a record is left for the next one; behind a damaged one there is nothing.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn read_new(&mut self) -> Result<Vec<SeenEvent>> {
+        let read = || Error::read(&self.path);
+        let file = File::open(&self.path).map_err(read())?;
+        let end = file.metadata().map_err(read())?.len();
+        let mut file = BufReader::new(file);
+        file.seek(SeekFrom::Start(self.position)).map_err(read())?;
+        let mut found = vec![];
+        while end - self.position >= HEAD as u64 {
+            let Some(length) = read_head(&mut file).map_err(read())? else { break };
+            let whole = length.saturating_add(HEAD as u64 + TAIL);
+            if whole > end - self.position {
+                break;
+            }
+            if length > LONGEST {
+                file.seek_relative((length + TAIL) as i64).map_err(read())?;
+            } else {
+                let mut message = vec![0; length as usize];
+                file.read_exact(&mut message).map_err(read())?;
+                file.seek_relative(TAIL as i64).map_err(read())?;
+                found.extend(event(&message, self.position));
+            }
+            self.position += whole;
+        }
+        Ok(found)
+    }
+}
+
+/// The PNG in the event that begins `at` bytes into the file, if there is one.
+///
+/// # Errors
+/// The system's refusal.
+pub fn read_picture(path: &Path, at: u64) -> Result<Option<Vec<u8>>> {
+    let mut file = File::open(path).map_err(Error::read(path))?;
+    file.seek(SeekFrom::Start(at)).map_err(Error::read(path))?;
+    let Some(length) = read_head(&mut file).map_err(Error::read(path))? else { return Ok(None) };
+    let mut message = vec![];
+    file.take(length.min(LONGEST)).read_to_end(&mut message).map_err(Error::read(path))?;
+    Ok(png(&message).map(<[u8]>::to_vec))
+}
+
+/// The length of the message that follows; none where the checksum says that it is no length.
+fn read_head(file: &mut impl Read) -> std::io::Result<Option<u64>> {
+    let mut head = [0; HEAD];
+    file.read_exact(&mut head)?;
+    let (length, sum) = head.split_at(8);
+    let is_right = masked_crc32c(length).to_le_bytes() == sum;
+    Ok(is_right.then(|| u64::from_le_bytes(length.try_into().expect("eight bytes"))))
+}
+
+fn event(message: &[u8], at: u64) -> Option<SeenEvent> {
+    let mut event = SeenEvent { step: 0, wall_time: 0., is_start: false, picture: None };
+    for (number, field) in Fields(message) {
+        match (number, field) {
+            (1, Field::Eight(bytes)) => event.wall_time = f64::from_le_bytes(bytes),
+            (2, Field::Varint(step)) => event.step = step,
+            // The format's version tells of no step.
+            (3, _) => return None,
+            (7, _) => event.is_start = true,
+            _ => {}
+        }
+    }
+    event.picture = png(message).map(|_| at);
+    Some(event)
+}
+
+/// Summary.value.image.encoded_image_string of an event, if it is a PNG.
+fn png(event: &[u8]) -> Option<&[u8]> {
+    [5, 1, 4, 4]
+        .into_iter()
+        .try_fold(event, |message, wanted| {
+            Fields(message).find_map(|(number, field)| match field {
+                Field::Bytes(bytes) if number == wanted => Some(bytes),
+                _ => None,
+            })
+        })
+        .filter(|bytes| bytes.starts_with(PNG))
+}
+
+/// A protobuf message's fields with their numbers, up to where it is no such message.
+struct Fields<'a>(&'a [u8]);
+
+enum Field<'a> {
+    Varint(u64),
+    Eight([u8; 8]),
+    Bytes(&'a [u8]),
+    Four,
+}
+
+impl<'a> Fields<'a> {
+    fn varint(&mut self) -> Option<u64> {
+        let mut value = 0;
+        for shift in (0..64).step_by(7) {
+            let (&byte, rest) = self.0.split_first()?;
+            self.0 = rest;
+            value |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return Some(value);
+            }
+        }
+        None
+    }
+
+    fn take(&mut self, count: u64) -> Option<&'a [u8]> {
+        let (taken, rest) = self.0.split_at_checked(usize::try_from(count).ok()?)?;
+        self.0 = rest;
+        Some(taken)
+    }
+}
+
+impl<'a> Iterator for Fields<'a> {
+    type Item = (u64, Field<'a>);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let key = self.varint()?;
+        let field = match key & 7 {
+            0 => Field::Varint(self.varint()?),
+            1 => Field::Eight(self.take(8)?.try_into().ok()?),
+            2 => {
+                let length = self.varint()?;
+                Field::Bytes(self.take(length)?)
+            }
+            5 => self.take(4).map(|_| Field::Four)?,
+            _ => return None,
+        };
+        Some((key >> 3, field))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::event_file::EventFile;
+    use super::*;
+    use tch::{Device, Kind, Tensor};
+
+    #[test]
+    fn what_was_written_is_read_while_it_grows() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tfevents");
+        let mut file = EventFile::create(&path).unwrap();
+        file.start(7).unwrap();
+        file.scalars(8, &[("train/psnr".into(), 12.5)]).unwrap();
+        let mut reader = EventReader::new(&path);
+        let seen = reader.read_new().unwrap();
+        assert_eq!(seen.iter().map(|e| (e.step, e.is_start)).collect::<Vec<_>>(), [(7, true), (8, false)]);
+        assert!(seen.iter().all(|event| event.wall_time > 1.7e9 && event.picture.is_none()));
+
+        // A record that is half there waits for its other half.
+        file.picture(9, "train/views", &Tensor::zeros([3, 4, 5], (Kind::Float, Device::Cpu))).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &whole[..whole.len() - 9]).unwrap();
+        assert_eq!(reader.read_new().unwrap(), []);
+        std::fs::write(&path, &whole).unwrap();
+        let seen = reader.read_new().unwrap();
+        let picture = read_picture(&path, seen[0].picture.unwrap()).unwrap().unwrap();
+        let picture = image::load_from_memory(&picture).unwrap();
+        assert_eq!((seen[0].step, picture.width(), picture.height()), (9, 5, 4));
+        assert_eq!(reader.read_new().unwrap(), []);
+        assert!(!reader.is_void());
+
+        // Nothing behind a damaged length is believed.
+        std::fs::write(&path, [&whole[..], &[255; 40]].concat()).unwrap();
+        assert_eq!(reader.read_new().unwrap(), []);
+        assert_eq!(read_picture(&path, whole.len() as u64).unwrap(), None);
+        std::fs::write(&path, &whole[..20]).unwrap();
+        assert!(reader.is_void());
+    }
+
+    #[test]
+    fn no_bytes_are_too_odd() {
+        for length in 0..40 {
+            for byte in [0, 0x0a, 0x2a, 0x7f, 0x80, 0xff] {
+                let message = vec![byte; length];
+                assert!(png(&message).is_none());
+                let _ = event(&message, 0);
+            }
+        }
+    }
+}
