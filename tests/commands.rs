@@ -30,6 +30,7 @@ fn who_reads_no_further_is_told_nothing() {
 fn every_command_helps_with_an_example() {
     for command in [
         "train",
+        "watch",
         "eval",
         "report",
         "reconstruct",

@@ -28,6 +28,7 @@ mod render;
 mod report;
 mod synth;
 mod train;
+mod watch;
 mod weights_out;
 
 use clap::{Parser, Subcommand};
@@ -54,6 +55,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Train(train::Train),
+    Watch(watch::Watch),
     Eval(eval::Eval),
     Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
@@ -75,6 +77,7 @@ impl Command {
     fn run(self) -> anyhow::Result<()> {
         match self {
             Command::Train(command) => command.run(),
+            Command::Watch(command) => command.run(),
             Command::Eval(command) => command.run(),
             Command::Report(command) => command.run(),
             Command::Reconstruct(command) => command.run(),

@@ -1,0 +1,126 @@
+//! Who may ask what, and what is answered.
+
+use super::page;
+use anyhow::{Result, bail};
+use globalsplat::error::Error;
+use globalsplat::train::WatchedRun;
+use oxhttp::Server;
+use oxhttp::model::header::{
+    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, REFERRER_POLICY,
+    X_CONTENT_TYPE_OPTIONS,
+};
+use oxhttp::model::{Body, Method, Request, Response, StatusCode};
+use serde_json::json;
+use std::io::ErrorKind;
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+/// Who says nothing for so long is hung up on.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// A page keeps up to six.
+const CONNECTIONS: usize = 64;
+/// A free port may be taken by somebody else before it is ours.
+const TRIES: usize = 8;
+
+const TEXT: &str = "text/plain; charset=utf-8";
+
+/// Serves `run` from now on and as long as the process lives, on `port` or, where that is 0, a free one, and returns the
+/// page's address.
+///
+/// # Errors
+/// A port that is in use, or that the system refuses.
+pub fn serve(run: WatchedRun, port: u16) -> Result<String> {
+    let run = std::sync::Arc::new(Mutex::new(run));
+    for _ in 0..TRIES {
+        // The server doesn't tell which port it was given.
+        let chosen = match port {
+            0 => TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
+            port => port,
+        };
+        let run = run.clone();
+        let server = Server::new(move |request| answer(request, chosen, &run))
+            .bind((Ipv4Addr::LOCALHOST, chosen))
+            .with_global_timeout(PATIENCE)
+            .with_max_concurrent_connections(CONNECTIONS);
+        match server.spawn() {
+            Ok(_) => return Ok(format!("http://{}:{chosen}/", Ipv4Addr::LOCALHOST)),
+            Err(e) if port == 0 && e.kind() == ErrorKind::AddrInUse => {}
+            Err(e) => {
+                let found = format!("{chosen}, which can't be listened on ({e})");
+                return Err(Error::setting("--port", found, "a free one, or 0 to have one chosen").into());
+            }
+        }
+    }
+    bail!("no free port was found in {TRIES} tries")
+}
+
+fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Response<Body> {
+    if !is_meant_for_us(request, port) {
+        return refuse(StatusCode::FORBIDDEN, "this page is for browsers on the machine that serves it");
+    }
+    if ![Method::GET, Method::HEAD].contains(request.method()) {
+        let mut answer =
+            refuse(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD: nothing can be changed here");
+        answer.headers_mut().insert(ALLOW, "GET, HEAD".parse().expect("two methods"));
+        return answer;
+    }
+    // A reader that panicked left nothing that isn't read again.
+    let mut run = run.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut answer = match request.uri().path() {
+        "/" => {
+            let page = page::Page::new();
+            let mut answer = send(StatusCode::OK, "text/html; charset=utf-8", page.html);
+            let policy = page.policy.parse().expect("ASCII");
+            answer.headers_mut().insert(CONTENT_SECURITY_POLICY, policy);
+            answer
+        }
+        "/state" => match run.look().map_err(|e| e.to_string()).and_then(|state| {
+            serde_json::to_string(&state).map_err(|e| format!("the run can't be told in JSON: {e}"))
+        }) {
+            Ok(state) => send(StatusCode::OK, "application/json", state),
+            Err(e) => {
+                let error = json!({"error": e}).to_string();
+                send(StatusCode::INTERNAL_SERVER_ERROR, "application/json", error)
+            }
+        },
+        path => match step_of(path).map(|step| run.picture(step)) {
+            Some(Ok(Some(png))) => send(StatusCode::OK, "image/png", png),
+            Some(Err(e)) => refuse(StatusCode::INTERNAL_SERVER_ERROR, &e.to_string()),
+            Some(Ok(None)) | None => refuse(StatusCode::NOT_FOUND, "there is nothing here"),
+        },
+    };
+    if request.method() == Method::HEAD {
+        *answer.body_mut() = Body::empty();
+    }
+    answer
+}
+
+/// Whether the browser knows that it speaks to its own machine. One that was told that a stranger's name means this address
+/// (DNS rebinding) names the stranger, whose page could read the answer.
+fn is_meant_for_us(request: &Request<Body>, port: u16) -> bool {
+    let own = ["127.0.0.1", "localhost", "[::1]"].map(|name| format!("{name}:{port}"));
+    request.headers().get(HOST).is_some_and(|host| own.iter().any(|own| host == own.as_str()))
+}
+
+/// `/picture/STEP.png`. A number is all that ever gets from an address to a file.
+fn step_of(path: &str) -> Option<u64> {
+    path.strip_prefix("/picture/")?.strip_suffix(".png")?.parse().ok()
+}
+
+fn refuse(status: StatusCode, why: &str) -> Response<Body> {
+    send(status, TEXT, format!("{why}\n"))
+}
+
+fn send(status: StatusCode, kind: &str, body: impl Into<Body>) -> Response<Body> {
+    Response::builder()
+        .status(status)
+        .header(CONTENT_TYPE, kind)
+        .header(X_CONTENT_TYPE_OPTIONS, "nosniff")
+        .header(REFERRER_POLICY, "no-referrer")
+        .header(CACHE_CONTROL, "no-store")
+        // Nor may a stranger's page show our pictures.
+        .header("cross-origin-resource-policy", "same-origin")
+        .body(body.into())
+        .expect("headers without a line's end")
+}
