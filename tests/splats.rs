@@ -5,7 +5,7 @@ mod common;
 use common::program::{arg, refuse, room, succeed};
 use common::{Random, largest_error};
 use globalsplat::io::{Splat, find_splat, fit_splat, read_splat, write_splat};
-use globalsplat::render::render_views;
+use globalsplat::render::{HarmonicLimits, render_views};
 use globalsplat::scene::{Camera, Gaussians, Intrinsics};
 use serde_json::Value;
 use std::io::{Read, Write};
@@ -620,11 +620,27 @@ fn convert_keeps_what_a_capture_sees() {
     splat.gaussians.sh.narrow(2, 1, 15).copy_(&(Random::new(3).symmetric(&[1, size[1], 15, 3]) * 3.));
     write_splat(&strong, &splat).unwrap();
     let cameras = globalsplat::data::open_capture(&room).unwrap().cameras();
-    for (ending, gain) in [("spz", 6.), ("splat", 0.5)] {
+    for (ending, gain, always) in [
+        ("spz", 6., &[][..]),
+        ("splat", 0.5, &[]),
+        ("ply", 6., &["--for-viewers"]),
+        ("spz", 6., &["--for-viewers"]),
+    ] {
         let psnr = |options: &[&str]| {
             let to = folder.path().join(format!("a.{ending}"));
-            succeed(&[&["convert", arg(&strong), arg(&to)], options].concat());
+            succeed(&[&["convert", arg(&strong), arg(&to)], options, always].concat());
             let copy = read_splat(&to).unwrap();
+            if !always.is_empty() {
+                let colour = copy.gaussians.sh.narrow(2, 0, 1) * 0.28209479177387814;
+                let others = copy.gaussians.sh.narrow(2, 1, 15);
+                // A byte of SPZ's is 0.03 apart.
+                let beyond =
+                    [colour.abs().max().double_value(&[]) - 0.5, others.abs().max().double_value(&[]) - 1.];
+                assert!(
+                    beyond.iter().all(|&beyond| beyond < 0.02),
+                    "{ending}: {beyond:?} beyond what viewers hold"
+                );
+            }
             globalsplat::eval::psnr_between(&splat.gaussians, &copy.gaussians, &cameras).unwrap().unwrap()
         };
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
@@ -637,6 +653,7 @@ fn convert_keeps_what_a_capture_sees() {
         String::from_utf8(done.stderr).unwrap()
     };
     assert!(said(&[]).contains("beyond what the format holds"), "{}", said(&[]));
+    assert!(said(&["--for-viewers"]).contains("beyond what viewers hold"), "{}", said(&["--for-viewers"]));
     assert_eq!(said(&["--scene", arg(&room)]), "");
     for to in [&out, &own] {
         let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
@@ -644,7 +661,9 @@ fn convert_keeps_what_a_capture_sees() {
     }
     let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap().gaussians);
     let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
-    let cut = fit_splat(&out, &Splat { gaussians: large.map(Tensor::copy) }, 3, &[]).unwrap().gaussians;
+    let cut = fit_splat(&out, &Splat { gaussians: large.map(Tensor::copy) }, &HarmonicLimits::up_to(3), &[])
+        .unwrap()
+        .gaussians;
     let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
     assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
 }

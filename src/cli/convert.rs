@@ -1,13 +1,14 @@
 use super::{print_json, render::orbit_around_splat};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Capture, open_capture};
+use globalsplat::data::open_capture;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
-use globalsplat::scene::ImageSize;
+use globalsplat::render::HarmonicLimits;
+use globalsplat::scene::{Camera, ImageSize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use tch::Kind;
+use tch::{Kind, Tensor};
 
 /// On an orbit around a splat whose capture isn't named.
 const VIEWS: usize = 8;
@@ -19,11 +20,13 @@ const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
 /// which has no spherical harmonics. What was written is read again and drawn beside the original: the loss is the PSNR between
 /// both, of eight views around the splat or of the capture's cameras.
 ///
-/// SPZ's coefficients are within ±1 and a .splat has one for each colour. Where the capture is named, those that are left show its
-/// cameras what all did before; else what a format can't hold is cut off, which may cost much.
+/// SPZ's coefficients are within ±1 and a .splat has one for each colour; viewers for browsers hold no more of a PLY's, either
+/// (--for-viewers). Where the capture is named, those that are left show its cameras what all did before; else what can't be held is
+/// cut off, which may cost much.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
-    globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room")]
+    globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
+    globalsplat convert room.ply shared.ply --for-viewers --scene captures/room")]
 pub struct Convert {
     /// The splat: .ply, .compressed.ply, .spz or .splat
     #[arg(value_name = "FROM")]
@@ -34,6 +37,10 @@ pub struct Convert {
     /// Leave out spherical harmonics of higher degrees, or add some that are 0
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..=3))]
     sh_degree: Option<i64>,
+    /// Keep within what viewers for browsers show, whatever the format holds: a Gaussian's own colour in [0, 1], other
+    /// coefficients within ±1
+    #[arg(long)]
+    for_viewers: bool,
     /// Lose least for the cameras of this capture, and tell the loss by them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
@@ -50,8 +57,17 @@ impl Convert {
         // Before the file is replaced, if it is the same.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.unwrap_or(original.sh_degree());
-        let fit = |capture: &Capture| fit_splat(&self.to, &original, degree, &capture.cameras());
-        let fitted = capture.as_ref().map(fit).transpose()?;
+        let limits = match self.for_viewers {
+            true => HarmonicLimits::of_viewers(degree),
+            false => HarmonicLimits::up_to(degree),
+        };
+        let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
+        let fitted = match &capture {
+            Some(capture) => Some(fit(&capture.cameras())?),
+            // What writes cuts off by itself.
+            None if !self.for_viewers => None,
+            None => Some(fit(&[])?),
+        };
         write_splat(&self.to, &fitted.as_ref().unwrap_or(&original).with_sh_degree(degree))?;
         let copy = read_splat(&self.to)?;
         let to = description(&self.to, &copy)?;
@@ -61,7 +77,7 @@ impl Convert {
             None => orbit_around_splat(&original, SIZE, VIEWS),
         };
         if capture.is_none() {
-            tell_cut(&self.to, &original, degree)?;
+            self.tell_cut(&original, &fit(&[])?.gaussians.sh);
         }
         let psnr = psnr_between(&original.gaussians, &copy.gaussians, &cameras)?;
         let views = cameras.len();
@@ -77,22 +93,20 @@ impl Convert {
         }
         Ok(())
     }
-}
 
-/// Says so where coefficients are beyond what the format of `path` holds, and nobody said for which cameras that matters.
-fn tell_cut(path: &Path, original: &Splat, degree: i64) -> Result<()> {
-    let held = fit_splat(path, original, degree, &[])?.gaussians.sh;
-    let cut = original.gaussians.sh.narrow(2, 0, held.size()[2]).not_equal_tensor(&held);
-    let share = cut.to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
-    if share > 0. {
-        eprintln!(
-            "{}: {:.1} % of the colours' coefficients are beyond what the format holds and cut off; --scene, with the cameras that \
-             matter, loses less",
-            path.display(),
-            100. * share
-        );
+    /// Says so where coefficients are beyond what is held, and nobody said for which cameras that matters.
+    fn tell_cut(&self, original: &Splat, held: &Tensor) {
+        let cut = original.gaussians.sh.narrow(2, 0, held.size()[2]).not_equal_tensor(held);
+        let share = 100. * cut.to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+        if share > 0. {
+            let who = if self.for_viewers { "viewers hold" } else { "the format holds" };
+            eprintln!(
+                "{}: {share:.1} % of the colours' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
+                 matter, loses less",
+                self.to.display()
+            );
+        }
     }
-    Ok(())
 }
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {

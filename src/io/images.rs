@@ -141,7 +141,7 @@ pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
 ///
 /// # Errors
 /// libtorch's refusal, as for another shape.
-pub(crate) fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
+pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
     let planes = if picture.dim() == 2 {
         picture.unsqueeze(0).f_expand([3, -1, -1], false)?
     } else {

@@ -16,11 +16,11 @@ mod torch_file;
 mod weights;
 mod weights_file;
 
-pub use atomic::{check_writable_dir, check_writable_file};
+pub use atomic::{check_writable_dir, check_writable_file, write_atomically};
 pub use film::write_film;
 pub use images::{
-    Photo, colourize_depth, decode_photo, read_image, tensor_from_rgb, tile_horizontally, tile_vertically,
-    write_png,
+    Photo, colourize_depth, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb,
+    tile_horizontally, tile_vertically, write_png,
 };
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
@@ -36,11 +36,9 @@ pub use weights_file::{WeightsFile, is_weights_name, read_weights};
 pub(crate) use torch_file::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 
 pub(crate) use append::AppendFile;
-pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_atomically, write_json};
+pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
 pub(crate) use event_reader::{EventReader, read_picture};
-pub(crate) use images::{
-    PHOTO_EXTENSIONS, encode_photo, encoded_image_size, enlarge, read_image_size, rgb_from_tensor, write_jpeg,
-};
+pub(crate) use images::{PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, write_jpeg};
 pub(crate) use pretrained::pretrained_folders;

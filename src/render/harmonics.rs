@@ -25,7 +25,7 @@ const OUTSIDE: f64 = 1e-6;
 /// Nearer than this, nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
-/// Coefficients that a file can hold.
+/// Coefficients that a file, or who shows it, can hold.
 #[derive(Debug, Clone)]
 pub struct HarmonicLimits {
     /// Of the spherical harmonics, at most.
@@ -37,6 +37,30 @@ pub struct HarmonicLimits {
 }
 
 impl HarmonicLimits {
+    /// Up to `degree`, of any size.
+    pub fn up_to(degree: i64) -> Self {
+        HarmonicLimits { degree, constant: f64::MIN..=f64::MAX, others: f64::MIN..=f64::MAX }
+    }
+
+    /// Those that viewers for browsers show, whatever the file holds: Spark and Babylon.js keep a Gaussian's own colour in
+    /// [0, 1] and the others within ±1, in a byte each.
+    pub fn of_viewers(degree: i64) -> Self {
+        let constant = 0.5 / SH_C0;
+        HarmonicLimits { degree, constant: -constant..=constant, others: -1. ..=127. / 128. }
+    }
+
+    /// What both hold.
+    pub fn and(&self, other: &Self) -> Self {
+        let both = |a: &RangeInclusive<f64>, b: &RangeInclusive<f64>| {
+            a.start().max(*b.start())..=a.end().min(*b.end())
+        };
+        HarmonicLimits {
+            degree: self.degree.min(other.degree),
+            constant: both(&self.constant, &other.constant),
+            others: both(&self.others, &other.others),
+        }
+    }
+
     fn of(&self, basis: usize) -> (f64, f64) {
         let range = if basis == 0 { &self.constant } else { &self.others };
         let bases = (self.degree + 1) * (self.degree + 1);

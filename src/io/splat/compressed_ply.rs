@@ -121,7 +121,7 @@ fn bound_names(of: &[&str; 3]) -> Vec<String> {
 
 /// Colours of a chunk are between bounds of their own.
 pub(super) fn limits() -> HarmonicLimits {
-    HarmonicLimits { degree: 3, constant: f64::MIN..=f64::MAX, others: -SH_RANGE / 2. ..=SH_RANGE / 2. }
+    HarmonicLimits { others: -SH_RANGE / 2. ..=SH_RANGE / 2., ..HarmonicLimits::up_to(3) }
 }
 
 /// Writes a compressed PLY: Gaussians in Morton order, so that those of a chunk are near each other.

@@ -161,16 +161,15 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// As there.
 pub fn write_splat_for(path: &Path, splat: &Splat, cameras: &[Camera]) -> Result<()> {
-    write_splat(path, &fit_splat(path, splat, splat.sh_degree(), cameras)?)
+    write_splat(path, &fit_splat(path, splat, &HarmonicLimits::up_to(splat.sh_degree()), cameras)?)
 }
 
-/// What `cameras` see of `splat` in spherical harmonics that the format of `path` holds, up to `sh_degree`.
+/// What `cameras` see of `splat` in spherical harmonics within `limits` that the format of `path` holds, too.
 ///
 /// # Errors
 /// An ending that is no format's.
-pub fn fit_splat(path: &Path, splat: &Splat, sh_degree: i64, cameras: &[Camera]) -> Result<Splat> {
-    let limits = (format_of(path)?.limits)();
-    let limits = HarmonicLimits { degree: limits.degree.min(sh_degree), ..limits };
+pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &[Camera]) -> Result<Splat> {
+    let limits = limits.and(&(format_of(path)?.limits)());
     Ok(Splat { gaussians: fit_harmonics(&splat.gaussians, cameras, &limits) })
 }
 

@@ -88,7 +88,7 @@ fn check(path: &Path, names: &[String], values: &[f32]) -> Result<()> {
 
 /// Any number is one of a PLY.
 pub(super) fn limits() -> HarmonicLimits {
-    HarmonicLimits { degree: 3, constant: f64::MIN..=f64::MAX, others: f64::MIN..=f64::MAX }
+    HarmonicLimits::up_to(3)
 }
 
 /// Writes one scene, [1, N, ..], whole or not at all.
