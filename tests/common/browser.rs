@@ -53,7 +53,9 @@ impl Browser {
                 "--remote-debugging-pipe",
                 "--headless",
                 "--no-sandbox",
-                "--disable-gpu",
+                // WebGL on the CPU, as no machine that tests has to have a GPU.
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
                 "--disable-quic",
             ])
             .args(["--no-first-run", "--disable-background-networking", "--disable-component-update"])

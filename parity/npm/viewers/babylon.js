@@ -1,0 +1,49 @@
+// Babylon.js, as its page on Gaussian splatting says: for tests/viewers.rs, which tells what `show` does in spark.js.
+
+import { TargetCamera } from "@babylonjs/core/Cameras/targetCamera.js";
+import { Engine } from "@babylonjs/core/Engines/engine.js";
+import { ImportMeshAsync } from "@babylonjs/core/Loading/sceneLoader.js";
+import { Color4 } from "@babylonjs/core/Maths/math.color.js";
+import { Matrix, Quaternion, Vector3 } from "@babylonjs/core/Maths/math.vector.js";
+import { Scene } from "@babylonjs/core/scene.js";
+import "@babylonjs/loaders/SPLAT/index.js";
+import * as fflate from "fflate";
+
+window.show = async (bytes, ending, { c2w, angle, width, height }) => {
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  document.body.append(canvas);
+  const scene = new Scene(new Engine(canvas, false, { preserveDrawingBuffer: true }));
+  scene.clearColor = new Color4(0, 0, 0, 1);
+  // Nothing is fetched from elsewhere.
+  const options = { keepInRam: true, fflate, spzLibraryUrl: undefined };
+  const { meshes } = await ImportMeshAsync(new File([bytes], `scene.${ending}`), scene, { pluginOptions: { splat: options } });
+  const splat = meshes.find((mesh) => mesh.getClassName() === "GaussianSplattingMesh");
+  // From our axes to the file's, of which an SPZ's y points up and its z backward; the mesh takes them to its own, in which x, y
+  // and z are a left hand's.
+  const signs = ending === "spz" ? [1, -1, -1] : [1, 1, 1];
+  splat.computeWorldMatrix(true);
+  const world = splat.getWorldMatrix();
+  const turned = ([x, y, z]) => Vector3.TransformNormal(new Vector3(signs[0] * x, signs[1] * y, signs[2] * z), world);
+  const column = (index, sign = 1) => turned([0, 1, 2].map((row) => sign * c2w[4 * row + index]));
+  const [right, up, forward] = [column(0), column(1, -1), column(2)];
+  const camera = new TargetCamera("camera", column(3), scene);
+  Object.assign(camera, { minZ: 0.01, maxZ: 1000, fov: angle });
+  const rows = [right, up, forward].flatMap((axis) => [axis.x, axis.y, axis.z, 0]);
+  camera.rotationQuaternion = Quaternion.FromRotationMatrix(Matrix.FromValues(...rows, 0, 0, 0, 1));
+  for (let picture = 0; picture < 10; picture++) {
+    scene.render();
+    await new Promise((resolve) => setTimeout(resolve, 100));
+  }
+  // Of the file's means, taken back to our axes.
+  const means = splat.splatsData;
+  const numbers = new Float32Array(means);
+  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+  for (let splat = 0; splat < numbers.length / 8; splat++) {
+    for (let axis = 0; axis < 3; axis++) {
+      const place = signs[axis] * numbers[8 * splat + axis];
+      low[axis] = Math.min(low[axis], place);
+      high[axis] = Math.max(high[axis], place);
+    }
+  }
+  return { count: splat.splatCount ?? numbers.length / 8, low, high, png: canvas.toDataURL() };
+};

@@ -1,0 +1,137 @@
+//! Our splats in other people's viewers: what Spark and Babylon.js, which are public and know nothing of each other, show of
+//! them in a browser. The pictures stay in `target/viewers`.
+
+mod common;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use common::browser::Browser;
+use common::program::{arg, succeed};
+use common::{captures, skip};
+use globalsplat::data::open_capture;
+use globalsplat::eval::psnr;
+use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb, write_png};
+use globalsplat::render::render_views;
+use globalsplat::scene::{Camera, ImageSize, Intrinsics};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use tch::{Kind, Tensor};
+
+const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
+/// Between a viewer's picture and ours, in dB.
+const LEAST: f64 = 25.;
+
+/// Pages with the viewers, by their names.
+fn viewers(folder: &Path) -> Option<Vec<(&'static str, PathBuf)>> {
+    let npm = Path::new(env!("CARGO_MANIFEST_DIR")).join("parity/npm");
+    let bundler = npm.join("node_modules/.bin/esbuild");
+    if !bundler.exists() {
+        skip(
+            "other viewers",
+            "parity/npm has no packages; install Node.js 20 or newer with npm and run make venv",
+        );
+        return None;
+    }
+    let page = |name| {
+        let (script, page) = (folder.join(format!("{name}.js")), folder.join(format!("{name}.html")));
+        let bundled = Command::new(&bundler)
+            .args(["--bundle", "--format=iife", "--log-level=error"])
+            .args([format!("--outfile={}", script.display()), format!("viewers/{name}.js")])
+            .current_dir(&npm)
+            .status();
+        assert!(bundled.expect("esbuild").success());
+        let text = format!("<!doctype html><meta charset=utf-8><body><script src={name}.js></script>");
+        std::fs::write(&page, text).expect("a page");
+        (name, page)
+    };
+    Some(["spark", "babylon"].map(page).into())
+}
+
+/// The first camera of a capture, for a picture of [`SIZE`].
+fn first_camera(capture: &Path) -> Camera {
+    let camera = open_capture(capture).unwrap().cameras()[0];
+    let factor = f64::from(SIZE.width) / f64::from(camera.width);
+    let k = camera.intrinsics;
+    let intrinsics =
+        Intrinsics { fx: k.fx * factor, fy: k.fy * factor, cx: k.cx * factor, cy: k.cy * factor };
+    Camera { intrinsics, width: SIZE.width, height: SIZE.height, ..camera }
+}
+
+/// What a viewer tells of a splat, and its picture [3, H, W].
+fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Value, Tensor) {
+    browser.open(page);
+    let c2w: Vec<f64> = (0..12).map(|i| camera.c2w.col(i % 4)[i / 4]).collect();
+    let k = camera.intrinsics;
+    let angle = 2. * (f64::from(camera.height) / 2. / k.fy).atan();
+    let (width, height) = (camera.width, camera.height);
+    let camera = json!({
+        "c2w": c2w, "angle": angle, "aspect": k.fy / k.fx, "width": width, "height": height,
+    });
+    let bytes = STANDARD.encode(std::fs::read(file).unwrap());
+    let ending = file.extension().unwrap().to_str().unwrap();
+    let told = browser.evaluate(&format!(
+        "show(Uint8Array.from(atob({bytes:?}), (letter) => letter.charCodeAt(0)), {ending:?}, {camera})"
+    ));
+    assert!(browser.errors().is_empty(), "{:?}", browser.errors());
+    let png = told["png"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let picture = folder.path().join("picture.png");
+    std::fs::write(&picture, STANDARD.decode(png).unwrap()).unwrap();
+    (told, tensor_from_rgb(&read_image(&picture).unwrap()))
+}
+
+/// The corners of the means' box.
+fn bounds(splat: &Splat) -> [Vec<f64>; 2] {
+    let means = splat.gaussians.means.view([-1, 3]).to_kind(Kind::Double);
+    [means.amin([0i64].as_slice(), false), means.amax([0i64].as_slice(), false)]
+        .map(|corner| Vec::try_from(corner).unwrap())
+}
+
+fn numbers(list: &Value) -> Vec<f64> {
+    list.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn public_viewers_show_our_splats_as_we_do() {
+    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let Some(viewers) = viewers(folder.path()) else { return };
+    let Some(mut browser) = Browser::start() else { return };
+    let of = |name: &str| folder.path().join(name);
+    let published = capture.join("reference.ply");
+    // What the shipped model makes of the photos, as it comes; the published splat, whose colours are far beyond a byte's, as
+    // `convert --for-viewers` makes it.
+    succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.ply"))]);
+    succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.spz"))]);
+    for ending in ["ply", "spz"] {
+        let to = of(&format!("published.{ending}"));
+        succeed(&["convert", arg(&published), arg(&to), "--for-viewers", "--scene", arg(&capture)]);
+    }
+    let pictures = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/viewers");
+    std::fs::create_dir_all(&pictures).unwrap();
+    let camera = first_camera(&capture);
+    for (name, original) in [("made", of("made.ply")), ("published", published)] {
+        let splat = read_splat(&original).unwrap();
+        let own = render_views(&splat.gaussians, &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
+        write_png(&pictures.join(format!("{name}-own.png")), &own).unwrap();
+        let box_of_ours = bounds(&splat);
+        for ending in ["ply", "spz"] {
+            for (viewer, page) in &viewers {
+                let what = format!("{name}.{ending} in {viewer}");
+                let (told, picture) = show(&mut browser, page, &of(&format!("{name}.{ending}")), &camera);
+                write_png(&pictures.join(format!("{name}-{ending}-{viewer}.png")), &picture).unwrap();
+                assert_eq!(told["count"].as_i64(), Some(splat.gaussians.count()), "{what}");
+                for (corner, own) in ["low", "high"].iter().zip(&box_of_ours) {
+                    // Spark keeps means in half precision.
+                    for (a, b) in numbers(&told[*corner]).iter().zip(own) {
+                        assert!((a - b).abs() <= 1e-3 * b.abs(), "{what}: {corner} {a}, {b}");
+                    }
+                }
+                let psnr = psnr(&picture, &own);
+                println!("{what}: {psnr:.2} dB");
+                assert!(psnr >= LEAST, "{what}: {psnr:.2} dB");
+            }
+        }
+    }
+}
