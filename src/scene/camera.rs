@@ -102,6 +102,16 @@ pub struct Camera {
     pub height: u32,
 }
 
+impl Camera {
+    /// The same view in a picture of another size: as much to see along the side that has fewer pixels for it.
+    pub fn with_size(&self, ImageSize { width, height }: ImageSize) -> Self {
+        let (x, y) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let (factor, k) = (x.min(y), self.intrinsics);
+        let intrinsics = Intrinsics { fx: k.fx * factor, fy: k.fy * factor, cx: k.cx * x, cy: k.cy * y };
+        Camera { intrinsics, c2w: self.c2w, width, height }
+    }
+}
+
 /// Checks that `c2w` is a rigid motion: finite, last row (0, 0, 0, 1), an orthonormal right-handed rotation.
 ///
 /// # Errors

@@ -6,6 +6,7 @@ mod camera;
 mod gaussians;
 mod normalize;
 mod rays;
+mod smooth_path;
 mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
@@ -14,4 +15,5 @@ pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
 pub use normalize::{Normalization, Similarity, normalize};
 pub(crate) use rays::plucker_rays;
+pub use smooth_path::smooth_path;
 pub use trajectory::{orbit_around_cameras, orbit_around_point};
