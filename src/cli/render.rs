@@ -45,8 +45,8 @@ pub struct Render {
     /// An orbit, around the splat when no capture is named
     #[arg(long, group = "cameras")]
     orbit: bool,
-    /// Cameras of this cameras.json, whose images need not exist
-    #[arg(long, value_name = "FILE", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
+    /// Cameras of this capture, of any format, whose photos need not exist, or of a camera_path.json of nerfstudio's viewer
+    #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
     path: Option<PathBuf>,
     /// A folder for a PNG per camera, or a film: .gif, .mp4 (by ffmpeg); or a .png of all side by side
     #[arg(long, value_name = "DIR|FILE")]
@@ -158,7 +158,7 @@ impl Render {
         };
         let numbered = |cameras: &[Camera]| (0..cameras.len()).map(|i| format!("{i:03}")).collect();
         if let Some(path) = &self.path {
-            let cameras = resized(read_camera_path(path)?);
+            let cameras = resized(read_camera_path(path, size)?.cameras);
             return Ok((numbered(&cameras), cameras));
         }
         let frames = self.frames.unwrap_or(DEFAULT_FRAMES);

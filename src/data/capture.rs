@@ -95,11 +95,40 @@ impl View {
     }
 }
 
+/// What a capture is read for.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Purpose {
+    /// Its photos, which have to be there.
+    Photos,
+    /// Its cameras alone. Where the file doesn't tell how large its photos are and they aren't there to be asked, they are
+    /// taken to be of this size.
+    Cameras(Option<ImageSize>),
+}
+
+impl Purpose {
+    /// The size of the photo `field`, (width, height), of which `file` tells none; `asked` is what the photo says of itself.
+    pub(super) fn size(self, file: &Path, field: &str, asked: Result<(u32, u32)>) -> Result<(u32, u32)> {
+        match (asked, self) {
+            (Ok(size), _) => Ok(size),
+            (Err(_), Purpose::Cameras(Some(ImageSize { width, height }))) => Ok((width, height)),
+            (Err(_), Purpose::Cameras(None)) => {
+                let expected = "one in the file, a photo to be asked, or --size WxH";
+                Err(Error::input(file, format!("the size of {field}"), "absent", expected))
+            }
+            (Err(e), Purpose::Photos) => Err(e),
+        }
+    }
+}
+
 impl Capture {
-    /// Checks what every format has to hold: two views, rigid poses, sensible intrinsics.
-    pub(super) fn new(name: String, file: PathBuf, frames: Vec<Frame>) -> Result<Self> {
-        if frames.len() < 2 {
-            return Err(Error::input(&file, "the number of views", frames.len(), "two or more"));
+    /// Checks what every format has to hold: two views, or one camera of a path, rigid poses, sensible intrinsics.
+    pub(super) fn new(name: String, file: PathBuf, frames: Vec<Frame>, purpose: Purpose) -> Result<Self> {
+        let (least, expected) = match purpose {
+            Purpose::Photos => (2, "two or more"),
+            Purpose::Cameras(_) => (1, "one or more"),
+        };
+        if frames.len() < least {
+            return Err(Error::input(&file, "the number of views", frames.len(), expected));
         }
         check_cameras(&file, frames.iter().map(|frame| &frame.camera))?;
         Ok(Capture { name, file, frames })

@@ -1,6 +1,6 @@
 //! Made-up videos, named where a data set is named: `synth:seed=1,scenes=10000`.
 
-use super::capture::{Capture, Frame, Photo};
+use super::capture::{Capture, Frame, Photo, Purpose};
 use super::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, read_image};
@@ -110,7 +110,7 @@ impl MadeUp {
             distortion: Distortion::default(),
         };
         let frames = video.cameras().iter().enumerate().map(frame).collect();
-        Capture::new(self.key(number), PathBuf::from(&self.name), frames)
+        Capture::new(self.key(number), PathBuf::from(&self.name), frames, Purpose::Photos)
     }
 }
 

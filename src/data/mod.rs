@@ -17,8 +17,8 @@ pub use capture::{Capture, View};
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use formats::{
-    Chunk, ChunkWriter, INDEX_FILE, Point, find_captures, open_capture, points_of, read_camera_path,
-    write_cameras_json,
+    CameraPath, Chunk, ChunkWriter, INDEX_FILE, Point, find_captures, open_capture, points_of,
+    read_camera_path, write_cameras_json,
 };
 pub use holdout::Holdout;
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};

@@ -3,7 +3,7 @@
 
 use super::json::null_for_not_a_number;
 use super::{Found, file_in, folder_name};
-use crate::data::capture::{Capture, Frame, Photo, check_cameras};
+use crate::data::capture::{Capture, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::write_json;
@@ -36,18 +36,18 @@ type Number = Option<f64>;
 pub(super) fn find(path: &Path) -> Option<Found> {
     let itself = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
     let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
-    Some(Box::new(move || read(&file)))
+    Some(Box::new(move |purpose| read(&file, purpose)))
 }
 
 /// Reads the capture that `file` describes. Views come as its author put them, whatever they are called.
-fn read(file: &Path) -> Result<Capture> {
+pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let parsed = parse(file)?;
     let root = file.parent().unwrap_or(Path::new("."));
     let cameras = cameras(file, &parsed)?;
     let mut frames = vec![];
     for (i, (view, camera)) in parsed.views.into_iter().zip(cameras).enumerate() {
         let image = root.join(&view.image);
-        if view.image.is_empty() || !image.is_file() {
+        if matches!(purpose, Purpose::Photos) && (view.image.is_empty() || !image.is_file()) {
             let expected = "the path of an image beside it";
             return Err(Error::input(
                 file,
@@ -63,14 +63,7 @@ fn read(file: &Path) -> Result<Capture> {
             distortion: Distortion::default(),
         });
     }
-    Capture::new(folder_name(root), file.to_owned(), frames)
-}
-
-/// Reads the cameras alone.
-pub(super) fn read_cameras(file: &Path) -> Result<Vec<Camera>> {
-    let cameras = cameras(file, &parse(file)?)?;
-    check_cameras(file, cameras.iter())?;
-    Ok(cameras)
+    Capture::new(folder_name(root), file.to_owned(), frames, purpose)
 }
 
 /// Writes a `cameras.json` at `file`; `images` are paths relative to its folder. All cameras have one size.

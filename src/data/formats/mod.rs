@@ -1,5 +1,6 @@
 //! Formats of captures on disk: a file a format, and a line in [`FORMATS`], by which captures are recognized.
 
+mod camera_path;
 mod cameras_json;
 mod chunk;
 mod colmap;
@@ -7,13 +8,13 @@ mod json;
 mod natural;
 mod transforms_json;
 
+pub use camera_path::{CameraPath, read_camera_path};
 pub use cameras_json::write_cameras_json;
 pub use chunk::{Chunk, ChunkWriter, INDEX_FILE};
 pub use colmap::{Point, points_of};
 
-use super::capture::Capture;
+use super::capture::{Capture, Purpose};
 use crate::error::{Error, Result};
-use crate::scene::Camera;
 use natural::natural_order;
 use std::path::{Path, PathBuf};
 
@@ -21,7 +22,7 @@ use std::path::{Path, PathBuf};
 type Format = fn(&Path) -> Option<Found>;
 
 /// Reads the capture that was found.
-type Found = Box<dyn FnOnce() -> Result<Capture>>;
+type Found = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
 
 /// Of several in a folder, the first is taken.
 const FORMATS: [Format; 4] = [chunk::find, cameras_json::find, transforms_json::find, colmap::find];
@@ -53,8 +54,12 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
 /// # Errors
 /// Nothing that is known there, or a capture that breaks its format's rules.
 pub fn open_capture(path: &Path) -> Result<Capture> {
+    open_for(path, Purpose::Photos)
+}
+
+fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
     match recognize(path) {
-        Some(read) => read(),
+        Some(read) => read(purpose),
         None if !path.exists() => Err(Error::Request(format!("{}: no such capture", path.display()))),
         None => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
     }
@@ -65,14 +70,6 @@ pub(in crate::data) fn folder_name(path: &Path) -> String {
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     let folder = path.canonicalize().unwrap_or(path.to_owned());
     folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
-}
-
-/// The cameras of a `cameras.json` without its images, as a path to render along.
-///
-/// # Errors
-/// As [`open_capture`]; the images don't have to exist.
-pub fn read_camera_path(file: &Path) -> Result<Vec<Camera>> {
-    cameras_json::read_cameras(file)
 }
 
 /// How many folders deep captures are looked for.

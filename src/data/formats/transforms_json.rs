@@ -5,7 +5,7 @@
 use super::json::null_for_not_a_number;
 use super::natural::natural_order;
 use super::{Found, file_in, folder_name};
-use crate::data::capture::{Capture, Frame, Photo};
+use crate::data::capture::{Capture, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, read_image_size};
@@ -26,12 +26,12 @@ pub(super) fn find(path: &Path) -> Option<Found> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
     let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
-    Some(Box::new(move || read(&file)))
+    Some(Box::new(move |purpose| read(&file, purpose)))
 }
 
 /// Reads the capture that `file` describes. Frames come in the order of their names, numbers in them by value. Those whose
 /// image isn't there are left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
-fn read(file: &Path) -> Result<Capture> {
+pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
     let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
@@ -43,11 +43,12 @@ fn read(file: &Path) -> Result<Capture> {
     let root = file.parent().unwrap_or(Path::new("."));
     let (mut frames, mut absent) = (vec![], None);
     for (index, frame) in entries.iter().enumerate() {
-        let fields = Fields { file, index, frame, shared: &json };
+        let fields = Fields { file, index, frame, shared: &json, purpose };
         let name = fields.file_path()?;
-        match image_at(root, name) {
-            Some(image) => frames.push(fields.frame(image, name)?),
-            None => absent = absent.or(Some(name)),
+        match (image_at(root, name), purpose) {
+            (Some(image), _) => frames.push(fields.frame(image, name)?),
+            (None, Purpose::Cameras(_)) => frames.push(fields.frame(root.join(name), name)?),
+            (None, Purpose::Photos) => absent = absent.or(Some(name)),
         }
     }
     if let (Some(name), true) = (absent, frames.len() < 2) {
@@ -55,7 +56,7 @@ fn read(file: &Path) -> Result<Capture> {
         return Err(Error::input(file, "the number of frames with an image", found, "two or more"));
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Capture::new(folder_name(root), file.to_owned(), frames)
+    Capture::new(folder_name(root), file.to_owned(), frames, purpose)
 }
 
 fn image_at(root: &Path, name: &str) -> Option<PathBuf> {
@@ -65,7 +66,7 @@ fn image_at(root: &Path, name: &str) -> Option<PathBuf> {
 }
 
 /// What stands in the file, for an error.
-fn shown(value: Option<&Value>) -> String {
+pub(super) fn shown(value: Option<&Value>) -> String {
     match value {
         None => "absent".into(),
         Some(Value::Null) => "null or NaN".into(),
@@ -75,12 +76,20 @@ fn shown(value: Option<&Value>) -> String {
     }
 }
 
+/// The pose of 16 numbers, row by row, with OpenCV axes: OpenGL's y looks up and its z backward, so those two columns change
+/// sign.
+pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
+    let opengl = DMat4::from_cols_array(entries).transpose();
+    opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
+}
+
 /// A frame's fields, each its own or else the one shared by all.
 struct Fields<'a> {
     file: &'a Path,
     index: usize,
     frame: &'a Value,
     shared: &'a Value,
+    purpose: Purpose,
 }
 
 impl<'a> Fields<'a> {
@@ -141,7 +150,7 @@ impl<'a> Fields<'a> {
         self.check_camera_model()?;
         let (width, height) = match (self.size("w")?, self.size("h")?) {
             (Some(width), Some(height)) => (width, height),
-            _ => read_image_size(&image)?,
+            _ => self.purpose.size(self.file, &format!("frame {}", self.index), read_image_size(&image))?,
         };
         let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w: self.c2w()?, width, height };
         let distortion = self.distortion()?;
@@ -206,7 +215,7 @@ impl<'a> Fields<'a> {
         Ok(())
     }
 
-    /// `transform_matrix` with OpenCV axes: OpenGL's y looks up and its z backward, so those two columns change sign.
+    /// `transform_matrix` with OpenCV axes.
     fn c2w(&self) -> Result<DMat4> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");
@@ -233,8 +242,7 @@ impl<'a> Fields<'a> {
                 })?,
             };
         }
-        let opengl = DMat4::from_cols_array(&entries).transpose();
-        let c2w = opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.));
+        let c2w = from_opengl(&entries);
         nearest_rigid(&c2w).map_err(|(found, expected)| Error::input(self.file, name, found, expected))
     }
 }

@@ -13,7 +13,12 @@ use tch::Device;
 pub fn cameras_json(bytes: &[u8]) {
     let file = file("cameras_json", "cameras.json", bytes);
     let _ = open_capture(&file).map(|capture| load(&capture));
-    let _ = read_camera_path(&file);
+    let _ = read_camera_path(&file, None);
+}
+
+/// A path of nerfstudio's viewer, or what its keys make it.
+pub fn camera_path(bytes: &[u8]) {
+    let _ = read_camera_path(&file("camera_path", "path.json", bytes), Some([8, 8].into()));
 }
 
 pub fn transforms_json(bytes: &[u8]) {

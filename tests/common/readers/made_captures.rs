@@ -100,7 +100,7 @@ pub fn cameras(bytes: &[u8]) {
     let json = json!({"image_shape": shape, "views": made.views.iter().map(view).collect::<Vec<_>>()});
     let file = file("made_cameras", "cameras.json", json.to_string().as_bytes());
     let _ = open_capture(&file).map(|capture| load(&capture));
-    let _ = read_camera_path(&file);
+    let _ = read_camera_path(&file, None);
 }
 
 /// What describes a lens, for one frame or all.

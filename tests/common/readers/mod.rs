@@ -20,8 +20,9 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 28] = [
+pub const READERS: [(&str, Reader); 29] = [
     ("antimatter", files::antimatter),
+    ("camera_path", files::camera_path),
     ("cameras_json", files::cameras_json),
     ("checkpoint", files::checkpoint),
     ("chunk", files::chunk),

@@ -7,7 +7,7 @@ mod write;
 pub use write::{ChunkWriter, INDEX_FILE};
 
 use super::Found;
-use crate::data::capture::{Capture, Frame, Photo};
+use crate::data::capture::{Capture, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::{Archive, encoded_image_size};
@@ -36,10 +36,10 @@ pub(super) fn find(path: &Path) -> Option<Found> {
         path.to_str().and_then(|path| path.rsplit_once('#')).filter(|(file, _)| is_chunk(file.as_ref()));
     if let Some((file, key)) = keyed {
         let (file, key) = (PathBuf::from(file), key.to_string());
-        return Some(Box::new(move || Chunk::read(&file)?.capture(&key)));
+        return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
     }
     let file = is_chunk(path).then(|| path.to_owned())?;
-    Some(Box::new(move || Chunk::read(&file)?.only_capture()))
+    Some(Box::new(move |purpose| Chunk::read(&file)?.only_capture(purpose)))
 }
 
 /// Whether `path` is a file of scenes, by its name.
@@ -78,8 +78,12 @@ impl Chunk {
     /// # Errors
     /// No such scene, or one that breaks what every capture has to hold.
     pub fn capture(&self, key: &str) -> Result<Capture> {
+        self.capture_for(key, Purpose::Photos)
+    }
+
+    fn capture_for(&self, key: &str, purpose: Purpose) -> Result<Capture> {
         match self.scenes.iter().find(|scene| scene.key == key) {
-            Some(scene) => self.capture_of(scene),
+            Some(scene) => self.capture_of(scene, purpose),
             None => Err(Error::input(
                 &self.file,
                 "the scene",
@@ -93,9 +97,9 @@ impl Chunk {
     ///
     /// # Errors
     /// More scenes, or none; otherwise as [`Chunk::capture`].
-    fn only_capture(&self) -> Result<Capture> {
+    fn only_capture(&self, purpose: Purpose) -> Result<Capture> {
         match self.scenes.as_slice() {
-            [scene] => self.capture_of(scene),
+            [scene] => self.capture_of(scene, purpose),
             scenes => {
                 let file = self.file.display();
                 Err(Error::Request(format!(
@@ -115,14 +119,14 @@ impl Chunk {
         format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
     }
 
-    fn capture_of(&self, scene: &Scene) -> Result<Capture> {
+    fn capture_of(&self, scene: &Scene, purpose: Purpose) -> Result<Capture> {
         let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
         // A frame that is damaged is found when it is loaded; until then it is as large as the others.
         let sizes: Vec<_> =
             scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
-        let Some(usual) = sizes.iter().flatten().next() else {
-            return Err(Error::input(&named, "every image", "undecodable", "a JPEG or PNG"));
-        };
+        let undecodable = || Error::input(&named, "every image", "undecodable", "a JPEG or PNG");
+        let told = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
+        let usual = purpose.size(&named, "the images", told)?;
         let cameras = scene.cameras(&self.bytes);
         let frames = scene
             .images
@@ -133,11 +137,11 @@ impl Chunk {
             .enumerate()
             .map(|(index, ((bytes, numbers), size))| {
                 let name = format!("{index:06}");
-                let camera = camera(numbers, size.unwrap_or(*usual));
+                let camera = camera(numbers, size.unwrap_or(usual));
                 let photo = Photo::Part { file: self.bytes.clone(), bytes, name: named.join(&name) };
                 Frame { photo, name, camera, distortion: Distortion::default() }
             });
-        Capture::new(scene.key.clone(), named.clone(), frames.collect())
+        Capture::new(scene.key.clone(), named.clone(), frames.collect(), purpose)
     }
 }
 

@@ -9,7 +9,7 @@ pub use points::{Point, points_of};
 
 use super::natural::natural_order;
 use super::{Found, folder_name};
-use crate::data::capture::{Capture, Frame, Photo};
+use crate::data::capture::{Capture, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::scene::{Camera, Intrinsics};
@@ -86,11 +86,11 @@ struct ImageEntry {
 /// A folder with a model.
 pub(super) fn find(folder: &Path) -> Option<Found> {
     let (folder, model) = (folder.to_owned(), Model::find(folder)?);
-    Some(Box::new(move || read(&folder, &model)))
+    Some(Box::new(move |purpose| read(&folder, &model, purpose)))
 }
 
 /// Reads `model` as the capture in `folder`. Frames come in the order of their names, numbers in them by value.
-fn read(folder: &Path, model: &Model) -> Result<Capture> {
+fn read(folder: &Path, model: &Model, purpose: Purpose) -> Result<Capture> {
     let text = model.cameras.extension().is_some_and(|form| form == "txt");
     let (cameras, images) = match text {
         true => (cameras_of_text(&model.cameras)?, images_of_text(&model.images)?),
@@ -128,7 +128,7 @@ fn read(folder: &Path, model: &Model) -> Result<Capture> {
             return refuse("translation", format!("{:?}", image.translation), "finite numbers".into());
         }
         let photo = model.photos.join(&image.name);
-        if image.name.is_empty() || !photo.is_file() {
+        if matches!(purpose, Purpose::Photos) && (image.name.is_empty() || !photo.is_file()) {
             let expected = format!("the name of an image in {}", model.photos.display());
             return refuse("name", format!("{:?}, which is not there", image.name), expected);
         }
@@ -139,7 +139,7 @@ fn read(folder: &Path, model: &Model) -> Result<Capture> {
         frames.push(Frame { photo: Photo::File(photo), name: image.name, camera, distortion: *distortion });
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Capture::new(folder_name(folder), model.images.clone(), frames)
+    Capture::new(folder_name(folder), model.images.clone(), frames, purpose)
 }
 
 /// The camera, at the origin, and its distortion.

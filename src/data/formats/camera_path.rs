@@ -1,0 +1,102 @@
+//! Cameras to render along: those of any capture, without its photos, or a `camera_path.json` of nerfstudio's viewer.
+//!
+//! The latter is {"camera_path": [{"camera_to_world": 16 numbers, row by row, OpenGL axes, "fov": degrees from top to bottom}, …],
+//! "render_height", "render_width", and maybe "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
+
+use super::json::null_for_not_a_number;
+use super::transforms_json::{from_opengl, shown};
+use super::{cameras_json, open_for, recognize, transforms_json};
+use crate::data::capture::{Purpose, check_cameras};
+use crate::error::{Error, Result};
+use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid};
+use serde_json::Value;
+use std::path::Path;
+
+/// Where pictures are to be taken from, one after the other.
+#[derive(Debug)]
+pub struct CameraPath {
+    /// One at least.
+    pub cameras: Vec<Camera>,
+    /// How fast they follow each other, where the file tells.
+    pub frames_per_second: Option<u32>,
+}
+
+/// Reads the cameras of a capture of any format, as [`open_capture`](super::open_capture) finds it, or of a JSON file of any
+/// name, which its keys tell: `frames` of a `transforms.json`, `camera_path` of nerfstudio's viewer, else a `cameras.json`. No
+/// photo has to be there; where only a photo could tell its size and isn't there, it is taken to be of `size`.
+///
+/// # Errors
+/// As [`open_capture`](super::open_capture).
+pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
+    let purpose = Purpose::Cameras(size);
+    let json = match path.is_file() && path.extension().is_some_and(|ending| ending == "json") {
+        false => None,
+        true => {
+            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
+            // What is no JSON is refused by whoever reads it.
+            Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
+        }
+    };
+    let has = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
+    let capture = match (&json, recognize(path)) {
+        (Some(json), _) if has("camera_path") => return of_viewer(path, json),
+        (Some(_), None) if has("frames") => transforms_json::read(path, purpose)?,
+        (Some(_), None) => cameras_json::read(path, purpose)?,
+        _ => open_for(path, purpose)?,
+    };
+    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None })
+}
+
+fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
+    let refuse = |field: &str, found: Option<&Value>, expected: &str| {
+        Error::input(file, field, shown(found), expected)
+    };
+    let number = |of: &Value, key: &str, field: &str, expected: &str, least: f64, most: f64| {
+        let value = of.get(key);
+        let number = value.and_then(Value::as_f64).filter(|number| *number > least && *number < most);
+        number.ok_or_else(|| refuse(field, value, expected))
+    };
+    if let Some(kind) = json.get("camera_type").filter(|kind| *kind != "perspective") {
+        return Err(refuse("camera_type", Some(kind), "\"perspective\""));
+    }
+    let side = |key: &str| {
+        let expected = "a number of pixels, 1 to 16384";
+        let side = number(json, key, key, expected, 0., 16385.)?;
+        if side < 1. || side.fract() != 0. {
+            Err(refuse(key, json.get(key), expected))
+        } else {
+            Ok(side as u32)
+        }
+    };
+    let (height, width) = (side("render_height")?, side("render_width")?);
+    let entries = json.get("camera_path").and_then(Value::as_array).filter(|entries| !entries.is_empty());
+    let entries =
+        entries.ok_or_else(|| refuse("camera_path", json.get("camera_path"), "a list of cameras"))?;
+    let camera = |(i, entry): (usize, &Value)| {
+        let named = |key: &str| format!("{key} of camera {i}");
+        let pose = entry.get("camera_to_world");
+        let numbers = pose.and_then(Value::as_array).into_iter().flatten();
+        let numbers: Vec<f64> = numbers.filter_map(Value::as_f64).collect();
+        let pose_refused = || refuse(&named("camera_to_world"), pose, "16 numbers");
+        let c2w = from_opengl(numbers.as_slice().try_into().map_err(|_| pose_refused())?);
+        let c2w = nearest_rigid(&c2w);
+        let c2w =
+            c2w.map_err(|(found, expected)| Error::input(file, named("camera_to_world"), found, expected))?;
+        let fov = number(entry, "fov", &named("fov"), "degrees between 0 and 180", 0., 180.)?;
+        let (w, h) = (f64::from(width), f64::from(height));
+        let focal = h / 2. / (fov.to_radians() / 2.).tan();
+        let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };
+        Ok(Camera { intrinsics, c2w, width, height })
+    };
+    let cameras = entries.iter().enumerate().map(camera).collect::<Result<Vec<_>>>()?;
+    check_cameras(file, cameras.iter())?;
+    let rate = match (json.get("fps"), json.get("seconds")) {
+        (Some(_), _) => Some(number(json, "fps", "fps", "frames per second, 1 to 120", 0.5, 120.5)?),
+        (None, Some(_)) => {
+            let seconds = number(json, "seconds", "seconds", "a number above 0", 0., f64::INFINITY)?;
+            Some((cameras.len() as f64 / seconds).clamp(1., 120.))
+        }
+        (None, None) => None,
+    };
+    Ok(CameraPath { cameras, frames_per_second: rate.map(|rate| rate.round() as u32) })
+}
