@@ -176,32 +176,6 @@ fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-/// Depth [H, W] as colours [3, H, W]: near is bright, far dark, by inverse depth between the picture's own 2nd and 98th
-/// percentiles; where little is seen (`alpha`) it fades to black.
-pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
-    /// Depth behind less opacity than this is no depth.
-    const MIN_ALPHA: f64 = 0.05;
-    // From far to near: dark blue, violet, orange, pale yellow.
-    const STOPS: [[f32; 3]; 5] =
-        [[0.05, 0.03, 0.30], [0.45, 0.05, 0.60], [0.80, 0.25, 0.45], [0.97, 0.60, 0.20], [0.98, 0.97, 0.70]];
-    let seen = alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.));
-    let inverse = depth.clamp_min(1e-6).reciprocal();
-    let values = inverse.masked_select(&seen);
-    if values.numel() == 0 {
-        return Tensor::zeros([3, depth.size()[0], depth.size()[1]], (Kind::Float, depth.device()));
-    }
-    let bound = |q: f64| values.quantile_scalar(q, None::<i64>, false, "linear").double_value(&[]);
-    let (far, near) = (bound(0.02), bound(0.98));
-    let position = ((inverse - far) / (near - far).max(1e-9)).clamp(0., 1.) * (STOPS.len() - 1) as f64;
-    let below = position.floor().clamp_max((STOPS.len() - 2) as f64);
-    let share = (&position - &below).unsqueeze(-1);
-    let stops = Tensor::from_slice2(&STOPS).to_device(depth.device());
-    let index = below.to_kind(Kind::Int64).flatten(0, -1);
-    let at = |i: &Tensor| stops.index_select(0, i).view([depth.size()[0], depth.size()[1], 3]);
-    let colour = Tensor::lerp_tensor(&at(&index), &at(&(&index + 1)), &share);
-    colour.permute([2, 0, 1]) * seen.to_kind(Kind::Float) * alpha.clamp(0., 1.)
-}
-
 /// `picture` [3, H, W] enlarged by a whole factor, pixels left as they are, until it is `height` high or a little less.
 pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
     let factor = (height / picture.size()[1]).max(1);

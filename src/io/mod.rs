@@ -2,6 +2,7 @@
 
 mod append;
 mod atomic;
+mod depth_colours;
 mod environment;
 mod event_file;
 mod event_reader;
@@ -17,10 +18,11 @@ mod weights;
 mod weights_file;
 
 pub use atomic::{check_writable_dir, check_writable_file, write_atomically};
+pub use depth_colours::{DepthScale, colourize_depth};
 pub use film::write_film;
 pub use images::{
-    Photo, colourize_depth, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb,
-    tile_horizontally, tile_vertically, write_png,
+    Photo, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb, tile_horizontally, tile_vertically,
+    write_png,
 };
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};

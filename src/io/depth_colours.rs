@@ -1,0 +1,134 @@
+//! Depth as colours that a person can compare: equal steps look equally large.
+
+use tch::{Kind, Tensor};
+
+/// Depth behind less opacity than this is no depth.
+const MIN_ALPHA: f64 = 0.05;
+
+/// matplotlib's viridis, from far to near: dark violet, blue, green, yellow. Of the well-known ones its lightness grows in the most
+/// even steps, so it reads the same in grey and for the colour-blind; and what is far isn't black, which is where nothing is.
+const COLOURS: colorous::Gradient = colorous::VIRIDIS;
+/// As many as the gradient has, and as a picture of 8 bits tells apart.
+const STEPS: usize = 256;
+
+/// Which depths the colours are for. One scale for all frames of a film keeps it from flickering.
+#[derive(Debug, Clone, Copy)]
+pub struct DepthScale {
+    /// 1/depth of the darkest colour.
+    far: f64,
+    /// 1/depth of the brightest.
+    near: f64,
+}
+
+impl DepthScale {
+    /// From the 2nd to the 98th percentile of inverse depth in all `pictures`, each a depth and its opacity, [H, W].
+    pub fn of(pictures: &[(&Tensor, &Tensor)]) -> Self {
+        /// Pixels that tell percentiles as well as more do; libtorch sorts 2²⁴ at most.
+        const ENOUGH: i64 = 1 << 20;
+        let inverses =
+            |&(depth, alpha): &(&Tensor, &Tensor)| inverse(depth).masked_select(&seen(depth, alpha));
+        let values = Tensor::cat(&pictures.iter().map(inverses).collect::<Vec<_>>(), 0);
+        if values.numel() == 0 {
+            return DepthScale { far: 0., near: 0. };
+        }
+        let values = values.slice(0, None, None, 1 + values.size()[0] / ENOUGH);
+        let bound = |q: f64| values.quantile_scalar(q, None::<i64>, false, "linear").double_value(&[]);
+        DepthScale { far: bound(0.02), near: bound(0.98) }
+    }
+
+    /// Depth [H, W] as colours [3, H, W]: near is bright, far dark, evenly by inverse depth; where little is seen (`alpha`) it
+    /// fades to black.
+    pub fn colourize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
+        let share = (inverse(depth) - self.far) / (self.near - self.far).max(1e-9);
+        let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
+        let colours = Tensor::from_slice2(&colours()).to_device(depth.device());
+        let (height, width) = (depth.size()[0], depth.size()[1]);
+        let picture =
+            colours.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
+        picture * seen(depth, alpha).to_kind(Kind::Float) * alpha.clamp(0., 1.)
+    }
+}
+
+/// [`DepthScale::colourize`] on the picture's own scale.
+pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
+    DepthScale::of(&[(depth, alpha)]).colourize(depth, alpha)
+}
+
+fn inverse(depth: &Tensor) -> Tensor {
+    depth.clamp_min(1e-6).reciprocal()
+}
+
+fn seen(depth: &Tensor, alpha: &Tensor) -> Tensor {
+    alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.))
+}
+
+/// RGB in [0, 1], from far to near.
+fn colours() -> [[f32; 3]; STEPS] {
+    std::array::from_fn(|step| {
+        let colorous::Color { r, g, b } = COLOURS.eval_rational(step, STEPS);
+        [r, g, b].map(|value| f32::from(value) / 255.)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// CIELAB's L*, from 0 to 100, of an sRGB colour (IEC 61966-2-1, CIE 15).
+    fn lightness(colour: [f32; 3]) -> f64 {
+        let linear = colour.map(|value| match f64::from(value) {
+            value if value <= 0.04045 => value / 12.92,
+            value => ((value + 0.055) / 1.055).powf(2.4),
+        });
+        let luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2];
+        match luminance {
+            y if y > (6f64 / 29.).powi(3) => 116. * y.cbrt() - 16.,
+            y => y * (29f64 / 3.).powi(3),
+        }
+    }
+
+    #[test]
+    fn lightness_grows_in_even_steps() {
+        // Sixteen at a time: 8 bits round by more than single steps are apart.
+        let levels: Vec<f64> = colours().iter().step_by(15).map(|&colour| lightness(colour)).collect();
+        let steps: Vec<f64> = levels.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        let mean = steps.iter().sum::<f64>() / steps.len() as f64;
+        println!("L* from {:.1} to {:.1}, steps {steps:.2?}", levels[0], levels[levels.len() - 1]);
+        assert!(levels[levels.len() - 1] - levels[0] > 70., "{levels:?}");
+        assert!(steps.iter().all(|step| (step / mean - 1.).abs() < 0.2), "{steps:?} about {mean}");
+        let all: Vec<f64> = colours().iter().map(|&colour| lightness(colour)).collect();
+        assert!(all.windows(2).all(|pair| pair[1] > pair[0] - 0.1), "darker again: {all:?}");
+    }
+
+    #[test]
+    fn near_is_bright_and_what_is_not_seen_black() {
+        let depth = Tensor::from_slice(&[1f32, 2., 4., 0., 1.]).view([1, 5]);
+        let alpha = Tensor::from_slice(&[1f32, 1., 1., 1., 0.01]).view([1, 5]);
+        let picture = colourize_depth(&depth, &alpha);
+        assert_eq!(picture.size(), [3, 1, 5]);
+        let at = |x: i64| {
+            <[f32; 3]>::try_from(Vec::try_from(picture.select(2, x).flatten(0, -1)).unwrap()).unwrap()
+        };
+        let all = colours();
+        assert_eq!((at(0), at(2)), (all[STEPS - 1], all[0]));
+        assert!(lightness(at(0)) > lightness(at(1)) && lightness(at(1)) > lightness(at(2)));
+        assert_eq!((at(3), at(4)), ([0.; 3], [0.; 3]));
+    }
+
+    #[test]
+    fn one_scale_gives_one_depth_one_colour() {
+        let opaque = Tensor::ones([1, 2], (Kind::Float, tch::Device::Cpu));
+        let [first, second] = [[1f32, 2.], [2., 8.]].map(|depths| Tensor::from_slice(&depths).view([1, 2]));
+        let scale = DepthScale::of(&[(&first, &opaque), (&second, &opaque)]);
+        let two = |picture: &Tensor, x: i64| scale.colourize(picture, &opaque).select(2, x);
+        assert_eq!(two(&first, 1), two(&second, 0));
+        // On scales of their own, 2 is the farthest in one and the nearest in the other.
+        assert_ne!(
+            colourize_depth(&first, &opaque).select(2, 1),
+            colourize_depth(&second, &opaque).select(2, 0)
+        );
+        // Nothing is seen, and nothing goes wrong.
+        let nothing = opaque.zeros_like();
+        assert_eq!(colourize_depth(&first, &nothing).sum(Kind::Float).double_value(&[]), 0.);
+    }
+}
