@@ -54,6 +54,7 @@ fn doctor_names_what_it_found() {
     assert_eq!(report["devices"][0], "cpu");
     assert!(["avx512", "avx2", "neon", "portable"].contains(&report["simd"].as_str().unwrap()));
     assert!(report["libtorch"].as_str().unwrap().starts_with("2."));
+    assert!(report["ffmpeg"].is_string() || report["ffmpeg"]["absent"].is_string());
 }
 
 #[test]
@@ -117,17 +118,6 @@ fn memory_before_is_not_counted() {
     if cfg!(target_os = "linux") {
         assert!(first > 20_000_000 && second < first / 2, "{first} {second}");
     }
-}
-
-#[test]
-fn frames_without_an_orbit_are_refused() {
-    let (_folder, room) = room();
-    let (splat, out) = (room.join("truth.ply"), room.join("out"));
-    let arguments =
-        ["render", "--splat", arg(&splat), "--scene", arg(&room), "--frames", "3", "--out", arg(&out)];
-    let output = globalsplat(&arguments);
-    let err = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.code() == Some(2) && err.contains("--orbit"), "{err}");
 }
 
 #[test]

@@ -2,7 +2,7 @@ use super::{device, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::error::Error;
-use globalsplat::io::{WEIGHTS_VARIABLE, find_pretrained};
+use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::SHIPPED_MODEL;
@@ -11,7 +11,7 @@ use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_
 use serde_json::{Value, json};
 use std::fmt::Display;
 
-/// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights found.
+/// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights and the ffmpeg found.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels")]
 pub struct Doctor {
@@ -39,7 +39,7 @@ impl Doctor {
         let (driver, nvrtc) = (Driver::find(), Nvrtc::find());
         let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
-        let together = Backends::built_in();
+        let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
         if self.json {
             let found: serde_json::Map<_, _> = weights
                 .into_iter()
@@ -61,6 +61,7 @@ impl Doctor {
                 "kernels": cache,
                 "model": SHIPPED_MODEL,
                 "weights": found,
+                "ffmpeg": or_error(&ffmpeg, |version| json!(version)),
                 "together": { "gloo": together.gloo, "nccl": together.nccl },
             }));
             return Ok(());
@@ -124,6 +125,10 @@ impl Doctor {
                 None => format!("absent (make weights makes them, {WEIGHTS_VARIABLE} names their folder)"),
             };
             line(metric, &found);
+        }
+        match &ffmpeg {
+            Err(why) => line("ffmpeg", &format!("absent, so films are GIFs: {why}")),
+            Ok(version) => line("ffmpeg", &format!("{version}, for films in MP4")),
         }
         Ok(())
     }

@@ -18,7 +18,7 @@ const OLD: &str = "globalsplat-old";
 /// # Errors
 /// What `fill` returns, or the system's refusal to write.
 pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let temporary = partial_file(path);
+    let temporary = sibling(path, PARTIAL);
     let attempt = || {
         let file = File::create(&temporary).map_err(Error::write(path))?;
         let mut writer = BufWriter::new(file);
@@ -156,9 +156,40 @@ pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
     Ok(())
 }
 
-/// Where what is to become the file at `path` is written.
-pub fn partial_file(path: &Path) -> PathBuf {
-    sibling(path, PARTIAL)
+/// A file that another hand fills, or by and by: at `place` until it is kept, and gone unless it is.
+#[derive(Debug)]
+pub struct PartialFile {
+    path: PathBuf,
+    /// Where it is filled.
+    pub place: PathBuf,
+    kept: bool,
+}
+
+impl PartialFile {
+    /// What is to become the file at `path`. Nothing is there yet.
+    pub fn of(path: &Path) -> Self {
+        PartialFile { path: path.to_owned(), place: sibling(path, PARTIAL), kept: false }
+    }
+
+    /// Gives it its name.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn keep(mut self) -> Result<()> {
+        let whole = File::open(&self.place).and_then(|file| file.sync_all());
+        whole.and_then(|()| fs::rename(&self.place, &self.path)).map_err(Error::write(&self.path))?;
+        self.kept = true;
+        sync_parent(&self.path);
+        Ok(())
+    }
+}
+
+impl Drop for PartialFile {
+    fn drop(&mut self) {
+        if !self.kept {
+            let _ = fs::remove_file(&self.place);
+        }
+    }
 }
 
 /// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.

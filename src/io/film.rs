@@ -1,86 +1,277 @@
-//! Moving pictures: GIF by ourselves, MP4 by the ffmpeg on the PATH.
+//! Moving pictures, frame by frame: GIF by ourselves, MP4 by the ffmpeg on the PATH. Nothing half-written stays behind.
 
-use super::atomic::{partial_file, write_atomically};
-use super::images::{padded, rgb_from_tensor};
+use super::atomic::PartialFile;
+use super::images::rgb_from_tensor;
 use crate::error::{Error, Result};
-use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, RgbImage};
-use std::io::Write;
-use std::path::Path;
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use crate::scene::ImageSize;
+use image::RgbImage;
+use std::fs::File;
+use std::io::{BufWriter, ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::thread::JoinHandle;
 use tch::Tensor;
 
-/// Writes frames [3, H, W], in [0, 1], as `path` says: `.gif` or `.mp4`. Frames that are smaller than others get a white margin.
-///
-/// # Errors
-/// Another ending, no ffmpeg for `.mp4`, or the system's refusal to write.
-pub fn write_film(path: &Path, frames: &[Tensor], frames_per_second: u32) -> Result<()> {
-    let frames = padded(frames, &[1, 2]).iter().map(rgb_from_tensor).collect::<Result<Vec<_>>>()?;
-    match path.extension().and_then(|e| e.to_str()) {
-        Some("gif") => write_gif(path, frames, frames_per_second),
-        Some("mp4") => write_mp4(path, &frames, frames_per_second),
-        _ => Err(Error::input(path, "the film's ending", path.display(), ".gif or .mp4")),
-    }
+/// A film under way. It appears at its path when it is finished; one that is dropped before leaves nothing.
+pub struct Film {
+    path: PathBuf,
+    size: ImageSize,
+    frames: u32,
+    encoder: Encoder,
+    // After the encoder, which writes to it until it is dropped.
+    partial: PartialFile,
 }
 
-fn write_gif(path: &Path, frames: Vec<RgbImage>, frames_per_second: u32) -> Result<()> {
-    // 1 is the best palette, 30 the fastest.
-    const SPEED: i32 = 10;
-    let mut bytes = vec![];
-    let failed =
-        |e: image::ImageError| Error::Failed(format!("{}: the film can't be encoded: {e}", path.display()));
-    {
-        let mut encoder = GifEncoder::new_with_speed(&mut bytes, SPEED);
-        encoder.set_repeat(Repeat::Infinite).map_err(failed)?;
-        let delay =
-            Delay::from_saturating_duration(Duration::from_millis(1000 / u64::from(frames_per_second)));
-        for frame in frames {
-            let frame = image::DynamicImage::ImageRgb8(frame).into_rgba8();
-            encoder.encode_frame(Frame::from_parts(frame, 0, 0, delay)).map_err(failed)?;
+enum Encoder {
+    Gif(Gif),
+    Mp4(Mp4),
+}
+
+impl Film {
+    /// Whether there could be a film at `path`, `.gif` or `.mp4`. Call it before the work, not after.
+    ///
+    /// # Errors
+    /// Another ending, more frames per second than the format has, or no ffmpeg with libx264 for `.mp4`.
+    pub fn check(path: &Path, frames_per_second: u32) -> Result<()> {
+        match path.extension().and_then(|e| e.to_str()) {
+            Some("gif") => Gif::check(path, frames_per_second),
+            Some("mp4") => Mp4::check(path),
+            _ => Err(Error::input(path, "the film's ending", path.display(), ".gif or .mp4")),
         }
     }
-    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+
+    /// Begins a film of `size`; an MP4 has even sides, and loses a row or a column that is too many.
+    ///
+    /// # Errors
+    /// As [`Film::check`], a size that the format doesn't know, or the system's refusal to write.
+    pub fn begin(path: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
+        Self::check(path, frames_per_second)?;
+        let partial = PartialFile::of(path);
+        let encoder = match path.extension().is_some_and(|ending| ending == "gif") {
+            true => Encoder::Gif(Gif::begin(path, &partial.place, size, frames_per_second)?),
+            false => Encoder::Mp4(Mp4::begin(path, &partial.place, size, frames_per_second)?),
+        };
+        Ok(Film { path: path.to_owned(), size, frames: 0, encoder, partial })
+    }
+
+    /// Adds a frame [3, H, W], in [0, 1], with a white margin where it is smaller than the film.
+    ///
+    /// # Errors
+    /// The encoder's or the system's refusal.
+    pub fn add(&mut self, frame: &Tensor) -> Result<()> {
+        let (height, width) = (i64::from(self.size.height), i64::from(self.size.width));
+        let margin = [0, width - frame.size()[2], 0, height - frame.size()[1]];
+        let frame = rgb_from_tensor(&frame.pad(margin, "constant", 1.))?;
+        self.frames += 1;
+        match &mut self.encoder {
+            Encoder::Gif(gif) => gif.add(&self.path, &frame),
+            Encoder::Mp4(mp4) => mp4.add(&self.path, &frame),
+        }
+    }
+
+    /// Puts the film where it belongs.
+    ///
+    /// # Errors
+    /// A film without a frame; the encoder's or the system's refusal.
+    pub fn finish(self) -> Result<()> {
+        let Film { path, frames, encoder, partial, .. } = self;
+        if frames == 0 {
+            return Err(Error::Request(format!("{}: a film needs a frame", path.display())));
+        }
+        match encoder {
+            Encoder::Gif(gif) => gif.finish(&path)?,
+            Encoder::Mp4(mp4) => mp4.finish(&path)?,
+        }
+        partial.keep()
+    }
 }
 
-fn write_mp4(path: &Path, frames: &[RgbImage], frames_per_second: u32) -> Result<()> {
-    let Some(first) = frames.first() else {
-        return Err(Error::Request("a film needs a frame".into()));
-    };
-    let partial = partial_file(path);
-    let size = format!("{}x{}", first.width(), first.height());
-    let rate = frames_per_second.to_string();
-    let child = Command::new("ffmpeg")
-        .args([
-            "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", &size, "-r", &rate, "-i", "-",
-        ])
-        // H.264 in 4:2:0, which every player shows, wants even sides.
-        .args(["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p", "-f", "mp4"])
-        .arg(&partial)
-        .stdin(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn();
-    let mut child = child.map_err(|e| {
-        Error::Request(format!(
-            "{} needs ffmpeg, which can't be started ({e}); a path that ends in .gif needs nothing",
-            path.display()
-        ))
+struct Gif {
+    encoder: gif::Encoder<BufWriter<File>>,
+    frames_per_second: u32,
+    frames: u32,
+}
+
+impl Gif {
+    fn check(path: &Path, frames_per_second: u32) -> Result<()> {
+        // Frames last hundredths of a second, and browsers slow down those that last one alone.
+        const MOST: u32 = 50;
+        match frames_per_second {
+            1..=MOST => Ok(()),
+            many => Err(Error::input(path, "the number of frames per second", many, "1 to 50 in a .gif")),
+        }
+    }
+
+    fn begin(path: &Path, place: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
+        let ImageSize { height, width } = size;
+        let (Ok(sixteen_wide), Ok(sixteen_high)) = (u16::try_from(width), u16::try_from(height)) else {
+            let found = format!("{width}×{height} pixels");
+            return Err(Error::input(path, "the film's size", found, "65535 or less a side in a .gif"));
+        };
+        let writer = BufWriter::new(File::create(place).map_err(Error::write(path))?);
+        let encoder = gif::Encoder::new(writer, sixteen_wide, sixteen_high, &[]);
+        let mut encoder = encoder.map_err(not_encoded(path))?;
+        encoder.set_repeat(gif::Repeat::Infinite).map_err(not_encoded(path))?;
+        Ok(Gif { encoder, frames_per_second, frames: 0 })
+    }
+
+    fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
+        // 1 is the best palette, 30 the fastest.
+        const SPEED: i32 = 10;
+        let (width, height) = (frame.width() as u16, frame.height() as u16);
+        let mut encoded = gif::Frame::from_rgb_speed(width, height, frame, SPEED);
+        // Rounded so that frames don't drift from their times.
+        let hundredths = |frames: u32| (100 * frames + self.frames_per_second / 2) / self.frames_per_second;
+        encoded.delay = (hundredths(self.frames + 1) - hundredths(self.frames)) as u16;
+        self.frames += 1;
+        self.encoder.write_frame(&encoded).map_err(not_encoded(path))
+    }
+
+    fn finish(self, path: &Path) -> Result<()> {
+        let writer = self.encoder.into_inner().map_err(not_encoded(path))?;
+        writer.into_inner().map(drop).map_err(|e| Error::write(path)(e.into_error()))
+    }
+}
+
+fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
+    move |e| match e {
+        gif::EncodingError::Io(e) => Error::write(path)(e),
+        e => Error::Failed(format!("{}: the film can't be encoded: {e}", path.display())),
+    }
+}
+
+/// The version of the ffmpeg on the PATH that encodes H.264.
+///
+/// # Errors
+/// What is missing, and how to get it.
+pub fn find_ffmpeg() -> std::result::Result<String, String> {
+    const GET: &str = "(Debian and Ubuntu: apt install ffmpeg; macOS: brew install ffmpeg)";
+    let output = Command::new("ffmpeg").arg("-encoders").stdin(Stdio::null()).output();
+    let output = output.map_err(|e| match e.kind() {
+        ErrorKind::NotFound => format!("ffmpeg isn't on the PATH {GET}"),
+        _ => format!("the ffmpeg on the PATH can't be started: {e} {GET}"),
     })?;
-    {
-        let mut input = child.stdin.take().expect("a pipe was asked for");
-        for frame in frames {
-            // When ffmpeg ends early, what it says on standard error tells more than the broken pipe.
-            if input.write_all(frame).is_err() {
-                break;
+    if !String::from_utf8_lossy(&output.stdout).split_whitespace().any(|word| word == ENCODER) {
+        return Err(format!("the ffmpeg on the PATH lacks {ENCODER} {GET}"));
+    }
+    // It begins with "ffmpeg version 5.1.9-0+deb12u1 Copyright …".
+    let banner = String::from_utf8_lossy(&output.stderr);
+    Ok(banner.split_whitespace().nth(2).unwrap_or("of unknown version").into())
+}
+
+/// The best one that ffmpeg has for H.264, and one that machines without a GPU have.
+const ENCODER: &str = "libx264";
+
+/// H.264 in 4:2:0, which every player and browser shows.
+struct Mp4 {
+    ffmpeg: Child,
+    /// Until the film ends.
+    input: Option<ChildStdin>,
+    /// Standard error, read while frames are written: a full pipe would stop both.
+    said: Option<JoinHandle<String>>,
+}
+
+impl Mp4 {
+    fn check(path: &Path) -> Result<()> {
+        find_ffmpeg().map(drop).map_err(|why| {
+            let path = path.display();
+            Error::Request(format!(
+                "{path}: {why}, expected for an .mp4; a .gif, or a folder for PNGs, needs nothing"
+            ))
+        })
+    }
+
+    fn begin(path: &Path, place: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
+        /// Next to nothing is lost to the eye; ffmpeg's own choice is 23.
+        const QUALITY: &str = "18";
+        /// sRGB says so. Without, players take small films for BT.601 and large ones for BT.709, and colours shift.
+        const COLOURS: [&str; 8] = [
+            "-colorspace",
+            "bt709",
+            "-color_primaries",
+            "bt709",
+            "-color_trc",
+            "iec61966-2-1",
+            "-color_range",
+            "tv",
+        ];
+        let ImageSize { height, width } = size;
+        if height < 2 || width < 2 {
+            let found = format!("{width}×{height} pixels");
+            return Err(Error::input(path, "the film's size", found, "2 pixels or more a side in an .mp4"));
+        }
+        let even = "crop=trunc(iw/2)*2:trunc(ih/2)*2";
+        let to_yuv = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=bicubic+accurate_rnd+full_chroma_int";
+        let mut command = Command::new("ffmpeg");
+        command
+            .args([
+                "-v",
+                "error",
+                "-y",
+                "-f",
+                "rawvideo",
+                "-pix_fmt",
+                "rgb24",
+                "-s",
+                &format!("{width}x{height}"),
+            ])
+            .args(["-r", &frames_per_second.to_string(), "-i", "-", "-vf", &format!("{even},{to_yuv}")])
+            .args(["-c:v", ENCODER, "-crf", QUALITY, "-pix_fmt", "yuv420p"])
+            .args(COLOURS)
+            // What a player needs to know first comes first, so that a page shows the film while it still loads.
+            .args(["-movflags", "+faststart", "-f", "mp4"])
+            .arg(place)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped());
+        // Ctrl-C is for the program, which then ends it.
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        let mut ffmpeg =
+            command.spawn().map_err(|e| Error::Failed(format!("ffmpeg can't be started: {e}")))?;
+        let input = ffmpeg.stdin.take();
+        let mut errors = ffmpeg.stderr.take().expect("a pipe was asked for");
+        let said = std::thread::spawn(move || {
+            let mut said = vec![];
+            let _ = errors.read_to_end(&mut said);
+            String::from_utf8_lossy(&said).trim().replace('\n', "; ")
+        });
+        Ok(Mp4 { ffmpeg, input, said: Some(said) })
+    }
+
+    fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
+        match self.input.as_mut().expect("the film goes on").write_all(frame) {
+            Ok(()) => Ok(()),
+            // What ffmpeg says tells more than the broken pipe.
+            Err(_) => {
+                self.end(path).and(Err(Error::Failed(format!("{}: ffmpeg ended early", path.display()))))
             }
         }
     }
-    let output = child.wait_with_output().map_err(Error::write(path))?;
-    if !output.status.success() {
-        let _ = std::fs::remove_file(&partial);
-        let why = String::from_utf8_lossy(&output.stderr).trim().replace('\n', "; ");
-        return Err(Error::Failed(format!("{}: ffmpeg failed: {why}", path.display())));
+
+    fn finish(mut self, path: &Path) -> Result<()> {
+        self.end(path)
     }
-    let whole = std::fs::File::open(&partial).and_then(|film| film.sync_all());
-    whole.and_then(|()| std::fs::rename(&partial, path)).map_err(Error::write(path))
+
+    /// Waits until ffmpeg has written what it was given.
+    fn end(&mut self, path: &Path) -> Result<()> {
+        self.input = None;
+        let status = self.ffmpeg.wait().map_err(Error::write(path))?;
+        let said = self.said.take().and_then(|said| said.join().ok()).unwrap_or_default();
+        match status.success() {
+            true => Ok(()),
+            false if said.is_empty() => {
+                Err(Error::Failed(format!("{}: ffmpeg failed ({status})", path.display())))
+            }
+            false => Err(Error::Failed(format!("{}: ffmpeg failed: {said}", path.display()))),
+        }
+    }
+}
+
+impl Drop for Mp4 {
+    fn drop(&mut self) {
+        // Nothing happens to one that has ended.
+        let _ = self.ffmpeg.kill();
+        let _ = self.ffmpeg.wait();
+    }
 }

@@ -2,6 +2,7 @@
 
 use super::write_atomically;
 use crate::error::{Error, Result};
+use crate::scene::ImageSize;
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Rgb, RgbImage};
@@ -195,9 +196,14 @@ pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 1)
 }
 
+/// How large `count` pictures of `size` are when [`tile_horizontally`] has put them side by side.
+pub fn tiled_size(size: ImageSize, count: u32) -> ImageSize {
+    ImageSize { width: count * size.width + (count - 1) * GAP as u32, ..size }
+}
+
 fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
     let mut parts = vec![];
-    for (i, picture) in padded(pictures, &[3 - dim]).into_iter().enumerate() {
+    for (i, picture) in padded(pictures, 3 - dim).into_iter().enumerate() {
         if i > 0 {
             let mut gap = picture.size();
             gap[dim as usize] = GAP;
@@ -208,16 +214,15 @@ fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
     Tensor::cat(&parts, dim)
 }
 
-/// Pictures [3, H, W], as large as the largest of them along `dims` by white below and to the right.
-pub(super) fn padded(pictures: &[Tensor], dims: &[i64]) -> Vec<Tensor> {
-    let sides = |dim: i64| pictures.iter().map(move |picture| picture.size()[dim as usize]);
-    let [heights, widths] = [1, 2].map(|dim| {
-        let largest = sides(dim).max().filter(|_| dims.contains(&dim));
-        sides(dim).map(move |side| largest.map_or(0, |largest| largest - side))
-    });
-    let missing = heights.zip(widths);
-    let padded = pictures.iter().zip(missing);
-    padded.map(|(picture, (below, right))| picture.pad([0, right, 0, below], "constant", 1.)).collect()
+/// Pictures [3, H, W], as large as the largest of them along `dim` by white below or to the right.
+fn padded(pictures: &[Tensor], dim: i64) -> Vec<Tensor> {
+    let largest = pictures.iter().map(|picture| picture.size()[dim as usize]).max().unwrap_or(0);
+    let pad = |picture: &Tensor| {
+        let missing = largest - picture.size()[dim as usize];
+        let sides = if dim == 1 { [0, 0, 0, missing] } else { [0, missing, 0, 0] };
+        picture.pad(sides, "constant", 1.)
+    };
+    pictures.iter().map(pad).collect()
 }
 
 #[cfg(test)]
@@ -230,11 +235,12 @@ mod tests {
         let picture = |height, width| Tensor::zeros([3, height, width], (Kind::Float, Device::Cpu));
         let row = tile_horizontally(&[picture(2, 3), picture(5, 1)]);
         assert_eq!(row.size(), [3, 5, 3 + GAP + 1]);
+        let of_three = tile_horizontally(&[picture(2, 3), picture(2, 3), picture(2, 3)]);
+        let ImageSize { height, width } = tiled_size(ImageSize { height: 2, width: 3 }, 3);
+        assert_eq!(of_three.size(), [3, height.into(), width.into()]);
         let black = |t: &Tensor| t.eq(0.).sum(Kind::Int64).int64_value(&[]);
         assert_eq!(black(&row), 3 * (2 * 3 + 5));
         assert_eq!(black(&row.narrow(1, 0, 2).narrow(2, 0, 3)), 3 * 2 * 3);
         assert_eq!(tile_vertically(&[picture(2, 3), picture(5, 1)]).size(), [3, 2 + GAP + 5, 3]);
-        let frames = padded(&[picture(2, 3), picture(5, 1)], &[1, 2]);
-        assert!(frames.iter().all(|frame| frame.size() == [3, 5, 3]));
     }
 }

@@ -1,0 +1,163 @@
+//! What is seen of a splat: `render`.
+
+mod output;
+mod shots;
+
+pub(super) use shots::orbit_around_splat;
+
+use super::{model, parse_size, print_json, progress, stop_flag};
+use anyhow::Result;
+use clap::{ArgGroup, Args};
+use globalsplat::data::{Capture, Holdout, open_capture};
+use globalsplat::error::Error;
+use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
+use globalsplat::reconstruct::{load_context, reconstruct};
+use globalsplat::render::{Rendered, render_views};
+use globalsplat::scene::{Camera, ImageSize};
+use output::Output;
+use serde_json::json;
+use shots::Shots;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use tch::{Device, Tensor};
+
+/// Render a splat, or what a model makes of a capture's photos, from the capture's cameras, along a path, or on an orbit.
+///
+/// Colour always; --depth and --alpha add those, side by side in a film and as files of their own in a folder.
+#[derive(Args)]
+#[command(group(ArgGroup::new("source").required(true)))]
+#[command(group(ArgGroup::new("cameras").required(true).multiple(true)))]
+#[command(
+    after_help = "Examples:\n  globalsplat render --splat room.ply --scene captures/room --out views/\n  \
+    globalsplat render --splat room.ply --scene captures/room --orbit --depth --out orbit.mp4\n  \
+    globalsplat render --splat room.ply --scene captures/room --frames 200 --out smooth.mp4\n  \
+    globalsplat render --splat room.ply --path camera_path.json --out flight.mp4\n  \
+    globalsplat render --weights model.ckpt --scene captures/room --orbit --out orbit.gif"
+)]
+pub struct Render {
+    /// A splat: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE", group = "source")]
+    splat: Option<PathBuf>,
+    /// What a model makes of the capture's photos, as `reconstruct` does: what `export` or `import` wrote, or a checkpoint (.ckpt)
+    #[arg(long, value_name = "FILE", group = "source", requires = "scene")]
+    weights: Option<PathBuf>,
+    /// Cameras of this capture; with --orbit, an orbit amid them
+    #[arg(long, value_name = "PATH", group = "cameras")]
+    scene: Option<PathBuf>,
+    /// An orbit, around the splat when no capture is named
+    #[arg(long, group = "cameras")]
+    orbit: bool,
+    /// Cameras of this capture, of any format, whose photos need not exist, or of a camera_path.json of nerfstudio's viewer
+    #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
+    path: Option<PathBuf>,
+    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side
+    #[arg(long, value_name = "DIR|FILE")]
+    out: PathBuf,
+    /// Also depth, near bright and far dark, on one scale for all pictures
+    #[arg(long)]
+    depth: bool,
+    /// Also accumulated opacity
+    #[arg(long)]
+    alpha: bool,
+    /// So many pictures: on a smooth path through the cameras, at constant speed, or of the orbit, which has 60 by default
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    frames: Option<u32>,
+    /// Frames of a film per second; by default what the path says, else 20
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=120))]
+    fps: Option<u32>,
+    /// Picture size, as in 640x480; by default the capture's
+    #[arg(long, value_name = "WxH")]
+    size: Option<String>,
+    /// Print what was written as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Render {
+    pub fn run(self) -> Result<()> {
+        Output::check(&self.out, self.fps)?;
+        let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let splat = self.splat(capture.as_ref())?;
+        let shots = self.shots(&splat, capture.as_ref())?;
+        let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
+
+        let stop = stop_flag()?;
+        let mut output = Output::begin(&self.out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
+        let bar = progress::bar(shots.cameras.len() as u64, "views");
+        for (name, camera) in shots.names.iter().zip(&shots.cameras) {
+            let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);
+            output.add(name, self.parts(&rendered, scale), capture.as_ref())?;
+            if stop.load(Ordering::Relaxed) {
+                let (done, of, out) = (bar.position() + 1, shots.cameras.len(), self.out.display());
+                return Err(Error::Failed(format!("{out}: stopped after {done} of {of} views")).into());
+            }
+            bar.inc(1);
+        }
+        let written = output.finish()?;
+        bar.finish_and_clear();
+        if self.json {
+            print_json(
+                &json!({ "views": shots.cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
+            );
+        } else {
+            println!("{}: {} views", self.out.display(), shots.cameras.len());
+        }
+        Ok(())
+    }
+
+    fn splat(&self, capture: Option<&Capture>) -> Result<Splat> {
+        let (Some(weights), Some(capture)) = (&self.weights, capture) else {
+            return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
+        };
+        let loaded = model::load(Some(weights), "f32", Device::Cpu)?;
+        let data = &loaded.config.data;
+        let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
+        Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
+    }
+
+    fn shots(&self, splat: &Splat, capture: Option<&Capture>) -> Result<Shots> {
+        let size = self.size.as_deref().map(parse_size).transpose()?;
+        let frames = self.frames.map(|frames| frames as usize);
+        let shots = match (&self.path, capture) {
+            (Some(path), _) => Shots::along(path, size, frames, splat)?,
+            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, splat)?,
+            (None, Some(capture)) => Shots::of(capture, size, frames, splat)?,
+            (None, None) => Shots::around(splat, size, frames),
+        };
+        Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
+    }
+
+    /// Colour and what else was asked for, [3, H, W], each with its file's suffix.
+    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<(&'static str, Tensor)> {
+        let mut parts = vec![("", rendered.rgb.clamp(0., 1.))];
+        if let Some(scale) = scale {
+            parts.push(("_depth", scale.colourize(&rendered.depth, &rendered.alpha)));
+        }
+        if self.alpha {
+            parts.push(("_alpha", rendered.alpha.unsqueeze(0).expand([3, -1, -1], false)));
+        }
+        parts
+    }
+
+    /// Of the largest picture, with its parts side by side.
+    fn size_of_all(&self, cameras: &[Camera]) -> ImageSize {
+        let largest = |side: fn(&Camera) -> u32| cameras.iter().map(side).max().unwrap_or(0);
+        let size =
+            ImageSize { width: largest(|camera| camera.width), height: largest(|camera| camera.height) };
+        tiled_size(size, 1 + u32::from(self.depth) + u32::from(self.alpha))
+    }
+}
+
+/// What all pictures together show, told by a few that are small: before the first is rendered, the last counts as well.
+fn depth_scale(splat: &Splat, cameras: &[Camera]) -> Result<DepthScale> {
+    const FEW: usize = 12;
+    const SMALL: u32 = 128;
+    let small = |camera: &Camera| {
+        let by = (camera.width.max(camera.height)).div_ceil(SMALL);
+        camera.with_size(ImageSize { width: camera.width.div_ceil(by), height: camera.height.div_ceil(by) })
+    };
+    let count = cameras.len().min(FEW);
+    let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
+    let rendered = render_views(&splat.gaussians, &spread.collect::<Vec<_>>())?;
+    Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
+}
