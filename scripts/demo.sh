@@ -64,6 +64,10 @@ show models/tiny.safetensors "$out/shipped"
 first="$(name_of "${scenes[0]}")"
 echo "LOOK: $out/shipped/${first}_held_out.png has views never shown (photo, ours, depth), ${first}_orbit.gif a look around," \
     "${first}.ply the splat for any 3DGS viewer"
+if "$globalsplat" doctor --json | grep -q '"viewer": *true'; then
+    "$globalsplat" render --splat "$out/shipped/$first.ply" --scene "${scenes[0]}" --html "$out/shipped/$first.html" >/dev/null
+    echo "LOOK: $out/shipped/$first.html is a page to walk in, for any browser"
+fi
 
 mkdir -p "$out/refined"
 "$globalsplat" refine --scene "${scenes[0]}" --holdout every:3+1 --seconds 30 --sheet "$out/refined/${first}_held_out.png" \

@@ -23,6 +23,20 @@ weights() {
     "$python" scripts/lpips_weights.py "$@"
 }
 
+# The viewer that `globalsplat view` has in its pages, bundled from what web/ pins. Without npm, or a registry, the program is
+# built without it, and says so when a page is asked for.
+page() {
+    [ -z "$(find web/src web/package-lock.json -newer web/dist/page.js 2>&1 | head -n 1)" ] && return
+    if ! command -v npm >/dev/null; then
+        echo "setup: no npm found: the program is built without pages to walk in; install Node.js 20 or newer to have them" >&2
+        return
+    fi
+    echo "setup: bundling the viewer that web/ pins" >&2
+    if ! (cd web && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error >/dev/null && npm run --silent build); then
+        echo "setup: npm can't do it; the program is built without pages to walk in" >&2
+    fi
+}
+
 if [ "${1:-}" = weights ]; then
     weights
     exit
@@ -31,6 +45,7 @@ fi
 command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.89 or newer"
 command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
 
+page
 if [ -n "${LIBTORCH:-}" ]; then
     [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; name the folder of a libtorch 2.11, or unset it"
     if [ "${1:-}" != venv ]; then

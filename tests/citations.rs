@@ -69,15 +69,17 @@ fn sections(specification: &str) -> Vec<&str> {
     numbers.collect()
 }
 
-/// The text files in `place`, with their paths from the root; none where it isn't there. What is hidden or Python's own is
-/// left out.
+/// The text files in `place`, with their paths from the root; none where it isn't there. What is hidden, Python's own or
+/// others' is left out.
 fn texts(place: &str, found: &mut Vec<(String, String)>) {
     let path = root().join(place);
     if path.is_dir() {
         let mut names: Vec<String> = fs::read_dir(&path)
             .expect("a readable folder")
             .map(|entry| entry.expect("a readable entry").file_name().to_string_lossy().into_owned())
-            .filter(|name| !name.starts_with('.') && name != "__pycache__")
+            .filter(|name| {
+                !name.starts_with('.') && !["__pycache__", "node_modules"].contains(&name.as_str())
+            })
             .collect();
         names.sort();
         names.iter().for_each(|name| texts(&format!("{place}/{name}"), found));

@@ -1,4 +1,4 @@
-use super::{device, print_json};
+use super::{device, print_json, view};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::error::Error;
@@ -62,6 +62,7 @@ impl Doctor {
                 "model": SHIPPED_MODEL,
                 "weights": found,
                 "ffmpeg": or_error(&ffmpeg, |version| json!(version)),
+                "viewer": view::has_viewer(),
                 "together": { "gloo": together.gloo, "nccl": together.nccl },
             }));
             return Ok(());
@@ -85,6 +86,13 @@ impl Doctor {
                     together.nccl,
                     "absent (its headers and CUDA's come with libtorch's wheel and requirements.txt)"
                 )
+            ),
+        );
+        line(
+            "viewer",
+            &of(
+                view::has_viewer(),
+                "absent: no pages to walk in (install Node.js 20 or newer with npm, then make build)",
             ),
         );
         match &driver {

@@ -28,6 +28,7 @@ mod render;
 mod report;
 mod synth;
 mod train;
+mod view;
 mod watch;
 mod weights_out;
 
@@ -61,6 +62,7 @@ enum Command {
     Reconstruct(reconstruct::Reconstruct),
     Refine(refine::Refine),
     Render(render::Render),
+    View(view::View),
     Convert(convert::Convert),
     Export(export::Export),
     Import(import::Import),
@@ -83,6 +85,7 @@ impl Command {
             Command::Reconstruct(command) => command.run(),
             Command::Refine(command) => command.run(),
             Command::Render(command) => command.run(),
+            Command::View(command) => command.run(),
             Command::Convert(command) => command.run(),
             Command::Export(command) => command.run(),
             Command::Import(command) => command.run(),

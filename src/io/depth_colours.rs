@@ -41,7 +41,7 @@ impl DepthScale {
     pub fn colourize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
         let share = (inverse(depth) - self.far) / (self.near - self.far).max(1e-9);
         let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
-        let colours = Tensor::from_slice2(&colours()).to_device(depth.device());
+        let colours = Tensor::from_slice2(&depth_colours()).to_device(depth.device());
         let (height, width) = (depth.size()[0], depth.size()[1]);
         let picture =
             colours.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
@@ -63,7 +63,7 @@ fn seen(depth: &Tensor, alpha: &Tensor) -> Tensor {
 }
 
 /// RGB in [0, 1], from far to near.
-fn colours() -> [[f32; 3]; STEPS] {
+pub fn depth_colours() -> [[f32; 3]; STEPS] {
     std::array::from_fn(|step| {
         let colorous::Color { r, g, b } = COLOURS.eval_rational(step, STEPS);
         [r, g, b].map(|value| f32::from(value) / 255.)
@@ -90,13 +90,13 @@ mod tests {
     #[test]
     fn lightness_grows_in_even_steps() {
         // Sixteen at a time: 8 bits round by more than single steps are apart.
-        let levels: Vec<f64> = colours().iter().step_by(15).map(|&colour| lightness(colour)).collect();
+        let levels: Vec<f64> = depth_colours().iter().step_by(15).map(|&colour| lightness(colour)).collect();
         let steps: Vec<f64> = levels.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let mean = steps.iter().sum::<f64>() / steps.len() as f64;
         println!("L* from {:.1} to {:.1}, steps {steps:.2?}", levels[0], levels[levels.len() - 1]);
         assert!(levels[levels.len() - 1] - levels[0] > 70., "{levels:?}");
         assert!(steps.iter().all(|step| (step / mean - 1.).abs() < 0.2), "{steps:?} about {mean}");
-        let all: Vec<f64> = colours().iter().map(|&colour| lightness(colour)).collect();
+        let all: Vec<f64> = depth_colours().iter().map(|&colour| lightness(colour)).collect();
         assert!(all.windows(2).all(|pair| pair[1] > pair[0] - 0.1), "darker again: {all:?}");
     }
 
@@ -109,7 +109,7 @@ mod tests {
         let at = |x: i64| {
             <[f32; 3]>::try_from(Vec::try_from(picture.select(2, x).flatten(0, -1)).unwrap()).unwrap()
         };
-        let all = colours();
+        let all = depth_colours();
         assert_eq!((at(0), at(2)), (all[STEPS - 1], all[0]));
         assert!(lightness(at(0)) > lightness(at(1)) && lightness(at(1)) > lightness(at(2)));
         assert_eq!((at(3), at(4)), ([0.; 3], [0.; 3]));

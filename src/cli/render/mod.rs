@@ -3,9 +3,9 @@
 mod output;
 mod shots;
 
-pub(super) use shots::orbit_around_splat;
+pub(super) use shots::{median_depth, orbit_around_splat};
 
-use super::{model, parse_size, print_json, progress, stop_flag};
+use super::{model, parse_size, print_json, progress, stop_flag, view};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout, open_capture};
@@ -17,7 +17,7 @@ use globalsplat::scene::{Camera, ImageSize};
 use output::Output;
 use serde_json::json;
 use shots::Shots;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::{Device, Tensor};
 
@@ -32,7 +32,8 @@ use tch::{Device, Tensor};
     globalsplat render --splat room.ply --scene captures/room --orbit --depth --out orbit.mp4\n  \
     globalsplat render --splat room.ply --scene captures/room --frames 200 --out smooth.mp4\n  \
     globalsplat render --splat room.ply --path camera_path.json --out flight.mp4\n  \
-    globalsplat render --weights model.ckpt --scene captures/room --orbit --out orbit.gif"
+    globalsplat render --weights model.ckpt --scene captures/room --orbit --out orbit.gif\n  \
+    globalsplat render --splat room.ply --scene captures/room --html room.html"
 )]
 pub struct Render {
     /// A splat: .ply, .compressed.ply, .spz or .splat
@@ -51,8 +52,12 @@ pub struct Render {
     #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
     path: Option<PathBuf>,
     /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side
-    #[arg(long, value_name = "DIR|FILE")]
-    out: PathBuf,
+    #[arg(long, value_name = "DIR|FILE", required_unless_present = "html")]
+    out: Option<PathBuf>,
+    /// Instead, a page to walk in, with the photos of --scene if there is one: one file that needs no other and no network
+    #[arg(long, value_name = "FILE", group = "cameras",
+        conflicts_with_all = ["out", "orbit", "path", "depth", "alpha", "frames", "fps", "size"])]
+    html: Option<PathBuf>,
     /// Also depth, near bright and far dark, on one scale for all pictures
     #[arg(long)]
     depth: bool,
@@ -75,20 +80,43 @@ pub struct Render {
 
 impl Render {
     pub fn run(self) -> Result<()> {
-        Output::check(&self.out, self.fps)?;
+        match (&self.html, &self.out) {
+            (Some(page), _) => self.page(page),
+            (None, Some(out)) => self.pictures(out),
+            (None, None) => unreachable!("clap asks for one of the two"),
+        }
+    }
+
+    fn page(&self, page: &Path) -> Result<()> {
+        view::check_writable(page)?;
+        let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let splat = self.splat(capture.as_ref())?;
+        let name = capture.as_ref().map_or_else(|| view::name_of(page), |capture| capture.name.clone());
+        view::write_page(page, &name, &splat, capture.as_ref())?;
+        let (gaussians, bytes) = (splat.gaussians.count(), std::fs::metadata(page)?.len());
+        if self.json {
+            print_json(&json!({ "page": page, "gaussians": gaussians, "bytes": bytes }));
+        } else {
+            println!("{}: {gaussians} Gaussians, {:.1} MB", page.display(), bytes as f64 * 1e-6);
+        }
+        Ok(())
+    }
+
+    fn pictures(&self, out: &Path) -> Result<()> {
+        Output::check(out, self.fps)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = self.splat(capture.as_ref())?;
         let shots = self.shots(&splat, capture.as_ref())?;
         let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
-        let mut output = Output::begin(&self.out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
+        let mut output = Output::begin(out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
         for (name, camera) in shots.names.iter().zip(&shots.cameras) {
             let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);
             output.add(name, self.parts(&rendered, scale), capture.as_ref())?;
             if stop.load(Ordering::Relaxed) {
-                let (done, of, out) = (bar.position() + 1, shots.cameras.len(), self.out.display());
+                let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
                 return Err(Error::Failed(format!("{out}: stopped after {done} of {of} views")).into());
             }
             bar.inc(1);
@@ -100,7 +128,7 @@ impl Render {
                 &json!({ "views": shots.cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
             );
         } else {
-            println!("{}: {} views", self.out.display(), shots.cameras.len());
+            println!("{}: {} views", out.display(), shots.cameras.len());
         }
         Ok(())
     }

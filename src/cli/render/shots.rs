@@ -89,7 +89,7 @@ fn smoothed(cameras: &[Camera], frames: usize, splat: &Splat) -> Result<Vec<Came
 }
 
 /// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer.
-fn median_depth(splat: &Splat, cameras: &[Camera]) -> Result<f64> {
+pub fn median_depth(splat: &Splat, cameras: &[Camera]) -> Result<f64> {
     let rendered = render_views(&splat.gaussians, &cameras[cameras.len() / 2..][..1])?.remove(0);
     let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
     Ok(if seen.numel() == 0 { 1. } else { seen.median().double_value(&[]) })

@@ -1,0 +1,132 @@
+//! What a page is told about its scene.
+
+use super::super::render::{median_depth, orbit_around_splat};
+use anyhow::Result;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use glam::DVec3;
+use globalsplat::data::{Capture, View};
+use globalsplat::io::{Splat, encode_photo, rgb_from_tensor};
+use globalsplat::render::DEFAULT_EPS2D;
+use globalsplat::scene::{Camera, ImageSize, smooth_path};
+use serde::Serialize;
+
+/// The longer side of a photo, in pixels.
+const LONGEST: u32 = 640;
+/// A page with more would take long to load: at about 100 KB each.
+const MOST_PHOTOS: usize = 100;
+/// Around a splat whose capture isn't named.
+const ORBIT: usize = 24;
+const SIZE: ImageSize = ImageSize { width: 640, height: 480 };
+/// On the path through the capture's cameras. Between them the page goes straight on.
+const FRAMES_PER_CAMERA: usize = 12;
+const MOST_FRAMES: usize = 1200;
+/// A camera's frustum is as long as this share of the distance to what is seen.
+const FRUSTUM: f64 = 0.06;
+
+/// In the page as JSON; read in web/src.
+#[derive(Serialize)]
+pub struct Contents {
+    pub name: String,
+    cameras: Vec<PageCamera>,
+    /// Camera-to-world [3, 4], row by row, as those of cameras.
+    path: Vec<[f64; 12]>,
+    /// Where the photos' up is, of length 1.
+    up: [f64; 3],
+    /// To what the middle camera sees, in the capture's unit.
+    distance: f64,
+    frustum: f64,
+    /// What is added to the covariance of a Gaussian in the picture, in square pixels (spec 6.2).
+    blur: f64,
+}
+
+#[derive(Serialize)]
+struct PageCamera {
+    name: String,
+    c2w: [f64; 12],
+    lens: Lens,
+    /// A JPEG as a data URL.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    photo: Option<String>,
+}
+
+/// In pixels.
+#[derive(Serialize)]
+struct Lens {
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    width: u32,
+    height: u32,
+}
+
+impl Contents {
+    /// Of `splat`, seen from the cameras of `capture` or, without one, from around it.
+    ///
+    /// # Errors
+    /// Photos that can't be read.
+    pub fn of(name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<Self> {
+        let (cameras, all) = match capture {
+            Some(capture) => (photographed(capture)?, capture.cameras()),
+            None => {
+                let orbit = orbit_around_splat(splat, SIZE, ORBIT);
+                let named =
+                    (1_usize..).zip(&orbit).map(|(i, camera)| PageCamera::of(i.to_string(), camera, None));
+                (named.collect(), orbit)
+            }
+        };
+        let distance = median_depth(splat, &all)?;
+        let path = match capture {
+            Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MOST_FRAMES))?,
+            None => [&all[..], &all[..1]].concat(),
+        };
+        let up = -all.iter().map(|camera| camera.c2w.y_axis.truncate()).sum::<DVec3>();
+        Ok(Contents {
+            name: name.into(),
+            cameras,
+            path: path.iter().map(rows).collect(),
+            up: up.try_normalize().unwrap_or(DVec3::NEG_Y).into(),
+            distance,
+            frustum: FRUSTUM * distance,
+            blur: DEFAULT_EPS2D,
+        })
+    }
+}
+
+impl PageCamera {
+    fn of(name: String, camera: &Camera, photo: Option<String>) -> Self {
+        let k = camera.intrinsics;
+        let Camera { width, height, .. } = *camera;
+        let lens = Lens { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height };
+        PageCamera { name, c2w: rows(camera), lens, photo }
+    }
+}
+
+/// The first three rows of a camera-to-world matrix.
+fn rows(camera: &Camera) -> [f64; 12] {
+    std::array::from_fn(|i| camera.c2w.col(i % 4)[i / 4])
+}
+
+/// Cameras and their photos, spread over the capture where there are many.
+fn photographed(capture: &Capture) -> Result<Vec<PageCamera>> {
+    let count = capture.len().min(MOST_PHOTOS);
+    let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
+    let photographed = |index: usize| {
+        let view = shrunk(capture.load(&[index], None)?.remove(0))?;
+        let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
+        let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
+        Ok(PageCamera::of(view.name, &view.camera, Some(photo)))
+    };
+    indices.map(photographed).collect()
+}
+
+fn shrunk(view: View) -> Result<View> {
+    let Camera { width, height, .. } = view.camera;
+    let longest = width.max(height);
+    if longest <= LONGEST {
+        return Ok(view);
+    }
+    let side = |side: u32| (side * LONGEST).div_ceil(longest);
+    Ok(view.fitted(ImageSize { width: side(width), height: side(height) })?)
+}

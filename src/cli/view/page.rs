@@ -1,0 +1,162 @@
+//! The page: a frame around the viewer that `web/` bundles, and all that it shows.
+
+use super::contents::Contents;
+use anyhow::Result;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use globalsplat::data::Capture;
+use globalsplat::error::Error;
+use globalsplat::io::{self, Splat, check_writable_file, fit_splat, write_atomically, write_splat};
+use globalsplat::render::HarmonicLimits;
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+use std::path::Path;
+
+/// What `web/` was bundled to when this program was built; empty where npm wasn't there.
+const VIEWER: &str = include_str!(concat!(env!("OUT_DIR"), "/page.js"));
+const STYLE: &str = include_str!("page.css");
+/// Nothing is asked of anybody: all that the page needs is in it. Spark's sorting is a worker, and WebAssembly, in the script.
+const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; \
+    connect-src data: blob:; img-src data: blob:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
+
+/// Whether this program was built where npm was.
+pub fn has_viewer() -> bool {
+    !VIEWER.is_empty()
+}
+
+/// That pages can be written.
+///
+/// # Errors
+/// A program that was built where npm wasn't.
+pub fn check_has_viewer() -> Result<()> {
+    if !has_viewer() {
+        return Err(Error::Request(
+            "this program was built without the viewer that pages need: install Node.js 20 or newer with npm, and run make build".into(),
+        )
+        .into());
+    }
+    Ok(())
+}
+
+/// That a page can be written at `path`. Call it before the work, not after.
+///
+/// # Errors
+/// As [`check_has_viewer`], or a place that can't be written to.
+pub fn check_writable(path: &Path) -> Result<()> {
+    check_has_viewer()?;
+    Ok(check_writable_file(path)?)
+}
+
+/// Writes a page in which `splat` can be walked in, with the photos of `capture`, as one file at `path`.
+///
+/// # Errors
+/// Photos that can't be read, or the system's refusal to write.
+pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<()> {
+    let contents = Contents::of(name, splat, capture)?;
+    let text = page(&contents, &spz(splat, capture)?)?.into_string();
+    Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
+}
+
+/// The splat in few bytes, by colours that viewers can show.
+fn spz(splat: &Splat, capture: Option<&Capture>) -> Result<Vec<u8>> {
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("scene.spz");
+    let cameras = capture.map(Capture::cameras).unwrap_or_default();
+    write_splat(&file, &fit_splat(&file, splat, &HarmonicLimits::of_viewers(splat.sh_degree()), &cameras)?)?;
+    Ok(std::fs::read(file)?)
+}
+
+/// Text that no end of its element is in.
+fn in_script(json: &str) -> PreEscaped<String> {
+    PreEscaped(json.replace('<', "\\u003c"))
+}
+
+fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
+    let json = serde_json::to_string(contents)?;
+    Ok(html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta http-equiv="Content-Security-Policy" content=(POLICY);
+                meta name="viewport" content="width=device-width, initial-scale=1, viewport-fit=cover";
+                meta name="color-scheme" content="dark";
+                meta name="generator" content={ "GlobalSplat " (env!("CARGO_PKG_VERSION")) };
+                title { (contents.name) }
+                style { (PreEscaped(STYLE)) }
+            }
+            body data-state="loading" {
+                (depth_colours())
+                canvas #canvas tabindex="0" aria-label="The scene. Arrow keys and W, A, S, D walk." {}
+                div #compare hidden {
+                    img #photo alt="The photo from here" draggable="false";
+                    input #share type="range" min="0" max="1" step="any" value="0" aria-label="Photo to the left, picture to the right";
+                }
+                p #message role="status" { "Loading the scene…" }
+                noscript { p { "This page needs JavaScript, its own alone." } }
+                header {
+                    h1 { (contents.name) }
+                    nav aria-label="View" {
+                        div role="group" aria-label="Shown" {
+                            button #colour type="button" aria-pressed="true" title="1" { "Colour" }
+                            button #depth type="button" aria-pressed="false" title="2" { "Depth" }
+                            button #centres type="button" aria-pressed="false" title="3" { "Centres" }
+                        }
+                        button #cameras type="button" aria-pressed="false" title="C" { "Cameras" }
+                        button #help-button type="button" aria-haspopup="dialog" title="?" { "Help" }
+                    }
+                }
+                footer {
+                    div #path {
+                        button #play type="button" aria-pressed="false" title="Space" { "Play" }
+                        input #along type="range" min="0" max="1" step="any" value="0" aria-label="Along the cameras' path";
+                    }
+                    div #strip role="group" aria-label="Photos to jump to" {}
+                }
+                (help())
+                script #scene type="application/json" { (in_script(&json)) }
+                script #splat type="text/plain" { (PreEscaped(STANDARD.encode(spz))) }
+                script { (PreEscaped(VIEWER.replace("</script", "<\\/script"))) }
+            }
+        }
+    })
+}
+
+fn help() -> Markup {
+    let keys = [
+        ("W A S D, arrows", "walk and turn; R and F up and down, Shift faster"),
+        ("Drag, wheel", "look around, go forward and back; right button or two fingers: aside"),
+        (", and .", "jump to the photo before or after"),
+        ("Space", "play along the cameras' path"),
+        ("1, 2, 3", "colour, depth, the Gaussians' centres"),
+        ("C", "cameras with their photos"),
+        ("H", "hide the controls"),
+        ("?", "this help"),
+    ];
+    html! {
+        dialog #help aria-label="Help" {
+            dl { @for (key, does) in keys { div { dt { (key) } dd { (does) } } } }
+            p { "At a photo's camera the slider draws the photo over the picture." }
+            form method="dialog" { button { "Close" } }
+        }
+    }
+}
+
+/// A filter that gives greys of depth the colours of `render --depth`, and leaves black what isn't there.
+fn depth_colours() -> Markup {
+    let colours = io::depth_colours();
+    let table = |channel: usize| -> String {
+        let values = colours[1..].iter().map(|colour| format!(" {:.3}", colour[channel]));
+        std::iter::once("0".into()).chain(values).collect()
+    };
+    html! {
+        svg width="0" height="0" aria-hidden="true" {
+            filter #depth-colours color-interpolation-filters="sRGB" {
+                feComponentTransfer {
+                    feFuncR type="table" tableValues=(table(0));
+                    feFuncG type="table" tableValues=(table(1));
+                    feFuncB type="table" tableValues=(table(2));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,159 @@
+/** The scene in WebGL: the splat, its Gaussians' centres, and the cameras that photographed it. */
+
+import { SparkRenderer, SplatMesh, dyno } from "@sparkjsdev/spark";
+import {
+  BufferAttribute, BufferGeometry, DoubleSide, Group, LineBasicMaterial, LineSegments, Matrix4, Mesh, MeshBasicMaterial,
+  PlaneGeometry, Points, PointsMaterial, SRGBColorSpace, Scene, TextureLoader, Vector3, WebGLRenderer,
+} from "three";
+import { LensCamera, pose } from "./lens.js";
+
+/** The share of Gaussians at either end of all depths that no colours are spent on. */
+const OUTLIERS = 0.02;
+
+export class Stage {
+  /** `world` is turned so that the scene's up is y, which is what whoever walks turns around. */
+  constructor(canvas, scene) {
+    this.scene = scene;
+    this.renderer = new WebGLRenderer({ canvas, antialias: false });
+    this.world = new Group();
+    this.world.quaternion.setFromUnitVectors(new Vector3(...scene.up), new Vector3(0, 1, 0));
+    this.world.updateMatrixWorld();
+    this.camera = new LensCamera();
+    // The blur and the order of our own rasterizer: by depth, and as much blur as the model was trained with.
+    this.spark = new SparkRenderer({
+      renderer: this.renderer, preBlurAmount: scene.blur, blurAmount: 0, sortRadial: false, maxStdDev: 3.3, onDirty: () => this.touch(),
+    });
+    this.all = new Scene();
+    this.all.add(this.world, this.spark);
+    this.mode = "colour";
+    this.place = new Vector3();
+    this.lookedFrom = new Matrix4();
+    this.touch();
+  }
+
+  /** Something is to be drawn anew. */
+  touch() {
+    this.isDirty = true;
+  }
+
+  async load(bytes) {
+    this.splat = new SplatMesh({ fileBytes: bytes, fileType: "spz" });
+    // An SPZ's y points up and its z backward.
+    this.splat.rotation.x = Math.PI;
+    this.world.add(this.splat);
+    await this.splat.initialized;
+    this.addCentres();
+    this.addDepth();
+    this.addFrustums();
+    this.touch();
+  }
+
+  addCentres() {
+    const [places, colours] = [[], []];
+    this.splat.splats.forEachSplat((_, centre, _scales, _quaternion, _opacity, colour) => {
+      places.push(centre.x, centre.y, centre.z);
+      colours.push(colour.r, colour.g, colour.b);
+    });
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
+    geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
+    // Numbers in a splat are colours as they are shown.
+    const material = new PointsMaterial({ size: 2 * this.renderer.getPixelRatio(), sizeAttenuation: false, vertexColors: true });
+    material.onBeforeCompile = (shader) => {
+      shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
+    };
+    this.centres = new Points(geometry, material);
+    this.centres.rotation.copy(this.splat.rotation);
+    this.centres.visible = false;
+    this.world.add(this.centres);
+  }
+
+  /** Grey by the depth of a Gaussian's centre, near bright, evenly by 1/depth: the page's filter gives greys their colours. */
+  addDepth() {
+    this.eye = dyno.dynoVec3(new Vector3());
+    this.forward = dyno.dynoVec3(new Vector3());
+    this.far = dyno.dynoFloat(0);
+    this.range = dyno.dynoFloat(1);
+    const number = (value) => dyno.dynoConst("float", value);
+    this.depthOf = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+      const depth = dyno.dot(dyno.sub(dyno.splitGsplat(gsplat).outputs.center, this.eye), this.forward);
+      const inverse = dyno.div(number(1), dyno.max(depth, number(1e-6)));
+      const grey = dyno.clamp(dyno.div(dyno.sub(inverse, this.far), this.range), number(0), number(1));
+      return { gsplat: dyno.combineGsplat({ gsplat, r: grey, g: grey, b: grey }) };
+    });
+    const places = this.centres.geometry.getAttribute("position");
+    const [eye, forward, place] = [new Vector3(), new Vector3(), new Vector3()];
+    const turned = new Matrix4().makeRotationFromEuler(this.centres.rotation);
+    const inverses = [];
+    for (const camera of this.scene.cameras) {
+      const matrix = pose(camera.c2w);
+      eye.setFromMatrixPosition(matrix);
+      forward.setFromMatrixColumn(matrix, 2).negate();
+      // Enough of them to know the range by.
+      const step = Math.max(1, Math.floor((places.count * this.scene.cameras.length) / 50_000));
+      for (let index = 0; index < places.count; index += step) {
+        const depth = place.fromBufferAttribute(places, index).applyMatrix4(turned).sub(eye).dot(forward);
+        if (depth > 0) inverses.push(1 / depth);
+      }
+    }
+    inverses.sort((a, b) => a - b);
+    const at = (share) => inverses[Math.floor(share * (inverses.length - 1))] ?? 0;
+    this.far.value = at(OUTLIERS);
+    this.range.value = Math.max(at(1 - OUTLIERS) - this.far.value, 1e-9);
+  }
+
+  addFrustums() {
+    this.frustums = new Group();
+    const size = this.scene.frustum;
+    for (const { c2w, lens, photo } of this.scene.cameras) {
+      if (!photo) continue;
+      const camera = new Group();
+      pose(c2w).decompose(camera.position, camera.quaternion, camera.scale);
+      const corner = (x, y) => [((x - lens.cx) / lens.fx) * size, (-(y - lens.cy) / lens.fy) * size, -size];
+      const corners = [corner(0, 0), corner(lens.width, 0), corner(lens.width, lens.height), corner(0, lens.height)];
+      const lines = corners.flatMap((from, index) => [from, corners[(index + 1) % 4], [0, 0, 0], from]).flat();
+      const edges = new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(lines), 3));
+      camera.add(new LineSegments(edges, new LineBasicMaterial({ color: 0xffb43a })));
+      const [left, top] = corners[0];
+      const [right, bottom] = corners[2];
+      const plane = new PlaneGeometry(right - left, top - bottom).translate((left + right) / 2, (top + bottom) / 2, -size);
+      const texture = new TextureLoader().load(photo, () => this.touch());
+      texture.colorSpace = SRGBColorSpace;
+      camera.add(new Mesh(plane, new MeshBasicMaterial({ map: texture, side: DoubleSide, toneMapped: false })));
+      this.frustums.add(camera);
+    }
+    this.frustums.visible = false;
+    this.world.add(this.frustums);
+  }
+
+  /** `colour`, `depth` or `centres`. */
+  show(mode) {
+    this.mode = mode;
+    this.splat.visible = mode !== "centres";
+    this.centres.visible = mode === "centres";
+    this.splat.worldModifier = mode === "depth" ? this.depthOf : undefined;
+    this.splat.updateGenerator();
+    this.touch();
+  }
+
+  /** Draws what changed; whether anything did. */
+  draw() {
+    if (!this.isDirty) return false;
+    this.isDirty = false;
+    this.camera.updateMatrixWorld();
+    if (this.mode === "depth" && !this.camera.matrixWorld.equals(this.lookedFrom)) {
+      // Greys are for one place to look from, and made anew for the next; that makes the picture dirty again.
+      this.lookedFrom.copy(this.camera.matrixWorld);
+      this.eye.value.setFromMatrixPosition(this.lookedFrom);
+      this.forward.value.setFromMatrixColumn(this.lookedFrom, 2).negate();
+      this.splat.updateVersion();
+    }
+    for (const frustum of this.frustums?.children ?? []) {
+      // A photo right before the eye would hide all else; greys of depth have no place for photos.
+      const isNear = frustum.getWorldPosition(this.place).distanceTo(this.camera.position) < 3 * this.scene.frustum;
+      frustum.visible = !isNear && this.mode !== "depth";
+    }
+    this.renderer.render(this.all, this.camera);
+    return true;
+  }
+}
