@@ -38,6 +38,7 @@ export class Walk {
   /** Goes to camera number `index`; at once where movement isn't wanted. */
   jumpTo(index, smoothly) {
     this.isPlaying = false;
+    this.halt();
     const to = this.placeOf(this.stage.scene.cameras[index].c2w);
     const { position, quaternion } = this.stage.camera;
     this.jump = { to, index, from: { position: position.clone(), quaternion: quaternion.clone() }, begun: performance.now(), takes: smoothly ? JUMP : 0 };
@@ -48,7 +49,14 @@ export class Walk {
   play(isPlaying) {
     this.isPlaying = isPlaying && this.poses.length > 1;
     if (this.isPlaying && this.along >= 1) this.along = 0;
+    this.halt();
     this.leave();
+  }
+
+  /** What hands set in motion before doesn't go on, and isn't taken for hands again. */
+  halt() {
+    const { scroll, rotateVelocity, moveVelocity } = this.controls.pointerControls;
+    for (const motion of [scroll, rotateVelocity, moveVelocity]) motion.set(0, 0, 0);
   }
 
   seek(along) {

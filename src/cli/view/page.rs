@@ -152,9 +152,9 @@ fn depth_colours() -> Markup {
         svg width="0" height="0" aria-hidden="true" {
             filter #depth-colours color-interpolation-filters="sRGB" {
                 feComponentTransfer {
-                    feFuncR type="table" tableValues=(table(0));
-                    feFuncG type="table" tableValues=(table(1));
-                    feFuncB type="table" tableValues=(table(2));
+                    feFuncR type="table" tableValues=(table(0)) {}
+                    feFuncG type="table" tableValues=(table(1)) {}
+                    feFuncB type="table" tableValues=(table(2)) {}
                 }
             }
         }
