@@ -74,8 +74,8 @@ export class Walk {
   /** Stands where the path is. */
   stand() {
     const place = this.along * (this.poses.length - 1);
-    const [before, share] = [Math.min(Math.floor(place), this.poses.length - 2), place - Math.min(Math.floor(place), this.poses.length - 2)];
-    this.between(this.poses[before], this.poses[before + 1], share);
+    const before = Math.min(Math.floor(place), this.poses.length - 2);
+    this.between(this.poses[before], this.poses[before + 1], place - before);
   }
 
   between(from, to, share) {
