@@ -144,22 +144,31 @@ fn a_browser_plays_an_mp4_from_disk() {
     assert!((told[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{told}");
     assert_eq!((told[2].as_i64(), told[3].as_i64()), (Some(384), Some(256)));
     for (i, picture) in pictures(&views).iter().enumerate().step_by(4) {
-        // To the middle of the frame, then onto the canvas.
+        // To the middle of the frame.
         browser.evaluate(&format!(
-            "new Promise(done => {{
+            "new Promise((done) => {{
                 const v = document.querySelector('video');
-                const c = document.querySelector('canvas').getContext('2d');
-                v.onseeked = () => {{ c.drawImage(v, 0, 0); requestAnimationFrame(() => requestAnimationFrame(done)); }};
+                v.onseeked = done;
                 v.currentTime = {};
             }})",
             (i as f64 + 0.5) / 20.
         ));
-        // A page from disk may not read a film's pixels back; what it shows can be seen all the same.
-        let clip = json!({"x": 0, "y": 0, "width": 384, "height": 256, "scale": 1});
-        let shot = browser.call("Page.captureScreenshot", json!({"format": "png", "clip": clip}));
-        let png = base64::engine::general_purpose::STANDARD.decode(shot["data"].as_str().unwrap()).unwrap();
-        let shown = image::load_from_memory(&png).unwrap().into_rgb8();
-        let likeness = psnr(&shown, picture);
+        // When it says that it is there, a canvas may still be given the frame before.
+        let mut look = || {
+            browser.evaluate(
+                "new Promise((done) => {
+                    document.querySelector('canvas').getContext('2d').drawImage(document.querySelector('video'), 0, 0);
+                    requestAnimationFrame(() => requestAnimationFrame(done));
+                })",
+            );
+            // A page from disk may not read a film's pixels back; what it shows can be seen all the same.
+            let clip = json!({"x": 0, "y": 0, "width": 384, "height": 256, "scale": 1});
+            let shot = browser.call("Page.captureScreenshot", json!({"format": "png", "clip": clip}));
+            let png =
+                base64::engine::general_purpose::STANDARD.decode(shot["data"].as_str().unwrap()).unwrap();
+            psnr(&image::load_from_memory(&png).unwrap().into_rgb8(), picture)
+        };
+        let likeness = (0..20).map(|_| look()).find(|&likeness| likeness > 28.).unwrap_or_else(&mut look);
         println!("frame {i}: {likeness:.1} dB");
         assert!(likeness > 28., "the browser's frame {i} is {likeness} dB like its picture");
     }
