@@ -208,7 +208,8 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.key("Comma");
     shown.wait_for("page.walk.at === 2");
     assert_eq!(shown.value("[...strip.children].findIndex((of) => of.hasAttribute('aria-current'))"), 2);
-    shown.key("Home");
+    // Held for many frames, it goes there and nowhere else.
+    shown.key_for("Home", Duration::from_millis(500));
     shown.wait_for("page.walk.at === 0");
 
     // Depth has the colours of depth, centres are points.

@@ -19,6 +19,9 @@ export class Walk {
     this.controls.fpsMovement.moveSpeed = 0.5 * scene.distance;
     this.controls.pointerControls.slideSpeed *= 0.5 * scene.distance;
     this.controls.pointerControls.scrollSpeed *= 0.3 * scene.distance;
+    // Home is the page's: it goes to the first photo, and doesn't turn.
+    const { Home, End, ...turning } = this.controls.fpsMovement.keycodeRotateMapping;
+    this.controls.fpsMovement.keycodeRotateMapping = turning;
     this.poses = scene.path.map((c2w) => this.placeOf(c2w));
     /** Which of the cameras this is the view of, if any. */
     this.at = null;
