@@ -6,7 +6,8 @@ use std::{
 };
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 8] = [
+const BRIDGES: [&str; 9] = [
+    "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
     "src/device.rs",
@@ -88,7 +89,13 @@ fn main() {
         .compile("globalsplat_torch");
 
     cpp()
-        .files(["raster/raster.cpp", "raster/fit.cpp", "raster/parallel.cpp", "raster/kernels.cpp"])
+        .files([
+            "raster/raster.cpp",
+            "raster/attend.cpp",
+            "raster/fit.cpp",
+            "raster/parallel.cpp",
+            "raster/kernels.cpp",
+        ])
         .compile("globalsplat_raster");
     // Kernels for GPUs give the CPU's bits, so here, too, nothing is fused that isn't written so.
     cpp()

@@ -1,5 +1,6 @@
 // Everything that knows torch, as one translation unit: reading torch's headers is half of the work.
 #include "arguments.cpp"
+#include "attention.cpp"
 #include "chunk.cpp"
 #include "cpu/projection.cpp"
 #include "cpu/splat.cpp"

@@ -1,6 +1,7 @@
 // The kernels that exist once per instruction set, and the choice among them.
 #pragma once
 
+#include "rows.h"
 #include "types.h"
 
 namespace globalsplat::raster {
@@ -30,6 +31,9 @@ struct Kernels {
   const char* name;  // "avx512", "avx2", "neon", "portable"
   KernelsOf<float> of_float;
   KernelsOf<double> of_double;
+  // attention.h
+  void (*attend)(const AttentionHead&, Rows<float> out, float* log_sums, float* room);
+  void (*attend_backward)(const AttentionHead&, const AttentionPast&, float* dq, Rows<float> dk, Rows<float> dv, float* room);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

@@ -1,5 +1,6 @@
 // Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
 #include "adam.h"
+#include "attention.h"
 #include "blend.h"
 #include "cover.h"
 #include "kernels.h"
@@ -19,6 +20,8 @@ const Kernels table = {
      ssim<float>, fit_gradient<float>, unevenness<float>, adam<float>},
     {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>,
      ssim<double>, fit_gradient<double>, unevenness<double>, adam<double>},
+    attend,
+    attend_backward,
     multiply_adds,
 };
 

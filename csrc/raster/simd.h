@@ -240,6 +240,19 @@ GS_INLINE Vector<double> sqrt(Vector<double> v) {
 }
 #endif
 
+// Four rows of four numbers, `stride` apart, to four columns.
+GS_INLINE void transpose4(const float* from, int64_t stride, float* to, int64_t to_stride) {
+#if defined(__SSE2__)
+  __m128 row[4];
+  for (int i = 0; i < 4; ++i) row[i] = _mm_loadu_ps(from + i * stride);
+  _MM_TRANSPOSE4_PS(row[0], row[1], row[2], row[3]);
+  for (int i = 0; i < 4; ++i) _mm_storeu_ps(to + i * to_stride, row[i]);
+#else
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < 4; ++j) to[j * to_stride + i] = from[i * stride + j];
+#endif
+}
+
 // 1/v to 2e-7: an estimate of 12 or 14 bits and one step of Newton's method. No decision hangs on it.
 #if defined(__AVX512F__)
 GS_INLINE Vector<float> reciprocal(Vector<float> v) {
@@ -344,6 +357,16 @@ GS_INLINE double sum_of_lanes(Vector<T> v) {
   for (const T value : lane) sum += double(value);
   return sum;
 }
+
+#if defined(__AVX512F__)
+GS_INLINE float largest_lane(Vector<float> v) { return _mm512_reduce_max_ps(v); }
+#else
+GS_INLINE float largest_lane(Vector<float> v) {
+  float largest = v[0];
+  for (int lane = 1; lane < Simd<float>::lanes; ++lane) largest = v[lane] > largest ? v[lane] : largest;
+  return largest;
+}
+#endif
 
 // out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.
 template <class T, int count>

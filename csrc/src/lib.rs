@@ -1,5 +1,6 @@
 //! The C++ of GlobalSplat as Rust sees it. A crate of its own, without tch, so that both compile side by side.
 
+pub mod attention;
 pub mod chunk;
 pub mod cuda;
 pub mod device;

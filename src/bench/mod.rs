@@ -1,5 +1,6 @@
 //! How fast things are: measured by commands that anyone can run, never by tests.
 
+mod attention;
 mod loader;
 mod model;
 mod raster;
@@ -8,6 +9,7 @@ mod synth;
 mod train;
 mod video;
 
+pub use attention::{AttentionReport, AttentionRow, bench_attention};
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use model::{ModelReport, bench_model};
 pub use raster::{RasterReport, bench_raster, made_up_scene};

@@ -1,3 +1,4 @@
+use super::bench_attention::Attention;
 use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
@@ -25,6 +26,7 @@ pub struct Bench {
 
 #[derive(Subcommand)]
 enum Part {
+    Attention(Attention),
     Raster(Raster),
     Loader(Loader),
     Model(Model),
@@ -36,6 +38,7 @@ enum Part {
 impl Bench {
     pub fn run(self) -> Result<()> {
         match self.part {
+            Part::Attention(attention) => attention.run(),
             Part::Raster(raster) => raster.run(),
             Part::Loader(loader) => loader.run(),
             Part::Model(model) => model.run(),

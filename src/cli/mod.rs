@@ -4,6 +4,7 @@
 //! object), everything else to standard error.
 
 mod bench;
+mod bench_attention;
 mod bench_model;
 mod bench_refine;
 mod bench_train;

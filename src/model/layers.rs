@@ -85,25 +85,3 @@ impl Mlp {
         precision.linear(&self.contract, &precision.linear(&self.expand, xs).gelu("none"))
     }
 }
-
-/// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
-pub(super) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
-    let split = |t: &Tensor| {
-        let (b, n, d) = t.size3().expect("[B, n, d]");
-        t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
-    };
-    // Strided as the linear layers leave them, of one kind, without a mask: so libtorch's fused kernels take them as they are, as
-    // long as a head's width is a multiple of 8.
-    Tensor::scaled_dot_product_attention(
-        &split(q),
-        &split(k),
-        &split(v),
-        None::<&Tensor>,
-        0.,
-        false,
-        None,
-        false,
-    )
-    .transpose(1, 2)
-    .flatten(2, 3)
-}

@@ -3,6 +3,7 @@
 //! Parameters carry the names of the published weights, so that a model trained here and one published by the authors
 //! are the same file after a change of container.
 
+mod attention;
 mod camera_code;
 mod config;
 mod decoder;
@@ -30,6 +31,7 @@ pub(crate) use leaves::{leaf, pull_back};
 pub(crate) use recompute::KeptRounds;
 
 // For the parity checks, which run every module by itself.
+pub(crate) use attention::{attention, by_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
 pub(crate) use encoder::Encoder;

@@ -1,7 +1,8 @@
 //! One stream's part of an encoder round: look at the images, think, then talk among the scene tokens (spec 4.2).
 
+use super::attention::attention;
 use super::config::ModelConfig;
-use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear};
+use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear};
 use super::precision::Precision;
 use tch::{Tensor, nn, nn::Module};
 

@@ -1,0 +1,88 @@
+#include "attend.h"
+
+#include <algorithm>
+#include <cmath>
+#include <memory>
+#include <vector>
+
+#include "kernels.h"
+#include "parallel.h"
+
+namespace globalsplat::raster {
+namespace {
+
+// Tasks that a call is cut into, about: by shapes alone, so that sums are the same on every machine.
+constexpr int64_t kTasks = 64;
+// Queries that make packing keys worth while, and keys that make a gradient of all queries so.
+constexpr int64_t kFewestQueries = 96, kFewestKeys = 2 * kBackwardKeys;
+constexpr int64_t kSumRows = 64;  // of gradients, that are one task
+
+int64_t rounded_up(int64_t number, int64_t step) { return (number + step - 1) / step * step; }
+
+// How many of `count` rows are one task, at least `fewest`, in whole `step`s.
+int64_t part(int64_t heads, int64_t count, int64_t fewest, int64_t step) {
+  return rounded_up(std::max(fewest, (count * heads + kTasks - 1) / kTasks), step);
+}
+
+template <class Number>
+Rows<Number> head_of(const Heads<Number>& all, const AttentionShape& shape, int64_t head) {
+  return {all.data + head / shape.heads * all.scene + head % shape.heads * shape.width, all.row};
+}
+
+// A thread's own, on whole cache lines.
+float* room(int64_t count) {
+  thread_local std::vector<float> numbers;
+  numbers.resize(std::max(numbers.size(), size_t(count) + 16));
+  const auto address = reinterpret_cast<uintptr_t>(numbers.data());
+  return numbers.data() + (64 - address % 64) % 64 / sizeof(float);
+}
+
+}  // namespace
+
+void attend(const AttentionShape& shape, const AttentionInputs& in, Heads<float> out, float* log_sums, int threads) {
+  const int64_t heads = shape.scenes * shape.heads;
+  const int64_t most = std::min(part(heads, shape.queries, kFewestQueries, kProductRows), kAttentionQueries);
+  const int64_t blocks = (shape.queries + most - 1) / most;
+  const int64_t size = rounded_up((shape.queries + blocks - 1) / std::max<int64_t>(blocks, 1), kProductRows);
+  parallel_for(threads, heads * blocks, [&](int64_t task) {
+    const int64_t head = task / blocks, begin = std::min(task % blocks * size, shape.queries);
+    const AttentionHead of{head_of(in.q, shape, head).from(begin), head_of(in.k, shape, head), head_of(in.v, shape, head),
+                           std::min(size, shape.queries - begin), shape.keys, shape.width};
+    kernels().attend(of, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
+                     room(attention_room(shape.width)));
+  });
+}
+
+void attend_backward(const AttentionShape& shape, const AttentionInputs& in, Heads<const float> out, const float* log_sums,
+                     Heads<const float> slope, const AttentionGradients& gradients, int threads) {
+  const int64_t heads = shape.scenes * shape.heads;
+  // Every task has a part of a head's keys, and a gradient of all its queries, of which these are added up in order.
+  const int64_t size = part(heads, shape.keys, kFewestKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
+  const int64_t columns = attention_columns(shape.width), all = whole_product_rows(shape.queries) * columns;
+  const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
+  parallel_for(threads, heads * parts, [&](int64_t task) {
+    const int64_t head = task / parts, begin = task % parts * size;
+    const auto rows = [&](const auto& of) { return head_of(of, shape, head); };
+    const AttentionHead of{rows(in.q), rows(in.k).from(begin), rows(in.v).from(begin), shape.queries,
+                           std::min(size, shape.keys - begin), shape.width};
+    kernels().attend_backward(of, {rows(out), rows(slope), log_sums + head * shape.queries}, sums.get() + task * all,
+                              rows(gradients.k).from(begin), rows(gradients.v).from(begin),
+                              room(attention_backward_room(shape.width)));
+  });
+  const float scale = float(1 / std::sqrt(double(shape.width)));
+  const int64_t pieces = (shape.queries + kSumRows - 1) / kSumRows;
+  parallel_for(threads, heads * pieces, [&](int64_t task) {
+    const int64_t head = task / pieces, begin = task % pieces * kSumRows;
+    const Rows<float> to = head_of(gradients.q, shape, head);
+    for (int64_t i = begin; i < std::min(begin + kSumRows, shape.queries); ++i) {
+      const float* const first = sums.get() + head * parts * all + i * columns;
+      for (int c = 0; c < shape.width; ++c) {
+        float sum = 0;
+        for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c];
+        to.data[i * to.stride + c] = scale * sum;
+      }
+    }
+  });
+}
+
+}  // namespace globalsplat::raster

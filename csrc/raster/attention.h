@@ -1,0 +1,178 @@
+// Attention of one head: out = softmax(q kᵀ / √w) v over rows of w numbers (spec 4.2), forward beside backward. Scores never leave
+// the caches (FlashAttention, Dao et al. 2022): keys come in blocks, and a query's sums so far are scaled down whenever a larger
+// score turns up (Milakov & Gimelshein 2018). With s = q kᵀ · log₂e / √w, so that softmax's exponentials are to base 2:
+//
+//   m = maxⱼ sⱼ,  l = Σⱼ 2^(sⱼ − m),  out = Σⱼ 2^(sⱼ − m) vⱼ / l,  L = m + log₂ l
+//
+// Backward, scores are computed again. For a gradient g of `out`, and p = 2^(s − L):
+//
+//   dv = pᵀ g,  ds = p ⊙ (g vᵀ − Σ g ⊙ out),  dq = ds k / √w,  dk = dsᵀ q / √w
+#pragma once
+
+#include "product.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+// 2^x; what is below the least number is 0, and NaN is NaN.
+GS_INLINE Vector<float> power_of_two(Vector<float> x) {
+  return exp2_where(Mask<float>(~less(x, broadcast<float>(-126))), x);
+}
+
+// What is left of a task's room.
+class Room {
+ public:
+  explicit Room(float* from) : next_(from) {}
+  float* take(int64_t count) {
+    float* const taken = next_;
+    next_ += (count + 15) / 16 * 16;
+    return taken;
+  }
+
+ private:
+  float* next_;
+};
+
+static_assert(kForwardKeys % kProductColumns == 0 && kBackwardKeys % kProductColumns == 0 && kBackwardKeys % kProductRows == 0 &&
+              kBackwardQueries % kProductRows == 0 && kAttentionQueries % kProductRows == 0);
+
+// The largest of `count` scores, and of `largest`. Scores past them become −∞ up to `columns`.
+GS_INLINE float largest_score(float* scores, int64_t count, int64_t columns, float largest) {
+  constexpr int lanes = Simd<float>::lanes;
+  for (int64_t j = count; j < columns; ++j) scores[j] = -__builtin_inff();
+  Vector<float> most = broadcast<float>(largest);
+  for (int64_t j = 0; j < columns; j += lanes) most = larger(load<float>(scores + j), most);
+  return largest_lane(most);
+}
+
+inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, float* memory) {
+  using V = Vector<float>;
+  constexpr int lanes = Simd<float>::lanes;
+  const int width = head.width, columns = attention_columns(width);
+  const int64_t queries = whole_product_rows(head.queries);
+  const float scale = float(kLog2E / __builtin_sqrt(double(width)));
+
+  Room room(memory);
+  float* const q = room.take(queries * columns);
+  float* const sums = room.take(queries * columns);     // of values
+  float* const weights = room.take(queries * lanes);    // l, in parts
+  float* const most = room.take(queries);               // m
+  float* const k = room.take(kForwardKeys * width);
+  float* const v = room.take(kForwardKeys * columns);
+  float* const scores = room.take(kProductRows * kForwardKeys);
+
+  pack_rows(head.q, head.queries, width, scale, columns, queries, q);
+  for (int64_t i = 0; i < queries; ++i) most[i] = -__builtin_inff();
+  for (int64_t i = 0; i < queries * columns; ++i) sums[i] = 0;
+  for (int64_t i = 0; i < queries * lanes; ++i) weights[i] = 0;
+
+  for (int64_t first = 0; first < head.keys; first += kForwardKeys) {
+    const int64_t count = head.keys - first < kForwardKeys ? head.keys - first : kForwardKeys;
+    const int64_t whole = (count + lanes - 1) / lanes * lanes;
+    pack_panels(head.k.from(first), count, width, k);
+    pack_rows(head.v.from(first), count, width, 1, columns, count, v);
+    const int64_t next = first + kForwardKeys;
+    int64_t asked = next;
+    for (int64_t i = 0; i < queries; i += kProductRows) {
+      for (; asked < head.keys && (asked - next) * queries < (i + kProductRows) * kForwardKeys; ++asked)
+        for (int c = 0; c < width; c += 16) {
+          __builtin_prefetch(head.k.data + asked * head.k.stride + c);
+          __builtin_prefetch(head.v.data + asked * head.v.stride + c);
+        }
+      for (int64_t j = 0; j < count; j += kProductColumns)
+        multiply_panel<kProductVectors, true>({q + i * columns, columns, 1}, k + j * width, kProductColumns, width, scores + j,
+                                              kForwardKeys, nullptr);
+      float shrink[kProductRows];
+      for (int r = 0; r < kProductRows; ++r) {
+        float* const row = scores + r * kForwardKeys;
+        const float before = most[i + r], now = largest_score(row, count, whole, before);
+        most[i + r] = now;
+        const V shift = broadcast<float>(now), smaller = power_of_two(broadcast<float>(before) - shift);
+        float* const weight = weights + (i + r) * lanes;
+        V sum = load<float>(weight) * smaller;
+        for (int64_t j = 0; j < whole; j += lanes) {
+          const V p = power_of_two(load<float>(row + j) - shift);
+          store<float>(row + j, p);
+          sum = sum + p;
+        }
+        store<float>(weight, sum);
+        shrink[r] = smaller[0];
+      }
+      multiply_rows<false>({scores, kForwardKeys, 1}, v, columns, count, sums + i * columns, columns, columns, shrink);
+    }
+  }
+  for (int64_t i = 0; i < head.queries; ++i) {
+    const float weight = float(sum_of_lanes<float>(load<float>(weights + i * lanes)));
+    log_sums[i] = most[i] + float(__builtin_log2(double(weight)));
+    for (int c = 0; c < width; ++c) out.data[i * out.stride + c] = sums[i * columns + c] / weight;
+  }
+}
+
+// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
+// of q · √w, [whole_product_rows(queries), attention_columns(width)].
+inline void attend_backward(const AttentionHead& head, const AttentionPast& past, float* dq, Rows<float> dk, Rows<float> dv,
+                            float* memory) {
+  using V = Vector<float>;
+  constexpr int lanes = Simd<float>::lanes;
+  const int width = head.width, columns = attention_columns(width);
+  const float scale = float(kLog2E / __builtin_sqrt(double(width)));
+
+  Room room(memory);
+  const auto take_keys = [&] { return room.take(kBackwardKeys * columns); };
+  float *const k_panels = take_keys(), *const v_panels = take_keys(), *const k = take_keys();
+  float *const dk_sums = take_keys(), *const dv_sums = take_keys();
+  float* const q = room.take(kBackwardQueries * columns);
+  float* const slope = room.take(kBackwardQueries * columns);
+  float* const p = room.take(kBackwardQueries * kBackwardKeys);
+  float* const ds = room.take(kBackwardQueries * kBackwardKeys);
+
+  const int64_t queries = whole_product_rows(head.queries);
+  for (int64_t i = 0; i < queries * columns; ++i) dq[i] = 0;
+  for (int64_t first = 0; first < head.keys; first += kBackwardKeys) {
+    const int64_t count = head.keys - first < kBackwardKeys ? head.keys - first : kBackwardKeys;
+    pack_panels(head.k.from(first), count, width, k_panels);
+    pack_panels(head.v.from(first), count, width, v_panels);
+    pack_rows(head.k.from(first), count, width, 1, columns, count, k);
+    for (int64_t i = 0; i < kBackwardKeys * columns; ++i) dk_sums[i] = dv_sums[i] = 0;
+
+    for (int64_t tile = 0; tile < head.queries; tile += kBackwardQueries) {
+      const int64_t rows = head.queries - tile < kBackwardQueries ? head.queries - tile : kBackwardQueries;
+      const int64_t whole = whole_product_rows(rows);
+      pack_rows(head.q.from(tile), rows, width, scale, columns, whole, q);
+      pack_rows(past.slope.from(tile), rows, width, 1, columns, whole, slope);
+      for (int64_t i = 0; i < whole; i += kProductRows) {
+        for (int64_t j = 0; j < count; j += kProductColumns) {
+          multiply_panel<kProductVectors, true>({q + i * columns, columns, 1}, k_panels + j * width, kProductColumns, width,
+                                                p + i * kBackwardKeys + j, kBackwardKeys, nullptr);
+          multiply_panel<kProductVectors, true>({slope + i * columns, columns, 1}, v_panels + j * width, kProductColumns, width,
+                                                ds + i * kBackwardKeys + j, kBackwardKeys, nullptr);
+        }
+        for (int64_t r = i; r < i + kProductRows && r < rows; ++r) {
+          const float* const out = past.out.data + (tile + r) * past.out.stride;
+          V dot = V{};
+          for (int c = 0; c < width; c += lanes)
+            dot = fma(load_some<float>(out + c, width - c), load<float>(slope + r * columns + c), dot);
+          const V mean = broadcast<float>(float(sum_of_lanes<float>(dot))), log_sum = broadcast<float>(past.log_sums[tile + r]);
+          for (int64_t j = r * kBackwardKeys; j < r * kBackwardKeys + count; j += lanes) {
+            const V weight = power_of_two(load<float>(p + j) - log_sum);
+            store<float>(p + j, weight);
+            store<float>(ds + j, weight * (load<float>(ds + j) - mean));
+          }
+        }
+        multiply_rows<false>({ds + i * kBackwardKeys, kBackwardKeys, 1}, k, columns, count, dq + (tile + i) * columns, columns,
+                             columns);
+      }
+      for (int64_t j = 0; j < count; j += kProductRows) {
+        multiply_rows<false>({p + j, 1, kBackwardKeys}, slope, columns, rows, dv_sums + j * columns, columns, columns);
+        multiply_rows<false>({ds + j, 1, kBackwardKeys}, q, columns, rows, dk_sums + j * columns, columns, columns);
+      }
+    }
+    for (int64_t j = 0; j < count; ++j)
+      for (int c = 0; c < width; ++c) {
+        // What q was multiplied by more than it should be.
+        dk.data[(first + j) * dk.stride + c] = float(1 / kLog2E) * dk_sums[j * columns + c];
+        dv.data[(first + j) * dv.stride + c] = dv_sums[j * columns + c];
+      }
+  }
+}
+
+}  // namespace globalsplat::raster::GS_ISA

@@ -1,0 +1,55 @@
+// What attention reads and writes: plain memory and numbers, as in types.h.
+#pragma once
+
+#include <cstdint>
+
+namespace globalsplat::raster {
+
+// Rows of numbers, one after the other `stride` numbers on: of a head, the part that is its own of rows that all heads share.
+template <class Number>
+struct Rows {
+  Number* data;
+  int64_t stride;
+
+  Rows from(int64_t first) const { return {data + first * stride, stride}; }
+};
+
+// One head's queries, keys and values, all `width` numbers wide.
+struct AttentionHead {
+  Rows<const float> q, k, v;
+  int64_t queries, keys;
+  int width;
+};
+
+// What its backward pass knows: what came out, the gradient of that, and of every query the logarithm to base 2 of the sum that
+// its softmax divides by.
+struct AttentionPast {
+  Rows<const float> out, slope;
+  const float* log_sums;
+};
+
+// Rows of a product whose sums are in registers at a time (product.h).
+inline constexpr int64_t kProductRows = 6;
+inline constexpr int64_t whole_product_rows(int64_t rows) { return (rows + kProductRows - 1) / kProductRows * kProductRows; }
+
+// The widest head.
+inline constexpr int kAttentionWidth = 128;
+
+// Columns of what is packed: whole vectors on every machine.
+inline constexpr int attention_columns(int width) { return (width + 15) / 16 * 16; }
+
+// Queries that are one task forward, at most: so many share the work of packing all keys and values.
+inline constexpr int64_t kAttentionQueries = 516;
+
+// Of a block of keys, and backward of queries, too: what is packed of them, and summed up for them, stays in the second cache.
+inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 192, kBackwardQueries = 48;
+
+// Numbers that a task works with.
+inline constexpr int64_t attention_room(int width) {
+  return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
+}
+inline constexpr int64_t attention_backward_room(int width) {
+  return (5 * kBackwardKeys + 2 * kBackwardQueries) * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;
+}
+
+}  // namespace globalsplat::raster
