@@ -11,17 +11,14 @@
 namespace globalsplat::raster {
 namespace {
 
-// Tasks that a call is cut into, about: by shapes alone, so that sums are the same on every machine.
-constexpr int64_t kTasks = 64;
-// Queries that make packing keys worth while, and keys that make a gradient of all queries so.
-constexpr int64_t kFewestQueries = 96, kFewestKeys = 2 * kBackwardKeys;
+constexpr int64_t kFewestQueries = 96;  // that make packing keys worth while
 constexpr int64_t kSumRows = 64;  // of gradients, that are one task
 
 int64_t rounded_up(int64_t number, int64_t step) { return (number + step - 1) / step * step; }
 
-// How many of `count` rows are one task, at least `fewest`, in whole `step`s.
-int64_t part(int64_t heads, int64_t count, int64_t fewest, int64_t step) {
-  return rounded_up(std::max(fewest, (count * heads + kTasks - 1) / kTasks), step);
+// How many of every head's `count` rows are one task, that there are about `tasks`: at least `fewest`, in whole `step`s.
+int64_t part(int64_t heads, int64_t count, int64_t tasks, int64_t fewest, int64_t step) {
+  return rounded_up(std::max(fewest, (count * heads + tasks - 1) / tasks), step);
 }
 
 template <class Number>
@@ -41,7 +38,8 @@ float* room(int64_t count) {
 
 void attend(const AttentionShape& shape, const AttentionInputs& in, Heads<float> out, float* log_sums, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
-  const int64_t most = std::min(part(heads, shape.queries, kFewestQueries, kProductRows), kAttentionQueries);
+  // A query's bits are the same in any company, so this may hang on the number of threads.
+  const int64_t most = std::min(part(heads, shape.queries, 8 * threads, kFewestQueries, kProductRows), kAttentionQueries);
   const int64_t blocks = (shape.queries + most - 1) / most;
   const int64_t size = rounded_up((shape.queries + blocks - 1) / std::max<int64_t>(blocks, 1), kProductRows);
   parallel_for(threads, heads * blocks, [&](int64_t task) {
@@ -56,8 +54,8 @@ void attend(const AttentionShape& shape, const AttentionInputs& in, Heads<float>
 void attend_backward(const AttentionShape& shape, const AttentionInputs& in, Heads<const float> out, const float* log_sums,
                      Heads<const float> slope, const AttentionGradients& gradients, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
-  // Every task has a part of a head's keys, and a gradient of all its queries, of which these are added up in order.
-  const int64_t size = part(heads, shape.keys, kFewestKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
+  // Every task has a part of a head's keys, cut by shapes alone, and a gradient of all its queries; these are added up in order.
+  const int64_t size = part(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t columns = attention_columns(shape.width), all = whole_product_rows(shape.queries) * columns;
   const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
   parallel_for(threads, heads * parts, [&](int64_t task) {

@@ -70,14 +70,7 @@ inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, 
     const int64_t whole = (count + lanes - 1) / lanes * lanes;
     pack_panels(head.k.from(first), count, width, k);
     pack_rows(head.v.from(first), count, width, 1, columns, count, v);
-    const int64_t next = first + kForwardKeys;
-    int64_t asked = next;
     for (int64_t i = 0; i < queries; i += kProductRows) {
-      for (; asked < head.keys && (asked - next) * queries < (i + kProductRows) * kForwardKeys; ++asked)
-        for (int c = 0; c < width; c += 16) {
-          __builtin_prefetch(head.k.data + asked * head.k.stride + c);
-          __builtin_prefetch(head.v.data + asked * head.v.stride + c);
-        }
       for (int64_t j = 0; j < count; j += kProductColumns)
         multiply_panel<kProductVectors, true>({q + i * columns, columns, 1}, k + j * width, kProductColumns, width, scores + j,
                                               kForwardKeys, nullptr);

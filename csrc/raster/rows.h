@@ -39,10 +39,10 @@ inline constexpr int kAttentionWidth = 128;
 inline constexpr int attention_columns(int width) { return (width + 15) / 16 * 16; }
 
 // Queries that are one task forward, at most: so many share the work of packing all keys and values.
-inline constexpr int64_t kAttentionQueries = 516;
+inline constexpr int64_t kAttentionQueries = 1032;
 
 // Of a block of keys, and backward of queries, too: what is packed of them, and summed up for them, stays in the second cache.
-inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 192, kBackwardQueries = 48;
+inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 384, kBackwardQueries = 48;
 
 // Numbers that a task works with.
 inline constexpr int64_t attention_room(int width) {

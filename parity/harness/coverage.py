@@ -4,6 +4,7 @@ FOLDERS = ("src/model", "src/loss")  # every file of these has a case, or a reas
 
 CASES_OF = {
     "src/model/mod.rs": ["model", "model_16k"],
+    "src/model/attention.rs": ["attention", "attention_large"],
     "src/model/camera_code.rs": ["camera_code"],
     "src/model/decoder.rs": ["heads", "decoder"],
     "src/model/encoder.rs": ["encoder"],

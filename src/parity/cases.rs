@@ -24,6 +24,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "rgb_tokens" | "ray_tokens" | "tokens" => tokens(request),
         "rays" => rays(request),
         "camera_code" => camera_code(request),
+        "attention" => attention(request),
         "stream_round" => stream_round(request),
         "self_attention_block" => self_attention_block(request),
         "mixer" => mixer(request),
@@ -167,6 +168,19 @@ fn camera_code(request: &Request) -> Result<Answer> {
     let (module, params) = request.build(|vs| model::CameraCode::new(vs, config.ray_width))?;
     let code = module.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
     with_params([("code", code)], params)
+}
+
+fn attention(request: &Request) -> Result<Answer> {
+    let thirds = request.config.get("thirds").is_some();
+    let inputs = match thirds {
+        true => request.input("rows")?.chunk(3, -1),
+        false => ["q", "k", "v"]
+            .map(|name| request.input(name).map(Tensor::shallow_clone))
+            .into_iter()
+            .collect::<Result<_>>()?,
+    };
+    let [q, k, v] = [0, 1, 2].map(|n| &inputs[n]);
+    outputs([("seen", model::attention(q, k, v, request.number("heads")?))])
 }
 
 fn stream_round(request: &Request) -> Result<Answer> {

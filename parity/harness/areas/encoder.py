@@ -1,6 +1,8 @@
 """From the tokens of all views to the latents of the scene."""
 
+import numpy as np
 import reference.encoder
+import reference.layers
 import reference.stream
 import torch
 
@@ -8,8 +10,72 @@ from .. import draw
 from ..draw import normal, whole
 from ..names import reference_config, under
 from ..registry import Draw, by, case, twin
+from ..tolerance import Tolerance
 
 REGISTERS = 4  # the last slots of a stream
+
+
+def attention_inputs(rng, batch, queries, keys, width, scale=1.0):
+    """Scores have about this deviation: inputs are normal, and a product's deviation is the root of its length."""
+    shapes = {"q": (batch, queries, width), "k": (batch, keys, width), "v": (batch, keys, width)}
+    inputs = {name: normal(rng, *shape) for name, shape in shapes.items()}
+    inputs["q"] *= np.float32(scale)
+    return inputs
+
+
+def attention_draw(inputs, heads, what="", **more):
+    q, k = inputs["q"], inputs["k"]
+    label = f"{by(*q.shape)} to {by(*k.shape)}, heads {heads}{what}"
+    return Draw(label, inputs, {"heads": heads}, differentiate=tuple(inputs), module="attention", **more)
+
+
+@case
+def attention(rng):
+    """From one query and one key on. Queries are taken six at a time, keys a vector, a panel or a block of 256 or 384 at a time, and
+    widths a vector at a time; many of either are shared out: sizes lie around all of these. Widths of 4 and more that our kernel
+    takes, and others. Once queries, keys and values are thirds of the same rows, as self-attention has them."""
+    for batch, queries, keys, heads, width in [
+        (1, 1, 1, 1, 8),
+        (3, 1, 17, 2, 4),
+        (2, 7, 65, 3, 8),
+        (1, 37, 1, 2, 16),
+        (1, 13, 257, 1, 128),
+        (2, 50, 385, 4, 32),
+        (1, 103, 1000, 2, 64),
+        (1, 1100, 70, 1, 24),
+        (1, 9, 40, 2, 5),
+        (1, 9, 40, 1, 136),
+    ]:
+        yield attention_draw(attention_inputs(rng, batch, queries, keys, heads * width), heads)
+    inputs = attention_inputs(rng, 1, 30, 90, 64)
+    inputs["k"][:] = inputs["k"][:, :1]
+    yield attention_draw(inputs, 2, ", all keys equal")
+    rows = normal(rng, 2, 70, 3 * 96)
+    config = {"heads": 3, "thirds": True}
+    yield Draw("2×70×288 in thirds, heads 3", {"rows": rows}, config, differentiate=("rows",))
+
+
+@case
+def attention_large(rng):
+    """Scores of ±80, of which exponentials overflow float32, and below zero, where they would vanish; and a key that is nearly all
+    that half of the queries see."""
+    why = "a score of 80 has 4e-6 of its last digit's rounding, which is relative in its exponential"
+    tolerance = Tolerance(1e-4, 1e-3, why=why)
+    yield attention_draw(attention_inputs(rng, 1, 60, 300, 64, scale=25.0), 2, tolerance=tolerance)
+    inputs = attention_inputs(rng, 2, 20, 70, 32)
+    inputs["q"] = np.abs(inputs["q"]) + 4.0
+    inputs["k"] -= 5.0
+    yield attention_draw(inputs, 2, ", all below zero", tolerance=tolerance)
+    inputs = attention_inputs(rng, 1, 40, 600, 64)
+    inputs["k"][:, 333] = 3.0 * np.sign(inputs["q"][:, :1].mean(0))
+    inputs["q"][:, ::2] += inputs["k"][:, 333:334]
+    yield attention_draw(inputs, 1, ", one dominating", tolerance=tolerance)
+
+
+@twin("attention")
+def attention_twin(config, params, inputs):
+    q, k, v = inputs["rows"].chunk(3, dim=-1) if config.get("thirds") else (inputs[name] for name in "qkv")
+    return {"seen": reference.layers.attention(q, k, v, config["heads"])}
 
 
 @case
