@@ -21,9 +21,11 @@
 #include <thread>
 
 #include "../cuda/emulated.h"
+#include "../raster/attend.h"
 #include "../raster/fit.h"
 #include "../raster/kernels.h"
 #include "../raster/parallel.h"
+#include "../raster/rows.h"
 #include "refusals.h"
 #include "scenes.h"
 #include "schedules.h"
@@ -234,12 +236,53 @@ int64_t fits(const std::vector<int>& thread_counts) {
   return count;
 }
 
+// Attention, forward and backward. Arrays end where they end here, too.
+int64_t attentions(const std::vector<int>& thread_counts) {
+  Random random(12);
+  const auto numbers = [&](int64_t count) {
+    std::vector<float> values;
+    for (const double value : random.normal(size_t(count), 1)) values.push_back(float(value));
+    return values;
+  };
+  int64_t count = 0;
+  for (const raster::AttentionShape& shape : {raster::AttentionShape{1, 1, 1, 1, 4},
+                                              {2, 3, 7, 65, 8},
+                                              {1, 2, 103, 385, 24},
+                                              {1, 1, 1100, 300, 32},
+                                              {1, 2, 50, 800, 64},
+                                              {1, 1, 9, 20, raster::kAttentionWidth}}) {
+    const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
+    const std::vector<float> q = numbers(shape.scenes * in), slope = numbers(shape.scenes * in);
+    const std::vector<float> k = numbers(shape.scenes * seen), v = numbers(shape.scenes * seen);
+    const auto attended = [&](int threads) {
+      begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(threads) +
+            " threads");
+      const auto unwritten = [&](size_t n) { return std::vector<float>(n, float(threads)); };
+      const raster::AttentionInputs inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
+      std::vector<float> out = unwritten(q.size()), log_sums = unwritten(size_t(shape.scenes * shape.heads * shape.queries));
+      raster::attend(shape, inputs, {out.data(), in, row}, log_sums.data(), threads);
+      std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
+      raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {slope.data(), in, row},
+                              {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, threads);
+      for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
+      return out;
+    };
+    const std::vector<float> one = attended(1);
+    for (const float number : one) expect(std::isfinite(number), "attention isn't finite");
+    for (const int threads : thread_counts) {
+      expect(same(attended(threads), one), "threads change attention");
+      ++count;
+    }
+  }
+  return count;
+}
+
 // Every scene's pictures and gradients on any number of threads.
 int64_t bits(bool is_short) {
   std::vector<int> thread_counts = {2, 3, 16};
   if (!is_short)
     for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
-  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts);
+  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts) + attentions(thread_counts);
   size_t turn = 0;  // the short form has one degree for each scene, and all degrees for all of them
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);

@@ -12,7 +12,7 @@ namespace globalsplat::raster {
 namespace {
 
 constexpr int64_t kFewestQueries = 96;  // that make packing keys worth while
-constexpr int64_t kSumRows = 64;  // of gradients, that are one task
+constexpr int64_t kPiece = 66;  // rows that are one task where a pass over them is all
 
 int64_t rounded_up(int64_t number, int64_t step) { return (number + step - 1) / step * step; }
 
@@ -56,23 +56,38 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs& in, Hea
   const int64_t heads = shape.scenes * shape.heads;
   // Every task has a part of a head's keys, cut by shapes alone, and a gradient of all its queries; these are added up in order.
   const int64_t size = part(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
-  const int64_t columns = attention_columns(shape.width), all = whole_product_rows(shape.queries) * columns;
-  const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
+  const int64_t whole = whole_product_rows(shape.queries), columns = attention_columns(shape.width), all = whole * columns;
+  const std::unique_ptr<float[]> q(new float[size_t(heads * all)]), slopes(new float[size_t(heads * all)]);
+  const std::unique_ptr<float[]> means(new float[size_t(heads * whole)]), sums(new float[size_t(heads * parts * all)]);
+  const auto packed = [&](int64_t head, int64_t begin) {
+    const int64_t row = head * whole + begin;
+    return PackedQueries{q.get() + row * columns, slopes.get() + row * columns, means.get() + row};
+  };
+  const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
+
+  const int64_t pieces = (shape.queries + kPiece - 1) / kPiece;
+  parallel_for(threads, heads * pieces, [&](int64_t task) {
+    const int64_t head = task / pieces, begin = task % pieces * kPiece, end = std::min(begin + kPiece, shape.queries);
+    const PackedQueries to = packed(head, begin);
+    kernels().pack_queries({rows(in.q, head, begin), {}, {}, end - begin, 0, shape.width},
+                           {rows(out, head, begin), rows(slope, head, begin)}, to);
+    if (end < shape.queries) return;
+    std::fill(to.q + (end - begin) * columns, to.q + (whole - begin) * columns, 0.f);
+    std::fill(to.slope + (end - begin) * columns, to.slope + (whole - begin) * columns, 0.f);
+  });
   parallel_for(threads, heads * parts, [&](int64_t task) {
     const int64_t head = task / parts, begin = task % parts * size;
-    const auto rows = [&](const auto& of) { return head_of(of, shape, head); };
-    const AttentionHead of{rows(in.q), rows(in.k).from(begin), rows(in.v).from(begin), shape.queries,
-                           std::min(size, shape.keys - begin), shape.width};
-    kernels().attend_backward(of, {rows(out), rows(slope), log_sums + head * shape.queries}, sums.get() + task * all,
-                              rows(gradients.k).from(begin), rows(gradients.v).from(begin),
+    kernels().attend_backward({{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries, std::min(size, shape.keys - begin),
+                               shape.width},
+                              packed(head, 0), log_sums + head * shape.queries, sums.get() + task * all,
+                              rows(gradients.k, head, begin), rows(gradients.v, head, begin),
                               room(attention_backward_room(shape.width)));
   });
   const float scale = float(1 / std::sqrt(double(shape.width)));
-  const int64_t pieces = (shape.queries + kSumRows - 1) / kSumRows;
   parallel_for(threads, heads * pieces, [&](int64_t task) {
-    const int64_t head = task / pieces, begin = task % pieces * kSumRows;
+    const int64_t head = task / pieces, begin = task % pieces * kPiece;
     const Rows<float> to = head_of(gradients.q, shape, head);
-    for (int64_t i = begin; i < std::min(begin + kSumRows, shape.queries); ++i) {
+    for (int64_t i = begin; i < std::min(begin + kPiece, shape.queries); ++i) {
       const float* const first = sums.get() + head * parts * all + i * columns;
       for (int c = 0; c < shape.width; ++c) {
         float sum = 0;

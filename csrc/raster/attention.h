@@ -100,26 +100,37 @@ inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, 
   }
 }
 
-// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
-// of q · √w, [whole_product_rows(queries), attention_columns(width)].
-inline void attend_backward(const AttentionHead& head, const AttentionPast& past, float* dq, Rows<float> dk, Rows<float> dv,
-                            float* memory) {
-  using V = Vector<float>;
+// Some of a head's queries, and what is known of them, for attend_backward().
+inline void pack_queries(const AttentionHead& head, const AttentionPast& past, const PackedQueries& to) {
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
+  pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
+  pack_rows(past.slope, head.queries, width, 1, columns, head.queries, to.slope);
+  for (int64_t i = 0; i < head.queries; ++i) {
+    Vector<float> dot = Vector<float>{};
+    for (int c = 0; c < width; c += lanes)
+      dot = fma(load_some<float>(past.out.data + i * past.out.stride + c, width - c), load<float>(to.slope + i * columns + c), dot);
+    to.means[i] = float(sum_of_lanes<float>(dot));
+  }
+}
+
+// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
+// of q · √w, [whole_product_rows(queries), attention_columns(width)].
+inline void attend_backward(const AttentionHead& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
+                            Rows<float> dv, float* memory) {
+  using V = Vector<float>;
+  constexpr int lanes = Simd<float>::lanes;
+  const int width = head.width, columns = attention_columns(width);
 
   Room room(memory);
   const auto take_keys = [&] { return room.take(kBackwardKeys * columns); };
   float *const k_panels = take_keys(), *const v_panels = take_keys(), *const k = take_keys();
   float *const dk_sums = take_keys(), *const dv_sums = take_keys();
-  float* const q = room.take(kBackwardQueries * columns);
-  float* const slope = room.take(kBackwardQueries * columns);
   float* const p = room.take(kBackwardQueries * kBackwardKeys);
   float* const ds = room.take(kBackwardQueries * kBackwardKeys);
 
-  const int64_t queries = whole_product_rows(head.queries);
-  for (int64_t i = 0; i < queries * columns; ++i) dq[i] = 0;
+  for (int64_t i = 0; i < whole_product_rows(head.queries) * columns; ++i) dq[i] = 0;
   for (int64_t first = 0; first < head.keys; first += kBackwardKeys) {
     const int64_t count = head.keys - first < kBackwardKeys ? head.keys - first : kBackwardKeys;
     pack_panels(head.k.from(first), count, width, k_panels);
@@ -129,10 +140,8 @@ inline void attend_backward(const AttentionHead& head, const AttentionPast& past
 
     for (int64_t tile = 0; tile < head.queries; tile += kBackwardQueries) {
       const int64_t rows = head.queries - tile < kBackwardQueries ? head.queries - tile : kBackwardQueries;
-      const int64_t whole = whole_product_rows(rows);
-      pack_rows(head.q.from(tile), rows, width, scale, columns, whole, q);
-      pack_rows(past.slope.from(tile), rows, width, 1, columns, whole, slope);
-      for (int64_t i = 0; i < whole; i += kProductRows) {
+      const float *const q = of.q + tile * columns, *const slope = of.slope + tile * columns;
+      for (int64_t i = 0; i < rows; i += kProductRows) {
         for (int64_t j = 0; j < count; j += kProductColumns) {
           multiply_panel<kProductVectors, true>({q + i * columns, columns, 1}, k_panels + j * width, kProductColumns, width,
                                                 p + i * kBackwardKeys + j, kBackwardKeys, nullptr);
@@ -140,11 +149,7 @@ inline void attend_backward(const AttentionHead& head, const AttentionPast& past
                                                 ds + i * kBackwardKeys + j, kBackwardKeys, nullptr);
         }
         for (int64_t r = i; r < i + kProductRows && r < rows; ++r) {
-          const float* const out = past.out.data + (tile + r) * past.out.stride;
-          V dot = V{};
-          for (int c = 0; c < width; c += lanes)
-            dot = fma(load_some<float>(out + c, width - c), load<float>(slope + r * columns + c), dot);
-          const V mean = broadcast<float>(float(sum_of_lanes<float>(dot))), log_sum = broadcast<float>(past.log_sums[tile + r]);
+          const V mean = broadcast<float>(of.means[tile + r]), log_sum = broadcast<float>(log_sums[tile + r]);
           for (int64_t j = r * kBackwardKeys; j < r * kBackwardKeys + count; j += lanes) {
             const V weight = power_of_two(load<float>(p + j) - log_sum);
             store<float>(p + j, weight);

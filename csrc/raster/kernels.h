@@ -33,7 +33,9 @@ struct Kernels {
   KernelsOf<double> of_double;
   // attention.h
   void (*attend)(const AttentionHead&, Rows<float> out, float* log_sums, float* room);
-  void (*attend_backward)(const AttentionHead&, const AttentionPast&, float* dq, Rows<float> dk, Rows<float> dv, float* room);
+  void (*pack_queries)(const AttentionHead&, const AttentionPast&, const PackedQueries& to);
+  void (*attend_backward)(const AttentionHead&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk, Rows<float> dv,
+                          float* room);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

@@ -21,6 +21,7 @@ const Kernels table = {
     {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>,
      ssim<double>, fit_gradient<double>, unevenness<double>, adam<double>},
     attend,
+    pack_queries,
     attend_backward,
     multiply_adds,
 };

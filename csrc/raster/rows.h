@@ -21,11 +21,15 @@ struct AttentionHead {
   int width;
 };
 
-// What its backward pass knows: what came out, the gradient of that, and of every query the logarithm to base 2 of the sum that
-// its softmax divides by.
+// What came out, and the gradient of that.
 struct AttentionPast {
   Rows<const float> out, slope;
-  const float* log_sums;
+};
+
+// Of all queries of a head, side by side, whole_product_rows() of attention_columns() with zeros where there is nothing: themselves
+// times log₂e / √w, and the gradients of what came out. And of every query the sum of this times that.
+struct PackedQueries {
+  float *q, *slope, *means;
 };
 
 // Rows of a product whose sums are in registers at a time (product.h).
@@ -49,7 +53,7 @@ inline constexpr int64_t attention_room(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
 }
 inline constexpr int64_t attention_backward_room(int width) {
-  return (5 * kBackwardKeys + 2 * kBackwardQueries) * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;
+  return 5 * kBackwardKeys * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;
 }
 
 }  // namespace globalsplat::raster

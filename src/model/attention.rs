@@ -6,7 +6,7 @@ use tch::{Device, Kind, Tensor};
 /// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let all = [q, k, v];
-    let takes = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float;
+    let takes = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float && t.size()[1] > 0;
     if !all.iter().all(takes) || !ours::attention_takes(q.size()[2] / heads) {
         return by_libtorch(q, k, v, heads);
     }
@@ -36,4 +36,96 @@ pub(crate) fn by_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Ten
     )
     .transpose(1, 2)
     .flatten(2, 3)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use globalsplat_csrc::render::{set_threads, simd_level};
+    use std::process::{Command, Stdio};
+    use tch::no_grad;
+
+    const NAMES: [&str; 3] = ["seen", "slots", "memory"];
+
+    /// What comes out, and the gradients of queries, keys and values, where all of them are shared out: parts of 516 queries and of
+    /// 384 keys, and what is left of both.
+    fn answers() -> Vec<Tensor> {
+        tch::manual_seed(1);
+        let of = |n: i64| Tensor::randn([2, n, 3 * 64], (Kind::Float, Device::Cpu)).set_requires_grad(true);
+        let (slots, memory) = (of(530), of(1000));
+        let (of_slots, of_memory) = (slots.chunk(3, -1), memory.chunk(3, -1));
+        let seen = attention(&of_slots[0], &of_memory[1], &of_memory[2], 2);
+        let among = attention(&of_slots[0], &of_slots[1], &of_slots[2], 2);
+        ((&seen + among) * seen.detach().cos()).sum(Kind::Float).backward();
+        vec![seen.detach(), slots.grad(), memory.grad()]
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let expected = answers();
+        for threads in [1, 2, 3] {
+            set_threads(threads);
+            let found = answers();
+            set_threads(0);
+            assert!(expected.iter().zip(&found).all(|(a, b)| a.equal(b)), "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn instruction_sets_agree() {
+        // The choice is made once per process: this test runs itself again for every set, to compute and save.
+        const OUT: &str = "GLOBALSPLAT_TEST_OUT";
+        const UNSUPPORTED: i32 = 77;
+        if let Some(out) = std::env::var_os(OUT) {
+            if simd_level().is_err() {
+                std::process::exit(UNSUPPORTED);
+            }
+            let named: Vec<_> = NAMES.into_iter().zip(answers()).collect();
+            return Tensor::write_safetensors(&named, out).expect("a writable file");
+        }
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let expected = answers();
+        for level in ["avx512", "avx2", "neon", "portable"] {
+            let out = folder.path().join(level);
+            let status = Command::new(std::env::current_exe().expect("this test's path"))
+                .args(["--exact", "model::attention::tests::instruction_sets_agree"])
+                .env("GLOBALSPLAT_SIMD", level)
+                .env(OUT, &out)
+                .stdout(Stdio::null())
+                .status()
+                .expect("this test runs");
+            if status.code() == Some(UNSUPPORTED) {
+                continue;
+            }
+            assert!(status.success(), "{level}");
+            let found = Tensor::read_safetensors(&out).expect("what was written");
+            assert_eq!(found.len(), NAMES.len());
+            for (name, found) in &found {
+                let place = NAMES.iter().position(|known| known == name).expect("a name that was written");
+                let expected = &expected[place];
+                let error = (found - expected).norm() / expected.norm();
+                assert!(error.double_value(&[]) < 1e-6, "{level}: {name} differs by {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn shapes_that_dont_fit_are_refused() {
+        let of = |n: i64, d: i64| Tensor::zeros([1, n, d], (Kind::Float, Device::Cpu));
+        let refused = |q: &Tensor, k: &Tensor, v: &Tensor, heads: i64| {
+            let [q, k, v] = [q, k, v].map(|t| t.as_ptr() as usize);
+            unsafe { ours::attention(q, k, v, heads) }.expect_err("refused").to_string()
+        };
+        let said = refused(&of(3, 16), &of(4, 16), &of(5, 16), 2);
+        assert!(said.contains("keys [1, 4, 16] and values [1, 5, 16], expected"), "{said}");
+        let said = refused(&of(3, 18), &of(4, 18), &of(4, 18), 2);
+        assert!(said.contains("have 2 heads, expected a width of each that is a multiple of 4"), "{said}");
+        let double = of(3, 16).to_kind(Kind::Double);
+        let said = refused(&double, &double, &double, 2);
+        assert!(said.contains("must be float32 on the CPU"), "{said}");
+        // Nothing to look at is libtorch's matter.
+        let nothing = of(0, 16);
+        let seen = no_grad(|| attention(&of(3, 16), &nothing, &nothing, 2));
+        assert_eq!(seen.size(), [1, 3, 16]);
+    }
 }
