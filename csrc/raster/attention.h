@@ -102,16 +102,15 @@ inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, 
 
 // Some of a head's queries, and what is known of them, for attend_backward().
 inline void pack_queries(const AttentionHead& head, const AttentionPast& past, const PackedQueries& to) {
-  constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
   pack_rows(past.slope, head.queries, width, 1, columns, head.queries, to.slope);
   for (int64_t i = 0; i < head.queries; ++i) {
-    Vector<float> dot = Vector<float>{};
-    for (int c = 0; c < width; c += lanes)
-      dot = fma(load_some<float>(past.out.data + i * past.out.stride + c, width - c), load<float>(to.slope + i * columns + c), dot);
-    to.means[i] = float(sum_of_lanes<float>(dot));
+    const float *const out = past.out.data + i * past.out.stride, *const slope = to.slope + i * columns;
+    double sum = 0;
+    for (int c = 0; c < width; ++c) sum += double(out[c]) * double(slope[c]);
+    to.means[i] = float(sum);
   }
 }
 

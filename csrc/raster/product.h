@@ -74,12 +74,13 @@ GS_INLINE void multiply_rows(Factor a, const float* b, int64_t b_row, int64_t de
 // `rows`.
 GS_INLINE void pack_rows(Rows<const float> from, int64_t count, int width, float factor, int columns, int64_t rows, float* out) {
   constexpr int lanes = Simd<float>::lanes;
-  for (int64_t i = 0; i < rows; ++i, out += columns)
-    for (int c = 0; c < columns; c += lanes) {
-      const int left = i < count ? width - c : 0;
-      const Vector<float> v = left > 0 ? load_some<float>(from.data + i * from.stride + c, left) : Vector<float>{};
-      store<float>(out + c, v * factor);
-    }
+  for (int64_t i = 0; i < rows; ++i, out += columns) {
+    const float* const row = from.data + i * from.stride;
+    const int present = i < count ? width : 0;
+    int c = 0;
+    for (; c + lanes <= present; c += lanes) store<float>(out + c, load<float>(row + c) * factor);
+    for (; c < columns; ++c) out[c] = c < present ? row[c] * factor : 0;
+  }
 }
 
 // Copies `count` rows of `width` numbers, a multiple of 4, to panels of kProductColumns columns: number (row, k) goes to panel
