@@ -256,8 +256,7 @@ fn a_step_moves_nothing_but_what_is_told() {
             let (decoded, ops) = ops_of(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
             assert_eq!(moves(&ops), 0, "an inference");
             let is_fused = |op: &&String| {
-                op.starts_with("aten::_scaled_dot_product_flash_attention")
-                    || op.contains("AttentionFunction")
+                op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"
             };
             // In every round of either stream, to the memory and among the slots.
             assert_eq!(ops.iter().filter(is_fused).count(), 2 * 2 * 2, "attention");
