@@ -4,7 +4,7 @@ use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, randn};
 use super::mixer::Mixer;
 use super::precision::Precision;
-use super::stream::{REGISTERS, StreamRound};
+use super::stream::{REGISTERS, StreamRound, normalized};
 use tch::{Tensor, nn, nn::Module};
 
 /// Query tokens before the scene tokens; not decoded.
@@ -94,13 +94,15 @@ impl Encoder {
         self.decoded(&slots)
     }
 
-    /// Every stream's own view of the slots, and the memory [B, 4 + V·P, token width] that all rounds read.
+    /// Every stream's own view of the slots, and the memory [B, 4 + V·P, token width] that all rounds read, normalized.
     pub(super) fn start(&self, scene_tokens: &Tensor, tokens: &Tensor) -> (Slots, Tensor) {
         let batch = tokens.size()[0];
         let expand = |t: &Tensor| t.expand([batch, -1, -1], false);
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
         let slots = expand(&Tensor::cat(&slots, 1)); // [B, 4 + M + 1 + 4, d]
-        let memory = Tensor::cat(&[expand(&self.memory_registers), tokens.shallow_clone()], 1);
+        let memory = normalized(&Tensor::cat(&[expand(&self.memory_registers), tokens.shallow_clone()], 1));
+        // Where a gradient comes back, every round's is added up in float32.
+        let memory = if memory.requires_grad() { memory } else { self.precision.operand(&memory) };
         let slots = Slots {
             geometry: self.geometry_start.forward(&slots),
             appearance: self.appearance.as_ref().map(|branch| branch.start.forward(&slots)),

@@ -44,9 +44,12 @@ pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool
     nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
 }
 
-/// Layer normalization over the last dimension, ε = 1e-5.
+/// Of layer normalization.
+pub(super) const LAYER_NORM_EPS: f64 = 1e-5;
+
+/// Layer normalization over the last dimension.
 pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
-    nn::layer_norm(vs, vec![width], Default::default())
+    nn::layer_norm(vs, vec![width], nn::LayerNormConfig { eps: LAYER_NORM_EPS, ..Default::default() })
 }
 
 /// x ↦ γ ⊙ x, in float32.

@@ -38,7 +38,7 @@ pub(crate) use encoder::Encoder;
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
-pub(crate) use stream::{SelfAttentionBlock, StreamRound};
+pub(crate) use stream::{SelfAttentionBlock, StreamRound, normalized};
 pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;

@@ -19,13 +19,21 @@ pub enum Precision {
 }
 
 impl Precision {
+    /// `t` as products take it.
+    pub(super) fn operand(self, t: &Tensor) -> Tensor {
+        match self {
+            Precision::F32 => t.shallow_clone(),
+            Precision::Bf16 => t.to_kind(Kind::BFloat16),
+        }
+    }
+
     /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
     pub(super) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
         match self {
             Precision::F32 => layer.forward(xs),
             Precision::Bf16 => {
-                let half = |t: &Tensor| t.to_kind(Kind::BFloat16);
-                half(xs).linear(&half(&layer.ws), layer.bs.as_ref().map(half).as_ref())
+                let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
+                self.operand(xs).linear(&self.operand(&layer.ws), bias.as_ref())
             }
         }
     }

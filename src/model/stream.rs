@@ -2,7 +2,7 @@
 
 use super::attention::attention;
 use super::config::ModelConfig;
-use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear};
+use super::layers::{ENCODER_STD, LAYER_NORM_EPS, LayerScale, Mlp, layer_norm, linear};
 use super::precision::Precision;
 use tch::{Tensor, nn, nn::Module};
 
@@ -11,6 +11,12 @@ pub(super) const REGISTERS: i64 = 4;
 const MLP_RATIO: i64 = 4;
 const CROSS_LAYER_SCALE: f64 = 1e-3;
 const SELF_LAYER_SCALE: f64 = 1e-2;
+
+/// What all rounds' norms of `memory` have in common, before their γ and β.
+pub(crate) fn normalized(memory: &Tensor) -> Tensor {
+    let width = memory.size()[2];
+    memory.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true)
+}
 
 /// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
 #[derive(Debug)]
@@ -50,23 +56,33 @@ impl StreamRound {
         }
     }
 
-    /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width]; result [B, S, d].
+    /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width] as [`normalized`] gives it; result [B, S, d].
     pub fn forward(&self, slots: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
         // Registers change in self-attention, and where streams are mixed.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
 
-        let memory = self.memory_norm.forward(memory);
         let query = precision.linear(&self.query, &self.slots_norm.forward(&slots));
-        let [key, value] = [&self.key, &self.value].map(|layer| precision.linear(layer, &memory));
-        let seen = attention(&query, &key, &value, self.heads);
+        let read = precision.linear(&self.read(), memory).chunk(2, -1);
+        let seen = attention(&query, &read[0], &read[1], self.heads);
         let slots = slots + self.attention_scale.forward(&precision.linear(&self.output, &seen));
         let thought = self.mlp.forward(&self.mlp_norm.forward(&slots), precision);
         let slots = slots + self.mlp_scale.forward(&thought);
 
         let slots = Tensor::cat(&[slots, registers], 1);
         self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
+    }
+
+    /// Keys beside values of a memory that is normalized already: W (γ ⊙ x + β) + b = (W diag γ) x + (W β + b), so all rounds share
+    /// what they have of their norms in common, and read it in one product.
+    fn read(&self) -> nn::Linear {
+        let norm = &self.memory_norm;
+        let [gamma, beta] = [&norm.ws, &norm.bs].map(|t| t.as_ref().expect("an affine norm"));
+        let layers = [&self.key, &self.value];
+        let weights = Tensor::cat(&layers.map(|layer| &layer.ws), 0); // [2d, token width]
+        let biases = Tensor::cat(&layers.map(|layer| layer.bs.as_ref().expect("a bias")), 0);
+        nn::Linear { ws: &weights * gamma, bs: Some(weights.mv(beta) + biases) }
     }
 }
 

@@ -186,8 +186,8 @@ fn attention(request: &Request) -> Result<Answer> {
 fn stream_round(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
-    let (slots, memory) = (request.input("slots")?, request.input("memory")?);
-    with_params([("slots", module.forward(slots, memory, Precision::F32))], params)
+    let (slots, memory) = (request.input("slots")?, model::normalized(request.input("memory")?));
+    with_params([("slots", module.forward(slots, &memory, Precision::F32))], params)
 }
 
 fn self_attention_block(request: &Request) -> Result<Answer> {
