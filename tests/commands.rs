@@ -180,9 +180,28 @@ fn bench_model_tells_where_a_pass_goes() {
         json(&[&["bench", "model", "--repeats", "2", "--json"], &shape[..], options].concat())
     };
     let two = bench(&["--views", "2", "--precision", "bf16"]);
-    let names: Vec<&str> =
-        two["sections"].as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
-    assert_eq!(names, ["tokens", "encoder", "decoder"]);
+    let parts = two["parts"].as_array().unwrap();
+    let number = |part: &Value, what: &str| part[what].as_f64().unwrap();
+    let names: Vec<&str> = parts.iter().map(|part| part["name"].as_str().unwrap()).collect();
+    let expected = ["tokens", "norms", "queries and outputs", "keys and values", "cross-attention"];
+    let more = ["residual sums", "MLPs", "self-attention", "mixer", "heads"];
+    assert_eq!(names, [&expected[..], &more].concat());
+    // 8 reads of 4 + 2·4 tokens of 768 numbers for 32 + 32 of keys and values: by 16 + 5 slots.
+    let flop = |name: &str| 1e9 * number(&parts[names.iter().position(|n| *n == name).unwrap()], "gflop");
+    assert_eq!(flop("keys and values").round(), 8. * 2. * 12. * 768. * 64.);
+    assert_eq!(flop("cross-attention").round(), 8. * 4. * 21. * 12. * 32.);
+    assert_eq!(flop("norms"), 0.);
+    let whole = two["milliseconds"]["median"].as_f64().unwrap();
+    let least = |part: &Value| number(&part["milliseconds"], "least");
+    let sum: f64 = parts.iter().map(least).sum();
+    assert!(sum <= whole && sum > 0.5 * whole, "{sum} of {whole} ms");
+    for part in parts {
+        assert!(least(part) > 0. && number(part, "gigabytes") > 0., "{part}");
+        assert!(
+            number(part, "gflop") == 0. || (0.0..=1.5).contains(&number(part, "share_of_peak")),
+            "{part}"
+        );
+    }
     assert_eq!(
         (&two["views"], &two["precision"], &two["gaussians"]),
         (&2.into(), &"bf16".into(), &128.into())

@@ -1,6 +1,7 @@
 //! Attention on the CPU: our kernel beside libtorch's, and both beside a matrix product.
 
 use super::Spread;
+use super::yardstick::Yardstick;
 use crate::model::{attention, by_libtorch};
 use crate::optim::Stopwatch;
 use crate::render::cpu::simd_level;
@@ -58,14 +59,12 @@ pub fn bench_attention(
         ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
-    let side = 2048;
-    let matrix = Tensor::randn([side, side], (Kind::Float, Device::Cpu));
+    let yardstick = Yardstick::new(Kind::Float, Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms caches and threads up.
     for round in 0..=repeats {
-        let mut watch = Stopwatch::default();
-        no_grad(|| watch.time("product", || drop(matrix.matmul(&matrix))));
+        let one_product = yardstick.time();
         let mut measured = vec![];
         for (_, call, inputs, gradient) in ways {
             let mut watch = Stopwatch::default();
@@ -76,7 +75,7 @@ pub fn bench_attention(
             measured.push([0, 1].map(|section| 1e3 * watch.sections()[section].1.as_secs_f64()));
         }
         if round > 0 {
-            product.push(1e3 * watch.sections()[0].1.as_secs_f64());
+            product.push(one_product);
             for ((forward, backward), measured) in times.iter_mut().zip(measured) {
                 forward.push(measured[0]);
                 backward.push(measured[1]);
@@ -84,7 +83,7 @@ pub fn bench_attention(
         }
     }
     let gflops = |operations: f64, spread: &Spread| 1e-6 * operations / spread.least;
-    let product_gflops = gflops(2. * (side as f64).powi(3), &Spread::of(product));
+    let product_gflops = yardstick.gflops(Spread::of(product).least);
     // Two products forward, five backward.
     let one = 2. * queries as f64 * keys as f64 * width as f64;
     let row = |pass, by, products: f64, milliseconds| {

@@ -3,15 +3,18 @@
 mod attention;
 mod loader;
 mod model;
+mod parts;
 mod raster;
 mod refine;
 mod synth;
 mod train;
 mod video;
+mod yardstick;
 
 pub use attention::{AttentionReport, AttentionRow, bench_attention};
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, made_up_videos};
 pub use model::{ModelReport, bench_model};
+pub use parts::Part;
 pub use raster::{RasterReport, bench_raster, made_up_scene};
 pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};

@@ -1,9 +1,11 @@
 //! A forward pass: how long its parts take, and how much memory it needs.
 
+use super::Spread;
+use super::parts::{Part, Parts};
 use super::train::made_up_scene;
-use super::{Measured, Section, Spread};
+use super::yardstick::Yardstick;
 use crate::config::Config;
-use crate::data::Sample;
+use crate::data::{Sample, ViewBatch};
 use crate::error::Result;
 use crate::eval::{forget_peak_memory, peak_memory_bytes_on};
 use crate::model::{GlobalSplat, Precision};
@@ -29,7 +31,9 @@ pub struct ModelReport {
     /// From photos to Gaussians, on the device.
     pub milliseconds: Spread,
     /// In the order of the work.
-    pub sections: Vec<Section>,
+    pub parts: Vec<Part>,
+    /// A product of large matrices in the same precision, in 10⁹ floating-point operations a second.
+    pub peak_gflops: f64,
     /// Bytes that tensors on a GPU, or the process, took at the most during these passes; weights and photos are among them.
     pub peak_bytes: u64,
 }
@@ -49,24 +53,27 @@ pub fn bench_model(
     model.set_precision(precision);
     let context = Sample::of(&[made_up_scene(config, 0)], device).context;
     let stage = config.curriculum.final_stage();
-    let mut measured = Measured::default();
+    let yardstick = Yardstick::new(precision.kind(), device);
+    let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
     // The first pass warms caches, threads and the GPU's libraries up.
     for pass in 0..=repeats {
         if pass == 1 {
             forget_peak_memory(device);
         }
+        let product = yardstick.time();
         let mut watch = Stopwatch::of(device);
-        no_grad(|| {
-            let tokens =
-                watch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
-            let encoded = watch.time("encoder", || model.encode(&tokens));
-            watch.time("decoder", || model.decode(&encoded, stage))
-        });
-        if pass > 0 {
-            measured.add(&mut watch);
+        let ViewBatch { images, c2w, intrinsics, .. } = &context;
+        let mut forward =
+            || drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
+        if pass == 0 {
+            forward();
+            continue;
         }
+        parts.watch(device, forward);
+        passes.push(1e3 * watch.sections()[0].1.as_secs_f64());
+        products.push(product);
     }
-    let (milliseconds, sections) = measured.told();
+    let peak_gflops = yardstick.gflops(Spread::of(products).least);
     Ok(ModelReport {
         views: config.data.context_views,
         size: config.data.image_size.into(),
@@ -74,8 +81,9 @@ pub fn bench_model(
         precision,
         threads: tch::get_num_threads(),
         repeats,
-        milliseconds,
-        sections,
+        milliseconds: Spread::of(passes),
+        parts: parts.told(peak_gflops),
+        peak_gflops,
         peak_bytes: peak_memory_bytes_on(device),
     })
 }

@@ -1,10 +1,18 @@
 //! Attention (spec 4.2): by our own kernel where it is the fastest, by libtorch's elsewhere.
 
+use super::parts::does;
 use globalsplat_csrc::attention as ours;
 use tch::{Device, Kind, Tensor};
 
 /// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+    let out = attend(q, k, v, heads);
+    let size = q.size();
+    does(4 * size[0] * size[1] * k.size()[1] * size[2], &[q, k, v, &out]);
+    out
+}
+
+fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let all = [q, k, v];
     let takes = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float && t.size()[1] > 0;
     if !all.iter().all(takes) || !ours::attention_takes(q.size()[2] / heads) {

@@ -8,7 +8,7 @@ use super::precision::Precision;
 use super::rotation::{normalize, quaternion_from_6d};
 use crate::scene::Gaussians;
 use std::f64::consts::LN_2;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Tensor, nn};
 
 /// Weights of the geometry heads at the start.
 const GEOMETRY_STD: f64 = 1e-2;
@@ -131,14 +131,15 @@ impl Decoder {
     pub(crate) fn heads(&self, encoded: &Encoded) -> Heads {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
-        let parameters = self.parameters.forward(&encoded.geometry).view([b, m, k, PARAMETERS]);
+        let of_geometry = |head| Precision::F32.linear(head, &encoded.geometry);
+        let parameters = of_geometry(&self.parameters).view([b, m, k, PARAMETERS]);
         let sh = self.precision.linear(&self.sh, &encoded.appearance).to_kind(encoded.appearance.kind());
         Heads {
-            positions: self.positions.forward(&encoded.geometry).view([b, m, k, 3]),
+            positions: of_geometry(&self.positions).view([b, m, k, 3]),
             log_scales: parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET,
             rotations: parameters.narrow(-1, 3, 6),
             opacity_logits: parameters.narrow(-1, 9, 1),
-            gate: self.gate.forward(&encoded.geometry),
+            gate: of_geometry(&self.gate),
             sh: sh.view([b, m, k, self.sh_bases * 3]),
         }
     }

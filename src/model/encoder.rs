@@ -1,11 +1,12 @@
 //! The encoder: a fixed set of scene tokens reads every view, in two streams (spec 4.1).
 
 use super::config::{ModelConfig, Streams};
-use super::layers::{ENCODER_STD, layer_norm, linear, randn};
+use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
 use super::mixer::Mixer;
+use super::parts::part;
 use super::precision::Precision;
 use super::stream::{REGISTERS, StreamRound, normalized};
-use tch::{Tensor, nn, nn::Module};
+use tch::{Tensor, nn};
 
 /// Query tokens before the scene tokens; not decoded.
 const AUXILIARIES: i64 = 4;
@@ -171,6 +172,7 @@ impl StreamStart {
     }
 
     fn forward(&self, slots: &Tensor) -> Tensor {
-        self.project.forward(&self.norm.forward(slots))
+        let normed = normalize(&self.norm, slots);
+        part("queries and outputs", || Precision::F32.linear(&self.project, &normed))
     }
 }

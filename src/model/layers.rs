@@ -1,8 +1,9 @@
 //! The pieces that streams and mixer are made of, with the initializations of spec 4.4.
 
+use super::parts::{does, part};
 use super::precision::Precision;
 use std::cell::Cell;
-use tch::{Tensor, nn};
+use tch::{Tensor, nn, nn::Module};
 
 /// Of encoder linears and learnable tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
@@ -52,7 +53,16 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
     nn::layer_norm(vs, vec![width], nn::LayerNormConfig { eps: LAYER_NORM_EPS, ..Default::default() })
 }
 
-/// x ↦ γ ⊙ x, in float32.
+/// `norm` of `xs`.
+pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
+    part("norms", || {
+        let out = norm.forward(xs);
+        does(0, &[xs, &out]);
+        out
+    })
+}
+
+/// The gain γ, in float32, of what is added to a stream.
 #[derive(Debug)]
 pub(super) struct LayerScale {
     gamma: Tensor,
@@ -63,8 +73,13 @@ impl LayerScale {
         LayerScale { gamma: vs.var("gamma", &[width], nn::Init::Const(init)) }
     }
 
-    pub fn forward(&self, xs: &Tensor) -> Tensor {
-        xs * &self.gamma
+    /// xs + γ ⊙ `change`.
+    pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
+        part("residual sums", || {
+            let out = xs.addcmul(change, &self.gamma);
+            does(0, &[xs, change, &out]);
+            out
+        })
     }
 }
 
@@ -85,6 +100,10 @@ impl Mlp {
     }
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
-        precision.linear(&self.contract, &precision.linear(&self.expand, xs).gelu("none"))
+        part("MLPs", || {
+            let hidden = precision.linear(&self.expand, xs).gelu("none");
+            does(0, &[&hidden, &hidden]);
+            precision.linear(&self.contract, &hidden)
+        })
     }
 }

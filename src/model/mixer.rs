@@ -1,8 +1,9 @@
 //! Where the two streams meet, once per round (spec 4.3).
 
-use super::layers::{LayerScale, Mlp, layer_norm};
+use super::layers::{LayerScale, Mlp, layer_norm, normalize};
+use super::parts::part;
 use super::precision::Precision;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Tensor, nn};
 
 const MIXER_LAYER_SCALE: f64 = 1e-3;
 
@@ -29,11 +30,11 @@ impl Mixer {
 
     /// Both streams [B, S, d], and so the results.
     pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
-        let both = [self.geometry_norm.forward(geometry), self.appearance_norm.forward(appearance)];
-        let mixed = self.mlp.forward(&Tensor::cat(&both, -1), precision).chunk(2, -1);
-        (
-            geometry + self.geometry_scale.forward(&mixed[0]),
-            appearance + self.appearance_scale.forward(&mixed[1]),
-        )
+        part("mixer", || {
+            let both =
+                [normalize(&self.geometry_norm, geometry), normalize(&self.appearance_norm, appearance)];
+            let mixed = self.mlp.forward(&Tensor::cat(&both, -1), precision).chunk(2, -1);
+            (self.geometry_scale.add(geometry, &mixed[0]), self.appearance_scale.add(appearance, &mixed[1]))
+        })
     }
 }

@@ -12,6 +12,7 @@ mod layers;
 mod leaves;
 mod merge;
 mod mixer;
+mod parts;
 mod precision;
 mod recompute;
 mod rotation;
@@ -23,6 +24,7 @@ pub use config::{ModelConfig, Streams};
 pub use decoder::{Decoded, RawOutputs};
 pub use encoder::Encoded;
 pub use merge::Stage;
+pub use parts::{Event, told};
 pub use precision::Precision;
 pub use shapes::MODULES;
 
@@ -43,6 +45,7 @@ pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};
+use parts::part;
 use tch::{Tensor, nn};
 
 /// The whole model.
@@ -84,12 +87,12 @@ impl GlobalSplat {
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
         let tokens = self.tokens(images, c2w, intrinsics); // [B, V, P, 768]
         let encoded = self.encode(&tokens);
-        self.decoder.forward(&encoded, stage)
+        self.decode(&encoded, stage)
     }
 
     /// The first third of [`GlobalSplat::forward`]: [B, V, P, ray width + RGB width].
     pub fn tokens(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
-        self.tokenizer.forward(images, c2w, intrinsics)
+        part("tokens", || self.tokenizer.forward(images, c2w, intrinsics))
     }
 
     /// The second third: scene tokens that have seen every view.
@@ -104,7 +107,7 @@ impl GlobalSplat {
 
     /// The last third.
     pub fn decode(&self, encoded: &Encoded, stage: Stage) -> Decoded {
-        self.decoder.forward(encoded, stage)
+        part("heads", || self.decoder.forward(encoded, stage))
     }
 
     /// What matrix products are computed in from now on; float32 at first.

@@ -1,8 +1,9 @@
 //! What matrix products are computed in (spec 1.3).
 
+use super::parts::does;
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
-use tch::{Kind, Tensor, nn, nn::Module};
+use tch::{Kind, Tensor, nn};
 
 /// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
 /// float32, whatever this says: weights and their gradients, norms, the sums inside of softmax and products, residual streams;
@@ -19,24 +20,36 @@ pub enum Precision {
 }
 
 impl Precision {
+    /// Of the numbers that products take.
+    pub fn kind(self) -> Kind {
+        match self {
+            Precision::F32 => Kind::Float,
+            Precision::Bf16 => Kind::BFloat16,
+        }
+    }
+
     /// `t` as products take it.
     pub(super) fn operand(self, t: &Tensor) -> Tensor {
-        match self {
-            Precision::F32 => t.shallow_clone(),
-            Precision::Bf16 => t.to_kind(Kind::BFloat16),
-        }
+        t.to_kind(self.kind())
     }
 
     /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
     pub(super) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
         match self {
-            Precision::F32 => layer.forward(xs),
+            Precision::F32 => product(xs, &layer.ws, layer.bs.as_ref()),
             Precision::Bf16 => {
                 let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
-                self.operand(xs).linear(&self.operand(&layer.ws), bias.as_ref())
+                product(&self.operand(xs), &self.operand(&layer.ws), bias.as_ref())
             }
         }
     }
+}
+
+/// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
+fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
+    let out = xs.linear(weights, bias);
+    does(2 * (xs.numel() as i64) * weights.size()[0], &[xs, weights, &out]);
+    out
 }
 
 /// For networks of convolutions that learn nothing.

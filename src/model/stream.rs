@@ -2,9 +2,10 @@
 
 use super::attention::attention;
 use super::config::ModelConfig;
-use super::layers::{ENCODER_STD, LAYER_NORM_EPS, LayerScale, Mlp, layer_norm, linear};
+use super::layers::{ENCODER_STD, LAYER_NORM_EPS, LayerScale, Mlp, layer_norm, linear, normalize};
+use super::parts::{does, part};
 use super::precision::Precision;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Tensor, nn};
 
 /// The last of the slots, which neither look at the images nor pass the first MLP.
 pub(super) const REGISTERS: i64 = 4;
@@ -14,8 +15,12 @@ const SELF_LAYER_SCALE: f64 = 1e-2;
 
 /// What all rounds' norms of `memory` have in common, before their γ and β.
 pub(crate) fn normalized(memory: &Tensor) -> Tensor {
-    let width = memory.size()[2];
-    memory.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true)
+    part("norms", || {
+        let out =
+            memory.layer_norm([memory.size()[2]], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
+        does(0, &[memory, &out]);
+        out
+    })
 }
 
 /// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
@@ -63,12 +68,14 @@ impl StreamRound {
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
 
-        let query = precision.linear(&self.query, &self.slots_norm.forward(&slots));
-        let read = precision.linear(&self.read(), memory).chunk(2, -1);
-        let seen = attention(&query, &read[0], &read[1], self.heads);
-        let slots = slots + self.attention_scale.forward(&precision.linear(&self.output, &seen));
-        let thought = self.mlp.forward(&self.mlp_norm.forward(&slots), precision);
-        let slots = slots + self.mlp_scale.forward(&thought);
+        let read = part("keys and values", || precision.linear(&self.read(), memory)).chunk(2, -1);
+        let normed = normalize(&self.slots_norm, &slots);
+        let query = part("queries and outputs", || precision.linear(&self.query, &normed));
+        let seen = part("cross-attention", || attention(&query, &read[0], &read[1], self.heads));
+        let seen = part("queries and outputs", || precision.linear(&self.output, &seen));
+        let slots = self.attention_scale.add(&slots, &seen);
+        let thought = self.mlp.forward(&normalize(&self.mlp_norm, &slots), precision);
+        let slots = self.mlp_scale.add(&slots, &thought);
 
         let slots = Tensor::cat(&[slots, registers], 1);
         self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
@@ -115,9 +122,12 @@ impl SelfAttentionBlock {
 
     /// [B, S, d], and so the result.
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
-        let qkv = precision.linear(&self.qkv, &self.attention_norm.forward(xs)).chunk(3, -1);
-        let mixed = attention(&qkv[0], &qkv[1], &qkv[2], self.heads);
-        let xs = xs + self.attention_scale.forward(&precision.linear(&self.project, &mixed));
-        &xs + self.mlp_scale.forward(&self.mlp.forward(&self.mlp_norm.forward(&xs), precision))
+        let normed = normalize(&self.attention_norm, xs);
+        let qkv = part("queries and outputs", || precision.linear(&self.qkv, &normed)).chunk(3, -1);
+        let mixed = part("self-attention", || attention(&qkv[0], &qkv[1], &qkv[2], self.heads));
+        let mixed = part("queries and outputs", || precision.linear(&self.project, &mixed));
+        let xs = self.attention_scale.add(xs, &mixed);
+        let thought = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
+        self.mlp_scale.add(&xs, &thought)
     }
 }

@@ -3,8 +3,9 @@
 use super::camera_code::CameraCode;
 use super::config::ModelConfig;
 use super::layers::default_linear;
+use super::precision::Precision;
 use crate::scene::plucker_rays;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Tensor, nn};
 
 const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
@@ -68,7 +69,7 @@ impl RgbTokens {
     /// `images` [B, V, 3, H, W] in [0, 1]; the result is [B, V, P, RGB width].
     pub fn forward(&self, images: &Tensor) -> Tensor {
         let normalized = (images - &self.mean) / &self.deviation;
-        self.project.forward(&patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
+        Precision::F32.linear(&self.project, &patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
     }
 }
 
@@ -93,7 +94,7 @@ impl RayTokens {
     /// `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, P, ray width].
     pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let rays = plucker_rays(c2w, intrinsics, height, width);
-        let tokens = self.project.forward(&patchify(&rays, self.patch_size));
+        let tokens = Precision::F32.linear(&self.project, &patchify(&rays, self.patch_size));
         match &self.camera_code {
             Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
             None => tokens,

@@ -1,0 +1,103 @@
+//! The parts of a model's pass: how long each takes, what it computes, and what it moves.
+
+use super::Spread;
+use crate::device::Moment;
+use crate::model::{Event, told};
+use serde::Serialize;
+use std::cell::RefCell;
+use std::rc::Rc;
+use tch::Device;
+
+/// A part of a pass.
+#[derive(Debug, Serialize)]
+pub struct Part {
+    /// What the part is called.
+    pub name: &'static str,
+    /// Of a pass.
+    pub milliseconds: Spread,
+    /// 10⁹ floating-point operations of its products.
+    pub gflop: f64,
+    /// 10⁹ bytes that its products, norms and sums read and write, if each number is moved once.
+    pub gigabytes: f64,
+    /// Of the fastest time, what a product of large matrices reaches; 0 without products.
+    pub share_of_peak: f64,
+}
+
+/// One part in one pass.
+struct Piece {
+    name: &'static str,
+    begins: Moment,
+    ends: Option<Moment>,
+    flops: f64,
+    bytes: f64,
+}
+
+/// Every pass that was watched.
+#[derive(Default)]
+pub(super) struct Parts {
+    parts: Vec<Sum>,
+}
+
+#[derive(Default)]
+struct Sum {
+    name: &'static str,
+    milliseconds: Vec<f64>,
+    flops: f64,
+    bytes: f64,
+}
+
+impl Parts {
+    /// Does `pass` and adds its parts, by the clock of `device`.
+    pub fn watch<T>(&mut self, device: Device, pass: impl FnOnce() -> T) -> T {
+        let pieces = Rc::new(RefCell::new(Vec::<Piece>::new()));
+        let heard = pieces.clone();
+        let listener = move |event| {
+            let mut pieces = heard.borrow_mut();
+            match (event, pieces.last_mut()) {
+                (Event::Begins(name), _) => {
+                    let begins = Moment::now(device);
+                    pieces.push(Piece { name, begins, ends: None, flops: 0., bytes: 0. });
+                }
+                (Event::Ends, Some(piece)) => piece.ends = Some(Moment::now(device)),
+                (Event::Does { flops, bytes }, Some(piece)) => {
+                    piece.flops += flops;
+                    piece.bytes += bytes;
+                }
+                (_, None) => unreachable!("a part begins before all else"),
+            }
+        };
+        let result = told(listener, pass);
+        let mut sums: Vec<Sum> = vec![];
+        for piece in pieces.take() {
+            let elapsed = piece.ends.expect("a part that is over").since(&piece.begins);
+            let known = sums.iter().position(|sum| sum.name == piece.name).unwrap_or_else(|| {
+                sums.push(Sum { name: piece.name, milliseconds: vec![0.], ..Default::default() });
+                sums.len() - 1
+            });
+            sums[known].milliseconds[0] += 1e3 * elapsed.as_secs_f64();
+            sums[known].flops += piece.flops;
+            sums[known].bytes += piece.bytes;
+        }
+        match self.parts.is_empty() {
+            true => self.parts = sums,
+            // Every pass is the same.
+            false => self
+                .parts
+                .iter_mut()
+                .zip(sums)
+                .for_each(|(all, one)| all.milliseconds.extend(one.milliseconds)),
+        }
+        result
+    }
+
+    /// Beside products that reach `peak_gflops`.
+    pub fn told(self, peak_gflops: f64) -> Vec<Part> {
+        let part = |sum: Sum| {
+            let milliseconds = Spread::of(sum.milliseconds);
+            let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
+            let (gflop, gigabytes) = (1e-9 * sum.flops, 1e-9 * sum.bytes);
+            Part { name: sum.name, milliseconds, gflop, gigabytes, share_of_peak }
+        };
+        self.parts.into_iter().map(part).collect()
+    }
+}
