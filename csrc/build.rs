@@ -6,7 +6,7 @@ use std::{
 };
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 9] = [
+const BRIDGES: [&str; 10] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
@@ -14,6 +14,7 @@ const BRIDGES: [&str; 9] = [
     "src/fit.rs",
     "src/ops.rs",
     "src/optim.rs",
+    "src/processor.rs",
     "src/ranks.rs",
     "src/render.rs",
 ];

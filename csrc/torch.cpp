@@ -9,6 +9,7 @@
 #include "fit.cpp"
 #include "ops.cpp"
 #include "optim.cpp"
+#include "processor.cpp"
 #include "ranks.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

@@ -7,5 +7,6 @@ pub mod device;
 pub mod fit;
 pub mod ops;
 pub mod optim;
+pub mod processor;
 pub mod ranks;
 pub mod render;

@@ -36,6 +36,9 @@ pub struct AttentionRow {
     pub share: f64,
 }
 
+/// By whom, how, of what, and the gradient of what comes out.
+type Way<'a> = (&'static str, &'a dyn Fn([&Tensor; 3]) -> Tensor, &'a [Tensor; 3], &'a Tensor);
+
 /// Times `repeats` calls of each, by turns, for `queries` and `keys` of `heads` heads that are `width` wide together.
 ///
 /// # Errors
@@ -54,7 +57,7 @@ pub fn bench_attention(
     let torchs = |[q, k, v]: [&Tensor; 3]| {
         Tensor::scaled_dot_product_attention(q, k, v, None::<&Tensor>, 0., false, None, false)
     };
-    let ways: [(&'static str, &dyn Fn([&Tensor; 3]) -> Tensor, &[Tensor; 3], &Tensor); 3] = [
+    let ways: [Way; 3] = [
         ("ours", &|[q, k, v]| attention(q, k, v, heads), &inputs, &gradient),
         ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),

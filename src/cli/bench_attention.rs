@@ -39,7 +39,7 @@ impl Attention {
         if let Some(threads) = self.threads {
             tch::set_num_threads(threads.into());
         }
-        if self.width % self.heads != 0 {
+        if !self.width.is_multiple_of(self.heads) {
             let (width, heads) = (self.width, self.heads);
             return Err(Error::Request(format!(
                 "--width is {width}, expected a multiple of the {heads} heads"

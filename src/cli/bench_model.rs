@@ -1,9 +1,8 @@
 use super::bench::read_config;
-use super::{device, print_json};
+use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{ModelReport, Part, Spread, bench_model};
-use globalsplat::error::Error;
 use std::path::PathBuf;
 
 /// A forward pass, photos to Gaussians, part by part, over photos of noise and with fresh weights.
@@ -26,8 +25,8 @@ pub struct Model {
     /// Passes that are measured
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
-    /// Matrix products in f32 or bf16
-    #[arg(long, default_value = "f32")]
+    /// Matrix products in f32, bf16, or auto: bf16 where the device has instructions for it
+    #[arg(long, default_value = "auto")]
     precision: String,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
@@ -40,7 +39,7 @@ pub struct Model {
 impl Model {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
-        let precision = self.precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
+        let precision = model::precision(&self.precision, device)?;
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         config.data.context_views = self.views.into();
         let report = bench_model(&config, precision, self.repeats as usize, device)?;
@@ -57,7 +56,7 @@ fn print_report(r: &ModelReport, asked: &Model) {
     let [height, width] = r.size;
     println!(
         "{} photos of {width}x{height}, {} Gaussians, {}, {}, {} threads, {} passes",
-        r.views, r.gaussians, asked.precision, asked.device, r.threads, r.repeats
+        r.views, r.gaussians, r.precision, asked.device, r.threads, r.repeats
     );
     println!(
         "{:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
@@ -78,6 +77,6 @@ fn print_report(r: &ModelReport, asked: &Model) {
         .map(|of| r.parts.iter().map(of).sum::<f64>());
     let of_peak = 1e5 * flop / r.milliseconds.least / r.peak_gflops;
     row("pass", &r.milliseconds, format!("{flop:>9.2} {bytes:>7.3} {of_peak:>11.1} %"));
-    println!("a product of large matrices reaches {:.0} GFLOP/s in {}", r.peak_gflops, asked.precision);
+    println!("a product of large matrices reaches {:.0} GFLOP/s in {}", r.peak_gflops, r.precision);
     println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
 }

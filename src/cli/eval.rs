@@ -8,6 +8,7 @@ use globalsplat::eval::{
     contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
 use globalsplat::io::{check_writable_dir, check_writable_file, write_png};
+use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
@@ -82,8 +83,8 @@ pub struct Eval {
     /// Also write a picture: photo, render and depth side by side, a row per view
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
-    /// f32, or bf16 for the model's matrix products
-    #[arg(long, default_value = "f32", conflicts_with_all = ["splat", "renders"])]
+    /// f32, bf16 for the model's matrix products, or auto: bf16 where the device has instructions for it
+    #[arg(long, default_value = "auto", conflicts_with_all = ["splat", "renders"])]
     precision: String,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
@@ -209,7 +210,8 @@ impl Eval {
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
-        let load = |path: &PathBuf| model::load(Some(path), &self.precision, device);
+        let precision = model::precision(&self.precision, device)?;
+        let load = |path: &PathBuf| model::load(Some(path), precision, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 
@@ -266,15 +268,15 @@ impl Eval {
         let mut evaluations = vec![];
         for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let precision = match self.precision.as_str() {
-                "f32" => String::new(),
-                other => format!(" {other}"),
+            let precision = match model.map(|model| model.network.precision()) {
+                Some(Precision::Bf16) => " bf16",
+                _ => "",
             };
             let setting = match (model, self.views_at) {
                 (Some(Model { input, .. }), Some(height)) if !input.is_plain() => {
                     format!("{precision} {} {height}", self.views_as)
                 }
-                _ => precision,
+                _ => precision.into(),
             };
             let sweep = Sweep {
                 method: self.method(model),

@@ -1,17 +1,31 @@
-//! `--weights`, `--precision f32|bf16` and `--views-at`.
+//! `--weights`, `--precision auto|f32|bf16` and `--views-at`.
 
 use super::ranks;
 use globalsplat::config::Config;
-use globalsplat::model::Stage;
+use globalsplat::model::{Precision, Stage};
 use globalsplat::reconstruct::{Input, LoadedModel, SHIPPED_MODEL, ViewsAs, load_model, shipped_model};
 use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
 
+/// What `--precision` asks for: `auto` is the faster one on `device`. The slower one is told of.
+pub fn precision(asked: &str, device: Device) -> Result<Precision> {
+    let fastest = Precision::fastest_on(device);
+    if asked == "auto" {
+        return Ok(fastest);
+    }
+    let precision = asked.parse().map_err(|_| {
+        Error::Request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
+    })?;
+    if precision == Precision::Bf16 && fastest == Precision::F32 && ranks::is_first() {
+        eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
+    }
+    Ok(precision)
+}
+
 /// Reads the model in `weights`, or the one that comes with this program, which computes in `precision` from then on.
-pub fn load(weights: Option<&Path>, precision: &str, device: Device) -> Result<LoadedModel> {
-    let precision = precision.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
+pub fn load(weights: Option<&Path>, precision: Precision, device: Device) -> Result<LoadedModel> {
     let mut loaded = match weights {
         Some(weights) => load_model(weights, device)?,
         None => shipped_model(device)?,

@@ -43,8 +43,8 @@ pub struct Reconstruct {
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
     refine: Option<f64>,
-    /// f32, or bf16 for matrix products: faster on machines with instructions for it
-    #[arg(long, default_value = "f32")]
+    /// f32, bf16 for matrix products, or auto: bf16 where the device has instructions for it
+    #[arg(long, default_value = "auto")]
     precision: String,
     /// cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
@@ -86,8 +86,9 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_splat(&self.out)?;
+        let precision = model::precision(&self.precision, device)?;
         let clock = Instant::now();
-        let loaded = model::load(self.weights.as_deref(), &self.precision, device)?;
+        let loaded = model::load(self.weights.as_deref(), precision, device)?;
         let load_seconds = clock.elapsed().as_secs_f64();
         let capture = open_capture(&self.scene)?;
         let data = &loaded.config.data;
@@ -114,6 +115,7 @@ impl Reconstruct {
                 "image_size": input.photo_size(data.image_size),
                 "views": views,
                 "gaussians": count,
+                "precision": precision,
                 "load_seconds": load_seconds,
                 "seconds": seconds,
                 "peak_memory_bytes": peak_memory_bytes(),

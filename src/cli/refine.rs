@@ -9,6 +9,7 @@ use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures
 use globalsplat::io::{
     Splat, check_writable_file, check_writable_splat, read_splat, write_png, write_splat_for,
 };
+use globalsplat::model::Precision;
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
     Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
@@ -229,7 +230,7 @@ impl Refine {
             return Err(Error::Request(why.into()).into());
         }
         if self.from == Some(From::Weights) || needs_model {
-            let loaded = model::load(self.weights.as_deref(), "f32", Device::Cpu)?;
+            let loaded = model::load(self.weights.as_deref(), Precision::F32, Device::Cpu)?;
             let data = &loaded.config.data;
             let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
             let all: Vec<usize> = (0..photos.len()).collect();

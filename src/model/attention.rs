@@ -2,6 +2,7 @@
 
 use super::parts::does;
 use globalsplat_csrc::attention as ours;
+use globalsplat_csrc::processor::{Bf16, bf16_of_cpu};
 use tch::{Device, Kind, Tensor};
 
 /// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
@@ -13,11 +14,17 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
 }
 
 fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
-    let all = [q, k, v];
-    let takes = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float && t.size()[1] > 0;
-    if !all.iter().all(takes) || !ours::attention_takes(q.size()[2] / heads) {
+    let (kind, all) = (q.kind(), [q, k, v]);
+    // Libtorch's kernel for bf16 needs tiles to be fast: elsewhere on a CPU ours for float32 is.
+    let is_ours = kind == Kind::Float || kind == Kind::BFloat16 && bf16_of_cpu() != Bf16::Tiles;
+    let takes = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == kind && t.size()[1] > 0;
+    if !is_ours || !all.iter().all(takes) || !ours::attention_takes(q.size()[2] / heads) {
         return by_libtorch(q, k, v, heads);
     }
+    by_ours(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
+}
+
+fn by_ours(all: [&Tensor; 3], heads: i64) -> Tensor {
     let [q, k, v] = all.map(|t| t.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
     let out = unsafe { ours::attention(q, k, v, heads) }.unwrap_or_else(|error| panic!("{error}"));

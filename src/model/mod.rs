@@ -116,6 +116,11 @@ impl GlobalSplat {
         self.decoder.precision = precision;
     }
 
+    /// What matrix products are computed in.
+    pub fn precision(&self) -> Precision {
+        self.encoder.precision
+    }
+
     /// What the model was built from.
     pub fn config(&self) -> &ModelConfig {
         &self.config

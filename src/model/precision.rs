@@ -1,9 +1,11 @@
 //! What matrix products are computed in (spec 1.3).
 
 use super::parts::does;
+use globalsplat_csrc::processor::{Bf16, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
+use std::fmt;
 use std::str::FromStr;
-use tch::{Kind, Tensor, nn};
+use tch::{Device, Kind, Tensor, nn};
 
 /// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
 /// float32, whatever this says: weights and their gradients, norms, the sums inside of softmax and products, residual streams;
@@ -20,6 +22,16 @@ pub enum Precision {
 }
 
 impl Precision {
+    /// bf16 where `device` has instructions for its products, else float32.
+    pub fn fastest_on(device: Device) -> Self {
+        let has_bf16 = match device {
+            Device::Cpu => bf16_of_cpu() != Bf16::None,
+            Device::Cuda(_) => gpu_has_bf16(),
+            _ => false,
+        };
+        if has_bf16 { Precision::Bf16 } else { Precision::F32 }
+    }
+
     /// Of the numbers that products take.
     pub fn kind(self) -> Kind {
         match self {
@@ -72,6 +84,15 @@ impl Precision {
         if self == Precision::Bf16 {
             layer.bs = layer.bs.as_ref().map(|bias| bias.to_kind(Kind::BFloat16));
         }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Precision::F32 => "f32",
+            Precision::Bf16 => "bf16",
+        })
     }
 }
 

@@ -11,6 +11,7 @@ use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
+use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{Rendered, render_views};
 use globalsplat::scene::{Camera, ImageSize};
@@ -137,7 +138,7 @@ impl Render {
         let (Some(weights), Some(capture)) = (&self.weights, capture) else {
             return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
         };
-        let loaded = model::load(Some(weights), "f32", Device::Cpu)?;
+        let loaded = model::load(Some(weights), Precision::F32, Device::Cpu)?;
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
         Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
