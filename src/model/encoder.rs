@@ -86,8 +86,8 @@ impl Encoder {
         }
     }
 
-    /// `scene_tokens` [M, d], `tokens` [B, V·P, token width].
-    pub fn forward(&self, scene_tokens: &Tensor, tokens: &Tensor) -> Encoded {
+    /// `scene_tokens` [M, d], `tokens` [B, V·P, token width], which are given up as soon as they can be.
+    pub fn forward(&self, scene_tokens: &Tensor, tokens: Tensor) -> Encoded {
         let (mut slots, memory) = self.start(scene_tokens, tokens);
         for round in 0..self.rounds() {
             slots = self.round(round, &slots, &memory);
@@ -96,12 +96,14 @@ impl Encoder {
     }
 
     /// Every stream's own view of the slots, and the memory [B, 4 + V·P, token width] that all rounds read, normalized.
-    pub(super) fn start(&self, scene_tokens: &Tensor, tokens: &Tensor) -> (Slots, Tensor) {
+    pub(super) fn start(&self, scene_tokens: &Tensor, tokens: Tensor) -> (Slots, Tensor) {
         let batch = tokens.size()[0];
         let expand = |t: &Tensor| t.expand([batch, -1, -1], false);
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
         let slots = expand(&Tensor::cat(&slots, 1)); // [B, 4 + M + 1 + 4, d]
-        let memory = normalized(&Tensor::cat(&[expand(&self.memory_registers), tokens.shallow_clone()], 1));
+        let memory = Tensor::cat(&[&expand(&self.memory_registers), &tokens], 1);
+        drop(tokens);
+        let memory = normalized(&memory);
         // Where a gradient comes back, every round's is added up in float32.
         let memory = if memory.requires_grad() { memory } else { self.precision.operand(&memory) };
         let slots = Slots {

@@ -85,8 +85,7 @@ impl GlobalSplat {
     /// One pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics`
     /// [B, V, 3, 3] in pixels; H and W multiples of the patch size.
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
-        let tokens = self.tokens(images, c2w, intrinsics); // [B, V, P, 768]
-        let encoded = self.encode(&tokens);
+        let encoded = self.encode(self.tokens(images, c2w, intrinsics));
         self.decode(&encoded, stage)
     }
 
@@ -95,14 +94,16 @@ impl GlobalSplat {
         part("tokens", || self.tokenizer.forward(images, c2w, intrinsics))
     }
 
-    /// The second third: scene tokens that have seen every view.
-    pub fn encode(&self, tokens: &Tensor) -> Encoded {
-        self.encoder.forward(&self.scene_tokens, &tokens.flatten(1, 2))
+    /// The second third: scene tokens that have seen every view. Of many, image tokens are large: nobody holds them any longer.
+    pub fn encode(&self, tokens: Tensor) -> Encoded {
+        let of_all_views = tokens.flatten(1, 2);
+        drop(tokens);
+        self.encoder.forward(&self.scene_tokens, of_all_views)
     }
 
     /// As [`GlobalSplat::encode`], but every round is computed again in the backward pass.
     pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (Encoded, KeptRounds<'_>) {
-        self.encoder.forward_keeping_rounds(&self.scene_tokens, &tokens.flatten(1, 2))
+        self.encoder.forward_keeping_rounds(&self.scene_tokens, tokens.flatten(1, 2))
     }
 
     /// The last third.

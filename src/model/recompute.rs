@@ -23,7 +23,7 @@ impl Encoder {
     pub(crate) fn forward_keeping_rounds(
         &self,
         scene_tokens: &Tensor,
-        tokens: &Tensor,
+        tokens: Tensor,
     ) -> (Encoded, KeptRounds<'_>) {
         let (slots, memory) = self.start(scene_tokens, tokens);
         let memory_leaf = leaf(&memory);

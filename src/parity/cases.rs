@@ -211,7 +211,7 @@ fn encoder(request: &Request) -> Result<Answer> {
         let scene_tokens = model::scene_tokens(vs, &config);
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
-    let encoded = encoder.forward(&scene_tokens, request.input("tokens")?);
+    let encoded = encoder.forward(&scene_tokens, request.input("tokens")?.shallow_clone());
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
 

@@ -102,7 +102,7 @@ pub fn reconstruct<'a>(
 
     let start = Instant::now();
     let (encoded, decoded) = tch::no_grad(|| {
-        let encoded = network.encode(&network.tokens(&images, &c2w, &intrinsics));
+        let encoded = network.encode(network.tokens(&images, &c2w, &intrinsics));
         let decoded = network.decode(&encoded, stage);
         (encoded, decoded)
     });
