@@ -1,0 +1,131 @@
+"""The program's forward pass beside the same model in PyTorch, on the CPU, in one run.
+
+    python parity/model_speed.py                       24 views of 256x256, 16,384 Gaussians, in f32 and in bf16
+    python parity/model_speed.py --views 4 --rounds 2
+
+The model is the parity checks' reference with torch's own fused functions for its layers: linear, layer_norm, gelu,
+scaled_dot_product_attention; bf16 is torch.autocast. Weights and photos are random. What the program measures is
+`globalsplat bench model`; both warm up, and take turns.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import reference.decoder
+import reference.encoder
+import reference.layers
+import reference.model
+import reference.rays
+import reference.stream
+import reference.tokens
+import torch
+from harness import draw
+from harness.names import reference_config
+from torch.nn import functional
+from torch.utils.flop_counter import FlopCounterMode
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SIZE = 256
+
+
+def linear(params, name, x):
+    return functional.linear(x, params[f"{name}.weight"], params.get(f"{name}.bias"))
+
+
+def layer_norm(params, name, x):
+    weight = params[f"{name}.weight"]
+    return functional.layer_norm(x, weight.shape, weight, params[f"{name}.bias"], reference.layers.LAYER_NORM_EPS)
+
+
+def mlp(params, first, second, x):
+    return linear(params, second, functional.gelu(linear(params, first, x)))
+
+
+def attention(q, k, v, heads):
+    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (q, k, v))
+    return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+
+
+def use_fused_layers():
+    fused = {"linear": linear, "layer_norm": layer_norm, "mlp": mlp, "attention": attention, "gelu": functional.gelu}
+    for module in (reference.decoder, reference.encoder, reference.rays, reference.stream, reference.tokens):
+        for name in fused.keys() & vars(module).keys():
+            setattr(module, name, fused[name])
+
+
+class Torch:
+    def __init__(self, views):
+        rng = np.random.default_rng(0)
+        self.config = reference_config(draw.MAIN_16K)
+        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(rng, 1, views, SIZE, SIZE)
+        self.inputs = [torch.from_numpy(inputs[name]) for name in ("images", "c2w", "intrinsics")]
+        params = {name: torch.from_numpy(value) for name, value in draw.parameters(rng, draw.MAIN_16K).items()}
+        self.params = params | {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
+
+    def run(self):
+        return reference.model.forward(self.config, self.params, *self.inputs, stage=3, mix=1.0)
+
+    def seconds(self, precision):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            start = time.perf_counter()
+            self.run()
+            return time.perf_counter() - start
+
+    def gflop(self):
+        """Of all products. Attention as it is written out, which torch can count."""
+        with torch.no_grad(), FlopCounterMode(display=False) as counter:
+            self.run()
+        return counter.get_total_flops() * 1e-9
+
+
+def program(binary, views, precision):
+    command = [binary, "bench", "model", "--views", str(views), "--precision", precision, "--repeats", "1", "--json"]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+
+
+def compare(options):
+    """By turns, so that whatever else the machine does meets both."""
+    twin, told = Torch(options.views), {}
+    for precision in options.precision:
+        twin.seconds(precision)
+        ours, theirs = [], []
+        for _ in range(options.rounds):
+            report = program(options.binary, options.views, precision)
+            ours.append(report["milliseconds"]["median"] * 1e-3)
+            theirs.append(twin.seconds(precision))
+            print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
+        ratios = [a / b for a, b in zip(ours, theirs)]
+        told[precision] = {
+            "program_seconds": statistics.median(ours),
+            "torch_seconds": statistics.median(theirs),
+            "ratio": statistics.median(ratios),
+            "ratios": ratios,
+            "program_gflop": sum(part["gflop"] for part in report["parts"]),
+            "program_peak_gflops": report["peak_gflops"],
+        }
+    return told
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", metavar="N", type=int, default=24, help="photos (default: 24)")
+    parser.add_argument("--rounds", metavar="N", type=int, default=3, help="by turns (default: 3)")
+    parser.add_argument("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
+    parser.add_argument("--gflop", action="store_true", help="only what the model in PyTorch computes, by torch's own count")
+    parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
+    options = parser.parse_args()
+    if options.gflop:
+        print(json.dumps({"gflop": Torch(options.views).gflop()}))
+        return
+    use_fused_layers()
+    print(json.dumps(compare(options)))
+
+
+if __name__ == "__main__":
+    main()
