@@ -86,7 +86,7 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
 fn a_stopped_sweep_goes_on_with_what_it_has() {
     let set = Set::new();
     let weights = tiny_weights(set.folder.path(), &set.path("captures"));
-    let arguments = set.arguments(&["--weights", arg(&weights)], "chunks");
+    let arguments = set.arguments(&["--precision", "f32", "--weights", arg(&weights)], "chunks");
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let first = read_evaluation(&set.path("out")).unwrap();
     let efficiency = first.efficiency.expect("a model's cost");

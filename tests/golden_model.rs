@@ -71,7 +71,7 @@ fn tokens_and_encoder_match() {
         let (inputs, golden) = (read(&case, "inputs").tensors, read(&case, "encoder").tensors);
         let tokens = model.tokens(&inputs["images"], &inputs["c2w"], &inputs["intrinsic"]);
         assert_close("tokens", &tokens, &golden["content_tokens"], OUTPUT_TOLERANCE);
-        let encoded = model.encode(tokens.shallow_clone());
+        let encoded = model.encode(&tokens);
         assert_close("geometry", &encoded.geometry, &golden["encoded_geo"], OUTPUT_TOLERANCE);
         assert_close("appearance", &encoded.appearance, &golden["encoded_tex"], OUTPUT_TOLERANCE);
     }

@@ -124,7 +124,7 @@ fn a_transition_starts_where_the_stage_before_ended() {
     // At λ = 0 every parent is there twice, its optical depth split between the two.
     let (_vs, model) = build(&small());
     let [images, c2w, intrinsics] = inputs(2, 16, 16);
-    let encoded = model.encode(model.tokens(&images, &c2w, &intrinsics));
+    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics));
     let after = model.decode(&encoded, Stage { index: 2, mix: 0. }).gaussians;
     let before = model.decode(&encoded, Stage { index: 1, mix: 1. }).gaussians;
     let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 1, None);

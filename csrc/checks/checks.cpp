@@ -236,6 +236,34 @@ int64_t fits(const std::vector<int>& thread_counts) {
   return count;
 }
 
+float to_float(raster::Bf16 number) {
+  const uint32_t bits = uint32_t(number) << 16;
+  float value;
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
+  std::vector<raster::Bf16> cut;
+  for (const float number : numbers) {
+    uint32_t bits;
+    std::memcpy(&bits, &number, sizeof bits);
+    cut.push_back(raster::Bf16(bits >> 16));
+  }
+  return cut;
+}
+
+// As raster::Bf16Products say, one number after the other.
+void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const raster::Bf16* a,
+                   const raster::Bf16* b, float* c) {
+  for (int64_t i = 0; i < m; ++i)
+    for (int64_t j = 0; j < n; ++j) {
+      float sum = adds ? c[i * c_row + j] : 0;
+      for (int64_t at = 0; at < k; ++at) sum += to_float(a[i * a_row + at]) * to_float(b[(at / 2 * b_row + j) * 2 + at % 2]);
+      c[i * c_row + j] = sum;
+    }
+}
+
 // Attention, forward and backward. Arrays end where they end here, too.
 int64_t attentions(const std::vector<int>& thread_counts) {
   Random random(12);
@@ -258,12 +286,19 @@ int64_t attentions(const std::vector<int>& thread_counts) {
       begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(threads) +
             " threads");
       const auto unwritten = [&](size_t n) { return std::vector<float>(n, float(threads)); };
-      const raster::AttentionInputs inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
+      const raster::AttentionInputs<float> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
       std::vector<float> out = unwritten(q.size()), log_sums = unwritten(size_t(shape.scenes * shape.heads * shape.queries));
       raster::attend(shape, inputs, {out.data(), in, row}, log_sums.data(), threads);
       std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
       raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {slope.data(), in, row},
                               {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, threads);
+      if (shape.width % 8 == 0) {
+        const std::vector<raster::Bf16> q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v);
+        std::vector<raster::Bf16> out_cut(q.size(), raster::Bf16(threads));
+        raster::attend_bf16(shape, {{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}},
+                            {out_cut.data(), in, row}, {multiply_bf16, [] {}}, threads);
+        for (const raster::Bf16 number : out_cut) out.push_back(to_float(number));
+      }
       for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
       return out;
     };

@@ -34,24 +34,40 @@ float* room(int64_t count) {
   return numbers.data() + (64 - address % 64) % 64 / sizeof(float);
 }
 
-}  // namespace
-
-void attend(const AttentionShape& shape, const AttentionInputs& in, Heads<float> out, float* log_sums, int threads) {
+// Calls task(some of a head's queries with all of its keys and values, head, where these queries begin) on up to `threads` threads.
+// Queries come in whole `step`s.
+template <class Number, class Task>
+void for_some_queries(const AttentionShape& shape, const AttentionInputs<Number>& in, int64_t step, int threads, const Task& task) {
   const int64_t heads = shape.scenes * shape.heads;
   // A query's bits are the same in any company, so this may hang on the number of threads.
-  const int64_t most = std::min(part(heads, shape.queries, 8 * threads, kFewestQueries, kProductRows), kAttentionQueries);
+  const int64_t most = std::min(part(heads, shape.queries, 8 * threads, kFewestQueries, step), kAttentionQueries / step * step);
   const int64_t blocks = (shape.queries + most - 1) / most;
-  const int64_t size = rounded_up((shape.queries + blocks - 1) / std::max<int64_t>(blocks, 1), kProductRows);
-  parallel_for(threads, heads * blocks, [&](int64_t task) {
-    const int64_t head = task / blocks, begin = std::min(task % blocks * size, shape.queries);
-    const AttentionHead of{head_of(in.q, shape, head).from(begin), head_of(in.k, shape, head), head_of(in.v, shape, head),
-                           std::min(size, shape.queries - begin), shape.keys, shape.width};
+  const int64_t size = rounded_up((shape.queries + blocks - 1) / std::max<int64_t>(blocks, 1), step);
+  parallel_for(threads, heads * blocks, [&](int64_t i) {
+    const int64_t head = i / blocks, begin = std::min(i % blocks * size, shape.queries);
+    task(AttentionHead<Number>{head_of(in.q, shape, head).from(begin), head_of(in.k, shape, head), head_of(in.v, shape, head),
+                               std::min(size, shape.queries - begin), shape.keys, shape.width},
+         head, begin);
+  });
+}
+
+}  // namespace
+
+void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums, int threads) {
+  for_some_queries(shape, in, kProductRows, threads, [&](const AttentionHead<float>& of, int64_t head, int64_t begin) {
     kernels().attend(of, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
                      room(attention_room(shape.width)));
   });
 }
 
-void attend_backward(const AttentionShape& shape, const AttentionInputs& in, Heads<const float> out, const float* log_sums,
+void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, const Bf16Products& products,
+                 int threads) {
+  for_some_queries(shape, in, kBf16Rows, threads, [&](const AttentionHead<Bf16>& of, int64_t head, int64_t begin) {
+    kernels().attend_bf16(of, products, head_of(out, shape, head).from(begin), room(attention_bf16_room(shape.width)));
+  });
+}
+
+void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
                      Heads<const float> slope, const AttentionGradients& gradients, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
   // Every task has a part of a head's keys, cut by shapes alone, and a gradient of all its queries; these are added up in order.

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "rows.h"
+
 namespace globalsplat::raster {
 
 // The numbers of all heads, side by side: row i of head h of scene b begins at data + b · scene + i · row + h · width.
@@ -18,18 +20,24 @@ struct AttentionShape {
   int width;  // of a head, at most kAttentionWidth
 };
 
+template <class Number>
 struct AttentionInputs {
-  Heads<const float> q, k, v;
+  Heads<const Number> q, k, v;
 };
 
 // Writes `out`, and log_sums[scene, head, query], which the backward pass asks for. There are keys.
-void attend(const AttentionShape& shape, const AttentionInputs& in, Heads<float> out, float* log_sums, int threads);
+void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums, int threads);
+
+// The same of bfloat16 numbers, whose `width` is a multiple of 8 and whose rows are an even number of them apart, by `products`
+// (attention_bf16.h). It has no way back.
+void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, const Bf16Products& products,
+                 int threads);
 
 // Of the gradient `slope` of what came out.
 struct AttentionGradients {
   Heads<float> q, k, v;
 };
-void attend_backward(const AttentionShape& shape, const AttentionInputs& in, Heads<const float> out, const float* log_sums,
+void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
                      Heads<const float> slope, const AttentionGradients& gradients, int threads);
 
 }  // namespace globalsplat::raster

@@ -44,7 +44,7 @@ GS_INLINE float largest_score(float* scores, int64_t count, int64_t columns, flo
   return largest_lane(most);
 }
 
-inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, float* memory) {
+inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log_sums, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
@@ -101,7 +101,7 @@ inline void attend(const AttentionHead& head, Rows<float> out, float* log_sums, 
 }
 
 // Some of a head's queries, and what is known of them, for attend_backward().
-inline void pack_queries(const AttentionHead& head, const AttentionPast& past, const PackedQueries& to) {
+inline void pack_queries(const AttentionHead<float>& head, const AttentionPast& past, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
@@ -116,7 +116,7 @@ inline void pack_queries(const AttentionHead& head, const AttentionPast& past, c
 
 // Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
 // of q · √w, [whole_product_rows(queries), attention_columns(width)].
-inline void attend_backward(const AttentionHead& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
+inline void attend_backward(const AttentionHead<float>& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
                             Rows<float> dv, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;

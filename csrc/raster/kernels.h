@@ -32,10 +32,12 @@ struct Kernels {
   KernelsOf<float> of_float;
   KernelsOf<double> of_double;
   // attention.h
-  void (*attend)(const AttentionHead&, Rows<float> out, float* log_sums, float* room);
-  void (*pack_queries)(const AttentionHead&, const AttentionPast&, const PackedQueries& to);
-  void (*attend_backward)(const AttentionHead&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk, Rows<float> dv,
+  void (*attend)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* room);
+  void (*pack_queries)(const AttentionHead<float>&, const AttentionPast&, const PackedQueries& to);
+  void (*attend_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk, Rows<float> dv,
                           float* room);
+  // attention_bf16.h
+  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* room);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

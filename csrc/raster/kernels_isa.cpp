@@ -1,6 +1,6 @@
 // Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
 #include "adam.h"
-#include "attention.h"
+#include "attention_bf16.h"
 #include "blend.h"
 #include "cover.h"
 #include "kernels.h"
@@ -23,6 +23,7 @@ const Kernels table = {
     attend,
     pack_queries,
     attend_backward,
+    attend_bf16,
     multiply_adds,
 };
 

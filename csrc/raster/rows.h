@@ -14,11 +14,25 @@ struct Rows {
   Rows from(int64_t first) const { return {data + first * stride, stride}; }
 };
 
+// A bfloat16 number: the upper half of a float's bits.
+using Bf16 = uint16_t;
+
 // One head's queries, keys and values, all `width` numbers wide.
+template <class Number>
 struct AttentionHead {
-  Rows<const float> q, k, v;
+  Rows<const Number> q, k, v;
   int64_t queries, keys;
   int width;
+};
+
+// Who multiplies matrices of bfloat16 numbers.
+struct Bf16Products {
+  // c [m, n] = a [m, k] · b [k, n], added to what is there where it `adds`; of b two rows lie side by side, [k / 2, n, 2], and k is
+  // even. c is float32. Numbers from one row to the next (of b to the next but one, halved): a_row, b_row, c_row.
+  void (*multiply)(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const Bf16* a,
+                   const Bf16* b, float* c);
+  // What a thread says when it was its last product for now.
+  void (*done)();
 };
 
 // What came out, and the gradient of that.
@@ -48,9 +62,16 @@ inline constexpr int64_t kAttentionQueries = 1032;
 // Of a block of keys, and backward of queries, too: what is packed of them, and summed up for them, stays in the second cache.
 inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 384, kBackwardQueries = 48;
 
+// The same of bfloat16 numbers, where rows of a block of queries have their scores side by side, and what is packed has panels of
+// columns.
+inline constexpr int64_t kBf16Rows = 32, kBf16Keys = 512, kBf16Columns = 64;
+
 // Numbers that a task works with.
 inline constexpr int64_t attention_room(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
+}
+inline constexpr int64_t attention_bf16_room(int width) {
+  return kAttentionQueries * (attention_columns(width) + 2) + kBf16Keys * attention_columns(width) + 2 * kBf16Rows * kBf16Keys + 64;
 }
 inline constexpr int64_t attention_backward_room(int width) {
   return 5 * kBackwardKeys * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;

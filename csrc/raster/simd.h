@@ -240,16 +240,18 @@ GS_INLINE Vector<double> sqrt(Vector<double> v) {
 }
 #endif
 
-// Four rows of four numbers, `stride` apart, to four columns.
-GS_INLINE void transpose4(const float* from, int64_t stride, float* to, int64_t to_stride) {
+// Four rows of four numbers of 32 bits, whatever they are, to four columns; rows are `stride` such numbers apart.
+GS_INLINE void transpose4(const void* from, int64_t stride, void* to, int64_t to_stride) {
+  const char* const rows = static_cast<const char*>(from);
+  char* const columns = static_cast<char*>(to);
 #if defined(__SSE2__)
   __m128 row[4];
-  for (int i = 0; i < 4; ++i) row[i] = _mm_loadu_ps(from + i * stride);
+  for (int i = 0; i < 4; ++i) __builtin_memcpy(row + i, rows + 4 * i * stride, 16);
   _MM_TRANSPOSE4_PS(row[0], row[1], row[2], row[3]);
-  for (int i = 0; i < 4; ++i) _mm_storeu_ps(to + i * to_stride, row[i]);
+  for (int i = 0; i < 4; ++i) __builtin_memcpy(columns + 4 * i * to_stride, row + i, 16);
 #else
   for (int i = 0; i < 4; ++i)
-    for (int j = 0; j < 4; ++j) to[j * to_stride + i] = from[i * stride + j];
+    for (int j = 0; j < 4; ++j) __builtin_memcpy(columns + 4 * (j * to_stride + i), rows + 4 * (i * stride + j), 4);
 #endif
 }
 

@@ -4,7 +4,7 @@ FOLDERS = ("src/model", "src/loss")  # every file of these has a case, or a reas
 
 CASES_OF = {
     "src/model/mod.rs": ["model", "model_16k"],
-    "src/model/attention.rs": ["attention", "attention_large"],
+    "src/model/attention.rs": ["attention", "attention_large", "attention_bf16"],
     "src/model/camera_code.rs": ["camera_code"],
     "src/model/decoder.rs": ["heads", "decoder"],
     "src/model/encoder.rs": ["encoder"],
@@ -46,6 +46,7 @@ EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
     "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
+    "src/model/parts.rs": "tells what is done, and does nothing",
     "src/model/precision.rs": "every case of the encoder runs in float32; tests/model.rs and tests/perceptual.rs hold bf16 against it",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
     "src/model/shapes.rs": "a configuration read off shapes; parity/tests/test_checkpoints.py holds it against models made here",

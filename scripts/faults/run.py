@@ -57,7 +57,15 @@ NOTICE = re.compile(
 )
 # Names of what is on its way.
 TEMPORARY = re.compile(r"(^|/)(\.[^/]+\.globalsplat-(partial|old)|\.globalsplat-probe)(/|$)")
-VOLATILE = {"seconds", "peak_memory_bytes", "samples_per_second", "forward_seconds", "load_seconds"}
+VOLATILE = {
+    "seconds",
+    "seconds_of",
+    "seconds_from_start",
+    "peak_memory_bytes",
+    "samples_per_second",
+    "forward_seconds",
+    "load_seconds",
+}
 
 
 def plain(text):

@@ -2,7 +2,7 @@
 
 use super::Spread;
 use super::yardstick::Yardstick;
-use crate::model::{attention, by_libtorch};
+use crate::model::{Precision, attention, by_libtorch};
 use crate::optim::Stopwatch;
 use crate::render::cpu::simd_level;
 use serde::Serialize;
@@ -15,7 +15,9 @@ pub struct AttentionReport {
     pub simd: String,
     /// Threads that shared the work.
     pub threads: i32,
-    /// A product of matrices of 2048×2048, in 10⁹ floating-point operations a second.
+    /// Of queries, keys and values.
+    pub precision: Precision,
+    /// A product of matrices of 2048×2048 in the same precision, in 10⁹ floating-point operations a second.
     pub product_gflops: f64,
     /// Forward and backward, each by whom it is computed.
     pub rows: Vec<AttentionRow>,
@@ -45,10 +47,11 @@ type Way<'a> = (&'static str, &'a dyn Fn([&Tensor; 3]) -> Tensor, &'a [Tensor; 3
 /// An instruction set that the machine doesn't have.
 pub fn bench_attention(
     [queries, keys, width, heads]: [i64; 4],
+    precision: Precision,
     repeats: usize,
 ) -> crate::Result<AttentionReport> {
     tch::manual_seed(0);
-    let of = |n: i64| Tensor::randn([1, n, width], (Kind::Float, Device::Cpu));
+    let of = |n: i64| Tensor::randn([1, n, width], (Kind::Float, Device::Cpu)).to_kind(precision.kind());
     // As self-attention has them: parts of what one layer gave.
     let of_all = |n: i64| of(n).repeat([1, 1, 3]).chunk(3, -1).swap_remove(1);
     let (inputs, gradient) = ([of_all(queries), of_all(keys), of_all(keys)], of(queries));
@@ -62,7 +65,7 @@ pub fn bench_attention(
         ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
-    let yardstick = Yardstick::new(Kind::Float, Device::Cpu);
+    let yardstick = Yardstick::new(precision.kind(), Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms caches and threads up.
@@ -98,5 +101,11 @@ pub fn bench_attention(
     let names = || ways.iter().map(|way| way.0);
     let rows = names().zip(forward).map(|(by, times)| row("forward", by, 2., times));
     let rows = rows.chain(names().zip(backward).map(|(by, times)| row("backward", by, 5., times))).collect();
-    Ok(AttentionReport { simd: simd_level()?, threads: tch::get_num_threads(), product_gflops, rows })
+    Ok(AttentionReport {
+        simd: simd_level()?,
+        threads: tch::get_num_threads(),
+        precision,
+        product_gflops,
+        rows,
+    })
 }

@@ -13,6 +13,9 @@ use crate::optim::Stopwatch;
 use serde::Serialize;
 use tch::{Device, nn, no_grad};
 
+/// Of fresh weights: much as they begin in training.
+const WEIGHTS_STD: f64 = 0.02;
+
 /// What [`bench_model`] measured.
 #[derive(Debug, Serialize)]
 pub struct ModelReport {
@@ -48,9 +51,13 @@ pub fn bench_model(
     repeats: usize,
     device: Device,
 ) -> Result<ModelReport> {
-    let vs = nn::VarStore::new(device);
-    let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
-    model.set_precision(precision);
+    let mut vs = nn::VarStore::new(device);
+    let model = GlobalSplat::to_be_filled(&mut vs, &config.model, precision)?;
+    no_grad(|| {
+        for mut weights in vs.variables().into_values().filter(|variable| variable.dim() > 1) {
+            let _ = weights.normal_(0., WEIGHTS_STD);
+        }
+    });
     let context = Sample::of(&[made_up_scene(config, 0)], device).context;
     let stage = config.curriculum.final_stage();
     let yardstick = Yardstick::new(precision.kind(), device);

@@ -1,8 +1,9 @@
-use super::print_json;
+use super::{model, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{AttentionReport, bench_attention};
 use globalsplat::error::Error;
+use tch::Device;
 
 /// Attention on the CPU, forward and backward: our kernel and libtorch's, beside a matrix product.
 ///
@@ -23,6 +24,9 @@ pub struct Attention {
     /// Heads
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..))]
     heads: u16,
+    /// Of queries, keys and values: f32, bf16, or auto: bf16 where the processor has instructions for it
+    #[arg(long, default_value = "f32")]
+    precision: String,
     /// Threads that share the work; by default all cores
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
@@ -47,7 +51,8 @@ impl Attention {
             .into());
         }
         let sizes = [self.queries.into(), self.keys.into(), self.width.into(), self.heads.into()];
-        let report = bench_attention(sizes, self.repeats as usize)?;
+        let precision = model::precision(&self.precision, Device::Cpu)?;
+        let report = bench_attention(sizes, precision, self.repeats as usize)?;
         if self.json {
             print_json(&serde_json::to_value(&report)?);
         } else {
@@ -59,11 +64,12 @@ impl Attention {
 
 fn print_report(r: &AttentionReport, asked: &Attention) {
     println!(
-        "{} queries, {} keys, {} heads of {}, {}, {} threads; a product of 2048x2048 reaches {:.0} GFLOP/s",
+        "{} queries, {} keys, {} heads of {}, {}, {}, {} threads; a product of 2048x2048 reaches {:.0} GFLOP/s",
         asked.queries,
         asked.keys,
         asked.heads,
         asked.width / asked.heads,
+        r.precision,
         r.simd,
         r.threads,
         r.product_gflops

@@ -1,5 +1,5 @@
 use super::bench::{print_sections, read_config};
-use super::{print_json, ranks};
+use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{Together, TrainReport, bench_train};
@@ -43,6 +43,7 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
+        memory::keep();
         let (group, device) = ranks::join(&self.device)?;
         let is_first = group.is_first();
         let mut config = read_config(self.config.as_deref(), &self.set)?;

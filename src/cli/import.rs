@@ -1,6 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
 use std::path::PathBuf;
@@ -32,7 +33,7 @@ impl Import {
         self.out.check(Format::Safetensors)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
-        let loaded = file.load(Device::Cpu)?;
+        let loaded = file.load(Device::Cpu, Precision::F32)?;
         let notes: Vec<String> = loaded
             .assumed
             .iter()

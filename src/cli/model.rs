@@ -3,7 +3,7 @@
 use super::ranks;
 use globalsplat::config::Config;
 use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{Input, LoadedModel, SHIPPED_MODEL, ViewsAs, load_model, shipped_model};
+use globalsplat::reconstruct::{Input, LoadedModel, ModelFile, SHIPPED_MODEL, ViewsAs};
 use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
 use std::path::Path;
@@ -26,11 +26,11 @@ pub fn precision(asked: &str, device: Device) -> Result<Precision> {
 
 /// Reads the model in `weights`, or the one that comes with this program, which computes in `precision` from then on.
 pub fn load(weights: Option<&Path>, precision: Precision, device: Device) -> Result<LoadedModel> {
-    let mut loaded = match weights {
-        Some(weights) => load_model(weights, device)?,
-        None => shipped_model(device)?,
+    let file = match weights {
+        Some(weights) => ModelFile::open(weights, &[])?,
+        None => ModelFile::shipped()?,
     };
-    loaded.model.set_precision(precision);
+    let loaded = file.load(device, precision)?;
     if !ranks::is_first() {
         return Ok(loaded);
     }

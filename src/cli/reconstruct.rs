@@ -4,14 +4,14 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
-use globalsplat::eval::peak_memory_bytes;
+use globalsplat::eval::{peak_memory_bytes, process_age};
 use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
+use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// Make a splat from posed photos.
 ///
@@ -87,22 +87,33 @@ impl Reconstruct {
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_splat(&self.out)?;
         let precision = model::precision(&self.precision, device)?;
-        let clock = Instant::now();
-        let loaded = model::load(self.weights.as_deref(), precision, device)?;
-        let load_seconds = clock.elapsed().as_secs_f64();
-        let capture = open_capture(&self.scene)?;
+        let started = process_age();
+        let mut watch = Stopwatch::default();
+        let loaded = watch.time("weights", || model::load(self.weights.as_deref(), precision, device))?;
+        let capture = watch.time("photos", || open_capture(&self.scene))?;
         let data = &loaded.config.data;
         let input = match self.views_at {
             Some(height) => Input::at(height, ViewsAs::Polyphase, data.image_size)?,
             None => Input::PLAIN,
         };
         let count = self.views.unwrap_or(data.context_views);
-        let photos = load_context(&capture, holdout, Some(count), input.photo_size(data.image_size))?;
+        let size = input.photo_size(data.image_size);
+        let photos = watch.time("photos", || load_context(&capture, holdout, Some(count), size))?;
         if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
             eprintln!("{line}");
         }
-        let reconstruction = reconstruct(Model { input, ..Model::from(&loaded) }, &photos, &[])?;
-        write_splat_for(&self.out, &Splat::of(&reconstruction.in_world())?, &capture.cameras())?;
+        let model = Model { input, ..Model::from(&loaded) };
+        let reconstruction = watch.time("network", || reconstruct(model, &photos, &[]))?;
+        watch.time("splat", || {
+            write_splat_for(&self.out, &Splat::of(&reconstruction.in_world())?, &capture.cameras())
+        })?;
+        let parts: Map<String, Value> = started
+            .map(|age| ("start", age))
+            .into_iter()
+            .chain(watch.sections().iter().copied())
+            .map(|(name, time)| (name.into(), json!(time.as_secs_f64())))
+            .collect();
+        let from_start = process_age().map(|age| age.as_secs_f64());
 
         let bytes = std::fs::metadata(&self.out)?.len();
         let views = photos.len() * input.views_of_photo();
@@ -116,8 +127,10 @@ impl Reconstruct {
                 "views": views,
                 "gaussians": count,
                 "precision": precision,
-                "load_seconds": load_seconds,
+                "load_seconds": parts["weights"],
                 "seconds": seconds,
+                "seconds_of": parts,
+                "seconds_from_start": from_start,
                 "peak_memory_bytes": peak_memory_bytes(),
                 "bytes": bytes,
             }));

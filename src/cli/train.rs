@@ -1,4 +1,4 @@
-use super::{print_json, progress, ranks, stop_flag};
+use super::{memory, print_json, progress, ranks, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -57,6 +57,7 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
+        memory::keep();
         let (group, device) = ranks::join(&self.device)?;
         let (is_first, count) = (group.is_first(), group.ranks());
         let config = Config::read(&self.config, &self.set)?;

@@ -6,6 +6,7 @@ use crate::io;
 use crate::scene::{Camera, ImageSize, check_pose};
 use crate::synth::Video;
 use image::RgbImage;
+use rayon::prelude::*;
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -188,7 +189,10 @@ impl Capture {
     /// # Errors
     /// An image that is missing, can't be decoded, or has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
-        indices.iter().map(|&index| self.load_view(&self.frames[index], size)).collect()
+        let views: Vec<_> =
+            indices.par_iter().map(|&index| self.load_view(&self.frames[index], size)).collect();
+        // Of several that can't be read the first one is told.
+        views.into_iter().collect()
     }
 
     /// [`Capture::load`] of every view.
@@ -196,7 +200,7 @@ impl Capture {
     /// # Errors
     /// As there.
     pub fn load_all(&self, size: Option<ImageSize>) -> Result<Vec<View>> {
-        self.frames.iter().map(|frame| self.load_view(frame, size)).collect()
+        self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {

@@ -1,5 +1,6 @@
 //! Judging pictures: metrics, what is judged and by what, validation, the paper's protocol over a data set, and its report.
 
+mod age;
 mod comparison_image;
 mod contact_sheet;
 mod evaluation;
@@ -19,6 +20,7 @@ mod scores;
 mod scores_file;
 mod sweep;
 
+pub use age::process_age;
 pub use contact_sheet::contact_sheet;
 pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 pub use fidelity::psnr_between;

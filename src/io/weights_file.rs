@@ -5,11 +5,12 @@ use super::state_dict::{Contents, state_dict};
 use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
-use memmap2::Mmap;
+use memmap2::{Mmap, UncheckedAdvice};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor, nn};
 
@@ -72,6 +73,17 @@ impl Bytes {
         match self {
             Bytes::Mapped(map) => map,
             Bytes::Carried(bytes) => bytes,
+        }
+    }
+
+    /// Says that nobody needs them again soon: a mapped file's pages don't stay beside what was copied from them.
+    fn let_go(&self, range: Range<usize>) {
+        if let Bytes::Mapped(map) = self {
+            // SAFETY: pages of a file that was mapped to be read; whoever reads them again gets the same.
+            let advised =
+                unsafe { map.unchecked_advise_range(UncheckedAdvice::DontNeed, range.start, range.len()) };
+            // It is advice alone.
+            let _ = advised;
         }
     }
 }
@@ -211,6 +223,7 @@ impl WeightsFile {
                 }
                 _ => variable.f_copy_(&self.copy(place)?)?,
             }
+            self.parts[place.part].let_go(bytes.clone());
             Ok(())
         })
     }

@@ -127,6 +127,11 @@ impl Decoder {
         }
     }
 
+    /// Layers that compute in the precision of products.
+    pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+        std::iter::once(&self.sh)
+    }
+
     /// The linear heads alone.
     pub(crate) fn heads(&self, encoded: &Encoded) -> Heads {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");

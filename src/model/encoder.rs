@@ -86,31 +86,58 @@ impl Encoder {
         }
     }
 
-    /// `scene_tokens` [M, d], `tokens` [B, V·P, token width], which are given up as soon as they can be.
-    pub fn forward(&self, scene_tokens: &Tensor, tokens: Tensor) -> Encoded {
-        let (mut slots, memory) = self.start(scene_tokens, tokens);
+    /// Layers that compute in the precision of products.
+    pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+        let branch = self.appearance.iter();
+        let rounds = self.geometry_rounds.iter().chain(branch.clone().flat_map(|branch| &branch.rounds));
+        let mixers = branch.flat_map(|branch| &branch.mixers);
+        rounds.flat_map(StreamRound::products).chain(mixers.flat_map(Mixer::products))
+    }
+
+    /// Whether gradients will come back to its weights from what is computed now.
+    pub(super) fn is_followed(&self) -> bool {
+        self.memory_registers.alias().requires_grad()
+    }
+
+    /// What all rounds read, [B, 4 + V·P, token width]: learned tokens, then those of images, of which `views` gives as many at a
+    /// time as it likes ([B, .., token width], `count` in all). Normalized.
+    pub fn memory(&self, count: i64, views: impl IntoIterator<Item = Tensor>) -> Tensor {
+        let mut views = views.into_iter().peekable();
+        let [batch, width] = views.peek().map(|t| [t.size()[0], t.size()[2]]).expect("a view");
+        let registers = self.memory_registers.expand([batch, -1, -1], false);
+        if registers.requires_grad() {
+            // Every round's gradient comes back, and is added up in float32.
+            return normalized(&Tensor::cat(&std::iter::once(registers).chain(views).collect::<Vec<_>>(), 1));
+        }
+        // There is no room for all twice.
+        let size = [batch, MEMORY_REGISTERS + count, width];
+        let memory = Tensor::empty(size, (self.precision.kind(), registers.device()));
+        let mut first = 0;
+        for tokens in std::iter::once(registers).chain(views) {
+            let count = tokens.size()[1];
+            memory.narrow(1, first, count).copy_(&normalized(&tokens));
+            first += count;
+        }
+        memory
+    }
+
+    /// `scene_tokens` [M, d], `memory` as [`Encoder::memory`] gives it.
+    pub fn forward(&self, scene_tokens: &Tensor, memory: &Tensor) -> Encoded {
+        let mut slots = self.start(scene_tokens, memory.size()[0]);
         for round in 0..self.rounds() {
-            slots = self.round(round, &slots, &memory);
+            slots = self.round(round, &slots, memory);
         }
         self.decoded(&slots)
     }
 
-    /// Every stream's own view of the slots, and the memory [B, 4 + V·P, token width] that all rounds read, normalized.
-    pub(super) fn start(&self, scene_tokens: &Tensor, tokens: Tensor) -> (Slots, Tensor) {
-        let batch = tokens.size()[0];
-        let expand = |t: &Tensor| t.expand([batch, -1, -1], false);
+    /// Every stream's own view of the slots, for `batch` scenes.
+    pub(super) fn start(&self, scene_tokens: &Tensor, batch: i64) -> Slots {
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
-        let slots = expand(&Tensor::cat(&slots, 1)); // [B, 4 + M + 1 + 4, d]
-        let memory = Tensor::cat(&[&expand(&self.memory_registers), &tokens], 1);
-        drop(tokens);
-        let memory = normalized(&memory);
-        // Where a gradient comes back, every round's is added up in float32.
-        let memory = if memory.requires_grad() { memory } else { self.precision.operand(&memory) };
-        let slots = Slots {
+        let slots = Tensor::cat(&slots, 1).expand([batch, -1, -1], false); // [B, 4 + M + 1 + 4, d]
+        Slots {
             geometry: self.geometry_start.forward(&slots),
             appearance: self.appearance.as_ref().map(|branch| branch.start.forward(&slots)),
-        };
-        (slots, memory)
+        }
     }
 
     /// Both streams read and think, each by itself, then they meet.

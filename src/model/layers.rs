@@ -99,9 +99,15 @@ impl Mlp {
         }
     }
 
+    /// Both layers.
+    pub fn products(&self) -> [&nn::Linear; 2] {
+        [&self.expand, &self.contract]
+    }
+
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
         part("MLPs", || {
-            let hidden = precision.linear(&self.expand, xs).gelu("none");
+            let mut hidden = precision.linear(&self.expand, xs);
+            hidden = if hidden.requires_grad() { hidden.gelu("none") } else { hidden.gelu_("none") };
             does(0, &[&hidden, &hidden]);
             precision.linear(&self.contract, &hidden)
         })

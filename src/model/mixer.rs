@@ -28,6 +28,11 @@ impl Mixer {
         }
     }
 
+    /// Layers that compute in the precision of products.
+    pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+        self.mlp.products().into_iter()
+    }
+
     /// Both streams [B, S, d], and so the results.
     pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
         part("mixer", || {

@@ -46,7 +46,8 @@ pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};
 use parts::part;
-use tch::{Tensor, nn};
+use std::collections::HashSet;
+use tch::{Kind, Tensor, nn};
 
 /// The whole model.
 #[derive(Debug)]
@@ -74,19 +75,33 @@ impl GlobalSplat {
         })
     }
 
-    /// The same with zeros where weights begin with random numbers: for weights from a file, which are there sooner so.
+    /// The same under the root of `vs`, which is empty, for weights from a file and passes in `precision`: with zeros where weights
+    /// begin with random numbers, and weights of products in the kind that these take, so that nobody converts them at every use.
     ///
     /// # Errors
     /// As [`GlobalSplat::new`].
-    pub fn to_be_filled(vs: &nn::Path, config: &ModelConfig) -> Result<Self> {
-        without_drawing(|| Self::new(vs, config))
+    pub fn to_be_filled(vs: &mut nn::VarStore, config: &ModelConfig, precision: Precision) -> Result<Self> {
+        // All else is converted, as it is little.
+        vs.set_kind(precision.kind());
+        let mut model = without_drawing(|| Self::new(&vs.root(), config))?;
+        model.set_precision(precision);
+        let layers = model.encoder.products().chain(model.decoder.products());
+        let kept: HashSet<_> = layers
+            .flat_map(|layer| std::iter::once(&layer.ws).chain(&layer.bs))
+            .map(Tensor::data_ptr)
+            .collect();
+        for mut variable in
+            vs.variables().into_values().filter(|variable| !kept.contains(&variable.data_ptr()))
+        {
+            variable.set_data(&variable.to_kind(Kind::Float));
+        }
+        Ok(model)
     }
 
     /// One pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics`
     /// [B, V, 3, 3] in pixels; H and W multiples of the patch size.
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
-        let encoded = self.encode(self.tokens(images, c2w, intrinsics));
-        self.decode(&encoded, stage)
+        self.decode(&self.encode_memory(&self.memory(images, c2w, intrinsics)), stage)
     }
 
     /// The first third of [`GlobalSplat::forward`]: [B, V, P, ray width + RGB width].
@@ -94,16 +109,41 @@ impl GlobalSplat {
         part("tokens", || self.tokenizer.forward(images, c2w, intrinsics))
     }
 
-    /// The second third: scene tokens that have seen every view. Of many, image tokens are large: nobody holds them any longer.
-    pub fn encode(&self, tokens: Tensor) -> Encoded {
-        let of_all_views = tokens.flatten(1, 2);
-        drop(tokens);
-        self.encoder.forward(&self.scene_tokens, of_all_views)
+    /// The second third: scene tokens that have seen every view.
+    pub fn encode(&self, tokens: &Tensor) -> Encoded {
+        self.encode_memory(&self.memory_of(tokens))
+    }
+
+    /// What the encoder reads of image tokens [B, V, P, token width].
+    fn memory_of(&self, tokens: &Tensor) -> Tensor {
+        let tokens = tokens.flatten(1, 2);
+        self.encoder.memory(tokens.size()[1], [tokens])
+    }
+
+    /// The first third and the beginning of the second. Image tokens of many views are large: where nobody asks for gradients, it
+    /// goes view by view.
+    pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
+        if self.encoder.is_followed() {
+            return self.memory_of(&self.tokens(images, c2w, intrinsics));
+        }
+        let size = images.size();
+        let patch = self.config.patch_size;
+        let of_view = |view| {
+            let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
+            self.tokens(&images, &c2w, &intrinsics).squeeze_dim(1)
+        };
+        let count = size[1] * (size[3] / patch) * (size[4] / patch);
+        self.encoder.memory(count, (0..size[1]).map(of_view))
+    }
+
+    /// The rest of the second third.
+    pub fn encode_memory(&self, memory: &Tensor) -> Encoded {
+        self.encoder.forward(&self.scene_tokens, memory)
     }
 
     /// As [`GlobalSplat::encode`], but every round is computed again in the backward pass.
     pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (Encoded, KeptRounds<'_>) {
-        self.encoder.forward_keeping_rounds(&self.scene_tokens, tokens.flatten(1, 2))
+        self.encoder.forward_keeping_rounds(&self.scene_tokens, self.memory_of(tokens))
     }
 
     /// The last third.

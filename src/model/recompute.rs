@@ -23,9 +23,9 @@ impl Encoder {
     pub(crate) fn forward_keeping_rounds(
         &self,
         scene_tokens: &Tensor,
-        tokens: Tensor,
+        memory: Tensor,
     ) -> (Encoded, KeptRounds<'_>) {
-        let (slots, memory) = self.start(scene_tokens, tokens);
+        let slots = self.start(scene_tokens, memory.size()[0]);
         let memory_leaf = leaf(&memory);
         let mut between = vec![slots.map(leaf)];
         for round in 0..self.rounds() {

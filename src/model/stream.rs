@@ -5,13 +5,15 @@ use super::config::ModelConfig;
 use super::layers::{ENCODER_STD, LAYER_NORM_EPS, LayerScale, Mlp, layer_norm, linear, normalize};
 use super::parts::{does, part};
 use super::precision::Precision;
-use tch::{Tensor, nn};
+use tch::{Device, Tensor, nn};
 
 /// The last of the slots, which neither look at the images nor pass the first MLP.
 pub(super) const REGISTERS: i64 = 4;
 const MLP_RATIO: i64 = 4;
 const CROSS_LAYER_SCALE: f64 = 1e-3;
 const SELF_LAYER_SCALE: f64 = 1e-2;
+/// In so many parts heads look at the memory, one after the other.
+const HEAD_GROUPS: i64 = 2;
 
 /// What all rounds' norms of `memory` have in common, before their γ and β.
 pub(crate) fn normalized(memory: &Tensor) -> Tensor {
@@ -61,6 +63,12 @@ impl StreamRound {
         }
     }
 
+    /// Layers that compute in the precision of products.
+    pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+        let own = [&self.query, &self.key, &self.value, &self.output].into_iter().chain(self.mlp.products());
+        own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::products))
+    }
+
     /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width] as [`normalized`] gives it; result [B, S, d].
     pub fn forward(&self, slots: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
         // Registers change in self-attention, and where streams are mixed.
@@ -68,10 +76,9 @@ impl StreamRound {
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
 
-        let read = part("keys and values", || precision.linear(&self.read(), memory)).chunk(2, -1);
         let normed = normalize(&self.slots_norm, &slots);
         let query = part("queries and outputs", || precision.linear(&self.query, &normed));
-        let seen = part("cross-attention", || attention(&query, &read[0], &read[1], self.heads));
+        let seen = self.look(&query, memory, precision);
         let seen = part("queries and outputs", || precision.linear(&self.output, &seen));
         let slots = self.attention_scale.add(&slots, &seen);
         let thought = self.mlp.forward(&normalize(&self.mlp_norm, &slots), precision);
@@ -81,14 +88,34 @@ impl StreamRound {
         self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
     }
 
-    /// Keys beside values of a memory that is normalized already: W (γ ⊙ x + β) + b = (W diag γ) x + (W β + b), so all rounds share
-    /// what they have of their norms in common, and read it in one product.
-    fn read(&self) -> nn::Linear {
+    /// Cross-attention of `query` [B, n, d]. Where nobody asks for gradients a CPU goes through some heads after the other: keys and
+    /// values of all of them are larger than the memory that they are made of.
+    fn look(&self, query: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
+        let is_for_all =
+            query.requires_grad() || query.device() != Device::Cpu || self.heads % HEAD_GROUPS != 0;
+        let groups = if is_for_all { 1 } else { HEAD_GROUPS };
+        let width = query.size()[2] / groups;
+        let seen: Vec<Tensor> = (0..groups)
+            .map(|group| {
+                let read = self.read(group * width, width);
+                let read = part("keys and values", || precision.linear(&read, memory)).chunk(2, -1);
+                let query = query.narrow(-1, group * width, width);
+                part("cross-attention", || attention(&query, &read[0], &read[1], self.heads / groups))
+            })
+            .collect();
+        Tensor::cat(&seen, -1)
+    }
+
+    /// Keys beside values, `width` numbers from `first` on of each, of a memory that is normalized already: W (γ ⊙ x + β) + b =
+    /// (W diag γ) x + (W β + b), so all rounds share what they have of their norms in common, and read it in one product.
+    fn read(&self, first: i64, width: i64) -> nn::Linear {
         let norm = &self.memory_norm;
         let [gamma, beta] = [&norm.ws, &norm.bs].map(|t| t.as_ref().expect("an affine norm"));
-        let layers = [&self.key, &self.value];
-        let weights = Tensor::cat(&layers.map(|layer| &layer.ws), 0); // [2d, token width]
-        let biases = Tensor::cat(&layers.map(|layer| layer.bs.as_ref().expect("a bias")), 0);
+        let rows = |of: [&Tensor; 2]| {
+            Tensor::cat(&of.map(|t| t.narrow(0, first, width)), 0).to_kind(gamma.kind()) // [2 width, ..]
+        };
+        let weights = rows([&self.key.ws, &self.value.ws]);
+        let biases = rows([&self.key.bs, &self.value.bs].map(|bias| bias.as_ref().expect("a bias")));
         nn::Linear { ws: &weights * gamma, bs: Some(weights.mv(beta) + biases) }
     }
 }
@@ -118,6 +145,10 @@ impl SelfAttentionBlock {
             mlp_scale: LayerScale::new(vs / "ls2", d, SELF_LAYER_SCALE),
             heads,
         }
+    }
+
+    fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+        [&self.qkv, &self.project].into_iter().chain(self.mlp.products())
     }
 
     /// [B, S, d], and so the result.

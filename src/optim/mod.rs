@@ -7,4 +7,4 @@ mod stopwatch;
 pub use adamw::{AdamW, ParameterGroup};
 
 // For benchmarks.
-pub(crate) use stopwatch::Stopwatch;
+pub use stopwatch::Stopwatch;

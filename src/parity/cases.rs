@@ -179,8 +179,11 @@ fn attention(request: &Request) -> Result<Answer> {
             .into_iter()
             .collect::<Result<_>>()?,
     };
-    let [q, k, v] = [0, 1, 2].map(|n| &inputs[n]);
-    outputs([("seen", model::attention(q, k, v, request.number("heads")?))])
+    let is_bf16 = request.config.get("bf16").is_some();
+    let kind = if is_bf16 { Kind::BFloat16 } else { inputs[0].kind() };
+    let [q, k, v] = [0, 1, 2].map(|n| inputs[n].to_kind(kind));
+    let seen = model::attention(&q, &k, &v, request.number("heads")?);
+    outputs([("seen", seen.to_kind(inputs[0].kind()))])
 }
 
 fn stream_round(request: &Request) -> Result<Answer> {
@@ -211,7 +214,9 @@ fn encoder(request: &Request) -> Result<Answer> {
         let scene_tokens = model::scene_tokens(vs, &config);
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
-    let encoded = encoder.forward(&scene_tokens, request.input("tokens")?.shallow_clone());
+    let tokens = request.input("tokens")?;
+    let memory = encoder.memory(tokens.size()[1], [tokens.shallow_clone()]);
+    let encoded = encoder.forward(&scene_tokens, &memory);
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
 

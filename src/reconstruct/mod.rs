@@ -102,7 +102,10 @@ pub fn reconstruct<'a>(
 
     let start = Instant::now();
     let (encoded, decoded) = tch::no_grad(|| {
-        let encoded = network.encode(network.tokens(&images, &c2w, &intrinsics));
+        let memory = network.memory(&images, &c2w, &intrinsics);
+        drop(images);
+        let encoded = network.encode_memory(&memory);
+        drop(memory);
         let decoded = network.decode(&encoded, stage);
         (encoded, decoded)
     });

@@ -4,7 +4,7 @@ use super::published::{CHECKPOINT_PREFIX, assumed, configuration, is_ours, model
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::io::{Weights, WeightsFile, write_checkpoint, write_weights};
-use crate::model::{GlobalSplat, Stage};
+use crate::model::{GlobalSplat, Precision, Stage};
 use std::collections::HashMap;
 use std::path::Path;
 use tch::{Device, Kind, nn};
@@ -36,7 +36,7 @@ pub struct LoadedModel {
     pub config: Config,
     /// To which the weights were trained: the final one, unless the file says otherwise.
     pub stage: Stage,
-    /// Holds the weights.
+    /// Holds the weights, those of products in the precision of passes.
     pub vs: nn::VarStore,
     /// For what a file without a configuration is taken.
     pub assumed: Option<String>,
@@ -94,13 +94,12 @@ pub fn save_checkpoint(path: &Path, weights: Weights) -> Result<()> {
 pub const SHIPPED_MODEL: &str = "models/tiny.safetensors";
 const SHIPPED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
 
-/// The model that comes with this program, [`SHIPPED_MODEL`].
+/// The model that comes with this program, [`SHIPPED_MODEL`], in float32.
 ///
 /// # Errors
 /// The device's refusal.
 pub fn shipped_model(device: Device) -> Result<LoadedModel> {
-    let name = Path::new(SHIPPED_MODEL);
-    ModelFile::of(WeightsFile::carried(SHIPPED_BYTES, name)?, &[])?.load(device)
+    ModelFile::shipped()?.load(device, Precision::F32)
 }
 
 /// Rebuilds the model that [`save_model`] wrote, or whose weights alone are known, in float32.
@@ -108,7 +107,7 @@ pub fn shipped_model(device: Device) -> Result<LoadedModel> {
 /// # Errors
 /// A file that can't be read, or whose weights don't fit their configuration or any.
 pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
-    ModelFile::open(path, &[])?.load(device)
+    ModelFile::open(path, &[])?.load(device, Precision::F32)
 }
 
 /// A file of a model's weights, of which none is read yet, and what it is a model of.
@@ -132,6 +131,14 @@ impl ModelFile {
     /// A file that can't be read, or is of no model; overrides that don't fit.
     pub fn open(path: &Path, overrides: &[String]) -> Result<Self> {
         Self::of(WeightsFile::open(path)?, overrides)
+    }
+
+    /// Looks into the weights that come with this program, [`SHIPPED_MODEL`].
+    ///
+    /// # Errors
+    /// None, unless they are damaged.
+    pub fn shipped() -> Result<Self> {
+        Self::of(WeightsFile::carried(SHIPPED_BYTES, Path::new(SHIPPED_MODEL))?, &[])
     }
 
     /// The same of a file that is open.
@@ -169,11 +176,11 @@ impl ModelFile {
         self.weights.load_into(vs)
     }
 
-    /// Builds the model.
+    /// Builds the model for passes in `precision`.
     ///
     /// # Errors
     /// Weights that don't fit the configuration.
-    pub fn load(self, device: Device) -> Result<LoadedModel> {
+    pub fn load(self, device: Device, precision: Precision) -> Result<LoadedModel> {
         // Before a model of whatever size is made.
         let numbers: i64 =
             self.weights.shapes().values().map(|(_, shape)| shape.iter().product::<i64>()).sum();
@@ -182,8 +189,8 @@ impl ModelFile {
             let expected = format!("{least} or more, as its configuration says");
             return Err(Error::input(self.weights.path(), "the number of weights", numbers, expected));
         }
-        let vs = nn::VarStore::new(device);
-        let model = GlobalSplat::to_be_filled(&vs.root(), &self.config.model)?;
+        let mut vs = nn::VarStore::new(device);
+        let model = GlobalSplat::to_be_filled(&mut vs, &self.config.model, precision)?;
         self.load_into(&vs)?;
         let ModelFile { config, stage, assumed, .. } = self;
         Ok(LoadedModel { model, config, stage, vs, assumed })

@@ -39,7 +39,7 @@ impl ForwardBackward<'_> {
                 let (encoded, kept) = model.encode_keeping_rounds(&tokens_leaf);
                 (encoded, Some(kept))
             }
-            false => (model.encode(tokens_leaf.shallow_clone()), None),
+            false => (model.encode(&tokens_leaf), None),
         });
         let encoded_leaves = encoded.map(leaf);
         let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));

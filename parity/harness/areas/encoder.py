@@ -1,5 +1,7 @@
 """From the tokens of all views to the latents of the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import reference.encoder
 import reference.layers
@@ -70,6 +72,25 @@ def attention_large(rng):
     inputs["k"][:, 333] = 3.0 * np.sign(inputs["q"][:, :1].mean(0))
     inputs["q"][:, ::2] += inputs["k"][:, 333:334]
     yield attention_draw(inputs, 1, ", one dominating", tolerance=tolerance)
+
+
+@case
+def attention_bf16(rng):
+    """Of bfloat16 numbers, which the reference takes as they are and computes with as exactly as ever. Keys are taken 512 at a time,
+    queries 32, and columns in panels of 64."""
+    tolerance = Tolerance(4e-3, 1.0, why="what comes out has 8 bits, and so have the weights that values are multiplied by")
+    for batch, queries, keys, heads, width in [
+        (1, 1, 1, 1, 8),
+        (2, 33, 65, 3, 16),
+        (1, 70, 513, 2, 64),
+        (1, 13, 1100, 1, 128),
+        (2, 40, 130, 2, 40),
+    ]:
+        inputs = attention_inputs(rng, batch, queries, keys, heads * width)
+        for numbers in inputs.values():
+            # The upper half of a number's bits, cut.
+            numbers.view(np.uint32)[...] &= 0xFFFF0000
+        yield replace(attention_draw(inputs, heads, tolerance=tolerance), config={"heads": heads, "bf16": True}, differentiate=())
 
 
 @twin("attention")
