@@ -52,11 +52,23 @@ def attention(q, k, v, heads):
     return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
 
+def in_float32(function):
+    """Where rays lead, autocast or not."""
+
+    def computed(*inputs):
+        with torch.autocast("cpu", enabled=False):
+            return function(*inputs)
+
+    return computed
+
+
 def use_fused_layers():
     fused = {"linear": linear, "layer_norm": layer_norm, "mlp": mlp, "attention": attention, "gelu": functional.gelu}
     for module in (reference.decoder, reference.encoder, reference.rays, reference.stream, reference.tokens):
         for name in fused.keys() & vars(module).keys():
             setattr(module, name, fused[name])
+    for name in ("plucker_rays", "camera_code"):
+        setattr(reference.tokens, name, in_float32(getattr(reference.tokens, name)))
 
 
 class Torch:
