@@ -2,7 +2,9 @@
 
 mod common;
 
+use globalsplat::config::Config;
 use globalsplat::model::{GlobalSplat, ModelConfig, Precision, Stage, Streams};
+use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, save_model};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -175,6 +177,34 @@ fn bf16_is_float32_but_for_its_rounding() {
             assert!((1e-5..2e-2).contains(&error), "{streams:?}, {name}: relative error {error:.1e}");
         }
     }
+}
+
+#[test]
+fn weights_of_a_file_in_bf16_are_kept_in_it() {
+    let config = Config { model: ModelConfig { streams: Streams::Dual, ..small() }, ..Default::default() };
+    let (vs, _) = build(&config.model);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let stage = config.curriculum.final_stage();
+    save_model(&path, &vs, &config, stage, ModelDtype::BF16).unwrap();
+    let load = |precision| ModelFile::open(&path, &[]).unwrap().load(Device::Cpu, precision).unwrap();
+
+    let mut cast = load(Precision::F32);
+    cast.model.set_precision(Precision::Bf16);
+    let kept = load(Precision::Bf16);
+    let bytes = |loaded: &LoadedModel, kind: Kind| -> usize {
+        let variables = loaded.vs.variables().into_values().filter(|t| t.kind() == kind);
+        variables.map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum()
+    };
+    assert_eq!(bytes(&cast, Kind::BFloat16), 0);
+    assert!(bytes(&kept, Kind::BFloat16) > 0);
+    assert_eq!(bytes(&kept, Kind::Float) + 2 * bytes(&kept, Kind::BFloat16), bytes(&cast, Kind::Float));
+
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let [cast, kept] = [&cast, &kept]
+        .map(|loaded| tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians));
+    assert!(cast.means.equal(&kept.means) && cast.scales.equal(&kept.scales) && cast.sh.equal(&kept.sh));
+    assert!(cast.quaternions.equal(&kept.quaternions) && cast.opacities.equal(&kept.opacities));
 }
 
 #[test]

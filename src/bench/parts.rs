@@ -17,6 +17,8 @@ pub struct Part {
     pub milliseconds: Spread,
     /// 10⁹ floating-point operations of its products.
     pub gflop: f64,
+    /// Of those that gradients take, where they are followed.
+    pub backward_gflop: f64,
     /// 10⁹ bytes that its products, norms and sums read and write, if each number is moved once.
     pub gigabytes: f64,
     /// Of the fastest time, what a product of large matrices reaches; 0 without products.
@@ -29,6 +31,7 @@ struct Piece {
     begins: Moment,
     ends: Option<Moment>,
     flops: f64,
+    owed: f64,
     bytes: f64,
 }
 
@@ -43,6 +46,7 @@ struct Sum {
     name: &'static str,
     milliseconds: Vec<f64>,
     flops: f64,
+    owed: f64,
     bytes: f64,
 }
 
@@ -56,11 +60,12 @@ impl Parts {
             match (event, pieces.last_mut()) {
                 (Event::Begins(name), _) => {
                     let begins = Moment::now(device);
-                    pieces.push(Piece { name, begins, ends: None, flops: 0., bytes: 0. });
+                    pieces.push(Piece { name, begins, ends: None, flops: 0., owed: 0., bytes: 0. });
                 }
                 (Event::Ends, Some(piece)) => piece.ends = Some(Moment::now(device)),
-                (Event::Does { flops, bytes }, Some(piece)) => {
+                (Event::Does { flops, owed, bytes }, Some(piece)) => {
                     piece.flops += flops;
+                    piece.owed += owed;
                     piece.bytes += bytes;
                 }
                 (_, None) => unreachable!("a part begins before all else"),
@@ -76,6 +81,7 @@ impl Parts {
             });
             sums[known].milliseconds[0] += 1e3 * elapsed.as_secs_f64();
             sums[known].flops += piece.flops;
+            sums[known].owed += piece.owed;
             sums[known].bytes += piece.bytes;
         }
         match self.parts.is_empty() {
@@ -95,8 +101,8 @@ impl Parts {
         let part = |sum: Sum| {
             let milliseconds = Spread::of(sum.milliseconds);
             let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
-            let (gflop, gigabytes) = (1e-9 * sum.flops, 1e-9 * sum.bytes);
-            Part { name: sum.name, milliseconds, gflop, gigabytes, share_of_peak }
+            let [gflop, backward_gflop, gigabytes] = [sum.flops, sum.owed, sum.bytes].map(|of| 1e-9 * of);
+            Part { name: sum.name, milliseconds, gflop, backward_gflop, gigabytes, share_of_peak }
         };
         self.parts.into_iter().map(part).collect()
     }

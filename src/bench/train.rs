@@ -1,5 +1,7 @@
 //! A training step: how long its parts take, and how much memory it needs.
 
+use super::parts::{Part, Parts};
+use super::yardstick::Yardstick;
 use super::{Measured, Section, Spread};
 use crate::config::Config;
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
@@ -7,6 +9,7 @@ use crate::device::Upload;
 use crate::error::Result;
 use crate::eval::peak_memory_bytes_on;
 use crate::loss::{PerceptualKind, PerceptualLoss};
+use crate::model::Precision;
 use crate::optim::Stopwatch;
 use crate::ranks::Group;
 use crate::scene::{Camera, ImageSize, Intrinsics};
@@ -18,6 +21,8 @@ use serde::Serialize;
 use std::sync::Arc;
 use tch::Device;
 
+/// Products that the machine is measured by.
+const PRODUCTS: usize = 5;
 /// Far end of the made-up scenes' frusta.
 const FAR: f64 = 40.;
 
@@ -44,6 +49,12 @@ pub struct TrainReport {
     pub milliseconds: Spread,
     /// In the order of the work.
     pub sections: Vec<Section>,
+    /// Of all forward passes, again where rounds are computed again; and what their gradients take.
+    pub parts: Vec<Part>,
+    /// Of matrix products.
+    pub precision: Precision,
+    /// A product of large matrices in that precision, in 10⁹ floating-point operations a second.
+    pub peak_gflops: f64,
     /// Bytes that tensors on a GPU, or the process, took at the most.
     pub peak_bytes: u64,
     /// What working together costs, where there are several processes.
@@ -97,8 +108,13 @@ pub fn bench_train(
     let scenes: Vec<LoadedScene> =
         seeds.take(config.train.batch).map(|seed| made_up_scene(&config, seed)).collect();
     let upload = Upload::to(device);
-    let measured = measure(&mut trainer, &scenes, steps, &upload)?;
+    let mut parts = Parts::default();
+    let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
+    let precision = config.train.precision;
+    let yardstick = Yardstick::new(precision.kind(), device);
+    let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
+    let peak_gflops = yardstick.gflops(Spread::of(products).least);
     let (milliseconds, sections) = measured.told();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
@@ -116,18 +132,31 @@ pub fn bench_train(
         steps,
         milliseconds,
         sections,
+        parts: parts.told(peak_gflops),
+        precision,
+        peak_gflops,
         peak_bytes,
         together: together.transpose()?,
     })
 }
 
 /// `steps` steps, after one that warms caches, threads and the GPU's libraries up.
-fn measure(trainer: &mut Trainer, scenes: &[LoadedScene], steps: usize, upload: &Upload) -> Result<Measured> {
+fn measure(
+    trainer: &mut Trainer,
+    scenes: &[LoadedScene],
+    steps: usize,
+    upload: &Upload,
+    parts: &mut Parts,
+) -> Result<Measured> {
     let mut measured = Measured::default();
     for step in 0..=steps {
         let mut watch = Stopwatch::of(upload.device());
         let sample = watch.time("data", || Sample::by(scenes, upload));
-        trainer.learn(&sample, &mut watch, &mut || true)?;
+        let mut learn = || trainer.learn(&sample, &mut watch, &mut || true);
+        match step {
+            0 => learn()?,
+            _ => parts.watch(upload.device(), learn)?,
+        };
         if step > 0 {
             measured.add(&mut watch);
         }
@@ -160,7 +189,7 @@ fn together(
     Ok(Together {
         ranks,
         scenes_per_second,
-        apart_milliseconds: measure(&mut apart, scenes, steps, upload)?.told().0,
+        apart_milliseconds: measure(&mut apart, scenes, steps, upload, &mut Parts::default())?.told().0,
         communication_milliseconds: communication,
         hidden: (1. - waited / communication.median).clamp(0., 1.),
         gradient_bytes,

@@ -6,7 +6,8 @@ use super::{device, parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    RasterReport, Section, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
+    self, RasterReport, Section, Spread, bench_loader, bench_raster, bench_synth, made_up_scene,
+    made_up_videos,
 };
 use globalsplat::config::Config;
 use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
@@ -71,6 +72,28 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
     };
     sections.iter().for_each(|section| row(section.name, &section.milliseconds));
     row(name, whole);
+}
+
+/// The parts of a forward pass, beside `whole`.
+pub fn print_parts(title: &str, parts: &[bench::Part], whole: &Spread) {
+    println!(
+        "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
+        "median", "least", "share", "GFLOP", "GB", "of the peak"
+    );
+    for part in parts {
+        let of_peak = match part.gflop > 0. {
+            true => format!("{:>11.1} %", 1e2 * part.share_of_peak),
+            false => String::new(),
+        };
+        let rest = format!("{:>9.2} {:>7.3} {of_peak}", part.gflop, part.gigabytes);
+        print_part(part.name, &part.milliseconds, whole, &rest);
+    }
+}
+
+/// One of them.
+pub fn print_part(name: &str, s: &Spread, whole: &Spread, rest: &str) {
+    let share = 1e2 * s.median / whole.median;
+    println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
 }
 
 /// The splat op, forward and backward, stage by stage.

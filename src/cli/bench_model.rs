@@ -1,8 +1,8 @@
-use super::bench::read_config;
+use super::bench::{print_part, print_parts, read_config};
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{ModelReport, Part, Spread, bench_model};
+use globalsplat::bench::{ModelReport, Part, bench_model};
 use std::path::PathBuf;
 
 /// A forward pass, photos to Gaussians, part by part, over photos of noise and with fresh weights.
@@ -58,25 +58,16 @@ fn print_report(r: &ModelReport, asked: &Model) {
         "{} photos of {width}x{height}, {} Gaussians, {}, {}, {} threads, {} passes",
         r.views, r.gaussians, r.precision, asked.device, r.threads, r.repeats
     );
-    println!(
-        "{:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
-        "ms per pass", "median", "least", "share", "GFLOP", "GB", "of the peak"
-    );
-    let row = |name: &str, s: &Spread, rest: String| {
-        let share = 1e2 * s.median / r.milliseconds.median;
-        println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
-    };
-    for part in &r.parts {
-        let of_peak = match part.gflop > 0. {
-            true => format!("{:>11.1} %", 1e2 * part.share_of_peak),
-            false => String::new(),
-        };
-        row(part.name, &part.milliseconds, format!("{:>9.2} {:>7.3} {of_peak}", part.gflop, part.gigabytes));
-    }
+    print_parts("ms per pass", &r.parts, &r.milliseconds);
     let [flop, bytes] = [|part: &Part| part.gflop, |part: &Part| part.gigabytes]
         .map(|of| r.parts.iter().map(of).sum::<f64>());
     let of_peak = 1e5 * flop / r.milliseconds.least / r.peak_gflops;
-    row("pass", &r.milliseconds, format!("{flop:>9.2} {bytes:>7.3} {of_peak:>11.1} %"));
+    print_part(
+        "pass",
+        &r.milliseconds,
+        &r.milliseconds,
+        &format!("{flop:>9.2} {bytes:>7.3} {of_peak:>11.1} %"),
+    );
     println!("a product of large matrices reaches {:.0} GFLOP/s in {}", r.peak_gflops, r.precision);
     println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
 }

@@ -1,8 +1,8 @@
-use super::bench::{print_sections, read_config};
+use super::bench::{print_parts, print_sections, read_config};
 use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{Together, TrainReport, bench_train};
+use globalsplat::bench::{Part, Together, TrainReport, bench_train};
 use globalsplat::error::Error;
 use serde_json::json;
 use std::path::PathBuf;
@@ -77,6 +77,16 @@ fn print_report(r: &TrainReport) {
         r.steps
     );
     print_sections("ms per step", &r.sections, ("step", &r.milliseconds));
+    print_parts("ms, forward alone", &r.parts, &r.milliseconds);
+    let sum = |of: fn(&Part) -> f64| r.parts.iter().map(of).sum::<f64>();
+    let (forward, backward) = (sum(|part| part.gflop), sum(|part| part.backward_gflop));
+    println!(
+        "{forward:.0} GFLOP forward and {backward:.0} for gradients: {:.1} % of the {:.0} GFLOP/s that a product of large matrices \
+         reaches in {}",
+        1e5 * (forward + backward) / r.milliseconds.least / r.peak_gflops,
+        r.peak_gflops,
+        r.precision
+    );
     println!("memory {:.2} GB at the most", r.peak_bytes as f64 * 1e-9);
     if let Some(together) = &r.together {
         print_together(together);

@@ -4,9 +4,8 @@
 use crate::device::leave_out_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
-use crate::model::Precision;
+use crate::model::{Precision, convolve};
 use std::path::Path;
-use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
 /// What the distance takes from pictures in [−1, 1], per channel, and divides them by: the mean and standard deviation of
@@ -214,7 +213,7 @@ impl Lpips {
                 let pool = self.network.pool();
                 xs = xs.max_pool2d([pool, pool], [2, 2], [0, 0], [1, 1], false);
             }
-            xs = step.convolution.forward(&xs).relu();
+            xs = convolve(&step.convolution, &xs);
             step.linear.is_some().then(|| unit(&xs.to_kind(Kind::Float)))
         })
     }

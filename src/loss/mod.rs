@@ -27,7 +27,7 @@ pub use vgg19::Vgg19;
 pub(crate) use consistency::{Share, consistency, depth_pixels};
 
 use crate::data::Sample;
-use crate::model::Decoded;
+use crate::model::{Decoded, part};
 use crate::render::Pictures;
 use tch::Tensor;
 
@@ -44,9 +44,11 @@ pub(crate) fn losses(
     let truth = &sample.target.images;
     let mse = mse(&pictures.rgb, truth) * share.scenes;
     let perceptual = match perceptual {
-        // Both halves of a paired sample have the same targets.
-        Some(network) if sample.paired => network.loss(&pictures.rgb, &truth.chunk(2, 0)[0]) * share.scenes,
-        Some(network) => network.loss(&pictures.rgb, truth) * share.scenes,
+        Some(network) => {
+            // Both halves of a paired sample have the same targets.
+            let halves = truth.chunk(if sample.paired { 2 } else { 1 }, 0);
+            part("L_perc", || network.loss(&pictures.rgb, &halves[0])) * share.scenes
+        }
         None => mse.zeros_like(),
     };
     let consistency = match sample.paired {

@@ -4,9 +4,8 @@
 use crate::device::leave_out_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
-use crate::model::Precision;
+use crate::model::{Precision, convolve};
 use std::path::Path;
-use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
 /// What the network takes from 255·x: the mean of the photos that it was trained on.
@@ -104,7 +103,7 @@ impl Vgg19 {
             if *pooled {
                 xs = xs.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None);
             }
-            xs = convolution.forward(&xs).relu();
+            xs = convolve(convolution, &xs);
             if counts.is_some() {
                 features.push(xs.shallow_clone());
             }

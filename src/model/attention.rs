@@ -9,7 +9,9 @@ use tch::{Device, Kind, Tensor};
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let out = attend(q, k, v, heads);
     let size = q.size();
-    does(4 * size[0] * size[1] * k.size()[1] * size[2], &[q, k, v, &out]);
+    let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
+    // Scores again, and gradients of queries, keys, weights and values.
+    does(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
     out
 }
 

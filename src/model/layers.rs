@@ -57,7 +57,7 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
     part("norms", || {
         let out = norm.forward(xs);
-        does(0, &[xs, &out]);
+        does(0, 0, &[xs, &out]);
         out
     })
 }
@@ -77,7 +77,7 @@ impl LayerScale {
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
         part("residual sums", || {
             let out = xs.addcmul(change, &self.gamma);
-            does(0, &[xs, change, &out]);
+            does(0, 0, &[xs, change, &out]);
             out
         })
     }
@@ -108,7 +108,7 @@ impl Mlp {
         part("MLPs", || {
             let mut hidden = precision.linear(&self.expand, xs);
             hidden = if hidden.requires_grad() { hidden.gelu("none") } else { hidden.gelu_("none") };
-            does(0, &[&hidden, &hidden]);
+            does(0, 0, &[&hidden, &hidden]);
             precision.linear(&self.contract, &hidden)
         })
     }

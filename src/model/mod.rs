@@ -24,8 +24,10 @@ pub use config::{ModelConfig, Streams};
 pub use decoder::{Decoded, RawOutputs};
 pub use encoder::Encoded;
 pub use merge::Stage;
+pub(crate) use parts::part;
 pub use parts::{Event, told};
 pub use precision::Precision;
+pub(crate) use precision::convolve;
 pub use shapes::MODULES;
 
 // For training, which goes through the model in parts.
@@ -45,7 +47,6 @@ pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};
-use parts::part;
 use std::collections::HashSet;
 use tch::{Kind, Tensor, nn};
 

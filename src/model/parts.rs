@@ -14,6 +14,8 @@ pub enum Event {
     Does {
         /// In products.
         flops: f64,
+        /// In products of the backward pass, where it will be followed.
+        owed: f64,
         /// Of numbers that come in and go out.
         bytes: f64,
     },
@@ -37,7 +39,7 @@ pub fn told<T>(listener: impl FnMut(Event) + 'static, pass: impl FnOnce() -> T) 
 }
 
 /// Does `work`, which is a part.
-pub(super) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
+pub(crate) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
     let begins = LISTENER.with_borrow_mut(|listener| match listener {
         Some(listener) if !listener.is_within => {
             listener.is_within = true;
@@ -58,12 +60,12 @@ pub(super) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
     result
 }
 
-/// Tells of `flops` that are done on `tensors`, which come in or go out.
-pub(super) fn does(flops: i64, tensors: &[&Tensor]) {
+/// Tells of `flops` that are done on `tensors`, which come in or go out, and of those that their gradients will take.
+pub(super) fn does(flops: i64, owed: i64, tensors: &[&Tensor]) {
     LISTENER.with_borrow_mut(|listener| {
         if let Some(listener) = listener.as_mut().filter(|listener| listener.is_within) {
             let bytes: usize = tensors.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
-            (listener.tell)(Event::Does { flops: flops as f64, bytes: bytes as f64 });
+            (listener.tell)(Event::Does { flops: flops as f64, owed: owed as f64, bytes: bytes as f64 });
         }
     });
 }
@@ -79,14 +81,19 @@ mod tests {
         let said = Rc::new(RefCell::new(vec![]));
         let numbers = Tensor::zeros([3, 5], (Kind::BFloat16, Device::Cpu));
         let pass = || {
-            does(7, &[&numbers]);
-            part("outer", || part("inner", || does(2, &[&numbers, &numbers])));
+            does(7, 0, &[&numbers]);
+            part("outer", || part("inner", || does(2, 3, &[&numbers, &numbers])));
             part("next", || 4)
         };
         let to = said.clone();
         assert_eq!(told(move |event| to.borrow_mut().push(format!("{event:?}")), pass), 4);
-        let expected =
-            ["Begins(\"outer\")", "Does { flops: 2.0, bytes: 60.0 }", "Ends", "Begins(\"next\")", "Ends"];
+        let expected = [
+            "Begins(\"outer\")",
+            "Does { flops: 2.0, owed: 3.0, bytes: 60.0 }",
+            "Ends",
+            "Begins(\"next\")",
+            "Ends",
+        ];
         assert_eq!(*said.borrow(), expected);
         assert_eq!(part("unheard", || 5), 5);
         assert_eq!(said.borrow().len(), expected.len());

@@ -5,6 +5,7 @@ use globalsplat_csrc::processor::{Bf16, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
+use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
 /// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
@@ -60,7 +61,21 @@ impl Precision {
 /// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let out = xs.linear(weights, bias);
-    does(2 * (xs.numel() as i64) * weights.size()[0], &[xs, weights, &out]);
+    let flops = 2 * (xs.numel() as i64) * weights.size()[0];
+    does(flops, owed(flops, xs, weights), &[xs, weights, &out]);
+    out
+}
+
+/// Of `flops` that multiply both with each other: as many for the gradient of each.
+fn owed(flops: i64, a: &Tensor, b: &Tensor) -> i64 {
+    flops * (i64::from(a.requires_grad()) + i64::from(b.requires_grad()))
+}
+
+/// ReLU of what `layer` makes of images, [B, C, H, W].
+pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
+    let out = layer.forward(images).relu_();
+    let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
+    does(flops, owed(flops, images, &layer.ws), &[images, &layer.ws, &out]);
     out
 }
 

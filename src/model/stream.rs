@@ -20,7 +20,7 @@ pub(crate) fn normalized(memory: &Tensor) -> Tensor {
     part("norms", || {
         let out =
             memory.layer_norm([memory.size()[2]], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
-        does(0, &[memory, &out]);
+        does(0, 0, &[memory, &out]);
         out
     })
 }
