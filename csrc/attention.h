@@ -11,7 +11,7 @@ bool attention_takes(int64_t width, bool is_bf16);
 
 // softmax(q kᵀ / √(d/h)) v over h heads side by side (raster/attention.h): q [B, n, d], k and v [B, m, d], m at least 1, float32 or
 // bfloat16 on the CPU, any strides; addresses of live tensors. Returns that of a new contiguous tensor [B, n, d] of their kind that the
-// caller owns. Of float32 it is differentiable, once. Throws on what doesn't fit.
+// caller owns. Differentiable, once. Throws on what doesn't fit.
 size_t attention(size_t q, size_t k, size_t v, int64_t heads);
 
 }  // namespace globalsplat

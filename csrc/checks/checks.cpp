@@ -236,13 +236,6 @@ int64_t fits(const std::vector<int>& thread_counts) {
   return count;
 }
 
-float to_float(raster::Bf16 number) {
-  const uint32_t bits = uint32_t(number) << 16;
-  float value;
-  std::memcpy(&value, &bits, sizeof value);
-  return value;
-}
-
 std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
   std::vector<raster::Bf16> cut;
   for (const float number : numbers) {
@@ -259,7 +252,7 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
   for (int64_t i = 0; i < m; ++i)
     for (int64_t j = 0; j < n; ++j) {
       float sum = adds ? c[i * c_row + j] : 0;
-      for (int64_t at = 0; at < k; ++at) sum += to_float(a[i * a_row + at]) * to_float(b[(at / 2 * b_row + j) * 2 + at % 2]);
+      for (int64_t at = 0; at < k; ++at) sum += raster::to_float(a[i * a_row + at]) * raster::to_float(b[(at / 2 * b_row + j) * 2 + at % 2]);
       c[i * c_row + j] = sum;
     }
 }
@@ -292,14 +285,23 @@ int64_t attentions(const std::vector<int>& thread_counts) {
       std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
       raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {slope.data(), in, row},
                               {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, threads);
-      if (shape.width % 8 == 0) {
-        const std::vector<raster::Bf16> q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v);
-        std::vector<raster::Bf16> out_cut(q.size(), raster::Bf16(threads));
-        raster::attend_bf16(shape, {{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}},
-                            {out_cut.data(), in, row}, {multiply_bf16, [] {}}, threads);
-        for (const raster::Bf16 number : out_cut) out.push_back(to_float(number));
-      }
       for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
+      if (shape.width % 8 != 0) return out;
+
+      using Halves = std::vector<raster::Bf16>;
+      const Halves q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v), slope_cut = cut_to_bf16(slope);
+      const auto unwritten_cut = [&](size_t n) { return Halves(n, raster::Bf16(threads)); };
+      const raster::AttentionInputs<raster::Bf16> cut{{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}};
+      const raster::Bf16Products products = {multiply_bf16, [] {}};
+      Halves out_cut = unwritten_cut(q.size()), dq_cut = unwritten_cut(q.size());
+      Halves dk_cut = unwritten_cut(k.size()), dv_cut = unwritten_cut(v.size());
+      raster::attend_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), products, threads);
+      raster::attend_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {slope_cut.data(), in, row},
+                                   {{dq_cut.data(), in, row}, {dk_cut.data(), seen, row}, {dv_cut.data(), seen, row}}, products,
+                                   threads);
+      out.insert(out.end(), log_sums.begin(), log_sums.end());
+      for (const Halves* more : {&out_cut, &dq_cut, &dk_cut, &dv_cut})
+        for (const raster::Bf16 number : *more) out.push_back(raster::to_float(number));
       return out;
     };
     const std::vector<float> one = attended(1);

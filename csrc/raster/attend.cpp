@@ -60,15 +60,16 @@ void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads
   });
 }
 
-void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, const Bf16Products& products,
-                 int threads) {
-  for_some_queries(shape, in, kBf16Rows, threads, [&](const AttentionHead<Bf16>& of, int64_t head, int64_t begin) {
-    kernels().attend_bf16(of, products, head_of(out, shape, head).from(begin), room(attention_bf16_room(shape.width)));
+void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
+                 const Bf16Products& products, int threads) {
+  for_some_queries(shape, in, kBf16Columns, threads, [&](const AttentionHead<Bf16>& of, int64_t head, int64_t begin) {
+    kernels().attend_bf16(of, products, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
+                          room(attention_bf16_room(shape.width)));
   });
 }
 
 void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
-                     Heads<const float> slope, const AttentionGradients& gradients, int threads) {
+                     Heads<const float> slope, const AttentionGradients<float>& gradients, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
   // Every task has a part of a head's keys, cut by shapes alone, and a gradient of all its queries; these are added up in order.
   const int64_t size = part(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
@@ -109,6 +110,51 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& 
         float sum = 0;
         for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c];
         to.data[i * to.stride + c] = scale * sum;
+      }
+    }
+  });
+}
+
+void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out, const float* log_sums,
+                          Heads<const Bf16> slope, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
+                          int threads) {
+  // Shared out as float32 numbers are.
+  const int64_t heads = shape.scenes * shape.heads, width = shape.width;
+  const int64_t size = part(heads, shape.keys, 64, kBf16BackwardKeys, kBf16BackwardKeys), parts = (shape.keys + size - 1) / size;
+  const int64_t whole = whole_bf16_columns(shape.queries), all = whole * width, rows_all = whole * attention_columns(shape.width);
+  const std::unique_ptr<Bf16[]> q_columns(new Bf16[size_t(heads * all)]), slope_columns(new Bf16[size_t(heads * all)]);
+  const std::unique_ptr<Bf16[]> q_rows(new Bf16[size_t(heads * rows_all)]), slope_rows(new Bf16[size_t(heads * rows_all)]);
+  const std::unique_ptr<float[]> shifts(new float[size_t(heads * whole)]), means(new float[size_t(heads * whole)]);
+  const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
+  const auto packed = [&](int64_t head) {
+    return PackedBf16Queries{q_columns.get() + head * all,     slope_columns.get() + head * all,   q_rows.get() + head * rows_all,
+                             slope_rows.get() + head * rows_all, shifts.get() + head * whole, means.get() + head * whole};
+  };
+  const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
+
+  const int64_t panels = whole / kBf16Columns;
+  parallel_for(threads, heads * panels, [&](int64_t task) {
+    const int64_t head = task / panels;
+    kernels().pack_queries_bf16({rows(in.q, head, 0), {}, {}, shape.queries, 0, shape.width}, {rows(out, head, 0), rows(slope, head, 0)},
+                                log_sums + head * shape.queries, task % panels * kBf16Columns, whole, packed(head));
+  });
+  parallel_for(threads, heads * parts, [&](int64_t task) {
+    const int64_t head = task / parts, begin = task % parts * size;
+    kernels().attend_backward_bf16({{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries,
+                                    std::min(size, shape.keys - begin), shape.width},
+                                   products, packed(head), sums.get() + task * all, rows(gradients.k, head, begin),
+                                   rows(gradients.v, head, begin), room(attention_bf16_backward_room(shape.width)));
+  });
+  const float scale = float(1 / std::sqrt(double(width)));
+  parallel_for(threads, heads * panels, [&](int64_t task) {
+    const int64_t head = task / panels, begin = task % panels * kBf16Columns;
+    const Rows<Bf16> to = rows(gradients.q, head, begin);
+    for (int64_t i = 0; i < std::min(kBf16Columns, shape.queries - begin); ++i) {
+      const float* const first = sums.get() + head * parts * all + begin * width + i;
+      for (int64_t c = 0; c < width; ++c) {
+        float sum = 0;
+        for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c * kBf16Columns];
+        to.data[i * to.stride + c] = to_bf16(scale * sum);
       }
     }
   });

@@ -29,15 +29,19 @@ struct AttentionInputs {
 void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums, int threads);
 
 // The same of bfloat16 numbers, whose `width` is a multiple of 8 and whose rows are an even number of them apart, by `products`
-// (attention_bf16.h). It has no way back.
-void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, const Bf16Products& products,
-                 int threads);
+// (attention_bf16.h).
+void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
+                 const Bf16Products& products, int threads);
 
 // Of the gradient `slope` of what came out.
+template <class Number>
 struct AttentionGradients {
-  Heads<float> q, k, v;
+  Heads<Number> q, k, v;
 };
 void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
-                     Heads<const float> slope, const AttentionGradients& gradients, int threads);
+                     Heads<const float> slope, const AttentionGradients<float>& gradients, int threads);
+void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out, const float* log_sums,
+                          Heads<const Bf16> slope, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
+                          int threads);
 
 }  // namespace globalsplat::raster

@@ -101,7 +101,7 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
 }
 
 // Some of a head's queries, and what is known of them, for attend_backward().
-inline void pack_queries(const AttentionHead<float>& head, const AttentionPast& past, const PackedQueries& to) {
+inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<float>& past, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);

@@ -1,29 +1,34 @@
-// Attention of one head as in attention.h, of bfloat16 numbers and without a way back. Products are somebody else's, who has the
-// instructions for them. Scores, the largest of them and all sums are float32; the weights 2^(s − m) are rounded before values are
-// multiplied by them, as libtorch does.
+// Attention of one head as in attention.h, forward beside backward, of bfloat16 numbers. Products are somebody else's, who has the
+// instructions for them. Scores, the largest of them and all sums are float32; the weights p and their scores' gradients ds are rounded
+// before anything is multiplied by them, as libtorch does.
 #pragma once
 
 #include "attention.h"
 
 namespace globalsplat::raster::GS_ISA {
 
-// The nearest, ties to even.
-GS_INLINE void store_bf16(Bf16* to, Vector<float> v) {
-  typedef uint32_t Bits __attribute__((vector_size(kVectorBytes)));
-  typedef Bf16 Halves __attribute__((vector_size(kVectorBytes / 2)));
+typedef uint32_t Bits __attribute__((vector_size(kVectorBytes)));
+
+// The nearest bfloat16 number, ties to even, in the upper half; anything in the lower one.
+GS_INLINE Bits rounded(Vector<float> v) {
   const Bits bits = (Bits)v;
-  const Halves rounded = __builtin_convertvector((bits + 0x7fff + ((bits >> 16) & 1)) >> 16, Halves);
-  __builtin_memcpy(to, &rounded, sizeof rounded);
+  return bits + 0x7fff + ((bits >> 16) & 1);
 }
 
-GS_INLINE Bf16 to_bf16(float number) {
-  uint32_t bits;
-  __builtin_memcpy(&bits, &number, 4);
-  return Bf16((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+GS_INLINE void store_bf16(Bf16* to, Bits rounded) {
+  typedef Bf16 Halves __attribute__((vector_size(kVectorBytes / 2)));
+  const Halves halves = __builtin_convertvector(rounded >> 16, Halves);
+  __builtin_memcpy(to, &halves, sizeof halves);
 }
 
-// Copies `count` rows of `width` numbers, a multiple of 8, an even number of them apart, to panels of kBf16Columns columns, rows there: what products take for
-// their second matrix, two numbers of a row side by side. Zeros fill up the last panel.
+// Two rows side by side.
+GS_INLINE void store_pair(Bf16* to, Bits even, Bits odd) {
+  const Bits both = (even >> 16) | (odd & 0xffff0000);
+  __builtin_memcpy(to, &both, sizeof both);
+}
+
+// Copies `count` rows of `width` numbers, a multiple of 8, an even number of them apart, to panels of kBf16Columns columns, rows
+// there: what products take for their second matrix, two numbers of a row side by side. Zeros fill up the last panel.
 GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, Bf16* out) {
   for (int64_t first = 0; first < count; first += kBf16Columns, out += int64_t(width) * kBf16Columns)
     for (int64_t j = 0; j < kBf16Columns; j += 4) {
@@ -45,79 +50,207 @@ GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, 
     }
 }
 
-// Copies `count` rows of `width` numbers to panels of kBf16Columns columns, the last one of what is left of `columns`: two rows
-// side by side, up to row `rows`, which is even. Zeros fill up.
-GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int columns, int64_t rows, Bf16* out) {
-  const Bf16 zeros[kBf16Columns] = {};
-  for (int first = 0; first < columns; first += kBf16Columns) {
-    const int panel = columns - first < kBf16Columns ? columns - first : kBf16Columns;
-    const int present = width - first < panel ? width - first : panel;
-    for (int64_t j = 0; j < rows; j += 2, out += 2 * panel) {
-      const auto row = [&](int64_t j) { return j < count ? from.data + j * from.stride + first : zeros; };
-      const Bf16 *const even = row(j), *const odd = row(j + 1);
-      for (int c = 0; c < present; ++c) {
-        out[2 * c] = even[c];
-        out[2 * c + 1] = odd[c];
+// Copies `count` rows of `width` numbers, a multiple of 8, to columns: number (row, c) goes to out[c · stride + row]. Zeros fill up
+// rows up to `whole`, a multiple of 8.
+GS_INLINE void pack_columns(Rows<const Bf16> from, int64_t count, int width, int64_t whole, int64_t stride, Bf16* out) {
+  const Bf16 zeros[kAttentionWidth] = {};
+  for (int64_t j = 0; j < whole; j += 8)
+    for (int c = 0; c < width; c += 8) {
+      Bf16 pairs[4][16];  // of rows, which a transposition of words puts in a line
+      for (int n = 0; n < 4; ++n) {
+        const auto row = [&](int64_t j) { return (j < count ? from.data + j * from.stride : zeros) + c; };
+        const Bf16 *const even = row(j + 2 * n), *const odd = row(j + 2 * n + 1);
+        for (int i = 0; i < 8; ++i) {
+          pairs[n][2 * i] = even[i];
+          pairs[n][2 * i + 1] = odd[i];
+        }
       }
-      for (int c = 2 * present; c < 2 * panel; ++c) out[c] = 0;
+      for (int half = 0; half < 8; half += 4) transpose4(pairs[0] + 2 * half, 8, out + (c + half) * stride + j, stride / 2);
     }
+}
+
+// Copies `count` rows of `width` numbers, two of them side by side, to kBf16Columns rows of `columns` numbers. Zeros fill up.
+GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int columns, Bf16* out) {
+  const Bf16 zeros[kBf16Columns] = {};
+  const int present = width < columns ? width : columns;
+  for (int64_t j = 0; j < kBf16Columns; j += 2, out += 2 * columns) {
+    const auto row = [&](int64_t j) { return j < count ? from.data + j * from.stride : zeros; };
+    const Bf16 *const even = row(j), *const odd = row(j + 1);
+    for (int c = 0; c < present; ++c) {
+      out[2 * c] = even[c];
+      out[2 * c + 1] = odd[c];
+    }
+    for (int c = 2 * present; c < 2 * columns; ++c) out[c] = 0;
   }
 }
 
-inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, Rows<Bf16> out, float* memory) {
+// Scores are transposed, a key's side by side, here and backward: what is done to them goes by queries, and whoever multiplies them
+// takes them as they lie, outᵀ = vᵀ pᵀ.
+inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, Rows<Bf16> out, float* log_sums,
+                        float* memory) {
   using V = Vector<float>;
-  constexpr int lanes = Simd<float>::lanes;
-  const int width = head.width, columns = attention_columns(width);
+  constexpr int lanes = Simd<float>::lanes, vectors = kBf16Columns / lanes;
+  const int width = head.width;
+  const int64_t queries = whole_bf16_columns(head.queries);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
+  const V factor = broadcast<float>(scale);
 
   Room room(memory);
   const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(room.take(count / 2)); };
-  float* const sums = room.take(head.queries * columns);  // of values
-  float* const weights = room.take(head.queries);         // l
-  float* const most = room.take(head.queries);            // m, but for the factor
-  float* const scores = room.take(kBf16Rows * kBf16Keys);
-  Bf16* const rounded = take_bf16(kBf16Rows * kBf16Keys);
-  Bf16* const k = take_bf16(kBf16Keys * width);
-  Bf16* const v = take_bf16(kBf16Keys * columns);
-  for (int64_t i = 0; i < head.queries; ++i) most[i] = -__builtin_inff(), weights[i] = 0;
-  for (int64_t i = 0; i < head.queries * columns; ++i) sums[i] = 0;
+  float* const sums = room.take(queries * width);  // of values, in panels of queries, [width, kBf16Columns]
+  float* const weights = room.take(queries);       // l
+  float* const most = room.take(queries);          // m, but for the factor
+  float* const scores = room.take(kBf16Keys * kBf16Columns);
+  Bf16* const p = take_bf16(kBf16Keys * kBf16Columns);
+  Bf16* const v = take_bf16(kBf16Keys * width);
+  Bf16* const q = take_bf16(queries * width);
+  pack_transposed(head.q, head.queries, width, q);
+  for (int64_t i = 0; i < queries; ++i) most[i] = -__builtin_inff(), weights[i] = 0;
 
   for (int64_t first = 0; first < head.keys; first += kBf16Keys) {
     const int64_t count = head.keys - first < kBf16Keys ? head.keys - first : kBf16Keys;
-    const int64_t whole = (count + kBf16Columns - 1) / kBf16Columns * kBf16Columns;
-    pack_transposed(head.k.from(first), count, width, k);
-    pack_pairs(head.v.from(first), count, width, columns, whole, v);
-    for (int64_t i = 0; i < head.queries; i += kBf16Rows) {
-      const int64_t rows = head.queries - i < kBf16Rows ? head.queries - i : kBf16Rows;
-      for (int64_t j = 0; j < whole; j += kBf16Columns)
-        products.multiply(rows, kBf16Columns, width, head.q.stride, kBf16Columns, kBf16Keys, false, head.q.from(i).data, k + j * width,
-                          scores + j);
-      for (int64_t r = 0; r < rows; ++r) {
-        float* const row = scores + r * kBf16Keys;
-        const float before = most[i + r], now = largest_score(row, count, whole, before);
-        most[i + r] = now;
-        const V factor = broadcast<float>(scale), shift = broadcast<float>(-now) * factor;
-        const float smaller = power_of_two(broadcast<float>((before - now) * scale))[0];
-        V sum = V{};
-        for (int64_t j = 0; j < whole; j += lanes) {
-          const V p = power_of_two(fma(load<float>(row + j), factor, shift));
-          store_bf16(rounded + r * kBf16Keys + j, p);
-          sum = sum + p;
+    const int64_t whole = whole_bf16_columns(count);
+    const Rows<const Bf16> k = head.k.from(first);
+    pack_columns(head.v.from(first), count, width, whole, kBf16Keys, v);
+    for (int64_t panel = 0; panel < queries; panel += kBf16Columns) {
+      float* const values = sums + panel * width;
+      products.multiply(count, kBf16Columns, width, k.stride, kBf16Columns, kBf16Columns, false, k.data, q + panel * width, scores);
+      V now[vectors], shift[vectors], sum[vectors];
+      for (int n = 0; n < vectors; ++n) now[n] = load<float>(most + panel + n * lanes);
+      for (int64_t j = 0; j < count; ++j)
+#pragma GCC unroll 8
+        for (int n = 0; n < vectors; ++n) now[n] = larger(load<float>(scores + j * kBf16Columns + n * lanes), now[n]);
+      for (int n = 0; n < vectors; ++n) shift[n] = -now[n] * factor, sum[n] = V{};
+      for (int64_t j = 0; j < whole; j += 2)
+#pragma GCC unroll 8
+        for (int n = 0; n < vectors; ++n) {
+          const auto round = [&](int64_t j) {
+            if (j >= count) return Bits{};
+            const V weight = power_of_two(fma(load<float>(scores + j * kBf16Columns + n * lanes), factor, shift[n]));
+            sum[n] = sum[n] + weight;
+            return rounded(weight);
+          };
+          const Bits even = round(j);
+          store_pair(p + j * kBf16Columns + 2 * n * lanes, even, round(j + 1));
         }
-        weights[i + r] = weights[i + r] * smaller + float(sum_of_lanes<float>(sum));
-        if (smaller == 1) continue;
-        float* const values = sums + (i + r) * columns;
-        for (int c = 0; c < columns; c += lanes) store<float>(values + c, load<float>(values + c) * smaller);
+      for (int n = 0; n < vectors; ++n) {
+        float *const before = most + panel + n * lanes, *const weight = weights + panel + n * lanes;
+        const V smaller = power_of_two((load<float>(before) - now[n]) * factor);
+        store<float>(before, now[n]);
+        store<float>(weight, fma(load<float>(weight), smaller, sum[n]));
+        for (int64_t at = n * lanes; first > 0 && at < width * kBf16Columns; at += kBf16Columns)
+          store<float>(values + at, load<float>(values + at) * smaller);
       }
-      for (int c = 0; c < columns; c += kBf16Columns) {
-        const int panel = columns - c < kBf16Columns ? columns - c : kBf16Columns;
-        products.multiply(rows, panel, whole, kBf16Keys, panel, columns, true, rounded, v + c * whole, sums + i * columns + c);
-      }
+      products.multiply(width, kBf16Columns, whole, kBf16Keys, kBf16Columns, kBf16Columns, first > 0, v, p, values);
     }
   }
   products.done();
-  for (int64_t i = 0; i < head.queries; ++i)
-    for (int c = 0; c < width; ++c) out.data[i * out.stride + c] = to_bf16(sums[i * columns + c] / weights[i]);
+  for (int64_t i = 0; i < head.queries; ++i) {
+    const float* const values = sums + i / kBf16Columns * kBf16Columns * width + i % kBf16Columns;
+    log_sums[i] = most[i] * scale + float(__builtin_log2(double(weights[i])));
+    for (int c = 0; c < width; ++c) out.data[i * out.stride + c] = to_bf16(values[c * kBf16Columns] / weights[i]);
+  }
+}
+
+// One panel of a head's queries, which begins at query `first`, and what is known of them, for attend_backward_bf16(). There are
+// `whole` queries when zeros have filled up the last panel.
+inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPast<Bf16>& past, const float* log_sums, int64_t first,
+                              int64_t whole, const PackedBf16Queries& to) {
+  const int width = head.width, columns = attention_columns(width);
+  const int64_t count = head.queries - first < kBf16Columns ? head.queries - first : kBf16Columns;
+  const auto pack = [&](Rows<const Bf16> from, Bf16* as_columns, Bf16* as_rows) {
+    pack_transposed(from, count, width, as_columns + first * width);
+    for (int c = 0; c < columns; c += kBf16Columns) {
+      const int panel = columns - c < kBf16Columns ? columns - c : kBf16Columns;
+      pack_pairs({from.data + c, from.stride}, count, width - c, panel, as_rows + c * whole + first * panel);
+    }
+  };
+  const Rows<const Bf16> slope = past.slope.from(first), out = past.out.from(first);
+  pack(head.q.from(first), to.q_columns, to.q_rows);
+  pack(slope, to.slope_columns, to.slope_rows);
+  for (int64_t i = 0; i < kBf16Columns; ++i) {
+    double sum = 0;
+    for (int c = 0; i < count && c < width; ++c)
+      sum += double(to_float(out.data[i * out.stride + c])) * double(to_float(slope.data[i * slope.stride + c]));
+    to.means[first + i] = float(sum);
+    to.log_sums[first + i] = i < count ? log_sums[first + i] : 0;
+  }
+}
+
+// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
+// of q · √w, in panels of kBf16Columns queries, [width, kBf16Columns]: dv = pᵀ g, dk = dsᵀ q, dqᵀ = kᵀ dsᵀ.
+inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, const PackedBf16Queries& of, float* dq,
+                                 Rows<Bf16> dk, Rows<Bf16> dv, float* memory) {
+  using V = Vector<float>;
+  constexpr int lanes = Simd<float>::lanes;
+  const int width = head.width, columns = attention_columns(width);
+  const int64_t queries = whole_bf16_columns(head.queries);
+  const float scale = float(1 / __builtin_sqrt(double(width)));
+  const V factor = broadcast<float>(float(kLog2E / __builtin_sqrt(double(width))));
+
+  Room room(memory);
+  const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(room.take(count / 2)); };
+  float* const dk_sums = room.take(kBf16BackwardKeys * columns);
+  float* const dv_sums = room.take(kBf16BackwardKeys * columns);
+  float* const scores = room.take(kBf16BackwardKeys * kBf16Columns);
+  float* const dp = room.take(kBf16BackwardKeys * kBf16Columns);
+  Bf16* const k_columns = take_bf16(kBf16BackwardKeys * width);
+  Bf16* const p = take_bf16(kBf16BackwardKeys * kBf16BackwardQueries);
+  Bf16* const ds = take_bf16(kBf16BackwardKeys * kBf16BackwardQueries);
+  Bf16* const ds_pairs = take_bf16(kBf16BackwardKeys * kBf16BackwardQueries);
+
+  for (int64_t first = 0; first < head.keys; first += kBf16BackwardKeys) {
+    const int64_t count = head.keys - first < kBf16BackwardKeys ? head.keys - first : kBf16BackwardKeys;
+    const int64_t whole = whole_bf16_columns(count);
+    const Rows<const Bf16> k = head.k.from(first), v = head.v.from(first);
+    pack_columns(k, count, width, whole, kBf16BackwardKeys, k_columns);
+
+    for (int64_t tile = 0; tile < queries; tile += kBf16BackwardQueries) {
+      const int64_t depth = queries - tile < kBf16BackwardQueries ? queries - tile : kBf16BackwardQueries;
+      for (int64_t i = 0; i < depth; i += kBf16Columns) {
+        const int64_t query = tile + i;
+        const auto multiply = [&](Rows<const Bf16> keys, const Bf16* queries, float* to) {
+          products.multiply(count, kBf16Columns, width, keys.stride, kBf16Columns, kBf16Columns, false, keys.data,
+                            queries + query * width, to);
+        };
+        multiply(k, of.q_columns, scores);
+        multiply(v, of.slope_columns, dp);
+        Bf16* const pairs = ds_pairs + i * kBf16BackwardKeys;
+        for (int64_t j = 0; j < whole; j += 2)
+          for (int64_t c = 0; c < kBf16Columns; c += lanes) {
+            const V shift = load<float>(of.log_sums + query + c), mean = load<float>(of.means + query + c);
+            const auto round = [&](int64_t j) {
+              if (j >= count) return Bits{};
+              const int64_t at = j * kBf16Columns + c, to = j * kBf16BackwardQueries + i + c;
+              const V weight = power_of_two(fma(load<float>(scores + at), factor, -shift));
+              const Bits slope = rounded(weight * (load<float>(dp + at) - mean));
+              store_bf16(p + to, rounded(weight));
+              store_bf16(ds + to, slope);
+              return slope;
+            };
+            const Bits even = round(j);
+            store_pair(pairs + j * kBf16Columns + 2 * c, even, round(j + 1));
+          }
+        products.multiply(width, kBf16Columns, whole, kBf16BackwardKeys, kBf16Columns, kBf16Columns, first > 0, k_columns, pairs,
+                          dq + query * width);
+      }
+      for (int c = 0; c < columns; c += kBf16Columns) {
+        const int panel = columns - c < kBf16Columns ? columns - c : kBf16Columns;
+        const auto multiply = [&](const Bf16* keys, const Bf16* rows, float* sums) {
+          products.multiply(count, panel, depth, kBf16BackwardQueries, panel, columns, tile > 0, keys, rows + c * queries + tile * panel,
+                            sums + c);
+        };
+        multiply(p, of.slope_rows, dv_sums);
+        multiply(ds, of.q_rows, dk_sums);
+      }
+    }
+    for (int64_t j = 0; j < count; ++j)
+      for (int c = 0; c < width; ++c) {
+        dk.data[(first + j) * dk.stride + c] = to_bf16(scale * dk_sums[j * columns + c]);
+        dv.data[(first + j) * dv.stride + c] = to_bf16(dv_sums[j * columns + c]);
+      }
+  }
+  products.done();
 }
 
 }  // namespace globalsplat::raster::GS_ISA

@@ -33,11 +33,15 @@ struct Kernels {
   KernelsOf<double> of_double;
   // attention.h
   void (*attend)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* room);
-  void (*pack_queries)(const AttentionHead<float>&, const AttentionPast&, const PackedQueries& to);
-  void (*attend_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk, Rows<float> dv,
-                          float* room);
+  void (*pack_queries)(const AttentionHead<float>&, const AttentionPast<float>&, const PackedQueries& to);
+  void (*attend_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk,
+                          Rows<float> dv, float* room);
   // attention_bf16.h
-  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* room);
+  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* log_sums, float* room);
+  void (*pack_queries_bf16)(const AttentionHead<Bf16>&, const AttentionPast<Bf16>&, const float* log_sums, int64_t first, int64_t whole,
+                            const PackedBf16Queries& to);
+  void (*attend_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
+                               Rows<Bf16> dv, float* room);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

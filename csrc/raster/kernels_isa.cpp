@@ -24,6 +24,8 @@ const Kernels table = {
     pack_queries,
     attend_backward,
     attend_bf16,
+    pack_queries_bf16,
+    attend_backward_bf16,
     multiply_adds,
 };
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 
 namespace globalsplat::raster {
 
@@ -14,8 +15,23 @@ struct Rows {
   Rows from(int64_t first) const { return {data + first * stride, stride}; }
 };
 
-// A bfloat16 number: the upper half of a float's bits.
+// A bfloat16 number: the upper half of a float's bits. What makes one of the other is compiled into its caller, whichever instruction
+// set that is for.
 using Bf16 = uint16_t;
+
+[[gnu::always_inline]] inline float to_float(Bf16 number) {
+  const uint32_t bits = uint32_t(number) << 16;
+  float exact;
+  std::memcpy(&exact, &bits, sizeof exact);
+  return exact;
+}
+
+// The nearest, ties to even.
+[[gnu::always_inline]] inline Bf16 to_bf16(float number) {
+  uint32_t bits;
+  std::memcpy(&bits, &number, sizeof bits);
+  return Bf16((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+}
 
 // One head's queries, keys and values, all `width` numbers wide.
 template <class Number>
@@ -36,14 +52,23 @@ struct Bf16Products {
 };
 
 // What came out, and the gradient of that.
+template <class Number>
 struct AttentionPast {
-  Rows<const float> out, slope;
+  Rows<const Number> out, slope;
 };
 
 // Of all queries of a head, side by side, whole_product_rows() of attention_columns() with zeros where there is nothing: themselves
 // times log₂e / √w, and the gradients of what came out. And of every query the sum of this times that.
 struct PackedQueries {
   float *q, *slope, *means;
+};
+
+// The same of bfloat16 numbers, whole_bf16_columns() of queries: themselves (not multiplied by anything) and the gradients, each in
+// both of the ways that products take their second matrix. As columns: in panels of kBf16Columns queries, [width / 2, kBf16Columns, 2]. As
+// rows: in panels of kBf16Columns numbers, [queries / 2, panel, 2].
+struct PackedBf16Queries {
+  Bf16 *q_columns, *slope_columns, *q_rows, *slope_rows;
+  float *log_sums, *means;
 };
 
 // Rows of a product whose sums are in registers at a time (product.h).
@@ -62,19 +87,23 @@ inline constexpr int64_t kAttentionQueries = 1032;
 // Of a block of keys, and backward of queries, too: what is packed of them, and summed up for them, stays in the second cache.
 inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 384, kBackwardQueries = 48;
 
-// The same of bfloat16 numbers, where rows of a block of queries have their scores side by side, and what is packed has panels of
-// columns.
-inline constexpr int64_t kBf16Rows = 32, kBf16Keys = 512, kBf16Columns = 64;
+// The same of bfloat16 numbers, and the columns of a panel of what is packed, be they queries or numbers of a row.
+inline constexpr int64_t kBf16Keys = 256, kBf16Columns = 64;
+inline constexpr int64_t kBf16BackwardKeys = 128, kBf16BackwardQueries = 128;
+inline constexpr int64_t whole_bf16_columns(int64_t count) { return (count + kBf16Columns - 1) / kBf16Columns * kBf16Columns; }
 
 // Numbers that a task works with.
 inline constexpr int64_t attention_room(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
 }
 inline constexpr int64_t attention_bf16_room(int width) {
-  return kAttentionQueries * (attention_columns(width) + 2) + kBf16Keys * attention_columns(width) + 2 * kBf16Rows * kBf16Keys + 64;
+  return kAttentionQueries * (3 * width / 2 + 2) + kBf16Keys * (3 * kBf16Columns + width) / 2 + 128;
 }
 inline constexpr int64_t attention_backward_room(int width) {
   return 5 * kBackwardKeys * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;
+}
+inline constexpr int64_t attention_bf16_backward_room(int width) {
+  return kBf16BackwardKeys * (5 * attention_columns(width) / 2 + 2 * kBf16Columns + 3 * kBf16BackwardQueries / 2) + 64;
 }
 
 }  // namespace globalsplat::raster

@@ -21,12 +21,10 @@ fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     if !all.iter().all(fits) {
         return by_libtorch(q, k, v, heads);
     }
-    let is_followed = all.iter().any(|t| t.requires_grad());
     match kind {
         Kind::Float if ours::attention_takes(width, false) => by_ours(all, heads),
-        // What only float32 has a way back for.
-        Kind::BFloat16 if !is_followed && ours::attention_takes(width, true) => by_ours(all, heads),
-        // Libtorch's kernel needs tiles to be fast.
+        Kind::BFloat16 if ours::attention_takes(width, true) => by_ours(all, heads),
+        // Without products of them: libtorch's kernel needs tiles to be fast.
         Kind::BFloat16 if bf16_of_cpu() != Bf16::Tiles && ours::attention_takes(width, false) => {
             by_ours(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
         }
@@ -105,30 +103,49 @@ mod tests {
             let numbers = Tensor::arange(2 * n * width, (Kind::Double, Device::Cpu)).square() + phase;
             (numbers.sin() * 1.5).to_kind(Kind::BFloat16).view([2, n, width])
         };
-        // A whole block of keys and a part; a head that products have to fill up; more than one panel of columns.
+        // What comes out of `attend`, and gradients.
+        let answers = |all: &[Tensor; 4], attend: &dyn Fn([&Tensor; 3]) -> Tensor| {
+            let [q, k, v, slope] = all;
+            let leaves = [q, k, v].map(|t| t.detach().set_requires_grad(true));
+            let seen = attend(leaves.each_ref());
+            (&seen * slope).sum(Kind::Float).backward();
+            std::iter::once(seen.detach()).chain(leaves.iter().map(Tensor::grad)).collect::<Vec<_>>()
+        };
+        // Whole blocks of keys and queries, and parts; a head that products have to fill up; more than one panel of columns.
         for (queries, keys, heads, width) in
-            [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128)]
+            [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128), (200, 131, 1, 72)]
         {
             if !ours::attention_takes(width, true) {
                 return println!("left out: this processor has no products of bfloat16 numbers");
             }
-            let all =
-                [of(queries, heads * width, 0.), of(keys, heads * width, 1.), of(keys, heads * width, 2.)];
-            let seen = no_grad(|| attention(&all[0], &all[1], &all[2], heads));
-            assert_eq!((seen.kind(), seen.size()), (Kind::BFloat16, all[0].size()));
-            let [q, k, v] = all.each_ref().map(|t| t.to_kind(Kind::Double));
-            let exact = by_libtorch(&q, &k, &v, heads);
-            let error = ((&seen - &exact).norm() / exact.norm()).double_value(&[]);
-            // What comes out is rounded to 8 bits, and so are the weights of values.
-            assert!(error < 4e-3, "{queries} queries, {keys} keys, {heads} heads of {width}: {error:.1e}");
-            set_threads(1);
-            let alone = no_grad(|| attention(&all[0], &all[1], &all[2], heads));
-            set_threads(0);
-            assert!(alone.equal(&seen), "threads change what is seen");
+            let rows = [(queries, 0.), (keys, 1.), (keys, 2.), (queries, 3.)];
+            let all = rows.map(|(count, phase)| of(count, heads * width, phase));
+            let found = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
+            assert_eq!((found[0].kind(), found[0].size()), (Kind::BFloat16, all[0].size()));
+            let exact = answers(&all.each_ref().map(|t| t.to_kind(Kind::Double)), &|[q, k, v]| {
+                by_libtorch(q, k, v, heads)
+            });
+            for (name, (found, exact)) in ["seen", "dq", "dk", "dv"].iter().zip(found.iter().zip(&exact)) {
+                // Of one key, scores have no gradients.
+                let size = exact.norm().double_value(&[]).max(1e-3);
+                let error = (found - exact).norm().double_value(&[]) / size;
+                // What comes out is rounded to 8 bits, and so are weights and gradients of scores.
+                assert!(
+                    error < 5e-3,
+                    "{name}, {queries} queries, {keys} keys, {heads} heads of {width}: {error:.1e}"
+                );
+            }
+            let same = |others: Vec<Tensor>| found.iter().zip(&others).all(|(a, b)| a.equal(b));
+            for threads in [1, 3] {
+                set_threads(threads);
+                let alone = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
+                set_threads(0);
+                assert!(same(alone), "{threads} threads change what is seen");
+            }
             // Rows that lie apart, as parts of what one layer gave.
-            let apart = all.each_ref().map(|t| Tensor::cat(&[t, t, t], -1).chunk(3, -1).swap_remove(1));
-            let same = no_grad(|| attention(&apart[0], &apart[1], &apart[2], heads));
-            assert!(same.equal(&seen), "strides change what is seen");
+            let apart = |t: &Tensor| Tensor::cat(&[t, t, t], -1).chunk(3, -1).swap_remove(1);
+            let strided = answers(&all, &|[q, k, v]| attention(&apart(q), &apart(k), &apart(v), heads));
+            assert!(same(strided), "strides change what is seen");
         }
     }
 

@@ -62,20 +62,23 @@ impl Precision {
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let out = xs.linear(weights, bias);
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
-    does(flops, owed(flops, xs, weights), &[xs, weights, &out]);
+    does(flops, owed(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
 }
 
-/// Of `flops` that multiply both with each other: as many for the gradient of each.
-fn owed(flops: i64, a: &Tensor, b: &Tensor) -> i64 {
-    flops * (i64::from(a.requires_grad()) + i64::from(b.requires_grad()))
+/// Of `flops` that multiply both with each other: as many for the gradient of each, if that of what came `out` is followed.
+fn owed(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
+    match out.requires_grad() {
+        true => flops * both.iter().filter(|t| t.requires_grad()).count() as i64,
+        false => 0,
+    }
 }
 
 /// ReLU of what `layer` makes of images, [B, C, H, W].
 pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     let out = layer.forward(images).relu_();
     let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
-    does(flops, owed(flops, images, &layer.ws), &[images, &layer.ws, &out]);
+    does(flops, owed(flops, [images, &layer.ws], &out), &[images, &layer.ws, &out]);
     out
 }
 

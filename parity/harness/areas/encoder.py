@@ -77,8 +77,9 @@ def attention_large(rng):
 @case
 def attention_bf16(rng):
     """Of bfloat16 numbers, which the reference takes as they are and computes with as exactly as ever. Keys are taken 512 at a time,
-    queries 32, and columns in panels of 64."""
-    tolerance = Tolerance(4e-3, 1.0, why="what comes out has 8 bits, and so have the weights that values are multiplied by")
+    queries 32, and columns in panels of 64; backward, both 128 at a time."""
+    why = "what comes out has 8 bits, and so have the weights that values are multiplied by, and gradients of scores"
+    tolerance = Tolerance(4e-3, 5e-3, why=why)
     for batch, queries, keys, heads, width in [
         (1, 1, 1, 1, 8),
         (2, 33, 65, 3, 16),
@@ -90,7 +91,7 @@ def attention_bf16(rng):
         for numbers in inputs.values():
             # The upper half of a number's bits, cut.
             numbers.view(np.uint32)[...] &= 0xFFFF0000
-        yield replace(attention_draw(inputs, heads, tolerance=tolerance), config={"heads": heads, "bf16": True}, differentiate=())
+        yield replace(attention_draw(inputs, heads, tolerance=tolerance), config={"heads": heads, "bf16": True})
 
 
 @twin("attention")
