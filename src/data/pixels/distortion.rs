@@ -89,41 +89,73 @@ impl Distortion {
             return photo;
         }
         let Intrinsics { fx, fy, cx, cy } = *intrinsics;
-        let mut removed = RgbImage::new(photo.width(), photo.height());
+        let (width, height) = photo.dimensions();
+        let across: Vec<f64> = (0..width).map(|j| (f64::from(j) + 0.5 - cx) / fx).collect();
+        let mut seen = vec![(0., 0.); across.len()];
+        let source = Source::of(photo);
+        let mut removed = RgbImage::new(width, height);
         for (i, row) in removed.rows_mut().enumerate() {
             let y = (i as f64 + 0.5 - cy) / fy;
-            for (j, pixel) in row.enumerate() {
-                let (x, y) = self.apply((j as f64 + 0.5 - cx) / fx, y);
-                *pixel = interpolate(&photo, fx * x + cx, fy * y + cy);
+            // By itself, as processors do it for several pixels at a time.
+            for (seen, x) in seen.iter_mut().zip(&across) {
+                let (x, y) = self.apply(*x, y);
+                *seen = (fx * x + cx, fy * y + cy);
+            }
+            for (pixel, (u, v)) in row.zip(&seen) {
+                *pixel = source.interpolate(*u, *v);
             }
         }
         removed
     }
 }
 
-/// The colour at (u, v), in pixels from the image's corner.
-#[inline]
-fn interpolate(image: &RgbImage, u: f64, v: f64) -> Rgb<u8> {
-    let along = |position: f64, size: u32| {
-        let position = (position - 0.5).max(0.).min(f64::from(size - 1));
-        // Processors convert to signed numbers of 32 bits the fastest.
-        let first = position as i32;
-        (first as usize, (first as usize + 1).min(size as usize - 1), position - f64::from(first))
-    };
-    let (left, right, s) = along(u, image.width());
-    let (top, bottom, t) = along(v, image.height());
-    let row = 3 * image.width() as usize;
-    let at = |x: usize, y: usize| -> [u8; 3] {
-        let first = y * row + 3 * x;
-        image.as_raw()[first..first + 3].try_into().expect("three numbers")
-    };
-    let [a, b, c, d] = [at(left, top), at(right, top), at(left, bottom), at(right, bottom)];
-    Rgb(std::array::from_fn(|k| {
-        let [a, b, c, d] = [a[k], b[k], c[k], d[k]].map(f64::from);
-        let (above, below) = (a + s * (b - a), c + s * (d - c));
-        // To the nearest, as none is below 0.
-        (above + t * (below - above) + 0.5) as i32 as u8
-    }))
+/// A photo that colours are read from between its pixels.
+struct Source {
+    /// And a byte more, that four can be read where the last pixel begins.
+    bytes: Vec<u8>,
+    width: u32,
+    height: u32,
+}
+
+impl Source {
+    fn of(photo: RgbImage) -> Source {
+        let (width, height) = photo.dimensions();
+        let mut bytes = photo.into_raw();
+        bytes.push(0);
+        Source { bytes, width, height }
+    }
+
+    /// The colour at (u, v), in pixels from the image's corner, to the nearest of 256 levels.
+    #[inline]
+    fn interpolate(&self, u: f64, v: f64) -> Rgb<u8> {
+        /// 2²³: a float32 number this large has no fraction, and what is below 256 in its lowest bits.
+        const WHOLE: f32 = 8_388_608.;
+        let along = |position: f64, size: u32| {
+            let position = (position - 0.5).max(0.).min(f64::from(size - 1));
+            // Processors convert to signed numbers of 32 bits the fastest.
+            let first = position as i32;
+            (
+                first as usize,
+                (first as usize + 1).min(size as usize - 1),
+                (position - f64::from(first)) as f32,
+            )
+        };
+        let (left, right, s) = along(u, self.width);
+        let (top, bottom, t) = along(v, self.height);
+        // Four bytes for three, which are a vector.
+        let at = |x: usize, y: usize| -> [f32; 4] {
+            let first = 3 * (y * self.width as usize + x);
+            let bytes: [u8; 4] = self.bytes[first..first + 4].try_into().expect("four numbers");
+            bytes.map(f32::from)
+        };
+        let between = |a: [f32; 4], b: [f32; 4], s: f32| -> [f32; 4] {
+            std::array::from_fn(|k| a[k] + s * (b[k] - a[k]))
+        };
+        let (above, below) =
+            (between(at(left, top), at(right, top), s), between(at(left, bottom), at(right, bottom), s));
+        let [red, green, blue, _] = between(above, below, t).map(|level| (level + WHOLE).to_bits() as u8);
+        Rgb([red, green, blue])
+    }
 }
 
 #[cfg(test)]
@@ -189,6 +221,31 @@ mod tests {
         // So little that it goes through the interpolation and changes nothing that is visible.
         let tiny = Distortion { radial: [1e-12, 0., 0., 0.], tangential: [0.; 2] };
         assert_eq!(tiny.remove(photo.clone(), &INTRINSICS), photo);
+    }
+
+    /// By the formulas of [`Distortion::remove`] in float64.
+    #[test]
+    fn colours_are_between_their_neighbours() {
+        let photo = RgbImage::from_fn(64, 48, |x, y| {
+            let level = |k: u32| ((x * 7919 + y * 104_729 + k * 31).wrapping_mul(2_654_435_761) >> 24) as u8;
+            Rgb([level(1), level(2), level(3)])
+        });
+        let removed = LENS.remove(photo.clone(), &INTRINSICS);
+        let level = |x: f64, y: f64, k: usize| f64::from(photo.get_pixel(x as u32, y as u32)[k]);
+        for (j, i, found) in removed.enumerate_pixels() {
+            let (x, y) = (f64::from(j) + 0.5 - INTRINSICS.cx, f64::from(i) + 0.5 - INTRINSICS.cy);
+            let (x, y) = LENS.apply(x / INTRINSICS.fx, y / INTRINSICS.fy);
+            let u = (INTRINSICS.fx * x + INTRINSICS.cx - 0.5).clamp(0., 63.);
+            let v = (INTRINSICS.fy * y + INTRINSICS.cy - 0.5).clamp(0., 47.);
+            let (s, t, right, below) = (u.fract(), v.fract(), (u + 1.).min(63.), (v + 1.).min(47.));
+            for k in 0..3 {
+                let top = level(u, v, k) * (1. - s) + level(right, v, k) * s;
+                let bottom = level(u, below, k) * (1. - s) + level(right, below, k) * s;
+                let exact = top * (1. - t) + bottom * t;
+                // The nearest level, but for float32's last digits.
+                assert!((f64::from(found[k]) - exact).abs() < 0.5001, "{found:?} for {exact} at ({j}, {i})");
+            }
+        }
     }
 
     #[test]
