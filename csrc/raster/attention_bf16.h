@@ -126,7 +126,7 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
         for (int n = 0; n < vectors; ++n) {
           const auto round = [&](int64_t j) {
             if (j >= count) return Bits{};
-            const V weight = power_of_two(fma(load<float>(scores + j * kBf16Columns + n * lanes), factor, shift[n]));
+            const V weight = power_of_two(add_product(load<float>(scores + j * kBf16Columns + n * lanes), factor, shift[n]));
             sum[n] = sum[n] + weight;
             return rounded(weight);
           };
@@ -137,7 +137,7 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
         float *const before = most + panel + n * lanes, *const weight = weights + panel + n * lanes;
         const V smaller = power_of_two((load<float>(before) - now[n]) * factor);
         store<float>(before, now[n]);
-        store<float>(weight, fma(load<float>(weight), smaller, sum[n]));
+        store<float>(weight, add_product(load<float>(weight), smaller, sum[n]));
         for (int64_t at = n * lanes; first > 0 && at < width * kBf16Columns; at += kBf16Columns)
           store<float>(values + at, load<float>(values + at) * smaller);
       }
@@ -222,7 +222,7 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
             const auto round = [&](int64_t j) {
               if (j >= count) return Bits{};
               const int64_t at = j * kBf16Columns + c, to = j * kBf16BackwardQueries + i + c;
-              const V weight = power_of_two(fma(load<float>(scores + at), factor, -shift));
+              const V weight = power_of_two(add_product(load<float>(scores + at), factor, -shift));
               const Bits slope = rounded(weight * (load<float>(dp + at) - mean));
               store_bf16(p + to, rounded(weight));
               store_bf16(ds + to, slope);

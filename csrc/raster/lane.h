@@ -37,6 +37,8 @@ GS_INLINE void store(T* to, T v) {
 
 GS_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 GS_INLINE float fnma(float a, float b, float c) { return ::fmaf(-a, b, c); }
+GS_INLINE float add_product(float a, float b, float c) { return fma(a, b, c); }
+GS_INLINE float take_product(float a, float b, float c) { return fnma(a, b, c); }
 GS_INLINE float sqrt(float v) { return ::sqrtf(v); }
 GS_INLINE float reciprocal(float v) { return 1.0f / v; }
 

@@ -99,7 +99,7 @@ GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vecto
                                             const Vector<T> g_colour[3], Vector<T> g_alpha, Vector<T> g_depth) {
   const Vector<T> per_z = select(less(broadcast<T>(T(kMinDepthAlpha)), alpha), g_depth / alpha, Vector<T>{});
   Vector<T> total = g_alpha * alpha;
-  for (int channel = 0; channel < 3; ++channel) total = fma(g_colour[channel], colour[channel], total);
+  for (int channel = 0; channel < 3; ++channel) total = add_product(g_colour[channel], colour[channel], total);
   return {transmittance, total, g_colour[0], g_colour[1], g_colour[2], per_z, g_alpha - per_z * depth};
 }
 
@@ -110,11 +110,11 @@ GS_INLINE void pass(const Splat<T>& s, const Exponent<T>& e, PixelGradients<T>& 
   Contribution<T> c;
   static_cast<Exponent<T>&>(c) = e;
   blend(px.transmittance, c);
-  V q = fma(px.g_red, broadcast<T>(s.red), px.constant);
-  q = fma(px.g_green, broadcast<T>(s.green), q);
-  q = fma(px.g_blue, broadcast<T>(s.blue), q);
-  q = fma(px.per_z, broadcast<T>(s.z), q);
-  px.remaining = fnma(c.weight, q, px.remaining);
+  V q = add_product(px.g_red, broadcast<T>(s.red), px.constant);
+  q = add_product(px.g_green, broadcast<T>(s.green), q);
+  q = add_product(px.g_blue, broadcast<T>(s.blue), q);
+  q = add_product(px.per_z, broadcast<T>(s.z), q);
+  px.remaining = take_product(c.weight, q, px.remaining);
 
   // ν = −α ∂L/∂α, nothing through the cap.
   const Mask<T> follows = both(c.goes_on, less(c.raw, broadcast<T>(T(kMaxAlpha))));
@@ -123,13 +123,13 @@ GS_INLINE void pass(const Splat<T>& s, const Exponent<T>& e, PixelGradients<T>& 
   sums[0] += nu;
   sums[1] += nu_p;
   sums[2] += nu_r;
-  sums[3] = fma(nu_p, c.p, sums[3]);
-  sums[4] = fma(nu_p, c.r, sums[4]);
-  sums[5] = fma(nu_r, c.r, sums[5]);
-  sums[6] = fma(c.weight, px.g_red, sums[6]);
-  sums[7] = fma(c.weight, px.g_green, sums[7]);
-  sums[8] = fma(c.weight, px.g_blue, sums[8]);
-  sums[9] = fma(c.weight, px.per_z, sums[9]);
+  sums[3] = add_product(nu_p, c.p, sums[3]);
+  sums[4] = add_product(nu_p, c.r, sums[4]);
+  sums[5] = add_product(nu_r, c.r, sums[5]);
+  sums[6] = add_product(c.weight, px.g_red, sums[6]);
+  sums[7] = add_product(c.weight, px.g_green, sums[7]);
+  sums[8] = add_product(c.weight, px.g_blue, sums[8]);
+  sums[9] = add_product(c.weight, px.per_z, sums[9]);
 
   px.transmittance = next_transmittance(c);
 }

@@ -50,7 +50,7 @@ GS_INLINE void multiply_panel(Factor a, const float* b, int64_t b_row, int64_t d
     for (int r = 0; r < kProductRows; ++r) {
       const V number = broadcast<float>(a.data[r * a.row + k * a.step]);
 #pragma GCC unroll 4
-      for (int c = 0; c < vectors; ++c) sum[r][c] = fma(number, row[c], sum[r][c]);
+      for (int c = 0; c < vectors; ++c) sum[r][c] = add_product(number, row[c], sum[r][c]);
     }
   }
 #pragma GCC unroll 8

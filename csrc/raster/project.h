@@ -249,8 +249,8 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
     d_basis[k] = zero;
     for (int channel = 0; channel < 3; ++channel) {
       V& sum = out.sh[3 * k + channel];
-      sum = fma(s.basis[k], d_colour[channel], sum);
-      d_basis[k] = fma(g.sh[3 * k + channel], d_colour[channel], d_basis[k]);
+      sum = add_product(s.basis[k], d_colour[channel], sum);
+      d_basis[k] = add_product(g.sh[3 * k + channel], d_colour[channel], d_basis[k]);
     }
   }
   sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);

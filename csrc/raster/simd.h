@@ -151,6 +151,19 @@ GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> 
 GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return c - a * b; }
 #endif
 
+// The same, where no decision and no picture hangs on the last bit: rounded twice where fusing would have to be emulated.
+#if defined(__AVX2__) || defined(__AVX512F__) || defined(__aarch64__)
+template <class V>
+GS_INLINE V add_product(V a, V b, V c) { return fma(a, b, c); }
+template <class V>
+GS_INLINE V take_product(V a, V b, V c) { return fnma(a, b, c); }
+#else
+template <class V>
+GS_INLINE V add_product(V a, V b, V c) { return c + a * b; }
+template <class V>
+GS_INLINE V take_product(V a, V b, V c) { return c - a * b; }
+#endif
+
 // Comparisons are false where an operand is NaN.
 #if defined(__AVX512F__)
 GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
@@ -274,7 +287,8 @@ GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
 // 2^x where `m` holds, for x ≥ −126, and 0 elsewhere. x = n + f with |f| ≤ ½, and a polynomial
 // of degree 6: with its rounding, the relative error is below 1.2e-7. Its terms are
 // paired (Estrin), because it is waiting for one after the other that costs. All machines give the same bits.
-GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
+template <class Fuse>
+GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x, const Fuse& fuse) {
   using V = Vector<float>;
 #if defined(__AVX512F__)
   const V n = _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
@@ -284,8 +298,8 @@ GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
   const V n = shifted - magic;
 #endif
   const V f = x - n, f2 = f * f;
-  const auto line = [&](int k) { return fma(broadcast<float>(kExp2[k + 1]), f, broadcast<float>(kExp2[k])); };
-  const V p = fma(fma(fma(broadcast<float>(kExp2[6]), f2, line(4)), f2, line(2)), f2, line(0));
+  const auto line = [&](int k) { return fuse(broadcast<float>(kExp2[k + 1]), f, broadcast<float>(kExp2[k])); };
+  const V p = fuse(fuse(fuse(broadcast<float>(kExp2[6]), f2, line(4)), f2, line(2)), f2, line(0));
 #if defined(__AVX512F__)
   return _mm512_maskz_scalef_ps(m, p, n);  // other lanes may be small enough to stumble over
 #else
@@ -293,6 +307,15 @@ GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
   typedef uint32_t Unsigned __attribute__((vector_size(kVectorBytes)));
   return select(m, (V)((Unsigned)p + ((Unsigned)shifted << 23)), V{});
 #endif
+}
+
+GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
+  return exp2_where(m, x, [](auto a, auto b, auto c) { return fma(a, b, c); });
+}
+
+// The same where no decision hangs on the last bit.
+GS_INLINE Vector<float> exp2_nearly_where(Mask<float> m, Vector<float> x) {
+  return exp2_where(m, x, [](auto a, auto b, auto c) { return add_product(a, b, c); });
 }
 
 // float64 exists to prove gradients, so it takes the library's exponential.

@@ -35,9 +35,9 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
         const V wa = w * a, wb = w * b;
         m = m + wa;
         n = n + wb;
-        p = fma(wa, a, p);
-        q = fma(wb, b, q);
-        r = fma(wa, b, r);
+        p = add_product(wa, a, p);
+        q = add_product(wb, b, q);
+        r = add_product(wa, b, r);
       }
       const V means[] = {m, n, p, q, r};
       for (int j = 0; j < 5; ++j) store<T>(room + j * stride + i, means[j]);
@@ -47,10 +47,10 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
       V means[5] = {};
       for (int k = 0; k < kWindow; ++k)
         for (int j = 0; j < 5; ++j)
-          means[j] = fma(broadcast<T>(plane.weights[k]), load<T>(room + j * stride + i + k), means[j]);
-      const V m = means[0], n = means[1], squares = fma(m, m, n * n);
-      const V like = fma(m + m, n, c1), varied = fma(s + s, fnma(m, n, means[4]), c2);
-      const V bright = squares + c1, variance = fma(s, means[2] + means[3] - squares, c2);
+          means[j] = add_product(broadcast<T>(plane.weights[k]), load<T>(room + j * stride + i + k), means[j]);
+      const V m = means[0], n = means[1], squares = add_product(m, m, n * n);
+      const V like = add_product(m + m, n, c1), varied = add_product(s + s, take_product(m, n, means[4]), c2);
+      const V bright = squares + c1, variance = add_product(s, means[2] + means[3] - squares, c2);
       const V inverse = broadcast<T>(1) / (bright * variance);
       const V similarity = like * varied * inverse;
       const int left = windows - i;
@@ -87,7 +87,7 @@ double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, 
       V slopes[3] = {};
       for (int at = first; at <= stop; ++at)
         for (int j = 0; j < 3; ++j)
-          slopes[j] = fma(broadcast<T>(plane.weights[row - at]),
+          slopes[j] = add_product(broadcast<T>(plane.weights[row - at]),
                           load_some<T>(plane.slopes + j * count + int64_t(at) * windows + i, windows - i), slopes[j]);
       for (int j = 0; j < 3; ++j) store<T>(room + j * stride + kWindow - 1 + i, slopes[j]);
     }
@@ -102,8 +102,8 @@ double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, 
         V slopes[3] = {};
         for (int k = 0; k < kWindow; ++k)
           for (int j = 0; j < 3; ++j)
-            slopes[j] = fma(broadcast<T>(plane.weights[k]), load<T>(room + j * stride + i + k), slopes[j]);
-        gradient = fma(broadcast<T>(similar), fma(x + x, slopes[1], fma(y, slopes[2], slopes[0])), gradient);
+            slopes[j] = add_product(broadcast<T>(plane.weights[k]), load<T>(room + j * stride + i + k), slopes[j]);
+        gradient = add_product(broadcast<T>(similar), add_product(x + x, slopes[1], add_product(y, slopes[2], slopes[0])), gradient);
       }
       sum = sum + larger(d, -d);
       if (plane.gradient != nullptr) store_some<T>(plane.gradient + at, gradient, left);
