@@ -43,7 +43,6 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        memory::keep();
         let (group, device) = ranks::join(&self.device)?;
         let is_first = group.is_first();
         let mut config = read_config(self.config.as_deref(), &self.set)?;
@@ -51,6 +50,7 @@ impl Train {
             return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
         }
         config.train.batch = self.batch.into();
+        memory::keep_for(&config.train);
         let report = bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?;
         if !is_first {
             return Ok(());

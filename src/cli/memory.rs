@@ -1,6 +1,7 @@
 //! Memory that the system refuses, as under `ulimit -v`: one sentence and exit code 1, as for all work that fails.
 
 use super::FAILED;
+use globalsplat::config::TrainConfig;
 use std::alloc::{GlobalAlloc, Layout, System};
 
 /// Ends the process where no memory is to be had: Rust's own answer is to abort, with a core dump. Files are written so that
@@ -66,9 +67,13 @@ pub fn end_as_failed() {
     grow_stack();
 }
 
-/// Keeps what tensors give back, for work that asks for the same again and again: a training step's activations are gigabytes, and
-/// the system zeroes every page that it hands out, which is up to a sixth of the step. glibc alone gives large tensors' memory back.
-pub fn keep() {
+/// Keeps what tensors give back, as training asks for the same again and again: a step's activations are gigabytes, and the system
+/// zeroes every page that it hands out, which is up to a sixth of the step. glibc alone gives large tensors' memory back. It takes a
+/// tenth more, and with rounds computed again a third: who asks for these, to save memory, does without it.
+pub fn keep_for(training: &TrainConfig) {
+    if training.checkpoint_rounds {
+        return;
+    }
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     // SAFETY: sets numbers of the allocator.
     unsafe {

@@ -57,10 +57,10 @@ pub struct Train {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        memory::keep();
         let (group, device) = ranks::join(&self.device)?;
         let (is_first, count) = (group.is_first(), group.ranks());
         let config = Config::read(&self.config, &self.set)?;
+        memory::keep_for(&config.train);
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,
             "never" => Resume::Never,
