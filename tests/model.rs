@@ -248,3 +248,15 @@ fn configurations_that_do_not_fit_are_refused() {
     }
     assert!(small().check_image(20, 16).unwrap_err().to_string().contains("height is 20"));
 }
+
+#[test]
+fn a_memory_that_nobody_follows_is_kept_as_products_take_it() {
+    let (_vs, mut model) = build(&small());
+    model.set_precision(Precision::Bf16);
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let followed = model.memory(&images, &c2w, &intrinsics);
+    assert!(followed.requires_grad() && followed.kind() == Kind::Float);
+    let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics));
+    assert!(!kept.requires_grad() && kept.kind() == Kind::BFloat16);
+    assert!(kept.equal(&followed.to_kind(Kind::BFloat16)));
+}

@@ -6,7 +6,7 @@ use super::mixer::Mixer;
 use super::parts::part;
 use super::precision::Precision;
 use super::stream::{REGISTERS, StreamRound, normalized};
-use tch::{Tensor, nn};
+use tch::{Kind, Tensor, nn};
 
 /// Query tokens before the scene tokens; not decoded.
 const AUXILIARIES: i64 = 4;
@@ -96,7 +96,8 @@ impl Encoder {
 
     /// Whether gradients will come back to its weights from what is computed now.
     pub(super) fn is_followed(&self) -> bool {
-        self.memory_registers.alias().requires_grad()
+        // A view would say what its base does, even where gradients are off.
+        self.memory_registers.sum(Kind::Float).requires_grad()
     }
 
     /// What all rounds read, [B, 4 + V·P, token width]: learned tokens, then those of images, of which `views` gives as many at a
@@ -105,7 +106,7 @@ impl Encoder {
         let mut views = views.into_iter().peekable();
         let [batch, width] = views.peek().map(|t| [t.size()[0], t.size()[2]]).expect("a view");
         let registers = self.memory_registers.expand([batch, -1, -1], false);
-        if registers.requires_grad() {
+        if self.is_followed() {
             // Every round's gradient comes back, and is added up in float32.
             return normalized(&Tensor::cat(&std::iter::once(registers).chain(views).collect::<Vec<_>>(), 1));
         }
