@@ -12,7 +12,7 @@ inline constexpr int kTileWarps = kTileThreads / kWarp;
 inline constexpr int kBatch = kWarp;  // entries that are taken at a time
 static_assert(sizeof(Splat<float>) == 64 && kTileThreads * 2 == kBatch * 16, "a batch's splats are two numbers a thread");
 
-using Exponent = raster::lane::Exponent<float>;
+using Evaluated = raster::lane::Evaluated<float>;
 
 // Bits of TileEntry::blocks that are this warp's: warps go by rows, two in each.
 inline uint32_t own_blocks() { return 3u << (2 * warp()); }
@@ -30,8 +30,8 @@ struct Pixel {
     inside = x < grid.width && y < grid.height;
     place = int64_t(y) * grid.width + x;
   }
-  Exponent evaluate(const Splat<float>& splat) const {
-    Exponent e;
+  Evaluated evaluate(const Splat<float>& splat) const {
+    Evaluated e;
     raster::lane::evaluate(splat, float(x) + 0.5f, float(y) + 0.5f, e);
     return e;
   }
@@ -63,12 +63,8 @@ __global__ void __launch_bounds__(kTileThreads)
     const unsigned reaching = __ballot_sync(kAll, reaches);
     if (reaches) batch[__popc(reaching & before())] = splats[entries[at].splat];
     __syncwarp();
-    for (int k = 0; k < __popc(reaching); ++k) {
-      raster::lane::Contribution<float> c;
-      static_cast<Exponent&>(c) = pixel.evaluate(batch[k]);
-      raster::lane::blend(sums.transmittance, c);
-      raster::lane::add(batch[k], c, sums);
-    }
+    for (int k = 0; k < __popc(reaching); ++k)
+      raster::lane::add(batch[k], raster::lane::blend<float>(sums.transmittance, pixel.evaluate(batch[k]).raw), sums);
     __syncwarp();
   }
   if (!pixel.inside) return;
@@ -122,7 +118,7 @@ __global__ void __launch_bounds__(kTileThreads)
     unsigned has_sums = 0;
     for (unsigned left = __ballot_sync(kAll, goes_on && own != 0); left != 0; left &= left - 1) {
       const int item = __ffs(int(left)) - 1;
-      const Exponent e = pixel.evaluate(batch[item]);
+      const Evaluated e = pixel.evaluate(batch[item]);
       // What reaches a block may miss all of its pixels that go on.
       if (!__any_sync(kAll, e.raw > 0 && state.transmittance > 0)) continue;
       float sums[kNumbers] = {};

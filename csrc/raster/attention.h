@@ -15,7 +15,7 @@ namespace globalsplat::raster::GS_ISA {
 
 // 2^x; what is below the least number is 0, and NaN is NaN.
 GS_INLINE Vector<float> power_of_two(Vector<float> x) {
-  return exp2_nearly_where(Mask<float>(~less(x, broadcast<float>(-126))), x);
+  return exp2_where(Mask<float>(~less(x, broadcast<float>(-126))), x);
 }
 
 // What is left of a task's room.

@@ -7,8 +7,6 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-typedef uint32_t Bits __attribute__((vector_size(kVectorBytes)));
-
 // The nearest bfloat16 number, ties to even, in the upper half; anything in the lower one.
 GS_INLINE Bits rounded(Vector<float> v) {
   const Bits bits = (Bits)v;

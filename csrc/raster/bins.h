@@ -25,11 +25,12 @@ struct Buffer {
 
 // Distributes the items of several lists among buckets, each list by itself, keeping the order within a bucket. A list is
 // taken in `chunks` consecutive parts, which are counted and placed side by side.
-//   each(list, chunk, visit)   calls visit(bucket, item) for the chunk's items in order; is called twice, with the same result
+//   count(list, chunk, visit)  calls visit(bucket) for the chunk's items, in any order
+//   each(list, chunk, visit)   calls visit(bucket, item) for them in order
 //   place(list, at, item)      puts the item at its place in the sorted list
 // Returns for every list where its buckets start, one more than there are buckets.
-template <class Each, class Place>
-std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chunks, int64_t buckets,
+template <class Count, class Each, class Place>
+std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chunks, int64_t buckets, const Count& count,
                                          const Each& each, const Place& place) {
   std::vector<Buffer<uint32_t>> starts(lists), next(lists);
   for (int64_t list = 0; list < lists; ++list) {
@@ -40,7 +41,7 @@ std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chu
     const int64_t list = task / chunks, chunk = task % chunks;
     uint32_t* counts = next[size_t(list)].data.get() + chunk * buckets;
     std::memset(counts, 0, size_t(buckets) * sizeof(uint32_t));
-    each(list, chunk, [&](int64_t bucket, const auto&) { ++counts[bucket]; });
+    count(list, chunk, [&](int64_t bucket) { ++counts[bucket]; });
   });
   parallel_for(threads, lists, [&](int64_t list) {
     Buffer<uint32_t>&start = starts[size_t(list)], &at = next[size_t(list)];
@@ -77,14 +78,18 @@ void sort_by_depth(int threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_
   std::vector<Buffer<DepthItem<T>>> sorted(lists.size());
   for (size_t i = 0; i < lists.size(); ++i) sorted[i] = Buffer<DepthItem<T>>(lists[i].size);
   for (int shift = 0; shift < int(8 * sizeof(T)); shift += kBits) {
+    const auto each = [&](int64_t list, int64_t chunk, const auto& visit) {
+      const Buffer<DepthItem<T>>& items = lists[size_t(list)];
+      const size_t begin = items.size * size_t(chunk) / size_t(chunks);
+      const size_t end = items.size * size_t(chunk + 1) / size_t(chunks);
+      for (size_t i = begin; i < end; ++i) visit(int64_t(items[i].key >> shift) & ((1 << kBits) - 1), items[i]);
+    };
     distribute(
         threads, int64_t(lists.size()), chunks, int64_t(1) << kBits,
         [&](int64_t list, int64_t chunk, const auto& visit) {
-          const Buffer<DepthItem<T>>& items = lists[size_t(list)];
-          const size_t begin = items.size * size_t(chunk) / size_t(chunks);
-          const size_t end = items.size * size_t(chunk + 1) / size_t(chunks);
-          for (size_t i = begin; i < end; ++i) visit(int64_t(items[i].key >> shift) & ((1 << kBits) - 1), items[i]);
+          each(list, chunk, [&](int64_t bucket, const auto&) { visit(bucket); });
         },
+        each,
         [&](int64_t list, uint32_t at, const DepthItem<T>& item) { sorted[size_t(list)][at] = item; });
     lists.swap(sorted);
   }

@@ -28,13 +28,17 @@ struct Centres {
 template <class T>
 inline constexpr Centres<T> kCentres{};
 
-// A tile's splats lie scattered in memory, and waiting for each costs more than blending it: they are asked for this many
-// items ahead.
+// A tile's splats lie scattered in memory, as do their records, and waiting for each costs more than blending it: they are asked
+// for this many items ahead.
 inline constexpr int64_t kPrefetch = 12;
 
 template <class T>
-GS_INLINE void prefetch_splat(const TileJob<T>& job, int64_t item) {
-  if (item < job.count) __builtin_prefetch(job.splats + job.entries[item].splat);
+GS_INLINE void prefetch(const TileJob<T>& job, const SplatGradient<T>* records, int64_t item) {
+  if (item >= job.count) return;
+  __builtin_prefetch(job.splats + job.entries[item].splat);
+  const SplatGradient<T>* const record = records + job.entries[item].record;  // which may lie in two lines
+  __builtin_prefetch(&record->power, 1);
+  __builtin_prefetch(&record->z, 1);
 }
 
 // A block's pixels in an image plane, and which of them lie inside the image.
@@ -76,6 +80,40 @@ GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
   for (int k = 0; k < kVectors<T>; ++k) transmittance[k] = load<T>(ones + k * Simd<T>::lanes);
 }
 
+// Splats on their way to a vector of pixels, each a step behind the one before it. A splat's instructions wait for one another
+// several times as long as they take, and a processor looks only two or three splats ahead: here each step's operands have
+// been ready since the last splat.
+template <class T>
+class Approach {
+ public:
+  GS_INLINE Approach(Vector<T> x, Vector<T> y, const Splat<T>& first, const Splat<T>& second, const Splat<T>& third) : x_(x), y_(y) {
+    offset_ = offset_of(first, x, y);
+    step(first, second);
+    step(second, third);
+  }
+
+  // What evaluate() calls `raw`, of the first, the second … splat; `near` and `far` are those two and three behind it.
+  GS_INLINE Vector<T> next(const Splat<T>& near, const Splat<T>& far) {
+    const Vector<T> raw = end_exp2(reaches_, power_);
+    step(near, far);
+    return raw;
+  }
+
+ private:
+  GS_INLINE void step(const Splat<T>& near, const Splat<T>& far) {
+    reaches_ = reaches<T>(exponent_);
+    power_ = begin_exp2(exponent_);
+    exponent_ = exponent_of(near, offset_);
+    offset_ = offset_of(far, x_, y_);
+  }
+
+  Vector<T> x_, y_;
+  Offset<T> offset_;
+  Vector<T> exponent_{};
+  Mask<T> reaches_;
+  Exp2<T> power_;
+};
+
 // The tile's list is taken in parts whose splats fit the first-level cache; each vector of pixels goes through those that
 // reach its block with all its sums in registers.
 template <class T>
@@ -104,17 +142,17 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
     for (uint32_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
       const int length = choose(splats, blocks_of, count, block, list);
+      if (length == 0) continue;
+      for (int i = 0; i < 3; ++i) list[length + i] = splats[0];  // seen coming, but not blended
+      const auto splat = [&](int i) -> const Splat<T>& { return job.splats[list[i]]; };
       bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
         Pixels<T> px = pixels[block][k];
         const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
         const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
-        for (int i = 0; i < length; ++i) {
-          const Splat<T>& s = job.splats[list[i]];
-          Contribution<T> c;
-          contribute(s, x, y, px.transmittance, c);
-          add(s, c, px);
-        }
+        Approach<T> approach(x, y, splat(0), splat(1), splat(2));
+        for (int i = 0; i < length; ++i)
+          add(splat(i), blend<T>(px.transmittance, approach.next(splat(i + 2), splat(i + 3))), px);
         goes_on |= any(less(V{}, px.transmittance));
         pixels[block][k] = px;
       }
@@ -164,6 +202,15 @@ GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const Picture
   }
 }
 
+template <bool capped, class T>
+GS_INLINE void pass_blocks(const Splat<T>& s, uint32_t blocks, const Evaluated<T> (&evaluated)[kBlocks][kVectors<T>],
+                           PixelGradients<T> (&pixels)[kBlocks][kVectors<T>], Vector<T> (&sums)[kSplatGradientNumbers]) {
+  for (; blocks != 0; blocks &= blocks - 1) {
+    const int block = __builtin_ctz(blocks);
+    for (int k = 0; k < kVectors<T>; ++k) pass<T, capped>(s, evaluated[block][k], pixels[block][k], sums);
+  }
+}
+
 // `pictures` are the forward pass's own, `gradients` the loss's with respect to them; one record per entry is written.
 // Here splats are the outer loop, so that a splat's ten sums over the tile stay in registers.
 template <class T>
@@ -185,7 +232,7 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
   // Which blocks have pixels that go on is asked once in a while: an answer after every splat would make the next one wait.
   constexpr int64_t while_items = 32;
   uint32_t alive = 0;
-  Exponent<T> exponents[kBlocks][kVectors<T>];
+  Evaluated<T> evaluated[kBlocks][kVectors<T>];
   for (int64_t item = 0; item < job.count; ++item) {
     if (item % while_items == 0) {
       alive = 0;
@@ -194,18 +241,18 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
           alive |= uint32_t(any(less(V{}, pixels[block][k].transmittance))) << block;
     }
     const TileEntry& entry = job.entries[item];
-    prefetch_splat(job, item + kPrefetch);
+    prefetch(job, records, item + kPrefetch);
     const Splat<T>& s = job.splats[entry.splat];
     V sums[kSplatGradientNumbers] = {};
     const uint32_t reached = entry.blocks & alive;
     for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
-      for (int k = 0; k < kVectors<T>; ++k) evaluate(s, x[block % 4][k], y[block / 4][k], exponents[block][k]);
+      for (int k = 0; k < kVectors<T>; ++k) evaluate(s, x[block % 4][k], y[block / 4][k], evaluated[block][k]);
     }
-    for (uint32_t blocks = reached; blocks != 0; blocks &= blocks - 1) {
-      const int block = __builtin_ctz(blocks);
-      for (int k = 0; k < kVectors<T>; ++k) pass(s, exponents[block][k], pixels[block][k], sums);
-    }
+    if (may_be_capped(s))
+      pass_blocks<true>(s, reached, evaluated, pixels, sums);
+    else
+      pass_blocks<false>(s, reached, evaluated, pixels, sums);
     sum_each(sums, &records[entry.record].power);
   }
 }
@@ -227,8 +274,9 @@ PairCounts count_tile(const TileJob<T>& job) {
         if (!any(less(V{}, t))) continue;
         const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
         const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
-        Contribution<T> c;
-        contribute(job.splats[job.entries[item].splat], x, y, t, c);
+        Evaluated<T> e;
+        evaluate(job.splats[job.entries[item].splat], x, y, e);
+        const Contribution<T> c = blend<T>(t, e.raw);
         t = next_transmittance(c);
         counts.evaluated += Simd<T>::lanes;
         counts.contributing += __builtin_popcount(uint32_t(lane_bits(less(V{}, c.weight))));

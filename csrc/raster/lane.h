@@ -31,6 +31,11 @@ GS_INLINE T load(const T* from) {
 }
 
 template <class T>
+GS_INLINE T load_some(const T* from, int) {
+  return *from;
+}
+
+template <class T>
 GS_INLINE void store(T* to, T v) {
   *to = v;
 }
@@ -55,16 +60,14 @@ GS_INLINE float larger(float a, float b) { return a > b ? a : b; }
 GS_INLINE float clamp(float v, float low, float high) { return smaller(larger(v, low), high); }
 
 GS_INLINE float exp2_where(bool m, float x) {
-  const float shifted = x + 12582912.0f;  // 1.5·2²³: adding it rounds to an integer in the low bits
-  const float f = x - (shifted - 12582912.0f), f2 = f * f;
-  const auto line = [&](int k) { return fma(kExp2[k + 1], f, kExp2[k]); };
-  const float p = fma(fma(fma(kExp2[6], f2, line(4)), f2, line(2)), f2, line(0));
+  const float shifted = x + kToEighths, f = x - (shifted - kToEighths);
+  const float p = ((kExp2[3] * f + kExp2[2]) * f + kExp2[1]) * f + kExp2[0];
   union {
     float number;
     uint32_t bits;
-  } power{p}, rounded{shifted};
-  power.bits += rounded.bits << 23;
-  return m ? power.number : 0;
+  } power, rounded{shifted};
+  power.bits = kExp2Eighths[rounded.bits % 8] + (rounded.bits << 20);
+  return m ? p * power.number : 0;
 }
 
 template <class T>

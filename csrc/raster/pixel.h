@@ -21,42 +21,64 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// What a splat is at a vector of pixels.
+// Where a vector of pixels lies, in the splat's own widths.
 template <class T>
-struct Exponent {
+struct Offset {
   Vector<T> p, r;
+};
+
+// What a splat is there.
+template <class T>
+struct Evaluated : Offset<T> {
   Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
 };
 
-// And what it does to them.
+// And what it does.
 template <class T>
-struct Contribution : Exponent<T> {
+struct Contribution {
   Vector<T> weight;   // 0 also where the pixel ends, or ended before
   Vector<T> behind;   // T behind the splat
   Mask<T> goes_on;    // T behind the splat > 1e-4
 };
 
 template <class T>
-GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Exponent<T>& e) {
+GS_INLINE Offset<T> offset_of(const Splat<T>& s, Vector<T> x, Vector<T> y) {
   const Vector<T> dx = s.u - x, dy = s.v - y;
-  e.p = fma(broadcast<T>(s.a), dx, s.b * dy);
-  e.r = s.c * dy;
-  const Vector<T> exponent = fnma(e.p, e.p, fnma(e.r, e.r, broadcast<T>(s.log2_opacity)));
-  e.raw = exp2_where(at_most(broadcast<T>(T(-kLog2Of255)), exponent), exponent);
+  return {fma(broadcast<T>(s.a), dx, s.b * dy), s.c * dy};
 }
 
 template <class T>
-GS_INLINE void blend(Vector<T> transmittance, Contribution<T>& c) {
-  const Vector<T> alpha = smaller(c.raw, broadcast<T>(T(kMaxAlpha)));
-  c.behind = fnma(transmittance, alpha, transmittance);
-  c.goes_on = less(broadcast<T>(T(kMinTransmittance)), c.behind);
-  c.weight = select(c.goes_on, transmittance * alpha, Vector<T>{});
+GS_INLINE Vector<T> exponent_of(const Splat<T>& s, const Offset<T>& at) {
+  return fnma(at.p, at.p, fnma(at.r, at.r, broadcast<T>(s.log2_opacity)));
 }
 
 template <class T>
-GS_INLINE void contribute(const Splat<T>& s, Vector<T> x, Vector<T> y, Vector<T> transmittance, Contribution<T>& c) {
-  evaluate(s, x, y, c);
-  blend(transmittance, c);
+GS_INLINE Mask<T> reaches(Vector<T> exponent) {
+  return at_most(broadcast<T>(T(-kLog2Of255)), exponent);
+}
+
+// Whether α may reach its cap: few splats' does.
+template <class T>
+GS_INLINE bool may_be_capped(const Splat<T>& s) {
+  return s.log2_opacity > T(-0.0015);  // log₂ 0.99896, with room for rounding
+}
+
+template <class T>
+GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Evaluated<T>& e) {
+  const Offset<T> at = offset_of(s, x, y);
+  const Vector<T> exponent = exponent_of(s, at);
+  e.p = at.p;
+  e.r = at.r;
+  e.raw = exp2_where(reaches<T>(exponent), exponent);
+}
+
+// `capped` says whether any α may have to be.
+template <class T, bool capped = true>
+GS_INLINE Contribution<T> blend(Vector<T> transmittance, Vector<T> raw) {
+  const Vector<T> weight = transmittance * (capped ? smaller(raw, broadcast<T>(T(kMaxAlpha))) : raw);
+  const Vector<T> behind = transmittance - weight;
+  const Mask<T> goes_on = less(broadcast<T>(T(kMinTransmittance)), behind);
+  return {select(goes_on, weight, Vector<T>{}), behind, goes_on};
 }
 
 // 0 where the pixel ends.
@@ -104,12 +126,10 @@ GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vecto
 }
 
 // Passes a splat, and adds what it asks of it to its sums, in SplatGradient's order.
-template <class T>
-GS_INLINE void pass(const Splat<T>& s, const Exponent<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
+template <class T, bool capped = true>
+GS_INLINE void pass(const Splat<T>& s, const Evaluated<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
   using V = Vector<T>;
-  Contribution<T> c;
-  static_cast<Exponent<T>&>(c) = e;
-  blend(px.transmittance, c);
+  const Contribution<T> c = blend<T, capped>(px.transmittance, e.raw);
   V q = add_product(px.g_red, broadcast<T>(s.red), px.constant);
   q = add_product(px.g_green, broadcast<T>(s.green), q);
   q = add_product(px.g_blue, broadcast<T>(s.blue), q);
@@ -117,15 +137,15 @@ GS_INLINE void pass(const Splat<T>& s, const Exponent<T>& e, PixelGradients<T>& 
   px.remaining = take_product(c.weight, q, px.remaining);
 
   // ν = −α ∂L/∂α, nothing through the cap.
-  const Mask<T> follows = both(c.goes_on, less(c.raw, broadcast<T>(T(kMaxAlpha))));
+  const Mask<T> follows = capped ? both(c.goes_on, less(e.raw, broadcast<T>(T(kMaxAlpha)))) : c.goes_on;
   const V nu = select(follows, c.weight * (px.remaining * reciprocal(c.behind) - q), V{});
-  const V nu_p = nu * c.p, nu_r = nu * c.r;
+  const V nu_p = nu * e.p, nu_r = nu * e.r;
   sums[0] += nu;
   sums[1] += nu_p;
   sums[2] += nu_r;
-  sums[3] = add_product(nu_p, c.p, sums[3]);
-  sums[4] = add_product(nu_p, c.r, sums[4]);
-  sums[5] = add_product(nu_r, c.r, sums[5]);
+  sums[3] = add_product(nu_p, e.p, sums[3]);
+  sums[4] = add_product(nu_p, e.r, sums[4]);
+  sums[5] = add_product(nu_r, e.r, sums[5]);
   sums[6] = add_product(c.weight, px.g_red, sums[6]);
   sums[7] = add_product(c.weight, px.g_green, sums[7]);
   sums[8] = add_product(c.weight, px.g_blue, sums[8]);

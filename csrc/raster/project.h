@@ -49,26 +49,42 @@ struct Shading {
   Vector<T> colour[3];  // before the clamp at 0
 };
 
-// Lanes from rows of `width` numbers: out[k] holds number k of each of the group's rows.
+// Whether transpose4() turns rows into lanes, and back, as far as they have four numbers and there are as many rows as lanes.
 template <class T>
-GS_INLINE void load_columns(const T* rows, int width, int count, Vector<T>* out) {
+inline constexpr bool kByFours = sizeof(T) == 4 && Simd<T>::lanes % 4 == 0;
+
+// Lanes from rows of `width` numbers, `stride` apart: out[k] holds number k of each of the group's rows.
+template <class T>
+GS_INLINE void load_columns(const T* rows, int stride, int width, int count, Vector<T>* out) {
   constexpr int lanes = Simd<T>::lanes;
   T columns[kMaxBases * 3][lanes];
+  int done = 0;
+  if constexpr (kByFours<T>) {
+    done = count == lanes ? width / 4 * 4 : 0;
+    for (int lane = 0; lane < lanes; lane += 4)
+      for (int k = 0; k < done; k += 4) transpose4(rows + int64_t(stride) * lane + k, stride, &columns[k][lane], lanes);
+  }
   for (int lane = 0; lane < lanes; ++lane) {
-    const T* row = rows + int64_t(width) * (lane < count ? lane : count - 1);
-    for (int k = 0; k < width; ++k) columns[k][lane] = row[k];
+    const T* row = rows + int64_t(stride) * (lane < count ? lane : count - 1);
+    for (int k = done; k < width; ++k) columns[k][lane] = row[k];
   }
   for (int k = 0; k < width; ++k) out[k] = load<T>(columns[k]);
 }
 
-// The way back, for the first `count` lanes.
+// The way back, for the first `count` lanes and rows that follow each other.
 template <class T>
 GS_INLINE void store_columns(const Vector<T>* in, int width, int count, T* rows) {
   constexpr int lanes = Simd<T>::lanes;
   T columns[kMaxBases * 3][lanes];
   for (int k = 0; k < width; ++k) store<T>(columns[k], in[k]);
+  int done = 0;
+  if constexpr (kByFours<T>) {
+    done = count == lanes ? width / 4 * 4 : 0;
+    for (int lane = 0; lane < lanes; lane += 4)
+      for (int k = 0; k < done; k += 4) transpose4(&columns[k][lane], lanes, rows + int64_t(width) * lane + k, width);
+  }
   for (int lane = 0; lane < count; ++lane)
-    for (int k = 0; k < width; ++k) rows[int64_t(width) * lane + k] = columns[k][lane];
+    for (int k = done; k < width; ++k) rows[int64_t(width) * lane + k] = columns[k][lane];
 }
 
 template <class T>
@@ -76,11 +92,11 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   group.count = int(end - begin < lanes ? end - begin : lanes);
-  load_columns(g.means + 3 * begin, 3, group.count, group.mean);
-  load_columns(g.scales + 3 * begin, 3, group.count, group.scale);
-  load_columns(g.quaternions + 4 * begin, 4, group.count, group.unit);
-  load_columns(g.opacities + begin, 1, group.count, &group.opacity);
-  load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, group.count, group.sh);
+  load_columns(g.means + 3 * begin, 3, 3, group.count, group.mean);
+  load_columns(g.scales + 3 * begin, 3, 3, group.count, group.scale);
+  load_columns(g.quaternions + 4 * begin, 4, 4, group.count, group.unit);
+  load_columns(g.opacities + begin, 1, 1, group.count, &group.opacity);
+  load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, 3 * g.bases, group.count, group.sh);
   group.log2_opacity = log2_of<T>(group.opacity);
 
   V* q = group.unit;
@@ -340,16 +356,18 @@ GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vecto
 template <class T>
 GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int count,
                               Vector<T> out[kSplatGradientNumbers]) {
-  constexpr int lanes = Simd<T>::lanes;
-  T sums[lanes][kSplatGradientNumbers] = {}, has_any[lanes] = {};
-  for (int lane = 0; lane < count; ++lane) {
-    for (uint32_t r = from.first[first + lane]; r < from.first[first + lane + 1]; ++r) {
-      const T* record = &from.records[r].power;
-      for (int k = 0; k < kSplatGradientNumbers; ++k) sums[lane][k] += record[k];
-      has_any[lane] = T(1);
-    }
+  constexpr int lanes = Simd<T>::lanes, parts = (kSplatGradientNumbers + lanes - 1) / lanes;
+  T sums[lanes][parts * lanes], has_any[lanes] = {};
+  for (int lane = 0; lane < lanes; ++lane) {
+    Vector<T> sum[parts] = {};
+    const uint32_t begin = lane < count ? from.first[first + lane] : 0, end = lane < count ? from.first[first + lane + 1] : 0;
+    for (uint32_t r = begin; r < end; ++r)
+      for (int k = 0; k < parts; ++k)
+        sum[k] += load_some<T>(&from.records[r].power + k * lanes, kSplatGradientNumbers - k * lanes);
+    for (int k = 0; k < parts; ++k) store<T>(sums[lane] + k * lanes, sum[k]);
+    has_any[lane] = T(begin < end);
   }
-  load_columns(sums[0], kSplatGradientNumbers, lanes, out);
+  load_columns(sums[0], parts * lanes, kSplatGradientNumbers, lanes, out);
   return less(Vector<T>{}, load<T>(has_any));
 }
 

@@ -161,27 +161,36 @@ std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) 
 template <class T>
 void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order) {
   for (PerView& view : views_) view.entries = Buffer<TileEntry>(view.first_record[size_t(count_)]);
+  const auto each = [&](int64_t k, int64_t chunk, const auto& visit) {
+    const Buffer<DepthItem<T>>& items = order[size_t(k)];
+    const PerView& view = views_[size_t(k)];
+    const size_t begin = items.size * size_t(chunk) / size_t(chunks());
+    const size_t end = items.size * size_t(chunk + 1) / size_t(chunks());
+    const auto first_pair = [&](uint32_t splat) {
+      const Part& part = made[size_t(k * tasks_) + splat / kTask];
+      return part.pairs.data.get() + (view.first_record[splat] - part.pairs_before);
+    };
+    for (size_t i = begin; i < end; ++i) {
+      // Splats in the order of depth lie anywhere.
+      if (i + 16 < end) __builtin_prefetch(&view.first_record[items[i + 16].splat]);
+      if (i + 8 < end) __builtin_prefetch(first_pair(items[i + 8].splat));
+      const uint32_t splat = items[i].splat;
+      const TilePair* pair = first_pair(splat);
+      for (uint32_t record = view.first_record[splat]; record < view.first_record[splat + 1]; ++record, ++pair)
+        visit(int64_t(pair->tile), TileEntry{splat, record, pair->blocks});
+    }
+  };
   std::vector<Buffer<uint32_t>> starts = distribute(
       settings_.threads, int64_t(views_.size()), chunks(), grid_.tiles(),
       [&](int64_t k, int64_t chunk, const auto& visit) {
-        const Buffer<DepthItem<T>>& items = order[size_t(k)];
-        const PerView& view = views_[size_t(k)];
-        const size_t begin = items.size * size_t(chunk) / size_t(chunks());
-        const size_t end = items.size * size_t(chunk + 1) / size_t(chunks());
-        const auto first_pair = [&](uint32_t splat) {
-          const Part& part = made[size_t(k * tasks_) + splat / kTask];
-          return part.pairs.data.get() + (view.first_record[splat] - part.pairs_before);
-        };
-        for (size_t i = begin; i < end; ++i) {
-          // Splats in the order of depth lie anywhere.
-          if (i + 16 < end) __builtin_prefetch(&view.first_record[items[i + 16].splat]);
-          if (i + 8 < end) __builtin_prefetch(first_pair(items[i + 8].splat));
-          const uint32_t splat = items[i].splat;
-          const TilePair* pair = first_pair(splat);
-          for (uint32_t record = view.first_record[splat]; record < view.first_record[splat + 1]; ++record, ++pair)
-            visit(int64_t(pair->tile), TileEntry{splat, record, pair->blocks});
+        if (chunks() > 1) return each(k, chunk, [&](int64_t tile, const TileEntry&) { visit(tile); });
+        // All of a view's pairs are counted as they lie.
+        for (int64_t i = 0; i < tasks_; ++i) {
+          const Part& part = made[size_t(k * tasks_ + i)];
+          for (int64_t pair = 0; pair < part.pair_count; ++pair) visit(int64_t(part.pairs[size_t(pair)].tile));
         }
       },
+      each,
       [&](int64_t k, uint32_t at, const TileEntry& entry) { views_[size_t(k)].entries[at] = entry; });
   for (size_t k = 0; k < views_.size(); ++k) views_[k].tile_start = std::move(starts[k]);
 }

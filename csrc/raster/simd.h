@@ -284,44 +284,65 @@ GS_INLINE Vector<float> reciprocal(Vector<float> v) { return 1.0f / v; }
 #endif
 GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
 
-// 2^x where `m` holds, for x ≥ −126, and 0 elsewhere. x = n + f with |f| ≤ ½, and a polynomial
-// of degree 6: with its rounding, the relative error is below 1.2e-7. Its terms are
-// paired (Estrin), because it is waiting for one after the other that costs. All machines give the same bits.
-template <class Fuse>
-GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x, const Fuse& fuse) {
-  using V = Vector<float>;
+// 32 bits a lane, which may overflow.
+typedef uint32_t Bits __attribute__((vector_size(kVectorBytes)));
+
+// Number i mod 8 of kExp2Eighths for each lane i.
 #if defined(__AVX512F__)
-  const V n = _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+GS_INLINE Bits eighth(Bits i) {
+  return (Bits)_mm512_permutexvar_epi32((__m512i)i, _mm512_broadcast_i64x4(_mm256_loadu_si256((const __m256i*)kExp2Eighths)));
+}
+#elif defined(__AVX2__)
+GS_INLINE Bits eighth(Bits i) {
+  return (Bits)_mm256_permutevar8x32_epi32(_mm256_loadu_si256((const __m256i*)kExp2Eighths), (__m256i)i);
+}
 #else
-  const V magic = broadcast<float>(12582912.0f);  // 1.5·2²³: adding it rounds to an integer in the low bits
-  const V shifted = x + magic;
-  const V n = shifted - magic;
+GS_INLINE Bits eighth(Bits i) {
+  for (int lane = 0; lane < Simd<float>::lanes; ++lane) i[lane] = kExp2Eighths[i[lane] % 8];
+  return i;
+}
 #endif
-  const V f = x - n, f2 = f * f;
-  const auto line = [&](int k) { return fuse(broadcast<float>(kExp2[k + 1]), f, broadcast<float>(kExp2[k])); };
-  const V p = fuse(fuse(fuse(broadcast<float>(kExp2[6]), f2, line(4)), f2, line(2)), f2, line(0));
-#if defined(__AVX512F__)
-  return _mm512_maskz_scalef_ps(m, p, n);  // other lanes may be small enough to stumble over
-#else
-  // Other lanes overflow, which only unsigned numbers may.
-  typedef uint32_t Unsigned __attribute__((vector_size(kVectorBytes)));
-  return select(m, (V)((Unsigned)p + ((Unsigned)shifted << 23)), V{});
-#endif
+
+// 2^x, begun and ended, with other work in between: x = i/8 + f with |f| ≤ 1/16, 2^f is a polynomial of degree 3, and 2^(i/8) a
+// table's number whose exponent i's whole part is added to. The relative error is below 1.7e-7 for x ≥ −126; below that there is
+// nothing to rely on. Nothing is fused, which costs little, as a sum in it is ready as soon as a product and goes elsewhere: so
+// all machines give the same bits, those that can't fuse without effort.
+template <class T>
+struct Exp2;
+template <>
+struct Exp2<float> {
+  Vector<float> f, power;
+};
+template <>
+struct Exp2<double> {
+  Vector<double> x;
+};
+
+GS_INLINE Exp2<float> begin_exp2(Vector<float> x) {
+  const Vector<float> magic = broadcast<float>(kToEighths), shifted = x + magic;  // rounds to eighths, counted in the low bits
+  const Bits i = (Bits)shifted;
+  return {x - (shifted - magic), (Vector<float>)(eighth(i) + (i << 20))};
 }
 
-GS_INLINE Vector<float> exp2_where(Mask<float> m, Vector<float> x) {
-  return exp2_where(m, x, [](auto a, auto b, auto c) { return fma(a, b, c); });
-}
-
-// The same where no decision hangs on the last bit.
-GS_INLINE Vector<float> exp2_nearly_where(Mask<float> m, Vector<float> x) {
-  return exp2_where(m, x, [](auto a, auto b, auto c) { return add_product(a, b, c); });
+// Where `m` holds, and 0 elsewhere.
+GS_INLINE Vector<float> end_exp2(Mask<float> m, const Exp2<float>& of) {
+  const auto c = [](int k) { return broadcast<float>(kExp2[k]); };
+  const Vector<float> p = ((c(3) * of.f + c(2)) * of.f + c(1)) * of.f + c(0);
+  return select(m, p * of.power, Vector<float>{});
 }
 
 // float64 exists to prove gradients, so it takes the library's exponential.
-GS_INLINE Vector<double> exp2_where(Mask<double> m, Vector<double> x) {
-  for (int i = 0; i < Simd<double>::lanes; ++i) x[i] = __builtin_exp2(x[i]);
-  return select(m, x, Vector<double>{});
+GS_INLINE Exp2<double> begin_exp2(Vector<double> x) { return {x}; }
+GS_INLINE Vector<double> end_exp2(Mask<double> m, const Exp2<double>& of) {
+  Vector<double> power;
+  for (int i = 0; i < Simd<double>::lanes; ++i) power[i] = __builtin_exp2(of.x[i]);
+  return select(m, power, Vector<double>{});
+}
+
+// 2^x where `m` holds, and 0 elsewhere.
+template <class M, class V>
+GS_INLINE V exp2_where(M m, V x) {
+  return end_exp2(m, begin_exp2(x));
 }
 
 // The logarithm to base 2, rounded from float64's.
@@ -365,6 +386,20 @@ GS_INLINE Vector<T> load_some(const T* from, int count) {
   __builtin_memcpy(lane, from, size_t(count) * sizeof(T));
   return load<T>(lane);
 }
+
+#if defined(__AVX512F__)
+template <>
+GS_INLINE Vector<float> load_some<float>(const float* from, int count) {
+  return _mm512_maskz_loadu_ps(__mmask16(count >= 16 ? 0xFFFF : (1 << count) - 1), from);
+}
+#elif defined(__AVX2__)
+template <>
+GS_INLINE Vector<float> load_some<float>(const float* from, int count) {
+  if (count >= 8) return load<float>(from);
+  const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+  return _mm256_maskload_ps(from, _mm256_cmpgt_epi32(_mm256_set1_epi32(count), lane));
+}
+#endif
 
 template <class T>
 GS_INLINE void store_some(T* to, Vector<T> v, int count) {

@@ -15,9 +15,12 @@ inline constexpr double kJacobianMargin = 0.15;     // share of the width (heigh
 inline constexpr double kMinDepthAlpha = 1e-10;     // expected depth is 0 where the accumulated opacity is not above
 inline constexpr double kLog2E = 1.4426950408889634;
 inline constexpr double kLog2Of255 = 7.994353436858858;
-// 2^f for |f| ≤ ½ to 1.9e-9 (Remez), by powers of f.
-inline constexpr float kExp2[7] = {1.0f,           6.931472057e-1f, 2.402264689e-1f, 5.550328777e-2f,
-                                   9.618488957e-3f, 1.339993122e-3f, 1.534581201e-4f};
+// 2^f for |f| ≤ 1/16 to 2.6e-8 (Remez), by powers of f.
+inline constexpr float kExp2[4] = {1.0f, 0.69314721f, 0.24025763f, 0.05549622f};
+// The bits of 2^(i/8) less i·2²⁰, which adding x + kToEighths = 1.5·2²⁰ + x, shifted left by 20 bits, gives back.
+inline constexpr float kToEighths = 1572864.0f;
+inline constexpr uint32_t kExp2Eighths[8] = {0x3f800000, 0x3f7b95c2, 0x3f7837f0, 0x3f75fed7,
+                                             0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7};
 inline constexpr int kTile = 16;                    // tile edge in pixels
 inline constexpr int kBlock = 4;                    // edge in pixels of the blocks that a tile is culled and blended by
 inline constexpr int kCoverTask = 512;              // splats whose tiles are listed in one go

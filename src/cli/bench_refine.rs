@@ -1,4 +1,4 @@
-use super::{parse_size, print_json};
+use super::{memory, parse_size, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{RefineReport, bench_refine};
@@ -29,6 +29,7 @@ pub struct Refine {
 
 impl Refine {
     pub fn run(self) -> Result<()> {
+        memory::keep();
         let config = RefineConfig::with(&self.set, true)?;
         let report = bench_refine(self.gaussians as usize, parse_size(&self.size)?, &config, self.steps)?;
         if self.json {

@@ -67,18 +67,23 @@ pub fn end_as_failed() {
     grow_stack();
 }
 
-/// Keeps what tensors give back, as training asks for the same again and again: a step's activations are gigabytes, and the system
-/// zeroes every page that it hands out, which is up to a sixth of the step. glibc alone gives large tensors' memory back. It takes a
-/// tenth more, and with rounds computed again a third: who asks for these, to save memory, does without it.
-pub fn keep_for(training: &TrainConfig) {
-    if training.checkpoint_rounds {
-        return;
-    }
+/// Has the process keep the memory that it gives back, for commands that ask for the same again and again: the system zeroes every
+/// page that it hands out, which is up to a sixth of a training step and a tenth of a step of refinement. glibc alone gives large
+/// tensors' memory back.
+pub fn keep() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     // SAFETY: sets numbers of the allocator.
     unsafe {
         libc::mallopt(libc::M_MMAP_MAX, 0);
         libc::mallopt(libc::M_TRIM_THRESHOLD, -1);
+    }
+}
+
+/// The same for training. It takes a tenth more, and with rounds computed again a third: who asks for these, to save memory, does
+/// without it.
+pub fn keep_for(training: &TrainConfig) {
+    if !training.checkpoint_rounds {
+        keep();
     }
 }
 

@@ -1,5 +1,5 @@
 use super::progress::{self, Progress};
-use super::{model, parse_size, print_json, stop_flag};
+use super::{memory, model, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
@@ -127,6 +127,7 @@ enum Start {
 
 impl Refine {
     pub fn run(self) -> Result<()> {
+        memory::keep();
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let config = RefineConfig::with(&self.set, self.splat.is_some())?;
