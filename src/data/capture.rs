@@ -1,6 +1,6 @@
 //! A capture: what every format on disk is read into.
 
-use super::pixels::{Distortion, Planes, fit};
+use super::pixels::{Distortion, Planes, fit, looked_at};
 use crate::error::{Error, Result};
 use crate::io;
 use crate::scene::{Camera, ImageSize, check_pose};
@@ -204,7 +204,7 @@ impl Capture {
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {
-        let image = self.read_photo(frame)?;
+        let image = self.read_photo(frame, size)?;
         let (planes, camera) = match size {
             Some(size) => fit(&image, &frame.camera, size),
             None => (Planes::from_rgb(&image), frame.camera),
@@ -226,15 +226,20 @@ impl Capture {
     /// # Errors
     /// As [`Capture::load`].
     pub(super) fn photo(&self, index: usize) -> Result<RgbImage> {
-        self.read_photo(&self.frames[index])
+        self.read_photo(&self.frames[index], None)
     }
 
-    fn read_photo(&self, frame: &Frame) -> Result<RgbImage> {
+    /// The photo, lens distortion removed as far as fitting it to `size` looks at it.
+    fn read_photo(&self, frame: &Frame, size: Option<ImageSize>) -> Result<RgbImage> {
         if let Photo::Made { video, index } = &frame.photo {
             return Ok(video.photo(*index));
         }
         let photo = self.decode(frame, &frame.photo.read()?)?;
-        Ok(frame.distortion.remove(photo.pixels, &frame.camera.intrinsics))
+        Ok(frame.distortion.remove(
+            photo.pixels,
+            &frame.camera,
+            size.map(|size| looked_at(&frame.camera, size)),
+        ))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<io::Photo> {
@@ -257,7 +262,7 @@ impl Capture {
         if photo.as_stored && frame.distortion == Distortion::default() {
             return Ok(bytes.into_owned());
         }
-        let pixels = frame.distortion.remove(photo.pixels, &frame.camera.intrinsics);
+        let pixels = frame.distortion.remove(photo.pixels, &frame.camera, None);
         io::encode_photo(&pixels, photo.is_jpeg)
     }
 }

@@ -1,45 +1,80 @@
 //! Fitting an image to the model's size (spec 9.2), with exact intrinsics.
 
 use super::planes::Planes;
-use super::resample::{Region, Resampler};
+use super::resample::{self, Region, Resampler};
 use crate::scene::{Camera, ImageSize};
 use image::RgbImage;
+use std::ops::Range;
 
 /// The width after the first resize is a multiple of it.
 const WIDTH_MULTIPLE: f64 = 8.;
 
+/// The largest centred rectangle of a size's aspect that a camera's image has, and how it is resized first.
+struct Cut {
+    region: Region,
+    /// After the first resize.
+    size: ImageSize,
+    /// Of the first resize, along x and y, and the corner of the rectangle after it.
+    scale: (f64, f64),
+    corner: (f64, f64),
+}
+
+impl Cut {
+    fn of(camera: &Camera, size: ImageSize) -> Self {
+        let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
+        let scaled = full_width * f64::from(size.height) / full_height;
+        let width = ((scaled / WIDTH_MULTIPLE).round() * WIDTH_MULTIPLE).max(WIDTH_MULTIPLE);
+        let height = f64::from(size.height);
+        let (scale_x, scale_y) = (width / full_width, height / full_height);
+
+        let aspect = f64::from(size.width) / height;
+        let (cut_width, cut_height) =
+            ((height * aspect).min(width).round(), (width / aspect).min(height).round());
+        let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
+        Cut {
+            // What will be cut away isn't made.
+            region: Region {
+                left: left / scale_x,
+                top: top / scale_y,
+                width: cut_width / scale_x,
+                height: cut_height / scale_y,
+            },
+            size: ImageSize { height: cut_height as u32, width: cut_width as u32 },
+            scale: (scale_x, scale_y),
+            corner: (left, top),
+        }
+    }
+}
+
+fn is_as_large(camera: &Camera, size: ImageSize) -> bool {
+    (camera.height, camera.width) == (size.height, size.width)
+}
+
+/// The columns and rows of `camera`'s image that [`fit`] looks at.
+pub fn looked_at(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
+    if is_as_large(camera, size) {
+        return [0..camera.width as usize, 0..camera.height as usize];
+    }
+    let cut = Cut::of(camera, size);
+    resample::looked_at((camera.width, camera.height), cut.region, cut.size)
+}
+
 /// Resizes to `size`'s height keeping the aspect (width rounded to a multiple of 8), cuts the largest centred rectangle of
 /// `size`'s aspect, and resizes once more where that isn't `size` yet.
 pub fn fit(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
-    if (camera.height, camera.width) == (size.height, size.width) {
+    if is_as_large(camera, size) {
         return (Planes::from_rgb(image), *camera);
     }
-    let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
-    let scaled = full_width * f64::from(size.height) / full_height;
-    let width = ((scaled / WIDTH_MULTIPLE).round() * WIDTH_MULTIPLE).max(WIDTH_MULTIPLE);
-    let height = f64::from(size.height);
-    let (scale_x, scale_y) = (width / full_width, height / full_height);
+    let cut = Cut::of(camera, size);
+    let planes = resample(image, cut.region, cut.size);
+    let intrinsics = camera.intrinsics.resized(cut.scale.0, cut.scale.1).cropped(cut.corner.0, cut.corner.1);
 
-    let aspect = f64::from(size.width) / height;
-    let (cut_width, cut_height) =
-        ((height * aspect).min(width).round(), (width / aspect).min(height).round());
-    let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
-    // What will be cut away isn't made.
-    let region = Region {
-        left: left / scale_x,
-        top: top / scale_y,
-        width: cut_width / scale_x,
-        height: cut_height / scale_y,
-    };
-    let cut = ImageSize { height: cut_height as u32, width: cut_width as u32 };
-    let planes = resample(image, region, cut);
-    let intrinsics = camera.intrinsics.resized(scale_x, scale_y).cropped(left, top);
-
-    let (planes, intrinsics) = if cut == size {
+    let (planes, intrinsics) = if cut.size == size {
         (planes, intrinsics)
     } else {
-        let region = Region { left: 0., top: 0., width: cut_width, height: cut_height };
-        let scale = (f64::from(size.width) / cut_width, height / cut_height);
+        let (width, height) = (f64::from(cut.size.width), f64::from(cut.size.height));
+        let region = Region { left: 0., top: 0., width, height };
+        let scale = (f64::from(size.width) / width, f64::from(size.height) / height);
         (resample(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
     };
     (planes, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })

@@ -7,7 +7,7 @@ mod jitter;
 mod planes;
 mod resample;
 
-pub use fit::fit;
+pub use fit::{fit, looked_at};
 pub use planes::Planes;
 
 pub(crate) use jitter::Jitter;

@@ -11,6 +11,7 @@ use super::planes::{CHANNELS, take_apart};
 use crate::scene::ImageSize;
 use image::RgbImage;
 use std::f64::consts::PI;
+use std::ops::Range;
 
 /// Lobes of the filter to either side.
 const LOBES: f64 = 3.;
@@ -71,7 +72,7 @@ impl Taps {
     }
 
     /// Inputs that any output looks at.
-    fn range(&self) -> std::ops::Range<usize> {
+    fn range(&self) -> Range<usize> {
         let (first, last) = (self.first.iter().min(), self.first.iter().max());
         *first.expect("an output")..last.expect("an output") + self.count
     }
@@ -88,6 +89,15 @@ const ROUNDING: f32 = 12_582_912.;
 /// The nearest of 0 to 255.
 fn to_level(value: f32) -> f32 {
     ((value + ROUNDING) - ROUNDING).clamp(0., 255.)
+}
+
+/// The columns and rows of an image of `width` × `height` that [`Resampler::resample`] looks at.
+pub fn looked_at((width, height): (u32, u32), region: Region, size: ImageSize) -> [Range<usize>; 2] {
+    [(width, region.left, region.width, size.width), (height, region.top, region.height, size.height)].map(
+        |(inputs, start, extent, outputs)| {
+            Taps::new((inputs as usize, start, extent, outputs as usize)).range()
+        },
+    )
 }
 
 /// Resamples images one after the other, and keeps what the next one can use.
@@ -163,7 +173,7 @@ fn taps(kept: &mut Option<Taps>, key: (usize, f64, f64, usize)) -> &Taps {
 }
 
 /// The pixels in `columns` of the rows from `top`; below the image its last row stands.
-fn fill_tile(tile: &mut [[f32; LANES]], image: &RgbImage, columns: std::ops::Range<usize>, top: usize) {
+fn fill_tile(tile: &mut [[f32; LANES]], image: &RgbImage, columns: Range<usize>, top: usize) {
     let (width, height) = (image.width() as usize, image.height() as usize);
     for row in 0..ROWS {
         let start = (top + row).min(height - 1) * width;
