@@ -87,6 +87,23 @@ pub fn keep_for(training: &TrainConfig) {
     }
 }
 
+/// `work` with [`keep`], for as long as it lasts; then what nobody uses goes back to the system.
+pub fn keep_during<T>(work: impl FnOnce() -> T) -> T {
+    keep();
+    let done = work();
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: sets numbers of the allocator, and has it look through what it keeps.
+    unsafe {
+        // What glibc comes to by itself after a while of large tensors.
+        const LARGEST_KEPT: libc::c_int = 32 << 20;
+        libc::mallopt(libc::M_MMAP_MAX, 65_536);
+        libc::mallopt(libc::M_MMAP_THRESHOLD, LARGEST_KEPT);
+        libc::mallopt(libc::M_TRIM_THRESHOLD, 2 * LARGEST_KEPT);
+        libc::malloc_trim(0);
+    }
+    done
+}
+
 /// Whether the system gives so many bytes of address space. It takes them back.
 fn is_given(bytes: usize) -> bool {
     let (protection, flags) = (libc::PROT_NONE, libc::MAP_PRIVATE | libc::MAP_ANON);

@@ -1,3 +1,4 @@
+use super::memory::keep_during;
 use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
 use super::{device, model, print_json};
 use anyhow::Result;
@@ -98,7 +99,8 @@ impl Reconstruct {
         };
         let count = self.views.unwrap_or(data.context_views);
         let size = input.photo_size(data.image_size);
-        let photos = watch.time("photos", || load_context(&capture, holdout, Some(count), size))?;
+        let photos =
+            watch.time("photos", || keep_during(|| load_context(&capture, holdout, Some(count), size)))?;
         if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
             eprintln!("{line}");
         }

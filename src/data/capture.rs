@@ -1,6 +1,6 @@
 //! A capture: what every format on disk is read into.
 
-use super::pixels::{Distortion, Planes, fit, looked_at};
+use super::pixels::{Distortion, Lens, Planes, fit, looked_at, undistort};
 use crate::error::{Error, Result};
 use crate::io;
 use crate::scene::{Camera, ImageSize, check_pose};
@@ -189,8 +189,11 @@ impl Capture {
     /// # Errors
     /// An image that is missing, can't be decoded, or has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
-        let views: Vec<_> =
-            indices.par_iter().map(|&index| self.load_view(&self.frames[index], size)).collect();
+        let lens = self.shared_lens(indices, size);
+        let views: Vec<_> = indices
+            .par_iter()
+            .map(|&index| self.load_view(&self.frames[index], size, lens.as_ref()))
+            .collect();
         // Of several that can't be read the first one is told.
         views.into_iter().collect()
     }
@@ -203,8 +206,19 @@ impl Capture {
         self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
-    fn load_view(&self, frame: &Frame, size: Option<ImageSize>) -> Result<View> {
-        let image = self.read_photo(frame, size)?;
+    /// What the first of several views was taken through, as others mostly are, too. Not of the largest photos: it takes 16 bytes a
+    /// pixel, and nobody has looked yet whether they are as large as the capture says.
+    fn shared_lens(&self, indices: &[usize], size: Option<ImageSize>) -> Option<Lens> {
+        const MOST_PIXELS: u64 = 1 << 23;
+        let Frame { camera, distortion, .. } = &self.frames[*indices.first()?];
+        let is_shared = indices.len() > 1
+            && *distortion != Distortion::default()
+            && u64::from(camera.width) * u64::from(camera.height) <= MOST_PIXELS;
+        is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
+    }
+
+    fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<View> {
+        let image = self.read_photo(frame, size, lens)?;
         let (planes, camera) = match size {
             Some(size) => fit(&image, &frame.camera, size),
             None => (Planes::from_rgb(&image), frame.camera),
@@ -226,20 +240,20 @@ impl Capture {
     /// # Errors
     /// As [`Capture::load`].
     pub(super) fn photo(&self, index: usize) -> Result<RgbImage> {
-        self.read_photo(&self.frames[index], None)
+        self.read_photo(&self.frames[index], None, None)
     }
 
-    /// The photo, lens distortion removed as far as fitting it to `size` looks at it.
-    fn read_photo(&self, frame: &Frame, size: Option<ImageSize>) -> Result<RgbImage> {
+    /// The photo, lens distortion removed as far as fitting it to `size` looks at it; by `lens` if it is the camera's.
+    fn read_photo(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<RgbImage> {
         if let Photo::Made { video, index } = &frame.photo {
             return Ok(video.photo(*index));
         }
         let photo = self.decode(frame, &frame.photo.read()?)?;
-        Ok(frame.distortion.remove(
-            photo.pixels,
-            &frame.camera,
-            size.map(|size| looked_at(&frame.camera, size)),
-        ))
+        if let Some(lens) = lens.filter(|lens| lens.is_of(&frame.distortion, &frame.camera)) {
+            return Ok(lens.undistort(photo.pixels));
+        }
+        let window = size.map(|size| looked_at(&frame.camera, size));
+        Ok(undistort(photo.pixels, &frame.distortion, &frame.camera, window))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<io::Photo> {
@@ -262,7 +276,7 @@ impl Capture {
         if photo.as_stored && frame.distortion == Distortion::default() {
             return Ok(bytes.into_owned());
         }
-        let pixels = frame.distortion.remove(photo.pixels, &frame.camera, None);
+        let pixels = undistort(photo.pixels, &frame.distortion, &frame.camera, None);
         io::encode_photo(&pixels, photo.is_jpeg)
     }
 }

@@ -4,6 +4,7 @@ mod augment;
 mod distortion;
 mod fit;
 mod jitter;
+mod lens;
 mod planes;
 mod resample;
 
@@ -15,4 +16,5 @@ pub(crate) use resample::{Region, Resampler};
 
 pub(in crate::data) use augment::Augmentation;
 pub(in crate::data) use distortion::Distortion;
+pub(in crate::data) use lens::{Lens, undistort};
 pub(in crate::data) use planes::CHANNELS;
