@@ -17,6 +17,7 @@ mod shapes;
 mod texture;
 mod things;
 mod tracer;
+mod tree;
 mod video;
 mod walk;
 

@@ -3,15 +3,11 @@
 use super::light::{Lamp, Sky};
 use super::material::Material;
 use super::mesh::Mesh;
+use super::tree::{Hit, Tree};
 use glam::{Vec2, Vec3, Vec3A};
-use obvhs::BvhBuildParams;
-use obvhs::cwbvh::CwBvh;
-use obvhs::cwbvh::builder::build_cwbvh_from_tris;
-use obvhs::ray::{Ray, RayHit};
 use obvhs::triangle::Triangle;
 use rayon::prelude::*;
 use std::f32::consts::{PI, TAU};
-use std::time::Duration;
 
 /// Directions in which a vertex looks for the light that other surfaces send it.
 const GATHERED: usize = 24;
@@ -29,10 +25,11 @@ pub(super) struct Parts {
 
 /// A world that can be looked at.
 pub(super) struct Tracer {
-    bvh: CwBvh,
-    triangles: Vec<Triangle>,
-    /// Of each triangle: its vertices and its material.
-    corners: Vec<([u32; 3], u32)>,
+    tree: Tree,
+    /// How many there are.
+    triangles: usize,
+    /// By places in the tree: neighbours in space are neighbours in memory.
+    faces: Vec<Face>,
     normals: Vec<Vec3>,
     uvs: Vec<Vec2>,
     /// Indirect irradiance at each vertex, over π: what reaches it by way of one other surface, or from the sky.
@@ -42,11 +39,12 @@ pub(super) struct Tracer {
     sky: Sky,
 }
 
-/// What a ray finds.
-#[derive(Debug, Clone, Copy)]
-struct Hit {
-    triangle: usize,
-    distance: f32,
+/// A triangle, its vertices and its material.
+#[derive(Clone, Copy)]
+struct Face {
+    triangle: Triangle,
+    vertices: [u32; 3],
+    material: u32,
 }
 
 /// Where a ray arrived.
@@ -74,30 +72,27 @@ impl Tracer {
     /// Gathers indirect light, which takes most of the time, on all threads.
     pub fn new(parts: Parts, sky: Sky) -> Tracer {
         let mut whole = Mesh::default();
-        let (mut corners, mut materials, mut normals) = (vec![], vec![], vec![]);
+        let (mut owners, mut materials, mut normals) = (vec![], vec![], vec![]);
         for (mesh, material) in parts.meshes {
-            let (first, number) = (whole.positions.len() as u32, materials.len() as u32);
-            corners.extend(mesh.triangles.iter().map(|c| (c.map(|vertex| first + vertex), number)));
+            owners.extend(mesh.triangles.iter().map(|_| materials.len() as u32));
             normals.extend(mesh.normals());
             whole.join(mesh);
             materials.push(material);
         }
         let position = |vertex: u32| Vec3A::from(whole.positions[vertex as usize]);
-        let triangle = |(c, _): &([u32; 3], u32)| Triangle {
-            v0: position(c[0]),
-            v1: position(c[1]),
-            v2: position(c[2]),
+        let face = |(&vertices, &material): (&[u32; 3], &u32)| {
+            let [v0, v1, v2] = vertices.map(position);
+            Face { triangle: Triangle { v0, v1, v2 }, vertices, material }
         };
-        let triangles: Vec<Triangle> = corners.iter().map(triangle).collect();
-        let bvh = build_cwbvh_from_tris(&triangles, BvhBuildParams::fast_build(), &mut Duration::default());
-        // In the tree's order: neighbours in space are neighbours in memory.
-        let order = || bvh.primitive_indices.iter().map(|&index| index as usize);
-        let triangles = order().map(|index| triangles[index]).collect();
-        let corners = order().map(|index| corners[index]).collect();
+        let faces: Vec<Face> = whole.triangles.iter().zip(&owners).map(face).collect();
+        let triangles: Vec<Triangle> = faces.iter().map(|face| face.triangle).collect();
+        let (tree, places) = Tree::new(&triangles);
+        // In places without a triangle, which no ray finds, is any.
+        let faces = places.iter().map(|place| faces[place.unwrap_or(0)]).collect();
         let insides = whole.insides();
         let uvs = whole.uvs;
-        let (lamps, indirect) = (taking_turns(parts.lamps), vec![]);
-        let mut tracer = Tracer { bvh, triangles, corners, normals, uvs, indirect, materials, lamps, sky };
+        let (lamps, indirect, triangles) = (taking_turns(parts.lamps), vec![], triangles.len());
+        let mut tracer = Tracer { tree, triangles, faces, normals, uvs, indirect, materials, lamps, sky };
         tracer.indirect = tracer.gathered(&insides);
         tracer
     }
@@ -109,15 +104,17 @@ impl Tracer {
 
     /// The distance to what is towards there, at most `limit`.
     pub fn free(&self, origin: Vec3, towards: Vec3, limit: f32) -> f32 {
-        self.nearest(origin, towards, limit).map_or(limit, |hit| hit.distance)
+        self.tree.nearest(origin, towards, limit).map_or(limit, |hit| hit.distance)
     }
 
     pub fn triangles(&self) -> usize {
-        self.triangles.len()
+        self.triangles
     }
 
     fn radiance(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice, depth: u32) -> Vec3 {
-        let Some(hit) = self.nearest(origin, towards, f32::INFINITY) else { return self.sky.seen(towards) };
+        let Some(hit) = self.tree.nearest(origin, towards, f32::INFINITY) else {
+            return self.sky.seen(towards);
+        };
         let surface = self.surface(origin, towards, hit, spread);
         let material = surface.material;
         let (direct, highlight) = self.direct(&surface, towards, choice);
@@ -145,7 +142,7 @@ impl Tracer {
             return (Vec3::ZERO, Vec3::ZERO);
         }
         let start = surface.point + LIFT * surface.flat;
-        if self.is_blocked(start, light.towards, light.distance - 2. * LIFT) {
+        if self.tree.is_blocked(start, light.towards, light.distance - 2. * LIFT) {
             return (Vec3::ZERO, Vec3::ZERO);
         }
         let colour = self.lamps.len() as f32 * light.colour;
@@ -162,9 +159,8 @@ impl Tracer {
     }
 
     fn surface(&self, origin: Vec3, towards: Vec3, hit: Hit, spread: f32) -> Surface<'_> {
-        let (corners, material) = self.corners[hit.triangle];
-        let [a, b, c] = corners.map(|vertex| vertex as usize);
-        let Triangle { v0, v1, v2 } = self.triangles[hit.triangle];
+        let Face { triangle: Triangle { v0, v1, v2 }, vertices, material } = self.faces[hit.place];
+        let [a, b, c] = vertices.map(|vertex| vertex as usize);
         let point = origin + hit.distance * towards;
         let cross = Vec3::from((v1 - v0).cross(v2 - v0));
         let area = cross.length_squared();
@@ -210,7 +206,7 @@ impl Tracer {
             let start = inside + 5. * LIFT * normal;
             let arriving = |(i, d): (usize, &Vec3)| {
                 let towards = d.x * right + d.y * up + d.z * normal;
-                let Some(hit) = self.nearest(start, towards, f32::INFINITY) else {
+                let Some(hit) = self.tree.nearest(start, towards, f32::INFINITY) else {
                     return self.sky.around(towards);
                 };
                 let surface = self.surface(start, towards, hit, 0.3);
@@ -224,36 +220,6 @@ impl Tracer {
         };
         insides.par_iter().zip(&self.normals).map(gather).collect()
     }
-
-    fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
-        let ray = Ray::new(origin.into(), towards.into(), 0., limit);
-        let mut hit = RayHit::none();
-        let is_hit = self.bvh.ray_traverse(ray, &mut hit, |ray, at| distance(&self.triangles[at], ray));
-        is_hit.then_some(Hit { triangle: hit.primitive_id as usize, distance: hit.t })
-    }
-
-    fn is_blocked(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
-        let ray = Ray::new(origin.into(), towards.into(), 0., limit);
-        let mut state = self.bvh.new_ray_traversal(ray);
-        let mut hit = RayHit::none();
-        self.bvh.ray_traverse_dynamic(&mut state, &mut hit, |ray, at| distance(&self.triangles[at], ray))
-    }
-}
-
-/// Along the ray to the triangle, infinite beside it (Möller and Trumbore, 1997). Edges belong to it, so that there is no gap
-/// between two.
-#[inline]
-fn distance(&Triangle { v0, v1, v2 }: &Triangle, ray: &Ray) -> f32 {
-    let (right, up) = (v1 - v0, v2 - v0);
-    let normal = right.cross(up);
-    let scale = 1. / normal.dot(ray.direction);
-    let way = v0 - ray.origin;
-    let across = way.cross(ray.direction);
-    let (u, v) = (scale * up.dot(across), -scale * right.dot(across));
-    let t = scale * normal.dot(way);
-    // False, too, where nothing is a number: the ray runs along the triangle.
-    let is_hit = u >= 0. && v >= 0. && u + v <= 1. && t >= ray.tmin;
-    if is_hit { t } else { f32::INFINITY }
 }
 
 /// One, two or four lamps, which a pixel's four samples ask equally often: one of three becomes two of half its light, and more

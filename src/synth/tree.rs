@@ -1,0 +1,350 @@
+//! Which triangle a ray meets first: a tree of boxes, four to a node, that a ray is held against at once.
+
+use glam::{Vec3, Vec3A, Vec4};
+use obvhs::BvhBuildParams;
+use obvhs::aabb::Aabb;
+use obvhs::bvh2::builder::build_bvh2_from_tris;
+use obvhs::bvh2::{Bvh2, Bvh2Node};
+use obvhs::triangle::Triangle;
+use std::time::Duration;
+
+/// Boxes of a node, and triangles of a leaf: what a vector holds.
+const WIDTH: usize = 4;
+/// Levels of the largest tree that rays find their way through; a hundred thousand triangles have a dozen.
+const LEVELS: usize = 32;
+/// What stays behind on every level, and the root.
+const STACK: usize = (WIDTH - 1) * LEVELS + 1;
+
+/// Triangles that rays are shot at.
+pub(super) struct Tree {
+    nodes: Vec<Node>,
+    leaves: Vec<Leaf>,
+    root: Child,
+}
+
+/// What a ray found.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Hit {
+    /// Of the triangle in the tree.
+    pub place: usize,
+    pub distance: f32,
+}
+
+/// Four boxes side by side, x of them, y of them and z of them.
+struct Node {
+    /// The least and the greatest corners: what a ray that goes down an axis, or up, enters by is chosen by its sign.
+    corners: [[Vec4; 3]; 2],
+    children: [Child; WIDTH],
+}
+
+/// Four triangles side by side: a corner, and the ways from it to the other two.
+struct Leaf {
+    corner: [Vec4; 3],
+    right: [Vec4; 3],
+    up: [Vec4; 3],
+}
+
+/// What is in a box: a node's number, or a leaf's and [`LEAF`].
+type Child = u32;
+const LEAF: Child = 1 << 31;
+
+/// A ray as boxes are held against it.
+struct Ray {
+    origin: [Vec4; 3],
+    towards: [Vec4; 3],
+    inverse: [Vec4; 3],
+    /// Of the corners by which it enters, axis by axis.
+    enters: [usize; 3],
+}
+
+impl Tree {
+    /// Of triangles, and where in the tree each of them is: for every place the triangle's number, or none. Places are more than
+    /// triangles.
+    pub fn new(triangles: &[Triangle]) -> (Tree, Vec<Option<usize>>) {
+        let settings = BvhBuildParams { max_prims_per_leaf: WIDTH as u32, ..BvhBuildParams::fast_build() };
+        let tree = build_bvh2_from_tris(triangles, settings, &mut Duration::default());
+        let mut build = Build { tree: &tree, triangles, places: vec![], nodes: vec![], leaves: vec![] };
+        let root = build.child(0, 1);
+        let Build { places, nodes, leaves, .. } = build;
+        (Tree { nodes, leaves, root }, places)
+    }
+
+    /// The first triangle from `origin` towards there (unit) that is nearer than `limit`.
+    pub fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
+        let ray = Ray::new(origin, towards);
+        let mut found = Hit { place: usize::MAX, distance: limit };
+        let mut stack = [(0., self.root); STACK];
+        let mut count = 1;
+        while count > 0 {
+            count -= 1;
+            let (entered, child) = stack[count];
+            if entered >= found.distance {
+                continue;
+            }
+            if child & LEAF != 0 {
+                let leaf = (child ^ LEAF) as usize;
+                let (distances, mask) = self.leaves[leaf].meet(&ray, found.distance);
+                for lane in lanes(mask) {
+                    if distances[lane] < found.distance {
+                        found = Hit { place: WIDTH * leaf + lane, distance: distances[lane] };
+                    }
+                }
+                continue;
+            }
+            let node = &self.nodes[child as usize];
+            let (entries, mask) = node.meet(&ray, found.distance);
+            let first = count;
+            for lane in lanes(mask) {
+                // The nearest last, as it is taken first.
+                let mut at = count;
+                while at > first && stack[at - 1].0 < entries[lane] {
+                    stack[at] = stack[at - 1];
+                    at -= 1;
+                }
+                stack[at] = (entries[lane], node.children[lane]);
+                count += 1;
+            }
+        }
+        (found.place != usize::MAX).then_some(found)
+    }
+
+    /// Whether there is any.
+    pub fn is_blocked(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
+        let ray = Ray::new(origin, towards);
+        let mut stack = [self.root; STACK];
+        let mut count = 1;
+        while count > 0 {
+            count -= 1;
+            let child = stack[count];
+            if child & LEAF != 0 {
+                if self.leaves[(child ^ LEAF) as usize].meet(&ray, limit).1 != 0 {
+                    return true;
+                }
+                continue;
+            }
+            let node = &self.nodes[child as usize];
+            for lane in lanes(node.meet(&ray, limit).1) {
+                stack[count] = node.children[lane];
+                count += 1;
+            }
+        }
+        false
+    }
+}
+
+/// The numbers of the bits that are set.
+fn lanes(mut mask: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let lane = (mask != 0).then(|| mask.trailing_zeros() as usize)?;
+        mask &= mask - 1;
+        Some(lane)
+    })
+}
+
+impl Ray {
+    fn new(origin: Vec3, towards: Vec3) -> Self {
+        // Never infinite: a box has no distance then to whom it begins at.
+        let inverse = towards.map(|d| 1. / if d.abs() < 1e-20 { 1e-20f32.copysign(d) } else { d });
+        let splat = |v: Vec3| v.to_array().map(Vec4::splat);
+        let enters = towards.to_array().map(|d| usize::from(d.is_sign_negative()));
+        Ray { origin: splat(origin), towards: splat(towards), inverse: splat(inverse), enters }
+    }
+}
+
+impl Node {
+    /// Where the ray enters the boxes, and which of them it meets before `limit`.
+    #[inline(always)]
+    fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
+        let reach =
+            |axis: usize, side: usize| (self.corners[side][axis] - ray.origin[axis]) * ray.inverse[axis];
+        let [x, y, z] = ray.enters;
+        let enters = reach(0, x).max(reach(1, y)).max(reach(2, z).max(Vec4::ZERO));
+        let leaves = reach(0, 1 - x).min(reach(1, 1 - y)).min(reach(2, 1 - z).min(Vec4::splat(limit)));
+        (enters.to_array(), enters.cmple(leaves).bitmask())
+    }
+}
+
+impl Leaf {
+    /// The ray's distances to the triangles, and which of them it meets before `limit` (Möller and Trumbore, 1997). Edges belong to
+    /// them, so that there is no gap between two.
+    #[inline(always)]
+    fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
+        let Leaf { corner, right, up } = self;
+        let normal = cross(right, up);
+        let scale = Vec4::ONE / dot(&normal, &ray.towards);
+        let way: [Vec4; 3] = std::array::from_fn(|axis| corner[axis] - ray.origin[axis]);
+        let across = cross(&way, &ray.towards);
+        let (u, v) = (scale * dot(up, &across), -scale * dot(right, &across));
+        let distance = scale * dot(&normal, &way);
+        // False, too, where nothing is a number: the ray runs along the triangle, or there is none.
+        let inside = u.cmpge(Vec4::ZERO) & v.cmpge(Vec4::ZERO) & (u + v).cmple(Vec4::ONE);
+        let mask = inside & distance.cmpge(Vec4::ZERO) & distance.cmplt(Vec4::splat(limit));
+        (distance.to_array(), mask.bitmask())
+    }
+}
+
+#[inline(always)]
+fn cross(a: &[Vec4; 3], b: &[Vec4; 3]) -> [Vec4; 3] {
+    [a[1] * b[2] - b[1] * a[2], a[2] * b[0] - b[2] * a[0], a[0] * b[1] - b[0] * a[1]]
+}
+
+#[inline(always)]
+fn dot(a: &[Vec4; 3], b: &[Vec4; 3]) -> Vec4 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// A tree with two boxes a node becomes one with four.
+struct Build<'a> {
+    tree: &'a Bvh2,
+    triangles: &'a [Triangle],
+    places: Vec<Option<usize>>,
+    nodes: Vec<Node>,
+    leaves: Vec<Leaf>,
+}
+
+impl Build<'_> {
+    /// What becomes of node `index`, `level` levels below.
+    fn child(&mut self, index: usize, level: usize) -> Child {
+        assert!(level <= LEVELS, "triangles that no tree of {LEVELS} levels can sort");
+        let Some(node) = self.tree.nodes.get(index) else { return self.leaf(&[]) };
+        let first = node.first_index as usize;
+        if node.is_leaf() {
+            return self.leaf(&self.tree.primitive_indices[first..][..node.prim_count as usize]);
+        }
+        // The largest is opened until there are four.
+        let mut open = vec![first, first + 1];
+        let size = |index: &usize| self.tree.nodes[*index].aabb.half_area();
+        while open.len() < WIDTH {
+            let inner = (0..open.len()).filter(|&i| !self.tree.nodes[open[i]].is_leaf());
+            let Some(largest) = inner.max_by(|&a, &b| size(&open[a]).total_cmp(&size(&open[b]))) else {
+                break;
+            };
+            let children = self.tree.nodes[open[largest]].first_index as usize;
+            open[largest] = children;
+            open.push(children + 1);
+        }
+        let number = self.nodes.len();
+        self.nodes.push(Node::around(open.iter().map(|&index| &self.tree.nodes[index])));
+        for (lane, &index) in open.iter().enumerate() {
+            self.nodes[number].children[lane] = self.child(index, level + 1);
+        }
+        number as Child
+    }
+
+    fn leaf(&mut self, triangles: &[u32]) -> Child {
+        let number = self.leaves.len() as Child;
+        let lane = |lane: usize| triangles.get(lane).map(|&index| index as usize);
+        let found: [Option<usize>; WIDTH] = std::array::from_fn(lane);
+        self.places.extend(found);
+        // What isn't there has no area, which no ray meets.
+        let nothing = Triangle { v0: Vec3A::ZERO, v1: Vec3A::ZERO, v2: Vec3A::ZERO };
+        let corners = found.map(|index| index.map_or(nothing, |index| self.triangles[index]));
+        let along = |point: fn(&Triangle) -> Vec3A| transposed(corners.each_ref().map(point));
+        self.leaves.push(Leaf {
+            corner: along(|t| t.v0),
+            right: along(|t| t.v1 - t.v0),
+            up: along(|t| t.v2 - t.v0),
+        });
+        LEAF | number
+    }
+}
+
+impl Node {
+    fn around<'a>(nodes: impl Iterator<Item = &'a Bvh2Node>) -> Node {
+        // What no ray meets: it ends before it begins.
+        let mut boxes = [Aabb { min: Vec3A::splat(f32::MAX), max: Vec3A::splat(f32::MIN) }; WIDTH];
+        for (known, node) in boxes.iter_mut().zip(nodes) {
+            // A little larger, for what is lost to rounding.
+            let margin = Vec3A::splat(1e-4);
+            *known = Aabb { min: node.aabb.min - margin, max: node.aabb.max + margin };
+        }
+        let corners = [boxes.map(|b| b.min), boxes.map(|b| b.max)].map(transposed);
+        Node { corners, children: [LEAF; WIDTH] }
+    }
+}
+
+/// x of all of them, y and z.
+fn transposed(points: [Vec3A; WIDTH]) -> [Vec4; 3] {
+    std::array::from_fn(|axis| Vec4::from_array(points.map(|point| point[axis])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// Of a soup of triangles, some of them large, some flat along an axis, and of rays from everywhere, some along an axis.
+    #[test]
+    fn rays_find_what_asking_every_triangle_finds() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        for count in [0, 1, 2, 3, 5, 17, 900] {
+            let triangles: Vec<Triangle> = (0..count)
+                .map(|i| {
+                    let mut vector =
+                        |size: f32| Vec3A::from_array([(); 3].map(|()| random.random_range(-size..size)));
+                    let (v0, size) = (vector(10.), if i % 7 == 0 { 8. } else { 0.6 });
+                    let [mut v1, mut v2] = [v0 + vector(size), v0 + vector(size)];
+                    if i % 3 == 0 {
+                        (v1[i % 9 / 3], v2[i % 9 / 3]) = (v0[i % 9 / 3], v0[i % 9 / 3]);
+                    }
+                    Triangle { v0, v1, v2 }
+                })
+                .collect();
+            let (tree, places) = Tree::new(&triangles);
+            let mut known: Vec<usize> = places.iter().flatten().copied().collect();
+            known.sort();
+            assert!(known.into_iter().eq(0..count), "every triangle has a place");
+            let mut hits = 0;
+            for i in 0..4000 {
+                let mut vector =
+                    |size: f32| Vec3::from_array([(); 3].map(|()| random.random_range(-size..size)));
+                let (origin, mut towards) = (vector(14.), vector(1.).normalize());
+                if i % 5 == 0 {
+                    towards = Vec3::AXES[i % 3] * [1., -1.][i / 5 % 2];
+                }
+                let limit = if i % 2 == 0 { f32::INFINITY } else { 6. };
+                let ray = Ray::new(origin, towards);
+                let nearest = tree.leaves.iter().flat_map(|leaf| {
+                    let (distances, mask) = leaf.meet(&ray, limit);
+                    lanes(mask).map(move |lane| distances[lane])
+                });
+                let nearest = nearest.min_by(f32::total_cmp);
+                let found = tree.nearest(origin, towards, limit);
+                assert_eq!(
+                    found.map(|hit| hit.distance),
+                    nearest,
+                    "{count} triangles, from {origin} to {towards}"
+                );
+                assert_eq!(tree.is_blocked(origin, towards, limit), nearest.is_some());
+                if let Some(hit) = found {
+                    hits += 1;
+                    let Triangle { v0, v1, v2 } = triangles[places[hit.place].expect("a triangle")];
+                    let (point, normal) =
+                        (Vec3A::from(origin + hit.distance * towards), (v1 - v0).cross(v2 - v0));
+                    assert!((point - v0).dot(normal.normalize()).abs() < 1e-3, "it isn't there");
+                }
+            }
+            assert!(hits > 1000 || count < 900, "{hits} of 4000 rays meet one of {count} triangles");
+        }
+    }
+
+    #[test]
+    fn what_is_at_the_same_distance_from_all_sides_has_no_gaps() {
+        // A fan of triangles about a point, seen along every edge.
+        let point = |i: usize| {
+            let angle = i as f32 / 12. * std::f32::consts::TAU;
+            Vec3A::new(angle.cos(), 0.3, angle.sin())
+        };
+        let centre = Vec3A::new(0., 0.3, 0.);
+        let fan: Vec<Triangle> =
+            (0..12).map(|i| Triangle { v0: centre, v1: point(i), v2: point(i + 1) }).collect();
+        let (tree, _) = Tree::new(&fan);
+        for i in 0..12 * 50 {
+            let at = centre.lerp(point(i / 50), (i % 50) as f32 / 51.);
+            let origin = Vec3::from(at) + Vec3::Y;
+            assert!(tree.is_blocked(origin, Vec3::NEG_Y, 1.1), "a gap at {at}");
+            assert!((tree.nearest(origin, Vec3::NEG_Y, 9.).expect("a triangle").distance - 1.).abs() < 1e-5);
+        }
+    }
+}
