@@ -6,12 +6,13 @@ use std::{
 };
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 10] = [
+const BRIDGES: [&str; 11] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
     "src/device.rs",
     "src/fit.rs",
+    "src/linear.rs",
     "src/ops.rs",
     "src/optim.rs",
     "src/processor.rs",

@@ -7,6 +7,7 @@
 #include "cuda/splat.cpp"
 #include "device.cpp"
 #include "fit.cpp"
+#include "linear.cpp"
 #include "ops.cpp"
 #include "optim.cpp"
 #include "processor.cpp"

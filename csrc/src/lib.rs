@@ -5,6 +5,7 @@ pub mod chunk;
 pub mod cuda;
 pub mod device;
 pub mod fit;
+pub mod linear;
 pub mod ops;
 pub mod optim;
 pub mod processor;

@@ -65,7 +65,7 @@ pub fn bench_attention(
         ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
-    let yardstick = Yardstick::new(precision.kind(), Device::Cpu);
+    let yardstick = Yardstick::new(precision, Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms caches and threads up.

@@ -60,7 +60,7 @@ pub fn bench_model(
     });
     let context = Sample::of(&[made_up_scene(config, 0)], device).context;
     let stage = config.curriculum.final_stage();
-    let yardstick = Yardstick::new(precision.kind(), device);
+    let yardstick = Yardstick::new(precision, device);
     let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
     // The first pass warms caches, threads and the GPU's libraries up.
     for pass in 0..=repeats {

@@ -112,7 +112,7 @@ pub fn bench_train(
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
-    let yardstick = Yardstick::new(precision.kind(), device);
+    let yardstick = Yardstick::new(precision, device);
     let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
     let peak_gflops = yardstick.gflops(Spread::of(products).least);
     let (milliseconds, sections) = measured.told();

@@ -1,24 +1,29 @@
 //! What the machine can do at best: a product of large square matrices, which all other products are measured by.
 
+use crate::model::Precision;
 use crate::optim::Stopwatch;
-use tch::{Device, Kind, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, nn, no_grad};
 
-/// Two matrices to multiply.
+/// Two matrices to multiply, as the model's layers multiply theirs.
 pub(super) struct Yardstick {
     matrix: Tensor,
+    layer: nn::Linear,
+    precision: Precision,
 }
 
 impl Yardstick {
-    /// Of numbers of that kind, on that device.
-    pub fn new(kind: Kind, device: Device) -> Self {
+    /// Of numbers in that precision, on that device.
+    pub fn new(precision: Precision, device: Device) -> Self {
         let side = if device == Device::Cpu { 2048 } else { 8192 };
-        Yardstick { matrix: Tensor::randn([side, side], (Kind::Float, device)).to_kind(kind) }
+        let matrix = Tensor::randn([side, side], (Kind::Float, device)).to_kind(precision.kind());
+        let layer = nn::Linear { ws: matrix.shallow_clone(), bs: None };
+        Yardstick { matrix, layer, precision }
     }
 
     /// Milliseconds of one product.
     pub fn time(&self) -> f64 {
         let mut watch = Stopwatch::of(self.matrix.device());
-        no_grad(|| watch.time("product", || drop(self.matrix.matmul(&self.matrix))));
+        no_grad(|| watch.time("product", || drop(self.precision.linear(&self.layer, &self.matrix))));
         1e3 * watch.sections()[0].1.as_secs_f64()
     }
 

@@ -1,6 +1,7 @@
 //! What matrix products are computed in (spec 1.3).
 
 use super::parts::does;
+use globalsplat_csrc::linear::{linear, linear_is_faster};
 use globalsplat_csrc::processor::{Bf16, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -47,7 +48,7 @@ impl Precision {
     }
 
     /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
-    pub(super) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
+    pub(crate) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
         match self {
             Precision::F32 => product(xs, &layer.ws, layer.bs.as_ref()),
             Precision::Bf16 => {
@@ -60,10 +61,20 @@ impl Precision {
 
 /// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
-    let out = xs.linear(weights, bias);
+    let is_for_one_dnn =
+        xs.device() == Device::Cpu && xs.kind() == Kind::Float && xs.numel() > 0 && linear_is_faster();
+    let out = if is_for_one_dnn { by_one_dnn(xs, weights, bias) } else { xs.linear(weights, bias) };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
     does(flops, owed(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
+}
+
+fn by_one_dnn(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
+    let address = |t: &Tensor| t.as_ptr() as usize;
+    // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
+    let out = unsafe { linear(address(xs), address(weights), bias.map_or(0, address)) };
+    let out = out.unwrap_or_else(|error| panic!("{error}"));
+    unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
 }
 
 /// Of `flops` that multiply both with each other: as many for the gradient of each, if that of what came `out` is followed.

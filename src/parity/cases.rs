@@ -24,6 +24,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "rgb_tokens" | "ray_tokens" | "tokens" => tokens(request),
         "rays" => rays(request),
         "camera_code" => camera_code(request),
+        "linear" => linear(request),
         "attention" => attention(request),
         "stream_round" => stream_round(request),
         "self_attention_block" => self_attention_block(request),
@@ -168,6 +169,12 @@ fn camera_code(request: &Request) -> Result<Answer> {
     let (module, params) = request.build(|vs| model::CameraCode::new(vs, config.ray_width))?;
     let code = module.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
     with_params([("code", code)], params)
+}
+
+fn linear(request: &Request) -> Result<Answer> {
+    let bias = request.inputs.get("bias").map(Tensor::shallow_clone);
+    let layer = nn::Linear { ws: request.input("weight")?.shallow_clone(), bs: bias };
+    outputs([("out", Precision::F32.linear(&layer, request.input("xs")?))])
 }
 
 fn attention(request: &Request) -> Result<Answer> {

@@ -17,6 +17,30 @@ from ..tolerance import Tolerance
 REGISTERS = 4  # the last slots of a stream
 
 
+@case
+def linear(rng):
+    """One row, and rows of scenes by themselves; weights' gradients are added up over 2048 rows at a time: one more, and twice as many.
+    With a bias and without."""
+    for rows, inputs, outputs, biased in [
+        ((1,), 3, 1, True),
+        ((2, 7), 5, 9, False),
+        ((3, 17), 64, 33, True),
+        ((2049,), 24, 20, True),
+        ((2, 2048), 16, 8, False),
+    ]:
+        numbers = {"xs": normal(rng, *rows, inputs), "weight": normal(rng, outputs, inputs, scale=inputs**-0.5)}
+        if biased:
+            numbers["bias"] = normal(rng, outputs)
+        label = f"{by(*rows, inputs)} to {outputs}, {'with' if biased else 'without'} bias"
+        yield Draw(label, numbers, differentiate=tuple(numbers))
+
+
+@twin("linear")
+def linear_twin(config, params, inputs):
+    layer = {f"layer.{name}": value for name, value in inputs.items()}
+    return {"out": reference.layers.linear(layer, "layer", inputs["xs"])}
+
+
 def attention_inputs(rng, batch, queries, keys, width, scale=1.0):
     """Scores have about this deviation: inputs are normal, and a product's deviation is the root of its length."""
     shapes = {"q": (batch, queries, width), "k": (batch, keys, width), "v": (batch, keys, width)}

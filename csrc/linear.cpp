@@ -1,0 +1,98 @@
+#include "linear.h"
+
+#include <ATen/Context.h>
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <torch/csrc/autograd/custom_function.h>
+
+#include <algorithm>
+#include <optional>
+
+#include "globalsplat-csrc/src/linear.rs.h"
+
+namespace globalsplat {
+namespace {
+
+using at::Tensor;
+using torch::autograd::AutogradContext;
+using torch::autograd::tensor_list;
+
+// Of the gradient of weights, summed up part by part: both matrices are read along their columns, and more rows fall out of the caches.
+constexpr int64_t kRows = 2048;
+
+using Product = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
+                       c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
+
+// What torch's compiler calls for a linear layer. Libtorch may have been built without it.
+std::optional<c10::TypedOperatorHandle<Product>> find_product() {
+  const auto found = c10::Dispatcher::singleton().findSchema({"mkldnn::_linear_pointwise", ""});
+  if (!found) return {};
+  return found->typed<Product>();
+}
+
+const std::optional<c10::TypedOperatorHandle<Product>>& product() {
+  static const auto known = find_product();
+  return known;
+}
+
+// xs [m, k] · weightsᵀ [n, k] + bias, if there is one.
+Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
+  return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
+}
+
+struct LinearFunction : torch::autograd::Function<LinearFunction> {
+  static Tensor forward(AutogradContext* ctx, Tensor xs, Tensor weights, std::optional<Tensor> bias) {
+    ctx->save_for_backward({xs, weights});
+    ctx->saved_data["has_bias"] = bias.has_value();
+    return multiply(xs, weights, bias);
+  }
+
+  static tensor_list backward(AutogradContext* ctx, tensor_list gradients) {
+    const tensor_list kept = ctx->get_saved_variables();
+    const Tensor &xs = kept[0], &weights = kept[1], g = gradients[0].contiguous();
+    Tensor d_xs, d_weights, d_bias;
+    if (ctx->needs_input_grad(0)) d_xs = multiply(g, weights.t(), {});
+    if (ctx->needs_input_grad(1)) {
+      for (int64_t first = 0; first < g.size(0); first += kRows) {
+        const int64_t rows = std::min(kRows, g.size(0) - first);
+        const Tensor part = multiply(g.narrow(0, first, rows).t(), xs.narrow(0, first, rows).t(), {});
+        d_weights = d_weights.defined() ? d_weights.add_(part) : part;
+      }
+    }
+    if (ctx->saved_data["has_bias"].toBool() && ctx->needs_input_grad(2)) d_bias = g.sum(0);
+    return {d_xs, d_weights, d_bias};
+  }
+};
+
+bool is_numbers(const Tensor& t) { return t.device().is_cpu() && t.scalar_type() == at::kFloat; }
+
+}  // namespace
+
+bool linear_is_faster() {
+#if defined(__x86_64__)
+  static const bool is = [] {
+    __builtin_cpu_init();
+    return at::hasMKL() && product() && __builtin_cpu_supports("avx2") && !__builtin_cpu_is("intel");
+  }();
+  return is;
+#else
+  return false;
+#endif
+}
+
+size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
+  const auto borrowed = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
+  TORCH_CHECK(linear_is_faster(), "products of float32 are libtorch's on this processor");
+  const Tensor &xs = borrowed(xs_address), &weights = borrowed(weights_address);
+  std::optional<Tensor> bias;
+  if (bias_address != 0) bias = borrowed(bias_address);
+  TORCH_CHECK(is_numbers(xs) && is_numbers(weights) && (!bias || is_numbers(*bias)), "linear layers must be float32 on the CPU");
+  TORCH_CHECK(weights.dim() == 2 && xs.dim() > 0 && xs.size(-1) == weights.size(1) && xs.numel() > 0 && weights.numel() > 0 &&
+                  (!bias || bias->sizes() == weights.sizes().slice(0, 1)),
+              "numbers have shape ", xs.sizes(), " and weights ", weights.sizes(), ", expected [.., k] and [n, k], and a bias [n]");
+  auto size = xs.sizes().vec();
+  size.back() = weights.size(0);
+  const Tensor out = LinearFunction::apply(xs.reshape({-1, xs.size(-1)}), weights, bias);
+  return reinterpret_cast<size_t>(new Tensor(out.view(size)));
+}
+
+}  // namespace globalsplat
