@@ -27,7 +27,7 @@ pub use vgg19::Vgg19;
 pub(crate) use consistency::{Share, consistency, depth_pixels};
 
 use crate::data::Sample;
-use crate::model::{Decoded, part};
+use crate::model::Decoded;
 use crate::render::Pictures;
 use tch::Tensor;
 
@@ -47,7 +47,7 @@ pub(crate) fn losses(
         Some(network) => {
             // Both halves of a paired sample have the same targets.
             let halves = truth.chunk(if sample.paired { 2 } else { 1 }, 0);
-            part("L_perc", || network.loss(&pictures.rgb, &halves[0])) * share.scenes
+            network.loss(&pictures.rgb, &halves[0]) * share.scenes
         }
         None => mse.zeros_like(),
     };

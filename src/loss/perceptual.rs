@@ -5,7 +5,7 @@ use super::lpips::{Lpips, LpipsNetwork};
 use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
-use crate::model::Precision;
+use crate::model::{Precision, part};
 use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
@@ -92,24 +92,56 @@ impl PerceptualLoss {
     }
 
     /// The mean over `rendered` [R·B, C, 3, H, W], R times `truth` [B, C, 3, H, W] along the batch: the truth's features are
-    /// computed once and serve every part.
+    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, as what
+    /// layers keep of all pictures would be several times what all else of a training step keeps.
     pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
-        let repeats = rendered.size()[0] / truth.size()[0];
-        let parts = rendered.chunk(repeats, 0);
-        let compared = match self {
-            PerceptualLoss::Vgg19(network) => {
-                let truth = tch::no_grad(|| network.features(truth));
-                parts.iter().map(|part| network.compare(&network.features(part), &truth)).collect::<Vec<_>>()
+        let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
+        let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
+        let pictures = rendered.detach().reshape([&[repeats][..], &truth.size()].concat());
+        // A leaf would say that it asks for gradients even where they are off.
+        let gradient = rendered.sum(None::<Kind>).requires_grad().then(|| pictures.empty_like());
+        let at_once = if rendered.device() == Device::Cpu { 1 } else { count };
+        let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
+        for first in (0..count).step_by(at_once as usize) {
+            let truth = truth.narrow(0, first, at_once);
+            let truth = part("L_perc", || tch::no_grad(|| self.features(&truth)));
+            for turn in 0..repeats {
+                let place = |of: &Tensor| of.select(0, turn).narrow(0, first, at_once);
+                let picture = place(&pictures).detach().set_requires_grad(gradient.is_some());
+                let share = at_once as f64 / (count * repeats) as f64;
+                let loss = part("L_perc", || self.compare(&self.features(&picture), &truth)) * share;
+                if let Some(gradient) = &gradient {
+                    loss.backward();
+                    place(gradient).copy_(&picture.grad());
+                }
+                sum += loss.detach();
             }
+        }
+        match gradient {
+            // Adds nothing but the way back.
+            Some(gradient) => {
+                let way = (rendered * gradient.view_as(rendered)).sum(None::<Kind>);
+                sum + (&way - way.detach())
+            }
+            None => sum,
+        }
+    }
+
+    fn features(&self, pictures: &Tensor) -> Vec<Tensor> {
+        match self {
+            PerceptualLoss::Vgg19(network) => network.features(pictures),
+            PerceptualLoss::Lpips(lpips) => lpips.features(pictures).collect(),
+        }
+    }
+
+    /// Mean over the pictures whose features these are.
+    fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
+        let each = |features: &[Tensor]| features.iter().map(Tensor::shallow_clone).collect::<Vec<_>>();
+        match self {
+            PerceptualLoss::Vgg19(network) => network.compare(picture, truth),
             PerceptualLoss::Lpips(lpips) => {
-                let truth: Vec<Tensor> = tch::no_grad(|| lpips.features(truth).collect());
-                let truth = || truth.iter().map(Tensor::shallow_clone);
-                parts
-                    .iter()
-                    .map(|part| lpips.compare(lpips.features(part), truth()).mean(None::<Kind>))
-                    .collect()
+                lpips.compare(each(picture).into_iter(), each(truth).into_iter()).mean(None::<Kind>)
             }
-        };
-        Tensor::stack(&compared, 0).mean(None::<Kind>)
+        }
     }
 }

@@ -72,13 +72,15 @@ def vgg19_twin(config, params, inputs):
 
 @case
 def perceptual(rng):
-    """Two renderings of the same targets. The network's weights are inputs that take no gradient."""
+    """Two renderings of the same targets, of which there are one and several. The network's weights are inputs that take no
+    gradient."""
     params = draw.vgg19_parameters(rng)
 
     def closest_to_vgg19(rendered, truth):
-        return min(closest_call_of_vgg19(params, half, truth[0]) for half in rendered)
+        truth = truth.reshape(-1, 3, 16, 16)
+        return min(closest_call_of_vgg19(params, half, truth) for half in rendered.reshape(2, *truth.shape))
 
-    rendered, truth = sure_pictures(rng, closest_to_vgg19, (2, 1, 3, 16, 16), (1, 1, 3, 16, 16))
+    rendered, truth = sure_pictures(rng, closest_to_vgg19, (2, 2, 3, 16, 16), (1, 2, 3, 16, 16))
     inputs = {"rendered": rendered, "truth": truth, **params}
     yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",))
     params = draw.lpips_parameters(rng, "lpips_alex")
