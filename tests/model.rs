@@ -207,6 +207,67 @@ fn weights_of_a_file_in_bf16_are_kept_in_it() {
     assert!(cast.quaternions.equal(&kept.quaternions) && cast.opacities.equal(&kept.opacities));
 }
 
+/// Bytes of the process' memory that lie in `file`, as Linux counts them.
+#[cfg(target_os = "linux")]
+fn resident(file: &std::path::Path) -> u64 {
+    let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
+    let name = file.canonicalize().unwrap().display().to_string();
+    let (mut is_of_file, mut kilobytes) = (false, 0);
+    for line in maps.lines() {
+        let first = line.split_whitespace().next().unwrap_or_default();
+        if first.contains('-') {
+            // A range of addresses, and at the line's end what lies there.
+            is_of_file = line.ends_with(&name);
+        } else if first == "Rss:" && is_of_file {
+            kilobytes += line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap();
+        }
+    }
+    1000 * kilobytes
+}
+
+#[test]
+fn weights_that_lie_in_their_file_are_those_that_are_copied() {
+    let model = ModelConfig { width: 64, heads: 4, ..small() };
+    let config = Config { model, ..Default::default() };
+    let (vs, _) = build(&config.model);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let stage = config.curriculum.final_stage();
+    for (dtype, precision) in [(ModelDtype::F32, Precision::F32), (ModelDtype::BF16, Precision::Bf16)] {
+        save_model(&path, &vs, &config, stage, dtype).unwrap();
+        let open = || ModelFile::open(&path, &[]).unwrap();
+        let copied = open().load(Device::Cpu, precision).unwrap();
+        let lies = open().lend(Device::Cpu, precision).unwrap();
+        let lent = lies.lent.expect("a file that was lent");
+        assert!(copied.lent.is_none());
+        let [images, c2w, intrinsics] = inputs(3, 16, 24);
+        let same = |loaded: &LoadedModel| {
+            let of = |loaded: &LoadedModel| {
+                tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians)
+            };
+            let (a, b) = (of(&copied), of(loaded));
+            // Where a tensor lies in memory may decide in which order sums are added up.
+            let pairs = [(&a.means, &b.means), (&a.opacities, &b.opacities), (&a.sh, &b.sh)];
+            pairs.iter().all(|(a, b)| common::relative_error(b, a) < 1e-5)
+        };
+        assert!(same(&lies), "{dtype:?}");
+        #[cfg(target_os = "linux")]
+        {
+            let bytes = std::fs::metadata(&path).unwrap().len();
+            let used = resident(&path);
+            lent.let_go();
+            let left = resident(&path);
+            assert!(2 * used > bytes && 8 * left < bytes, "{dtype:?}: {used} of {bytes} bytes, then {left}");
+        }
+        assert!(same(&lies), "{dtype:?}: read again");
+        // A page that is written to is the process' own.
+        let before = std::fs::read(&path).unwrap();
+        tch::no_grad(|| lies.vs.variables().values().for_each(|t| drop(t.shallow_clone().fill_(1.))));
+        assert!(!same(&lies) && std::fs::read(&path).unwrap() == before);
+        lent.let_go();
+    }
+}
+
 #[test]
 fn initial_weights_are_as_specified() {
     tch::manual_seed(0);

@@ -30,7 +30,7 @@ pub fn load(weights: Option<&Path>, precision: Precision, device: Device) -> Res
         Some(weights) => ModelFile::open(weights, &[])?,
         None => ModelFile::shipped()?,
     };
-    let loaded = file.load(device, precision)?;
+    let loaded = file.lend(device, precision)?;
     if !ranks::is_first() {
         return Ok(loaded);
     }

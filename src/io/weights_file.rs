@@ -5,7 +5,7 @@ use super::state_dict::{Contents, state_dict};
 use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
-use memmap2::{Mmap, UncheckedAdvice};
+use memmap2::{Mmap, MmapMut, MmapOptions, UncheckedAdvice};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
@@ -53,6 +53,8 @@ pub struct WeightsFile {
 #[derive(Debug)]
 enum Bytes {
     Mapped(Mmap),
+    /// What is written there is the process' own.
+    Lent(MmapMut),
     /// By the program itself.
     Carried(&'static [u8]),
 }
@@ -66,25 +68,38 @@ impl Bytes {
             Err(e) => return Err(read(e)),
         };
         // SAFETY: ours are replaced as a whole, never changed in place. Whoever cuts off a file that is being read ends the program.
-        Ok(Bytes::Mapped(unsafe { Mmap::map(&file) }.map_err(read)?))
+        Ok(Bytes::Mapped(unsafe { MmapOptions::new().map_copy_read_only(&file) }.map_err(read)?))
     }
 
     fn get(&self) -> &[u8] {
         match self {
             Bytes::Mapped(map) => map,
+            Bytes::Lent(map) => map,
             Bytes::Carried(bytes) => bytes,
         }
     }
 
-    /// Says that nobody needs them again soon: a mapped file's pages don't stay beside what was copied from them.
-    fn let_go(&self, range: Range<usize>) {
-        if let Bytes::Mapped(map) = self {
-            // SAFETY: pages of a file that was mapped to be read; whoever reads them again gets the same.
-            let advised =
-                unsafe { map.unchecked_advise_range(UncheckedAdvice::DontNeed, range.start, range.len()) };
-            // It is advice alone.
-            let _ = advised;
+    fn lend(self, path: &Path) -> Result<Self> {
+        match self {
+            Bytes::Mapped(map) => Ok(Bytes::Lent(map.make_mut().map_err(Error::read(path))?)),
+            other => Ok(other),
         }
+    }
+
+    /// Says that nobody needs them again soon: a mapped file's pages don't stay beside what was copied from them. Whoever reads them
+    /// again gets what is in the file.
+    fn let_go(&self, range: Range<usize>) {
+        let (start, length) = (range.start, range.len());
+        // SAFETY: pages of a file that others read as numbers of any value.
+        let advised = unsafe {
+            match self {
+                Bytes::Mapped(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
+                Bytes::Lent(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
+                Bytes::Carried(_) => Ok(()),
+            }
+        };
+        // It is advice alone.
+        let _ = advised;
     }
 }
 
@@ -201,6 +216,29 @@ impl WeightsFile {
     /// # Errors
     /// Names, shapes or types that don't fit, before anything is copied: the first name or shape is told and the rest counted.
     pub fn load_into(&self, vs: &nn::VarStore) -> Result<()> {
+        self.fill(vs, |_, _| false)
+    }
+
+    /// As [`WeightsFile::load_into`], but what variables on the host take as it is isn't copied: they lie in the file from now on, and
+    /// the process has the pages that are in use alone. Whoever writes to a variable gets a page of his own.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn lend_to(mut self, vs: &nn::VarStore) -> Result<LentWeights> {
+        let path = &self.path;
+        self.parts = self.parts.into_iter().map(|bytes| bytes.lend(path)).collect::<Result<_>>()?;
+        let is_lent = |bytes: &Bytes| matches!(bytes, Bytes::Lent(_));
+        let takes = |variable: &Tensor, view: &Tensor| {
+            variable.device() == Device::Cpu && variable.kind() == view.kind() && view.is_contiguous()
+        };
+        let all_lent = self.parts.iter().all(is_lent);
+        self.fill(vs, |variable, view| all_lent && takes(variable, view))?;
+        // Nobody knows how long variables will be held.
+        Ok(LentWeights(Box::leak(self.parts.into_boxed_slice())))
+    }
+
+    /// With the variables that `lies_in_file` says, given what the file has for them, in the file; the others get a copy.
+    fn fill(&self, vs: &nn::VarStore, lies_in_file: impl Fn(&Tensor, &Tensor) -> bool) -> Result<()> {
         let is_weight = |kind| matches!(kind, Kind::Float | Kind::Double | Kind::BFloat16 | Kind::Half);
         if let Some((name, place)) = self.tensors.iter().find(|(_, place)| !is_weight(place.array.dtype)) {
             let (field, found) = (format!("tensor {name}"), format!("{:?}", place.array.dtype));
@@ -214,11 +252,15 @@ impl WeightsFile {
             let part = &self.parts[place.part].get()[bytes.clone()];
             match part.as_ptr().align_offset(dtype.elt_size_in_bytes()) {
                 0 if !part.is_empty() => {
-                    // SAFETY: the array lies inside the file, which stays mapped until it is copied.
+                    // SAFETY: the array lies inside the file, which stays mapped until it is copied, or else for ever.
                     let view = unsafe {
                         let (size, stride) = (dimensions(size), dimensions(stride));
                         Tensor::f_from_blob(part.as_ptr(), &size, &stride, *dtype, Device::Cpu)?
                     };
+                    if lies_in_file(variable, &view) {
+                        variable.set_data(&view);
+                        return Ok(());
+                    }
                     variable.f_copy_(&view)?;
                 }
                 _ => variable.f_copy_(&self.copy(place)?)?,
@@ -233,6 +275,18 @@ impl WeightsFile {
         let count = bytes.len() / array.dtype.elt_size_in_bytes();
         let numbers = Tensor::f_from_data_size(bytes, &[count as i64], array.dtype)?;
         Ok(numbers.f_as_strided(dimensions(&array.size), dimensions(&array.stride), None)?.f_contiguous()?)
+    }
+}
+
+/// Files that variables lie in ([`WeightsFile::lend_to`]), as long as the process lives.
+#[derive(Debug, Clone, Copy)]
+pub struct LentWeights(&'static [Bytes]);
+
+impl LentWeights {
+    /// Gives memory of what was read back to the system, until it is read again: as a rule from the system's own memory of files.
+    /// What was written to variables that lie there is lost.
+    pub fn let_go(&self) {
+        self.0.iter().for_each(|bytes| bytes.let_go(0..bytes.get().len()));
     }
 }
 

@@ -19,7 +19,8 @@ pub use spread::spread_over_path;
 use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
-use crate::model::{Encoded, GlobalSplat, Stage};
+use crate::io::LentWeights;
+use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
 use crate::render::transform;
 use crate::scene::{Gaussians, Similarity, normalize};
 use glam::DMat4;
@@ -39,12 +40,14 @@ pub struct Model<'a> {
     pub device: Device,
     /// What it sees of a photo.
     pub input: Input,
+    /// What its weights lie in, if they weren't copied.
+    pub lent: Option<LentWeights>,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
-        let LoadedModel { model: network, config, stage, vs, .. } = loaded;
-        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN }
+        let LoadedModel { model: network, config, stage, vs, lent, .. } = loaded;
+        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN, lent: *lent }
     }
 }
 
@@ -81,7 +84,7 @@ pub fn reconstruct<'a>(
     photos: &[View],
     targets: &[DMat4],
 ) -> Result<Reconstruction> {
-    let Model { network, config, stage, device, input } = model.into();
+    let Model { network, config, stage, device, input, lent } = model.into();
     if photos.len() < 2 {
         return Err(Error::Request(format!(
             "a reconstruction needs two views or more, found {}",
@@ -101,13 +104,25 @@ pub fn reconstruct<'a>(
     config.model.check_image(images.size()[3], images.size()[4])?;
 
     let start = Instant::now();
-    let (encoded, decoded) = tch::no_grad(|| {
+    let pass = || {
         let memory = network.memory(&images, &c2w, &intrinsics);
         drop(images);
         let encoded = network.encode_memory(&memory);
         drop(memory);
         let decoded = network.decode(&encoded, stage);
         (encoded, decoded)
+    };
+    let (encoded, decoded) = tch::no_grad(|| match lent {
+        // A pass needs every weight once.
+        Some(lent) => told(
+            move |event| {
+                if let Event::Begins(_) = event {
+                    lent.let_go()
+                }
+            },
+            pass,
+        ),
+        None => pass(),
     });
     // Bringing the Gaussians to the host also waits for a GPU.
     let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);

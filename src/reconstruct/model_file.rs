@@ -3,7 +3,7 @@
 use super::published::{CHECKPOINT_PREFIX, assumed, configuration, is_ours, model_tensors};
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::io::{Weights, WeightsFile, write_checkpoint, write_weights};
+use crate::io::{LentWeights, Weights, WeightsFile, write_checkpoint, write_weights};
 use crate::model::{GlobalSplat, Precision, Stage};
 use std::collections::HashMap;
 use std::path::Path;
@@ -38,6 +38,8 @@ pub struct LoadedModel {
     pub stage: Stage,
     /// Holds the weights, those of products in the precision of passes.
     pub vs: nn::VarStore,
+    /// What weights lie in that weren't copied: nobody should write to these.
+    pub lent: Option<LentWeights>,
     /// For what a file without a configuration is taken.
     pub assumed: Option<String>,
 }
@@ -181,6 +183,24 @@ impl ModelFile {
     /// # Errors
     /// Weights that don't fit the configuration.
     pub fn load(self, device: Device, precision: Precision) -> Result<LoadedModel> {
+        self.build(device, precision, |weights, vs| weights.load_into(vs).map(|()| None))
+    }
+
+    /// The same for passes alone: weights that products take as they are on disk stay there, and the system reads them as they are
+    /// needed. The file mustn't be changed in its place meanwhile.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn lend(self, device: Device, precision: Precision) -> Result<LoadedModel> {
+        self.build(device, precision, |weights, vs| weights.lend_to(vs).map(Some))
+    }
+
+    fn build(
+        self,
+        device: Device,
+        precision: Precision,
+        fill: impl FnOnce(WeightsFile, &nn::VarStore) -> Result<Option<LentWeights>>,
+    ) -> Result<LoadedModel> {
         // Before a model of whatever size is made.
         let numbers: i64 =
             self.weights.shapes().values().map(|(_, shape)| shape.iter().product::<i64>()).sum();
@@ -191,9 +211,9 @@ impl ModelFile {
         }
         let mut vs = nn::VarStore::new(device);
         let model = GlobalSplat::to_be_filled(&mut vs, &self.config.model, precision)?;
-        self.load_into(&vs)?;
-        let ModelFile { config, stage, assumed, .. } = self;
-        Ok(LoadedModel { model, config, stage, vs, assumed })
+        let ModelFile { weights, config, stage, assumed, .. } = self;
+        let lent = fill(weights, &vs)?;
+        Ok(LoadedModel { model, config, stage, vs, lent, assumed })
     }
 }
 

@@ -463,7 +463,7 @@ impl Trainer {
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
-        Model { network, config, stage, device, input: Input::PLAIN }
+        Model { network, config, stage, device, input: Input::PLAIN, lent: None }
     }
 }
 
