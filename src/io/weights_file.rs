@@ -227,12 +227,11 @@ impl WeightsFile {
     pub fn lend_to(mut self, vs: &nn::VarStore) -> Result<LentWeights> {
         let path = &self.path;
         self.parts = self.parts.into_iter().map(|bytes| bytes.lend(path)).collect::<Result<_>>()?;
-        let is_lent = |bytes: &Bytes| matches!(bytes, Bytes::Lent(_));
+        let are_files = self.parts.iter().all(|bytes| matches!(bytes, Bytes::Lent(_)));
         let takes = |variable: &Tensor, view: &Tensor| {
             variable.device() == Device::Cpu && variable.kind() == view.kind() && view.is_contiguous()
         };
-        let all_lent = self.parts.iter().all(is_lent);
-        self.fill(vs, |variable, view| all_lent && takes(variable, view))?;
+        self.fill(vs, |variable, view| are_files && takes(variable, view))?;
         // Nobody knows how long variables will be held.
         Ok(LentWeights(Box::leak(self.parts.into_boxed_slice())))
     }

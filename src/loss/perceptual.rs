@@ -92,8 +92,8 @@ impl PerceptualLoss {
     }
 
     /// The mean over `rendered` [R·B, C, 3, H, W], R times `truth` [B, C, 3, H, W] along the batch: the truth's features are
-    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, as what
-    /// layers keep of all pictures would be several times what all else of a training step keeps.
+    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, as
+    /// layers would keep nearly as much of all pictures as all else of a training step keeps.
     pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
         let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);

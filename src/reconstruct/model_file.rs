@@ -186,13 +186,16 @@ impl ModelFile {
         self.build(device, precision, |weights, vs| weights.load_into(vs).map(|()| None))
     }
 
-    /// The same for passes alone: weights that products take as they are on disk stay there, and the system reads them as they are
-    /// needed. The file mustn't be changed in its place meanwhile.
+    /// The same for passes alone: on the CPU, weights that products take as they are on disk stay there, and the system reads them as
+    /// they are needed. The file mustn't be changed in its place meanwhile.
     ///
     /// # Errors
     /// As there.
     pub fn lend(self, device: Device, precision: Precision) -> Result<LoadedModel> {
-        self.build(device, precision, |weights, vs| weights.lend_to(vs).map(Some))
+        match device {
+            Device::Cpu => self.build(device, precision, |weights, vs| weights.lend_to(vs).map(Some)),
+            _ => self.load(device, precision),
+        }
     }
 
     fn build(
