@@ -5,7 +5,7 @@ use super::lpips::{Lpips, LpipsNetwork};
 use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
-use crate::model::{Precision, part};
+use crate::model::{Precision, is_followed, part};
 use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
@@ -98,9 +98,9 @@ impl PerceptualLoss {
         let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
         let pictures = rendered.detach().reshape([&[repeats][..], &truth.size()].concat());
-        // A leaf would say that it asks for gradients even where they are off.
-        let gradient = rendered.sum(None::<Kind>).requires_grad().then(|| pictures.empty_like());
+        let gradient = is_followed(rendered).then(|| pictures.empty_like());
         let at_once = if rendered.device() == Device::Cpu { 1 } else { count };
+        let share = at_once as f64 / (count * repeats) as f64;
         let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
         for first in (0..count).step_by(at_once as usize) {
             let truth = truth.narrow(0, first, at_once);
@@ -108,7 +108,6 @@ impl PerceptualLoss {
             for turn in 0..repeats {
                 let place = |of: &Tensor| of.select(0, turn).narrow(0, first, at_once);
                 let picture = place(&pictures).detach().set_requires_grad(gradient.is_some());
-                let share = at_once as f64 / (count * repeats) as f64;
                 let loss = part("L_perc", || self.compare(&self.features(&picture), &truth)) * share;
                 if let Some(gradient) = &gradient {
                     loss.backward();

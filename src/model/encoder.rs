@@ -2,11 +2,12 @@
 
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
+use super::leaves::is_followed;
 use super::mixer::Mixer;
 use super::parts::part;
 use super::precision::Precision;
 use super::stream::{REGISTERS, StreamRound, normalized};
-use tch::{Kind, Tensor, nn};
+use tch::{Tensor, nn};
 
 /// Query tokens before the scene tokens; not decoded.
 const AUXILIARIES: i64 = 4;
@@ -96,8 +97,7 @@ impl Encoder {
 
     /// Whether gradients will come back to its weights from what is computed now.
     pub(super) fn is_followed(&self) -> bool {
-        // A view would say what its base does, even where gradients are off.
-        self.memory_registers.sum(Kind::Float).requires_grad()
+        is_followed(&self.memory_registers)
     }
 
     /// What all rounds read, [B, 4 + V·P, token width]: learned tokens, then those of images, of which `views` gives as many at a

@@ -7,6 +7,12 @@ pub(crate) fn leaf(output: &Tensor) -> Tensor {
     output.detach().set_requires_grad(true)
 }
 
+/// Whether gradients will come back to `t` from what is computed of it now. A leaf, and a view of one, would say what it asks for
+/// even where gradients are off.
+pub(crate) fn is_followed(t: &Tensor) -> bool {
+    t.sum(Kind::Float).requires_grad()
+}
+
 /// Goes on with the backward pass from `outputs` of a part, whose gradients are those of the leaves beside them.
 ///
 /// tch can't begin with given gradients; with the sum of products it begins with just these.

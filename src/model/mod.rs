@@ -31,7 +31,7 @@ pub(crate) use precision::convolve;
 pub use shapes::MODULES;
 
 // For training, which goes through the model in parts.
-pub(crate) use leaves::{leaf, pull_back};
+pub(crate) use leaves::{is_followed, leaf, pull_back};
 pub(crate) use recompute::KeptRounds;
 
 // For the parity checks, which run every module by itself.
