@@ -10,6 +10,7 @@
 #include "globalsplat-csrc/src/attention.rs.h"
 #include "raster/attend.h"
 #include "raster/rows.h"
+#include "room.h"
 #include "threads.h"
 
 namespace globalsplat {
@@ -18,8 +19,6 @@ namespace {
 using at::Tensor;
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
-
-
 
 bool is_bf16(const Tensor& t) { return t.scalar_type() == at::kBFloat16; }
 
@@ -63,6 +62,7 @@ bool has_bf16_products() {
   static const bool has = [] {
     const std::vector<raster::Bf16> zeros(16 * 16);
     std::vector<float> sums(16 * 16);
+    expect_room_for_code(0);
     try {
       multiply(16, 16, 16, 16, 16, 16, false, zeros.data(), zeros.data(), sums.data());
     } catch (const c10::Error&) {
@@ -80,10 +80,12 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const Tensor log_sums = at::empty({q.size(0), heads, q.size(1)}, q.options().dtype(at::kFloat));
     const raster::AttentionShape shape = shape_of(q, k, heads);
     float* const sums = log_sums.data_ptr<float>();
-    if (is_bf16(q))
+    if (is_bf16(q)) {
+      expect_room_for_code(0);
       raster::attend_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, kProducts, threads());
-    else
+    } else {
       raster::attend(shape, read_all<float>(q, k, v), written<float>(out), sums, threads());
+    }
     ctx->save_for_backward({q, k, v, out, log_sums});
     ctx->saved_data["heads"] = heads;
     return out;
@@ -96,13 +98,15 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const Tensor dq = like(q), dk = like(k), dv = like(v);
     const raster::AttentionShape shape = shape_of(q, k, ctx->saved_data["heads"].toInt());
     const float* const sums = t[4].const_data_ptr<float>();
-    if (is_bf16(q))
+    if (is_bf16(q)) {
+      expect_room_for_code(0);
       raster::attend_backward_bf16(
           shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(slope),
           {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, kProducts, threads());
-    else
+    } else {
       raster::attend_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(slope),
                               {written<float>(dq), written<float>(dk), written<float>(dv)}, threads());
+    }
     return {dq, dk, dv, Tensor()};
   }
 };

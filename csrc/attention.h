@@ -6,7 +6,8 @@
 
 namespace globalsplat {
 
-// Whether attention() takes heads of that width: of float32 numbers, or of bfloat16 where there are products for them.
+// Whether attention() takes heads of that width: of float32 numbers, or of bfloat16 where there are products for them. Throws where
+// memory to find that out is refused.
 bool attention_takes(int64_t width, bool is_bf16);
 
 // softmax(q kᵀ / √(d/h)) v over h heads side by side (raster/attention.h): q [B, n, d], k and v [B, m, d], m at least 1, float32 or

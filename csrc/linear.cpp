@@ -8,6 +8,7 @@
 #include <optional>
 
 #include "globalsplat-csrc/src/linear.rs.h"
+#include "room.h"
 
 namespace globalsplat {
 namespace {
@@ -34,8 +35,9 @@ const std::optional<c10::TypedOperatorHandle<Product>>& product() {
   return known;
 }
 
-// xs [m, k] · weightsᵀ [n, k] + bias, if there is one.
+// xs [m, k] · weightsᵀ [n, k] + bias, if there is one. Beside the result there may be the weights in oneDNN's order.
 Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
+  expect_room_for_code(int64_t(sizeof(float)) * (xs.size(0) * weights.size(0) + weights.numel()));
   return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 

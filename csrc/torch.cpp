@@ -12,5 +12,6 @@
 #include "optim.cpp"
 #include "processor.cpp"
 #include "ranks.cpp"
+#include "room.cpp"
 #include "splat.cpp"
 #include "threads.cpp"

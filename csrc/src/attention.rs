@@ -10,7 +10,7 @@ mod ffi {
         include!("attention.h");
 
         /// See `csrc/attention.h`.
-        fn attention_takes(width: i64, is_bf16: bool) -> bool;
+        fn attention_takes(width: i64, is_bf16: bool) -> Result<bool>;
 
         /// See `csrc/attention.h`.
         ///

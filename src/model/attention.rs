@@ -21,11 +21,12 @@ fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     if !all.iter().all(fits) {
         return by_libtorch(q, k, v, heads);
     }
+    let takes = |is_bf16| ours::attention_takes(width, is_bf16).unwrap_or_else(|error| panic!("{error}"));
     match kind {
-        Kind::Float if ours::attention_takes(width, false) => by_ours(all, heads),
-        Kind::BFloat16 if ours::attention_takes(width, true) => by_ours(all, heads),
+        Kind::Float if takes(false) => by_ours(all, heads),
+        Kind::BFloat16 if takes(true) => by_ours(all, heads),
         // Without products of them: libtorch's kernel needs tiles to be fast.
-        Kind::BFloat16 if bf16_of_cpu() != Bf16::Tiles && ours::attention_takes(width, false) => {
+        Kind::BFloat16 if bf16_of_cpu() != Bf16::Tiles && takes(false) => {
             by_ours(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
         }
         _ => by_libtorch(q, k, v, heads),
@@ -115,7 +116,7 @@ mod tests {
         for (queries, keys, heads, width) in
             [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128), (200, 131, 1, 72)]
         {
-            if !ours::attention_takes(width, true) {
+            if !ours::attention_takes(width, true).unwrap() {
                 return println!("left out: this processor has no products of bfloat16 numbers");
             }
             let rows = [(queries, 0.), (keys, 1.), (keys, 2.), (queries, 3.)];
