@@ -167,9 +167,9 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
     V red[kVectors<T>], green[kVectors<T>], blue[kVectors<T>], alpha[kVectors<T>], depth[kVectors<T>];
     for (int k = 0; k < kVectors<T>; ++k) {
       const Pixels<T>& px = pixels[block][k];
-      red[k] = px.red;
-      green[k] = px.green;
-      blue[k] = px.blue;
+      red[k] = value_of(px.red);
+      green[k] = value_of(px.green);
+      blue[k] = value_of(px.blue);
       alpha[k] = px.alpha;
       depth[k] = expected_depth(px);
     }

@@ -19,6 +19,8 @@ template <class T>
 using Vector = T;
 template <class T>
 using Mask = bool;
+template <class T>
+using FusedSum = T;
 
 template <class T>
 GS_INLINE T broadcast(T value) {
@@ -42,6 +44,8 @@ GS_INLINE void store(T* to, T v) {
 
 GS_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 GS_INLINE float fnma(float a, float b, float c) { return ::fmaf(-a, b, c); }
+GS_INLINE float add_fused(float weight, float number, float sum) { return fma(weight, number, sum); }
+GS_INLINE float value_of(float sum) { return sum; }
 GS_INLINE float add_product(float a, float b, float c) { return fma(a, b, c); }
 GS_INLINE float take_product(float a, float b, float c) { return fnma(a, b, c); }
 GS_INLINE float sqrt(float v) { return ::sqrtf(v); }

@@ -44,12 +44,12 @@ struct Contribution {
 template <class T>
 GS_INLINE Offset<T> offset_of(const Splat<T>& s, Vector<T> x, Vector<T> y) {
   const Vector<T> dx = s.u - x, dy = s.v - y;
-  return {fma(broadcast<T>(s.a), dx, s.b * dy), s.c * dy};
+  return {fma(s.a, dx, s.b * dy), s.c * dy};
 }
 
 template <class T>
 GS_INLINE Vector<T> exponent_of(const Splat<T>& s, const Offset<T>& at) {
-  return fnma(at.p, at.p, fnma(at.r, at.r, broadcast<T>(s.log2_opacity)));
+  return fnma(at.p, at.p, fnma(at.r, at.r, s.log2_opacity));
 }
 
 template <class T>
@@ -90,22 +90,23 @@ GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c) {
 // Sums of a vector of pixels.
 template <class T>
 struct Pixels {
-  Vector<T> transmittance, alpha{}, red{}, green{}, blue{}, z{};
+  Vector<T> transmittance, alpha{};
+  FusedSum<T> red{}, green{}, blue{}, z{};
 };
 
 template <class T>
 GS_INLINE void add(const Splat<T>& s, const Contribution<T>& c, Pixels<T>& px) {
   px.alpha += c.weight;
-  px.red = fma(c.weight, broadcast<T>(s.red), px.red);
-  px.green = fma(c.weight, broadcast<T>(s.green), px.green);
-  px.blue = fma(c.weight, broadcast<T>(s.blue), px.blue);
-  px.z = fma(c.weight, broadcast<T>(s.z), px.z);
+  px.red = add_fused(c.weight, s.red, px.red);
+  px.green = add_fused(c.weight, s.green, px.green);
+  px.blue = add_fused(c.weight, s.blue, px.blue);
+  px.z = add_fused(c.weight, s.z, px.z);
   px.transmittance = next_transmittance(c);
 }
 
 template <class T>
 GS_INLINE Vector<T> expected_depth(const Pixels<T>& px) {
-  return select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), px.z / px.alpha, Vector<T>{});
+  return select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), value_of(px.z) / px.alpha, Vector<T>{});
 }
 
 // What the backward pass knows of a vector of pixels: T, Q less what has been passed, and q_i = g_red·r + g_green·g +

@@ -35,7 +35,7 @@ GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
     const V x_near = clamp(zero, x_low, x_high), y_near = clamp(zero, y_low, y_high);
     const V y = clamp(-s.slope_y * x_near, y_low, y_high), x = clamp(-s.slope_x * y_near, x_low, x_high);
     const auto value = [&](V x, V y) {
-      const V p = fma(broadcast<T>(s.a), x, s.b * y), r = s.c * y;
+      const V p = fma(s.a, x, s.b * y), r = s.c * y;
       return fma(p, p, r * r);
     };
     const V least = smaller(value(x_near, y), value(x, y_near));

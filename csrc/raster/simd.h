@@ -33,7 +33,8 @@ inline constexpr int kVectorBytes = 16;
 #endif
 
 // `bits` is what a comparison of vectors gives: −1 or 0 in every lane. `mask` is the form that the machine computes
-// with: a bit per lane in a mask register on AVX-512, the same as `bits` elsewhere.
+// with: a bit per lane in a mask register on AVX-512, the same as `bits` elsewhere. `sum` is one of products that are added by
+// add_fused(): a vector, or where fused multiply-add is emulated the same numbers in float64.
 template <class T>
 struct Simd;
 
@@ -47,6 +48,13 @@ struct Simd<float> {
 #else
   typedef bits mask;
 #endif
+#if defined(__SSE2__) && !defined(__AVX2__)
+  struct sum {
+    __m128d low, high;
+  };
+#else
+  typedef vector sum;
+#endif
 };
 
 template <>
@@ -59,12 +67,15 @@ struct Simd<double> {
 #else
   typedef bits mask;
 #endif
+  typedef vector sum;
 };
 
 template <class T>
 using Vector = typename Simd<T>::vector;
 template <class T>
 using Mask = typename Simd<T>::mask;
+template <class T>
+using FusedSum = typename Simd<T>::sum;
 
 template <class T>
 GS_INLINE Vector<T> broadcast(T value) {
@@ -135,23 +146,48 @@ GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double>
 #if defined(__SSE2__)
 // The product of two floats is exact in float64, and the sum rounded to float64 and then to float is all but always the
 // sum rounded once.
-GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) {
-  const auto low = [](__m128 v) { return _mm_cvtps_pd(v); };
-  const auto high = [](__m128 v) { return _mm_cvtps_pd(_mm_movehl_ps(v, v)); };
-  return _mm_movelh_ps(_mm_cvtpd_ps(low(a) * low(b) + low(c)), _mm_cvtpd_ps(high(a) * high(b) + high(c)));
+GS_INLINE FusedSum<float> widened(Vector<float> v) { return {_mm_cvtps_pd(v), _mm_cvtps_pd(_mm_movehl_ps(v, v))}; }
+GS_INLINE FusedSum<float> widened(float v) { return {_mm_set1_pd(v), _mm_set1_pd(v)}; }
+GS_INLINE Vector<float> value_of(const FusedSum<float>& sum) { return _mm_movelh_ps(_mm_cvtpd_ps(sum.low), _mm_cvtpd_ps(sum.high)); }
+GS_INLINE Vector<float> fused(const FusedSum<float>& a, const FusedSum<float>& b, const FusedSum<float>& c) {
+  return value_of({a.low * b.low + c.low, a.high * b.high + c.high});
+}
+GS_INLINE Vector<float> fused_less(const FusedSum<float>& a, const FusedSum<float>& b, const FusedSum<float>& c) {
+  return value_of({c.low - a.low * b.low, c.high - a.high * b.high});
+}
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return fused(widened(a), widened(b), widened(c)); }
+GS_INLINE Vector<float> fma(float a, Vector<float> b, Vector<float> c) { return fused(widened(a), widened(b), widened(c)); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return fused_less(widened(a), widened(b), widened(c)); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, float c) { return fused_less(widened(a), widened(b), widened(c)); }
+GS_INLINE FusedSum<float> add_fused(Vector<float> weight, float number, FusedSum<float> sum) {
+  const FusedSum<float> w = widened(weight), x = widened(number);
+  const auto rounded = [](__m128d v) { return _mm_cvtps_pd(_mm_cvtpd_ps(v)); };
+  return {rounded(w.low * x.low + sum.low), rounded(w.high * x.high + sum.high)};
 }
 #else
 GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) {
   for (int i = 0; i < Simd<float>::lanes; ++i) a[i] = __builtin_fmaf(a[i], b[i], c[i]);
   return a;
 }
-#endif
 GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return fma(-a, b, c); }
+#endif
 GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return a * b + c; }
 GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return c - a * b; }
 #endif
 
-// The same, where no decision and no picture hangs on the last bit: rounded twice where fusing would have to be emulated.
+// With the same number in every lane.
+template <class T>
+GS_INLINE Vector<T> fma(T a, Vector<T> b, Vector<T> c) { return fma(broadcast<T>(a), b, c); }
+template <class T>
+GS_INLINE Vector<T> fnma(Vector<T> a, Vector<T> b, T c) { return fnma(a, b, broadcast<T>(c)); }
+
+// sum + weight·number.
+template <class T>
+GS_INLINE Vector<T> add_fused(Vector<T> weight, T number, Vector<T> sum) { return fma(number, weight, sum); }
+template <class V>
+GS_INLINE V value_of(V sum) { return sum; }
+
+// fma() and fnma(), where no decision and no picture hangs on the last bit: rounded twice where fusing would have to be emulated.
 #if defined(__AVX2__) || defined(__AVX512F__) || defined(__aarch64__)
 template <class V>
 GS_INLINE V add_product(V a, V b, V c) { return fma(a, b, c); }
@@ -226,6 +262,14 @@ template <class V>
 GS_INLINE V larger(V a, V b) {
   return a > b ? a : b;
 }
+// One instruction, which compilers don't find.
+#if defined(__AVX2__)
+GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm256_min_ps(a, b); }
+GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm256_max_ps(a, b); }
+#elif defined(__SSE2__)
+GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm_min_ps(a, b); }
+GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm_max_ps(a, b); }
+#endif
 #endif
 
 template <class V>
@@ -295,6 +339,12 @@ GS_INLINE Bits eighth(Bits i) {
 #elif defined(__AVX2__)
 GS_INLINE Bits eighth(Bits i) {
   return (Bits)_mm256_permutevar8x32_epi32(_mm256_loadu_si256((const __m256i*)kExp2Eighths), (__m256i)i);
+}
+#elif defined(__x86_64__)
+GS_INLINE Bits eighth(Bits i) {
+  const __m128i wanted = (__m128i)(i % 8);
+  const uint64_t low = uint64_t(_mm_cvtsi128_si64(wanted)), high = uint64_t(_mm_cvtsi128_si64(_mm_unpackhi_epi64(wanted, wanted)));
+  return Bits{kExp2Eighths[uint32_t(low)], kExp2Eighths[low >> 32], kExp2Eighths[uint32_t(high)], kExp2Eighths[high >> 32]};
 }
 #else
 GS_INLINE Bits eighth(Bits i) {
