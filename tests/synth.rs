@@ -3,7 +3,7 @@
 mod common;
 
 use common::program::{arg, succeed, tiny_config};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use globalsplat::data::{Dataset, MadeUp, Split};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
@@ -112,6 +112,29 @@ fn cameras_are_in_free_space_and_move() {
         assert!(centres[0].distance(centres[1]) > 0.01, "video {index} doesn't move");
         assert!(centres[0].distance(centres[1]) < 12., "video {index} leaves");
     }
+}
+
+/// Some videos go around a thing, as people photograph things: all cameras look at nearly the same point, by more than 45 degrees
+/// from one another.
+#[test]
+fn things_are_looked_at_from_around() {
+    let is_around = |index| {
+        let cameras = Video::new(5, index, &settings(5, 16)).cameras().to_vec();
+        let rays: Vec<(DVec3, DVec3)> =
+            cameras.iter().map(|c| (c.c2w.w_axis.truncate(), c.c2w.z_axis.truncate())).collect();
+        let turn = rays.iter().map(|ray| ray.1.angle_between(rays[0].1)).fold(0., f64::max);
+        // Σ (I − d dᵀ) p = Σ (I − d dᵀ) c is the point that rays from c along d pass nearest.
+        let across = |d: DVec3| DMat3::IDENTITY - DMat3::from_cols(d.x * d, d.y * d, d.z * d);
+        let sum = rays.iter().fold(DMat3::ZERO, |sum, &(_, d)| sum + across(d));
+        let point = sum.inverse() * rays.iter().map(|&(c, d)| across(d) * c).sum::<DVec3>();
+        let near = |&(c, d): &(DVec3, DVec3)| {
+            let (away, past) = (point - c, across(d) * (point - c));
+            away.dot(d) > 0. && past.length() < 0.15 * away.length()
+        };
+        turn > 0.8 && rays.iter().all(near)
+    };
+    let around = (0..40).filter(|&index| is_around(index)).count();
+    assert!((6..=20).contains(&around), "{around} of 40 videos");
 }
 
 /// What is written is a data set, with an index to judge by; and one that isn't written has the same scenes.

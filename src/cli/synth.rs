@@ -19,9 +19,9 @@ const CHUNK_BYTES: usize = 20_000_000;
 
 /// Make videos of made-up worlds, with exact cameras, to train and to judge by.
 ///
-/// Rooms and open scenes full of things of all shapes and surfaces, ray traced, in the chunks that RealEstate10K comes in, with
-/// an index.json and an evaluation_index.json. The same seed makes the same bytes. Training makes them as it goes where
-/// data.captures names "synth:seed=1,scenes=10000".
+/// Rooms and open scenes full of things of all shapes and surfaces, filmed on the way past them or around one, ray traced, in the
+/// chunks that RealEstate10K comes in, with an index.json and an evaluation_index.json. The same seed makes the same bytes.
+/// Training makes them as it goes where data.captures names "synth:seed=1,scenes=10000".
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
     globalsplat synth --out worlds/train --scenes 2000\n  \

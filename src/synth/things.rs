@@ -1,12 +1,13 @@
 //! Things that stand about: each is made of plain shapes, stands on y = 0 about the origin, and faces +z.
 
-use super::maker::Maker;
+use super::maker::{Maker, standing};
 use super::material::Material;
 use super::mesh::Mesh;
 use super::shapes::{
     cone, cuboid, curtain, height_field, lathe, roughen, superellipsoid, taper, tube, twist,
 };
 use super::texture::Purpose;
+use super::walk::Exhibit;
 use glam::{Affine3A, Quat, Vec2, Vec3, vec2, vec3};
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
@@ -505,6 +506,36 @@ pub(super) fn fence(make: &mut Maker, place: Affine3A, length: f32) {
     for y in [0.3, 0.8] {
         make.put(cuboid(vec3(length, 0.08, 0.03), 0.), &wood, place * at(0., y * height, -0.03));
     }
+}
+
+/// Something by itself, on the ground at `spot` or on a block there, to be looked at from all sides.
+pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
+    let size = vec3(make.scaled(0.3, 1.5), make.scaled(0.3, 1.5), make.scaled(0.3, 1.5));
+    let below = if make.chance(0.3) { 0. } else { make.within(0.2..1.1) };
+    if below > 0. {
+        // Deep enough for uneven ground.
+        let (foot, broad) = (0.5, make.within(0.6..1.6));
+        let material = make.material(Purpose::Thing);
+        let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), make.within(0. ..0.05));
+        make.put(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
+    }
+    let place = standing(spot + below * Vec3::Y, make.turn());
+    match make.within(0..6) {
+        0 => {
+            let (mesh, material) = (plain(make, size), make.material(Purpose::Thing));
+            make.put(mesh, &material, place);
+        }
+        1 => {
+            let largest = size.max_element();
+            rock(make, place, largest);
+        }
+        2 => plant(make, place),
+        _ => {
+            let count = make.within(3..12);
+            heap(make, size, place, count);
+        }
+    }
+    Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length() }
 }
 
 /// Anything that stands in a room, along a wall or in the open floor.

@@ -5,8 +5,8 @@ use super::maker::Maker;
 use super::sensor::{Hash, Sensor};
 use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
-use super::walk::{Place, walk};
-use super::{open, room};
+use super::walk::{Exhibit, Place, walk};
+use super::{open, room, things};
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use glam::{DMat4, Vec2, Vec3, vec2};
 use image::RgbImage;
@@ -17,6 +17,8 @@ use std::sync::Arc;
 
 /// Rays a pixel, along a side.
 const RAYS: u32 = 2;
+/// Share of worlds in which there is a thing to walk around.
+const EXHIBITS: f64 = 0.35;
 /// Worlds that are made until there is a way through one.
 const WORLDS: u64 = 20;
 
@@ -57,9 +59,9 @@ impl Video {
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
         let mut make = Maker::new(random, settings.pictures.clone());
-        let (place, sky) = world(&mut make);
+        let (place, exhibit, sky) = world(&mut make);
         let tracer = Tracer::new(std::mem::take(&mut make.parts), sky);
-        let poses = walk(&mut make, &tracer, place, settings.frames)?;
+        let poses = walk(&mut make, &tracer, place, exhibit, settings.frames)?;
         let cameras = cameras(&mut make, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
         let sensor = Sensor::draw(&mut make, seen);
@@ -127,14 +129,16 @@ impl fmt::Debug for Video {
 }
 
 /// Rooms for the most part: what people photograph, and what is hardest to get right.
-fn world(make: &mut Maker) -> (Place, Sky) {
+fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
     let mut sky = open::sky(make);
     let place = match make.within(0..100) {
         0..55 => room::room(make, &mut sky),
         55..75 => room::box_of_shapes(make, &mut sky),
         _ => open::landscape(make, &sky),
     };
-    (place, sky)
+    let middle = 0.5 * (place.least + place.most);
+    let exhibit = make.chance(EXHIBITS).then(|| things::exhibit(make, middle.with_y(0.)));
+    (place, exhibit, sky)
 }
 
 fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {

@@ -9,7 +9,7 @@ use glam::{DMat4, DVec3, DVec4, Vec3, vec3};
 const TRIES: usize = 80;
 /// Places of a path that have to be free.
 const CHECKED: usize = 12;
-/// Mean depth of what every picture shows at least, in metres, where paths are easy to find.
+/// [`Path::wide`] of those that go past things.
 const WIDE: f32 = 1.8;
 
 /// Where cameras may be.
@@ -22,6 +22,14 @@ pub(super) struct Place {
     pub eye: (f32, f32),
     /// Free space that a camera needs around it, in metres.
     pub roomy: f32,
+}
+
+/// A thing that is there to be looked at from all sides.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Exhibit {
+    pub middle: Vec3,
+    /// Of a ball that it fits into, in metres.
+    pub radius: f32,
 }
 
 /// How a camera moves as time goes from 0 to 1.
@@ -40,6 +48,8 @@ struct Path {
     shake: (f32, f32),
     /// Tilt of the horizon at the start and at the end.
     roll: (f32, f32),
+    /// Mean depth of what every picture shows at least, in metres, where paths are easy to find.
+    wide: f32,
     noise: Noise,
 }
 
@@ -60,12 +70,22 @@ impl Path {
     }
 }
 
-/// Camera-to-world poses of `frames` pictures, x right, y down, z forward; none where there is no way through.
-pub(super) fn walk(make: &mut Maker, tracer: &Tracer, place: Place, frames: usize) -> Option<Vec<DMat4>> {
+/// Camera-to-world poses of `frames` pictures, x right, y down, z forward; none where there is no way through. Where there is an
+/// exhibit most go around it.
+pub(super) fn walk(
+    make: &mut Maker,
+    tracer: &Tracer,
+    place: Place,
+    exhibit: Option<Exhibit>,
+    frames: usize,
+) -> Option<Vec<DMat4>> {
     for attempt in 0..TRIES {
         // The longer it takes, the shorter paths get.
         let patience = 1. - attempt as f32 / TRIES as f32;
-        let path = draw(make, tracer, place, patience);
+        let path = match exhibit {
+            Some(exhibit) if make.chance(0.85) => Some(around(make, exhibit, place, patience)),
+            _ => through(make, tracer, place, patience),
+        };
         if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
             let last = frames.max(2) - 1;
             return path.map(|path| (0..frames).map(|i| pose(path.at(i as f32 / last as f32))).collect());
@@ -74,7 +94,29 @@ pub(super) fn walk(make: &mut Maker, tracer: &Tracer, place: Place, frames: usiz
     None
 }
 
-fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Option<Path> {
+/// Around something, by hand, from a few steps away.
+fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Path {
+    let Exhibit { middle, radius } = exhibit;
+    let away = 1.2 * radius + make.scaled(0.3, 2.);
+    let height = (middle.y + make.within(-0.2..0.9) * away).max(place.least.y + 0.2);
+    let (sin, cos) = make.turn().sin_cos();
+    let wander = |make: &mut Maker| make.within(-0.3..0.3) * patience * away;
+    Path {
+        start: (middle + away * vec3(cos, 0., sin)).with_y(height),
+        target: middle,
+        target_motion: 0.2 * radius * make.direction(),
+        motion: vec3(wander(make), wander(make), wander(make)),
+        orbit: make.one_of(&[-1., 1.]) * patience * make.scaled(0.8, 6.),
+        swing: (Vec3::Y * away * make.within(0. ..0.15), make.within(2. ..9.)),
+        shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
+        roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
+        wide: away,
+        noise: make.noise(),
+    }
+}
+
+/// Past what there is to see.
+fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Option<Path> {
     // Of several standpoints the one with the widest view, as photographers choose.
     let views: Vec<(Vec3, Vec3)> = (0..make.within(1..6)).map(|_| standpoint(make, tracer, place)).collect();
     let width = |&(start, towards): &(Vec3, Vec3)| {
@@ -106,6 +148,7 @@ fn draw(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Optio
         ),
         shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
         roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
+        wide: WIDE,
         noise: make.noise(),
     };
     match make.within(0..10) {
@@ -176,10 +219,10 @@ fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
         let sees = || {
             let depths = [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].map(|(x, y)| {
                 let ray = (towards + x * right + y * up).normalize();
-                tracer.free(at, ray, 2. * WIDE)
+                tracer.free(at, ray, 2. * path.wide)
             });
             let least = depths.into_iter().fold(f32::INFINITY, f32::min);
-            least > 1.6 * margin && depths.iter().sum::<f32>() > depths.len() as f32 * patience * WIDE
+            least > 1.6 * margin && depths.iter().sum::<f32>() > depths.len() as f32 * patience * path.wide
         };
         let is_open = before.is_none_or(|from| {
             let way = at - from;
