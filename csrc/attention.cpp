@@ -56,20 +56,24 @@ void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int
 
 void done() { at::native::cpublas::brgemm_release(true); }
 
-constexpr raster::Bf16Products kProducts = {multiply, done};
+// To be asked for once a call, as there may be no room for their code.
+raster::Bf16Products products() {
+  expect_room_for_code(0);
+  return {multiply, done};
+}
 
 // Libtorch refuses where oneDNN has none, and oneDNN where it was told to do without the instructions for them.
 bool has_bf16_products() {
   static const bool has = [] {
     const std::vector<raster::Bf16> zeros(16 * 16);
     std::vector<float> sums(16 * 16);
-    expect_room_for_code(0);
+    const raster::Bf16Products tried = products();
     try {
-      multiply(16, 16, 16, 16, 16, 16, false, zeros.data(), zeros.data(), sums.data());
+      tried.multiply(16, 16, 16, 16, 16, 16, false, zeros.data(), zeros.data(), sums.data());
     } catch (const std::exception&) {
       return false;
     }
-    done();
+    tried.done();
     return true;
   }();
   return has;
@@ -81,12 +85,10 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const Tensor log_sums = at::empty({q.size(0), heads, q.size(1)}, q.options().dtype(at::kFloat));
     const raster::AttentionShape shape = shape_of(q, k, heads);
     float* const sums = log_sums.data_ptr<float>();
-    if (is_bf16(q)) {
-      expect_room_for_code(0);
-      raster::attend_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, kProducts, threads());
-    } else {
+    if (is_bf16(q))
+      raster::attend_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, products(), threads());
+    else
       raster::attend(shape, read_all<float>(q, k, v), written<float>(out), sums, threads());
-    }
     ctx->save_for_backward({q, k, v, out, log_sums});
     ctx->saved_data["heads"] = heads;
     return out;
@@ -99,15 +101,13 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const Tensor dq = like(q), dk = like(k), dv = like(v);
     const raster::AttentionShape shape = shape_of(q, k, ctx->saved_data["heads"].toInt());
     const float* const sums = t[4].const_data_ptr<float>();
-    if (is_bf16(q)) {
-      expect_room_for_code(0);
+    if (is_bf16(q))
       raster::attend_backward_bf16(
           shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(slope),
-          {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, kProducts, threads());
-    } else {
+          {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, products(), threads());
+    else
       raster::attend_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(slope),
                               {written<float>(dq), written<float>(dk), written<float>(dv)}, threads());
-    }
     return {dq, dk, dv, Tensor()};
   }
 };

@@ -28,7 +28,7 @@ pub(super) struct Place {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exhibit {
     pub middle: Vec3,
-    /// Of a ball that it fits into, in metres.
+    /// Of a ball that it fits into, more or less, in metres.
     pub radius: f32,
 }
 
@@ -54,6 +54,22 @@ struct Path {
 }
 
 impl Path {
+    /// Standing still at the origin, held by a hand.
+    fn by_hand(make: &mut Maker) -> Self {
+        Path {
+            start: Vec3::ZERO,
+            target: Vec3::ZERO,
+            target_motion: Vec3::ZERO,
+            motion: Vec3::ZERO,
+            orbit: 0.,
+            swing: (Vec3::ZERO, 0.),
+            shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
+            roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
+            wide: WIDE,
+            noise: make.noise(),
+        }
+    }
+
     /// Position, direction of view, and roll.
     fn at(&self, time: f32) -> (Vec3, Vec3, f32) {
         // Nobody starts at full speed.
@@ -108,10 +124,8 @@ fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Pa
         motion: vec3(wander(make), wander(make), wander(make)),
         orbit: make.one_of(&[-1., 1.]) * patience * make.scaled(0.8, 6.),
         swing: (Vec3::Y * away * make.within(0. ..0.15), make.within(2. ..9.)),
-        shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
-        roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
         wide: away,
-        noise: make.noise(),
+        ..Path::by_hand(make)
     }
 }
 
@@ -139,17 +153,11 @@ fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Op
     let mut path = Path {
         start,
         target: start + depth * make.within(0.6..1.2) * towards,
-        target_motion: Vec3::ZERO,
-        motion: Vec3::ZERO,
-        orbit: 0.,
         swing: (
             right * length * make.within(0. ..0.12) + up * length * make.within(0. ..0.05),
             make.within(2. ..9.),
         ),
-        shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
-        roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
-        wide: WIDE,
-        noise: make.noise(),
+        ..Path::by_hand(make)
     };
     match make.within(0..10) {
         // Forwards or back, the way people walk and real-estate videos go.
