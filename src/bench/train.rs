@@ -43,6 +43,8 @@ pub struct TrainReport {
     pub perceptual: PerceptualKind,
     /// Threads that shared the work.
     pub threads: i32,
+    /// Slices of a step that these threads follow side by side. Sections, parts and the peak are of the first, with its share of them.
+    pub slices_at_once: usize,
     /// Steps that were measured.
     pub steps: usize,
     /// Of a whole step.
@@ -112,8 +114,11 @@ pub fn bench_train(
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
+    let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
     let yardstick = Yardstick::new(precision, device);
+    tch::set_num_threads((threads / slices_at_once as i32).max(1));
     let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
+    tch::set_num_threads(threads);
     let peak_gflops = yardstick.gflops(Spread::of(products).least);
     let (milliseconds, sections) = measured.told();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
@@ -128,7 +133,8 @@ pub fn bench_train(
         size: config.data.image_size.into(),
         gaussians: config.model.latents << config.curriculum.final_stage,
         perceptual: config.loss.perceptual,
-        threads: tch::get_num_threads(),
+        threads,
+        slices_at_once,
         steps,
         milliseconds,
         sections,

@@ -76,6 +76,9 @@ fn print_report(r: &TrainReport) {
         r.threads,
         r.steps
     );
+    if r.slices_at_once > 1 {
+        println!("{} slices side by side; all but steps and memory is of the first", r.slices_at_once);
+    }
     print_sections("ms per step", &r.sections, ("step", &r.milliseconds));
     print_parts("ms, forward alone", &r.parts, &r.milliseconds);
     let sum = |of: fn(&Part) -> f64| r.parts.iter().map(of).sum::<f64>();

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::render::handed_over;
 use globalsplat_csrc::fit::{AdamArguments, adam};
-use globalsplat_csrc::optim::{AdamWNumbers, forget_gradients, fused_adamw, norm, scale};
+use globalsplat_csrc::optim::{self as ffi, AdamWNumbers, fused_adamw, norm, scale};
 use std::collections::BTreeMap;
 use tch::{Device, Tensor};
 
@@ -66,6 +66,12 @@ fn address(t: &Tensor) -> usize {
 /// The same for several.
 fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
     tensors.into_iter().map(address).collect()
+}
+
+/// Leaves without gradients: what the next backward pass leaves takes their place, with nothing to be added to.
+pub(crate) fn forget_gradients<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
+    // SAFETY: the tensors outlive the call.
+    unsafe { ffi::forget_gradients(&addresses(leaves)) }.expect("leaves");
 }
 
 /// What a group's parameters have in common.
@@ -163,11 +169,9 @@ impl AdamW {
         gradients.filter(|(_, gradient)| gradient.defined())
     }
 
-    /// Forgets the gradients: what the next backward pass leaves takes their place, with nothing to be added to.
+    /// Forgets the gradients, as [`forget_gradients`] does.
     pub fn zero_grad(&mut self) {
-        let values = addresses(self.parameters.iter().map(|p| &p.value));
-        // SAFETY: the tensors outlive the call.
-        unsafe { forget_gradients(&values) }.expect("leaves");
+        forget_gradients(self.parameters.iter().map(|p| &p.value));
     }
 
     /// The norm of all gradients together, a scalar where they are.

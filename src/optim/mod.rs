@@ -8,3 +8,5 @@ pub use adamw::{AdamW, ParameterGroup};
 
 // For benchmarks.
 pub use stopwatch::Stopwatch;
+
+pub(crate) use adamw::forget_gradients;

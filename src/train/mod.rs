@@ -11,6 +11,7 @@ mod preview;
 mod rank_tests;
 mod run;
 mod schedule;
+mod side_by_side;
 mod step_report;
 #[cfg(test)]
 mod step_tests;

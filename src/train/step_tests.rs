@@ -138,8 +138,7 @@ pub(super) fn far_from_the_start(config: &Config) -> Trainer {
     trainer
 }
 
-/// Holds losses and gradients against those of another way to compute them; key biases, whose gradient is zero in exact
-/// arithmetic, as a share of the largest.
+/// Holds losses and gradients against those of another way to compute them.
 fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
     let ((loss, found), (expected_loss, expected)) = (found, expected);
     let terms = Term::ALL.map(|term| (term.name(), loss[term], expected_loss[term]));
@@ -147,6 +146,15 @@ fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
         assert!(expected > 0., "{name} counts");
         assert!((found / expected - 1.).abs() <= tolerance, "{name}: {found}, expected {expected}");
     }
+    assert_same_gradients(found, expected, tolerance);
+}
+
+/// Gradients alone; key biases, whose gradient is zero in exact arithmetic, as a share of the largest.
+fn assert_same_gradients(
+    found: &BTreeMap<String, Tensor>,
+    expected: &BTreeMap<String, Tensor>,
+    tolerance: f64,
+) {
     let norm = |t: &Tensor| t.to_kind(Kind::Double).norm().double_value(&[]);
     let largest = expected.values().map(norm).fold(0., f64::max);
     for (name, expected) in expected {
@@ -165,6 +173,43 @@ fn slices_of_a_step_add_up_to_it() {
         let sliced = config(small(), TrainConfig { micro_batch, ..Default::default() });
         assert_same(&gradients(&sliced, &sample), &whole, 1e-5);
     }
+}
+
+/// A step whose scenes nothing but the mean brings together, in one, two and three slices. In bf16, gradients of weights are rounded
+/// slice by slice.
+#[test]
+fn scenes_side_by_side_make_the_same_step_every_time() {
+    let sample = sample();
+    let threads = tch::get_num_threads();
+    for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
+        let mut config = config(small(), TrainConfig { precision, ..Default::default() });
+        config.loss.consistency_depth = 0.;
+        let by = |threads: i32| {
+            tch::set_num_threads(threads);
+            of_model(&config, |trainer| {
+                trainer.perceptual = None;
+                let mut step = || {
+                    let losses =
+                        trainer.gradients(&sample, STAGE, &mut Stopwatch::default()).expect("a step");
+                    assert_eq!(tch::get_num_threads(), threads);
+                    numbers(&losses)
+                };
+                step();
+                // Now there are gradients to forget.
+                let losses = step();
+                assert_eq!(trainer.twins.len() + 1, threads as usize);
+                losses
+            })
+        };
+        let (whole_losses, whole) = by(1);
+        for threads in [2, 3] {
+            let [(losses, gradients), again] = [(); 2].map(|()| by(threads));
+            assert!((losses.total / whole_losses.total - 1.).abs() < tolerance, "{}", losses.total);
+            assert_same_gradients(&gradients, &whole, tolerance);
+            assert!(losses.total == again.0.total && gradients == again.1, "other bits the second time");
+        }
+    }
+    tch::set_num_threads(threads);
 }
 
 #[test]

@@ -6,6 +6,7 @@ use super::is_due;
 use super::parameter_groups::{in_backward_order, parameter_groups};
 use super::preview::preview;
 use super::schedule::learning_rate;
+use super::side_by_side::{Twin, gradients_side_by_side};
 use super::step_report::StepReport;
 use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
@@ -30,6 +31,8 @@ pub struct Trainer {
     pub(super) config: Config,
     pub(super) vs: nn::VarStore,
     pub(super) model: GlobalSplat,
+    /// The model for further threads; made when they are first needed.
+    pub(super) twins: Vec<Twin>,
     pub(super) optimizer: AdamW,
     pub(super) perceptual: Option<PerceptualLoss>,
     /// Steps done.
@@ -89,6 +92,7 @@ impl Trainer {
             config,
             vs,
             model,
+            twins: vec![],
             optimizer,
             perceptual,
             step,
@@ -361,14 +365,18 @@ impl Trainer {
         stage: Stage,
         watch: &mut Stopwatch,
     ) -> Result<Tensor> {
-        let perceptual = self.perceptual.as_ref();
-        let group = &self.group;
-        let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage, group };
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
         let halves = pair.then(|| subsets(sample.context_views(), self.step));
         let scenes = sample.scenes();
+        let at_once = self.slices_at_once(scenes);
+        while self.twins.len() + 1 < at_once {
+            self.twins.push(Twin::of(&self.model, &self.vs)?);
+        }
+        let perceptual = self.perceptual.as_ref();
+        let group = &self.group;
+        let part = ForwardBackward { config: &self.config, model: &self.model, perceptual, stage, group };
         let count = match self.config.train.micro_batch {
-            0 => scenes,
+            0 => scenes.div_ceil(at_once),
             count => count,
         };
         let slice = |first: usize| {
@@ -378,27 +386,49 @@ impl Trainer {
                 None => slice,
             }
         };
-        let mut share = Share::WHOLE;
+        let share = |first: usize| Share {
+            scenes: count.min(scenes - first) as f64 / (scenes * group.ranks()) as f64,
+            ..Share::WHOLE
+        };
+        let firsts = (0..scenes).step_by(count);
+        if at_once > 1 {
+            watch.time("zero gradients", || self.optimizer.zero_grad());
+            let slices = watch.time("data", || firsts.map(|first| (slice(first), share(first))).collect());
+            return gradients_side_by_side(&part, &mut self.twins, slices, watch);
+        }
+        let mut depth_pixels = None;
         if pair && self.config.loss.consistency_depth > 0. && count < scenes {
-            let pixels = (0..scenes).step_by(count).map(|first| {
+            let pixels = firsts.clone().map(|first| {
                 let slice = watch.time("data", || slice(first));
                 watch.time("depth pixels", || part.depth_pixels(&slice))
             });
             let pixels = Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>);
             group.sum(&pixels)?;
-            share.depth_pixels = Some(pixels);
+            depth_pixels = Some(pixels);
         }
         watch.time("zero gradients", || self.optimizer.zero_grad());
         let mut losses = Tensor::zeros([Losses::COUNT as i64], (Kind::Double, self.vs.device()));
-        for first in (0..scenes).step_by(count) {
-            share.scenes = count.min(scenes - first) as f64 / (scenes * group.ranks()) as f64;
+        for first in firsts {
             if first + count >= scenes {
                 self.buckets.begin();
             }
+            let depth_pixels = depth_pixels.as_ref().map(Tensor::shallow_clone);
             let slice = watch.time("data", || slice(first));
-            losses += part.gradients(&slice, &share, watch)?;
+            losses += part.gradients(&slice, &Share { depth_pixels, ..share(first) }, watch)?;
         }
         Ok(losses)
+    }
+
+    /// Into how many slices, side by side, a step of `scenes` is cut. A GPU has work enough from one. Networks that compare pictures have
+    /// operations large enough to share, and depths are compared over all scenes. Ranks are side by side already, and their gradients
+    /// leave while the backward pass goes on.
+    pub(crate) fn slices_at_once(&self, scenes: usize) -> usize {
+        let apart = self.vs.device() == Device::Cpu
+            && self.group.ranks() == 1
+            && self.config.train.micro_batch == 0
+            && self.perceptual.is_none()
+            && self.config.loss.consistency_depth == 0.;
+        if apart { scenes.min(tch::get_num_threads() as usize) } else { 1 }
     }
 
     /// Where the next step's samples come from.
