@@ -548,7 +548,23 @@ fn a_run_begins_with_the_weights_that_are_named() {
     let stage = metrics(&second)[0]["stage"].as_u64();
     assert_eq!(stage, Some(2), "all Gaussians are shown from the first step on");
 
+    // Patches of half the edge are looked at by weights that are sums of those they come from.
+    let finer = folder.path().join("finer");
+    let still = ["train.steps=1", "train.learning_rate=1e-30", "model.patch_size=4"];
+    succeed(&text(&from(&finer, &still)));
+    for ((name, of_large), (_, of_small)) in of_model(&first).iter().zip(of_model(&finer)) {
+        if name.contains("_patch_embeds") {
+            assert_eq!(of_large.size()[1], 4 * of_small.size()[1], "{name}");
+            let sums = [of_large, &of_small].map(|t| t.sum_dim_intlist(1i64, false, None::<tch::Kind>));
+            assert!(sums[0].allclose(&sums[1], 1e-5, 1e-5, false), "{name}");
+        } else {
+            assert!(of_large.equal(&of_small), "{name}");
+        }
+    }
+
     let other = folder.path().join("other");
+    let err = fail(&text(&from(&other, &["model.patch_size=20", "data.image_size=[40, 40]"])), 2);
+    assert!(err.contains("the model is model.patch_size 8 → 20, expected"), "{err}");
     let err = fail(&text(&from(&other, &["model.width=64", "model.latents=32"])), 2);
     assert!(
         err.contains("model.safetensors: the model is model.latents 16 → 32, model.width 32 → 64, expected"),

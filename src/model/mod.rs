@@ -43,7 +43,7 @@ pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub(crate) use stream::{SelfAttentionBlock, StreamRound, normalized};
-pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
+pub(crate) use tokens::{PATCH_WEIGHTS, RayTokens, RgbTokens, Tokenizer, for_smaller_patches, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};

@@ -13,14 +13,14 @@ use crate::config::{Config, changed_keys};
 use crate::data::{BadData, Loader, News, Part, Sample, SceneGroups};
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, Share};
-use crate::model::{GlobalSplat, Stage};
+use crate::model::{GlobalSplat, ModelConfig, PATCH_WEIGHTS, Precision, Stage, for_smaller_patches};
 use crate::optim::{AdamW, Stopwatch};
 use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use tch::{Device, Kind, Tensor, nn};
+use tch::{Device, Kind, Tensor, nn, no_grad};
 
 /// The part of a step in which ranks wait for each other.
 pub(crate) const COMMUNICATION: &str = "communication";
@@ -121,16 +121,23 @@ impl Trainer {
         Trainer { shards_optimizer: true, ..self }
     }
 
-    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. All Gaussians are shown from
+    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may be of larger patches, whose edge is a
+    /// multiple of this model's: a patch looks to them as if enlarged, and training teaches them the rest. All Gaussians are shown from
     /// the first step on: weights that were trained to the last stage know nothing of the first any more.
     ///
     /// # Errors
     /// A file that can't be read, or whose model has another shape: its keys are named.
     pub fn begin_with(&mut self, path: &Path) -> Result<()> {
         let file = ModelFile::open(path, &[])?;
+        let (ours, theirs) = (self.config.model.clone(), file.config.model.clone());
+        let times = theirs.patch_size / ours.patch_size;
+        let has_larger_patches = times > 1 && times * ours.patch_size == theirs.patch_size;
         if file.assumed.is_none() {
-            let ours = Config { model: self.config.model.clone(), ..Default::default() };
-            let theirs = Config { model: file.config.model.clone(), ..Default::default() };
+            let model = match has_larger_patches {
+                true => ModelConfig { patch_size: ours.patch_size, ..theirs.clone() },
+                false => theirs.clone(),
+            };
+            let [ours, theirs] = [ours, model].map(|model| Config { model, ..Default::default() });
             let changed = changed_keys(&theirs.to_toml(), &ours.to_toml());
             if !changed.is_empty() {
                 let expected = "the model that the configuration describes";
@@ -138,7 +145,22 @@ impl Trainer {
             }
         }
         self.config.curriculum.full_capacity = true;
-        file.load_into(&self.vs)
+        if !has_larger_patches {
+            return file.load_into(&self.vs);
+        }
+        let mut larger = nn::VarStore::new(self.vs.device());
+        GlobalSplat::to_be_filled(&mut larger, &theirs, Precision::F32)?;
+        file.load_into(&larger)?;
+        let larger = larger.variables();
+        no_grad(|| {
+            for (name, mut variable) in self.vs.variables() {
+                match PATCH_WEIGHTS.contains(&name.as_str()) {
+                    true => variable.copy_(&for_smaller_patches(&larger[&name], theirs.patch_size, times)),
+                    false => variable.copy_(&larger[&name]),
+                }
+            }
+        });
+        Ok(())
     }
 
     /// Draws a sample and follows its gradient. `go_on` is asked before other ranks are told whether to.
