@@ -22,6 +22,8 @@ from core_runs import PROGRAM, REPOSITORY, core_seconds, environment, row, train
 STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
+# Where the model begins with nothing; small patches are for weights that know large ones.
+BASE = ["model.patch_size=16"]
 VARIANTS = {
     "tiny": [],
     "4 to 8 context views": ["data.context_views=8"],
@@ -66,7 +68,7 @@ def steps_in(seconds, config, settings, batch):
 
 def run(out, name, seconds, config, worlds, test, captures):
     """Steps, parameters, and PSNR of a variant: on made-up worlds and on captures."""
-    settings = [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
+    settings = BASE + [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
     longer = value_of("stages", VARIANTS[name], 1.0)
     batch = int(value_of("train.batch", settings, 2))
     folder = out / name.replace(" ", "_").replace(",", "")

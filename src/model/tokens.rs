@@ -28,7 +28,7 @@ pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
 pub(crate) const PATCH_WEIGHTS: [&str; 2] = ["ray_patch_embeds.1.weight", "rgb_patch_embeds.1.weight"];
 
 /// Of weights that look at patches of `patch` × `patch` pixels, [d, p·p·C], those that make of a patch of 1 / `times` the edge what these
-/// make of it enlarged.
+/// make of it enlarged (spec 3.4).
 pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
     let (d, edge) = (weights.size()[0], patch / times);
     let pixels = weights.view([d, edge, times, edge, times, -1]);
