@@ -68,7 +68,7 @@ fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
     tensors.into_iter().map(address).collect()
 }
 
-/// Leaves without gradients: what the next backward pass leaves takes their place, with nothing to be added to.
+/// Forgets the gradients of `leaves`.
 pub(crate) fn forget_gradients<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
     // SAFETY: the tensors outlive the call.
     unsafe { ffi::forget_gradients(&addresses(leaves)) }.expect("leaves");
@@ -169,7 +169,7 @@ impl AdamW {
         gradients.filter(|(_, gradient)| gradient.defined())
     }
 
-    /// Forgets the gradients, as [`forget_gradients`] does.
+    /// Forgets the gradients: what the next backward pass leaves takes their place, with nothing to be added to.
     pub fn zero_grad(&mut self) {
         forget_gradients(self.parameters.iter().map(|p| &p.value));
     }
