@@ -319,5 +319,13 @@ fn a_memory_that_nobody_follows_is_kept_as_products_take_it() {
     assert!(followed.requires_grad() && followed.kind() == Kind::Float);
     let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics));
     assert!(!kept.requires_grad() && kept.kind() == Kind::BFloat16);
-    assert!(kept.equal(&followed.to_kind(Kind::BFloat16)));
+    // Views are looked at one by one there: products of other shapes differ in float32's last digits, and a number in a hundred at the
+    // most lies where that makes it the next one of bfloat16.
+    let [kept, rounded] = [kept, followed.to_kind(Kind::BFloat16)].map(|t| t.to_kind(Kind::Double));
+    let off = (&kept - &rounded).abs();
+    let size = rounded.abs();
+    let next = &size * 2f64.powi(-7) + size.max() * 1e-6;
+    assert_eq!(off.le_tensor(&next).all().int64_value(&[]), 1);
+    let share = off.gt(0.).to_kind(Kind::Double).mean(Kind::Double).double_value(&[]);
+    assert!(share < 0.01, "{share}");
 }
