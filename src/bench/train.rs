@@ -116,7 +116,7 @@ pub fn bench_train(
     let precision = config.train.precision;
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
     let yardstick = Yardstick::new(precision, device);
-    tch::set_num_threads((threads / slices_at_once as i32).max(1));
+    tch::set_num_threads(threads / slices_at_once as i32);
     let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
     tch::set_num_threads(threads);
     let peak_gflops = yardstick.gflops(Spread::of(products).least);

@@ -53,7 +53,8 @@ impl Twin {
 }
 
 /// What [`ForwardBackward::gradients`] does of each of `slices`, which share libtorch's threads out: of the first on this thread, of each
-/// other by a twin. There are at least as many twins. `watch` hears of the first, and of the time for which others are waited for.
+/// other by a twin. There are no more of them than threads, and a twin for each but the first. `watch` hears of the first, and of the
+/// time for which others are waited for.
 ///
 /// # Errors
 /// A picture that can't be made.
@@ -64,7 +65,7 @@ pub(super) fn gradients_side_by_side(
     watch: &mut Stopwatch,
 ) -> Result<Tensor> {
     let threads = tch::get_num_threads();
-    let each = (threads / slices.len() as i32).max(1);
+    let each = threads / slices.len() as i32;
     let (config, stage) = (part.config, part.stage);
     let mut slices = slices.into_iter();
     let (sample, share) = slices.next().expect("a slice");

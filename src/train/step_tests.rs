@@ -198,6 +198,8 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
                 // Now there are gradients to forget.
                 let losses = step();
                 assert_eq!(trainer.twins.len() + 1, threads as usize);
+                // Three threads can't have four scenes more evenly than two can.
+                assert_eq!(trainer.slices_at_once(4), [1, 2, 2][threads as usize - 1]);
                 losses
             })
         };

@@ -450,7 +450,8 @@ impl Trainer {
             && self.config.train.micro_batch == 0
             && self.perceptual.is_none()
             && self.config.loss.consistency_depth == 0.;
-        if apart { scenes.min(tch::get_num_threads() as usize) } else { 1 }
+        // As many as there are with a thread or more for each, and as few scenes in the largest as that allows.
+        if apart { scenes.div_ceil(scenes.div_ceil(tch::get_num_threads() as usize)) } else { 1 }
     }
 
     /// Where the next step's samples come from.
