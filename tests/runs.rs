@@ -562,12 +562,28 @@ fn a_run_begins_with_the_weights_that_are_named() {
         }
     }
 
+    // Scene tokens become several, which cover together what one did.
+    let larger = folder.path().join("larger");
+    succeed(&text(&from(&larger, &["train.steps=1", "train.learning_rate=1e-30", "model.latents=32"])));
+    for ((name, of_few), (_, of_many)) in of_model(&first).iter().zip(of_model(&larger)) {
+        if name.ends_with("scene_tokens") {
+            let deviation = of_few.std(false).double_value(&[]);
+            let apart = of_many.view([16, 2, -1]) - of_few.unsqueeze(1);
+            let apart = apart.square().mean(None::<tch::Kind>).sqrt().double_value(&[]);
+            assert!((0.15..0.25).contains(&(apart / deviation)), "{apart} of {deviation}");
+        } else if name.ends_with("geo_param_readout.bias") {
+            assert!((of_few - of_many).max().double_value(&[]) > 0.8, "opacities are lower");
+        } else {
+            assert!(of_few.equal(&of_many), "{name}");
+        }
+    }
+
     let other = folder.path().join("other");
     let err = fail(&text(&from(&other, &["model.patch_size=20", "data.image_size=[40, 40]"])), 2);
     assert!(err.contains("the model is model.patch_size 8 → 20, expected"), "{err}");
-    let err = fail(&text(&from(&other, &["model.width=64", "model.latents=32"])), 2);
+    let err = fail(&text(&from(&other, &["model.width=64", "model.latents=24"])), 2);
     assert!(
-        err.contains("model.safetensors: the model is model.latents 16 → 32, model.width 32 → 64, expected"),
+        err.contains("model.safetensors: the model is model.latents 16 → 24, model.width 32 → 64, expected"),
         "{err}"
     );
     assert!(!other.join("checkpoints").exists(), "nothing was begun");

@@ -15,7 +15,9 @@ const GEOMETRY_STD: f64 = 1e-2;
 /// Weights of the SH head at the start.
 const SH_STD: f64 = 1e-3;
 /// Numbers per candidate in the parameter head: 3 log-scales, 6 of rotation, 1 opacity logit.
-const PARAMETERS: i64 = 10;
+pub(super) const PARAMETERS: i64 = 10;
+/// Which of them is the opacity logit.
+pub(super) const OPACITY: i64 = 9;
 
 /// Added to every position: the scene starts in front of the mean camera.
 const MEAN_OFFSET: [f32; 3] = [0., 0., 1.5];
@@ -143,7 +145,7 @@ impl Decoder {
             positions: of_geometry(&self.positions).view([b, m, k, 3]),
             log_scales: parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET,
             rotations: parameters.narrow(-1, 3, 6),
-            opacity_logits: parameters.narrow(-1, 9, 1),
+            opacity_logits: parameters.narrow(-1, OPACITY, 1),
             gate: of_geometry(&self.gate),
             sh: sh.view([b, m, k, self.sh_bases * 3]),
         }

@@ -8,6 +8,7 @@ mod camera_code;
 mod config;
 mod decoder;
 mod encoder;
+mod growth;
 mod layers;
 mod leaves;
 mod merge;
@@ -30,7 +31,8 @@ pub use precision::Precision;
 pub(crate) use precision::convolve;
 pub use shapes::MODULES;
 
-// For training, which goes through the model in parts.
+// For training, which goes through the model in parts and from smaller models to larger ones.
+pub(crate) use growth::Growth;
 pub(crate) use leaves::{is_followed, leaf, pull_back};
 pub(crate) use recompute::KeptRounds;
 
@@ -43,7 +45,7 @@ pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub(crate) use stream::{SelfAttentionBlock, StreamRound, normalized};
-pub(crate) use tokens::{PATCH_WEIGHTS, RayTokens, RgbTokens, Tokenizer, for_smaller_patches, patchify};
+pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};

@@ -5,7 +5,7 @@ use super::config::ModelConfig;
 use super::layers::default_linear;
 use super::precision::Precision;
 use crate::scene::plucker_rays;
-use tch::{Kind, Tensor, nn};
+use tch::{Tensor, nn};
 
 const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
@@ -22,17 +22,6 @@ pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
         (h / patch) * (w / patch),
         patch * patch * c,
     ])
-}
-
-/// Weights that look at patches.
-pub(crate) const PATCH_WEIGHTS: [&str; 2] = ["ray_patch_embeds.1.weight", "rgb_patch_embeds.1.weight"];
-
-/// Of weights that look at patches of `patch` × `patch` pixels, [d, p·p·C], those that make of a patch of 1 / `times` the edge what these
-/// make of it enlarged (spec 3.4).
-pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
-    let (d, edge) = (weights.size()[0], patch / times);
-    let pixels = weights.view([d, edge, times, edge, times, -1]);
-    pixels.sum_dim_intlist([2i64, 4].as_slice(), false, None::<Kind>).view([d, -1])
 }
 
 /// Images and cameras to tokens.
@@ -109,32 +98,6 @@ impl RayTokens {
         match &self.camera_code {
             Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
             None => tokens,
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use tch::Device;
-
-    #[test]
-    fn a_small_patch_is_looked_at_as_if_enlarged() {
-        let numbers = |size: &[i64], seed: f64| {
-            let count = size.iter().product();
-            (Tensor::linspace(0., seed, count, (Kind::Double, Device::Cpu)) * 1e3).sin().view(size)
-        };
-        for (patch, times) in [(8, 2), (12, 3), (4, 4), (6, 1)] {
-            let weights = numbers(&[5, patch * patch * 3], 1.);
-            let edge = patch / times;
-            let small = numbers(&[1, 2, 2 * edge, 3 * edge, 3], 2.);
-            let enlarged =
-                small.repeat_interleave_self_int(times, 2, None).repeat_interleave_self_int(times, 3, None);
-            let expected = patchify(&enlarged, patch).linear(&weights, None::<&Tensor>);
-            let of_small = for_smaller_patches(&weights, patch, times);
-            let found = patchify(&small, edge).linear(&of_small, None::<&Tensor>);
-            let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
-            assert!(found.size() == [1, 2, 6, 5] && error < 1e-9, "{patch}, {times}: {error:.1e}");
         }
     }
 }

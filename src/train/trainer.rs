@@ -13,7 +13,7 @@ use crate::config::{Config, changed_keys};
 use crate::data::{BadData, Loader, News, Part, Sample, SceneGroups};
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, Share};
-use crate::model::{GlobalSplat, ModelConfig, PATCH_WEIGHTS, Precision, Stage, for_smaller_patches};
+use crate::model::{GlobalSplat, Growth, Precision, Stage};
 use crate::optim::{AdamW, Stopwatch};
 use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
@@ -121,43 +121,34 @@ impl Trainer {
         Trainer { shards_optimizer: true, ..self }
     }
 
-    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may be of larger patches, whose edge is a
-    /// multiple of this model's: a patch looks to them as if enlarged, and training teaches them the rest. All Gaussians are shown from
-    /// the first step on: weights that were trained to the last stage know nothing of the first any more.
+    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may be of a smaller model: of larger patches,
+    /// whose edge is a multiple of this model's, or of fewer scene tokens, of whose number this model's is a multiple. All Gaussians are
+    /// shown from the first step on: weights that were trained to the last stage know nothing of the first any more.
     ///
     /// # Errors
     /// A file that can't be read, or whose model has another shape: its keys are named.
     pub fn begin_with(&mut self, path: &Path) -> Result<()> {
         let file = ModelFile::open(path, &[])?;
-        let (ours, theirs) = (self.config.model.clone(), file.config.model.clone());
-        let times = theirs.patch_size / ours.patch_size;
-        let has_larger_patches = times > 1 && times * ours.patch_size == theirs.patch_size;
-        if file.assumed.is_none() {
-            let model = match has_larger_patches {
-                true => ModelConfig { patch_size: ours.patch_size, ..theirs.clone() },
-                false => theirs.clone(),
-            };
-            let [ours, theirs] = [ours, model].map(|model| Config { model, ..Default::default() });
-            let changed = changed_keys(&theirs.to_toml(), &ours.to_toml());
-            if !changed.is_empty() {
-                let expected = "the model that the configuration describes";
-                return Err(Error::input(path, "the model", changed.join(", "), expected));
-            }
+        let (ours, mut theirs) = (self.config.model.clone(), file.config.model.clone());
+        if file.assumed.is_some() {
+            // Shapes don't tell it.
+            theirs.heads = ours.heads;
+        }
+        let growth = Growth::between(&theirs, &ours);
+        let [found, expected] = [growth.result(), ours].map(|model| Config { model, ..Default::default() });
+        let changed = changed_keys(&found.to_toml(), &expected.to_toml());
+        if !changed.is_empty() {
+            let expected = "the model that the configuration describes";
+            return Err(Error::input(path, "the model", changed.join(", "), expected));
         }
         self.config.curriculum.full_capacity = true;
-        if !has_larger_patches {
-            return file.load_into(&self.vs);
-        }
-        let mut larger = nn::VarStore::new(self.vs.device());
-        GlobalSplat::to_be_filled(&mut larger, &theirs, Precision::F32)?;
-        file.load_into(&larger)?;
-        let larger = larger.variables();
+        let mut smaller = nn::VarStore::new(self.vs.device());
+        GlobalSplat::to_be_filled(&mut smaller, &theirs, Precision::F32)?;
+        file.load_into(&smaller)?;
+        let smaller = smaller.variables();
         no_grad(|| {
             for (name, mut variable) in self.vs.variables() {
-                match PATCH_WEIGHTS.contains(&name.as_str()) {
-                    true => variable.copy_(&for_smaller_patches(&larger[&name], theirs.patch_size, times)),
-                    false => variable.copy_(&larger[&name]),
-                }
+                variable.copy_(&growth.of(&name, &smaller[&name]));
             }
         });
         Ok(())

@@ -1,0 +1,139 @@
+//! Weights of a smaller model as those of a larger one, for training to go on with (spec 3.4 and 4.7).
+
+use super::config::ModelConfig;
+use super::decoder::{OPACITY, PARAMETERS};
+use tch::{Kind, Tensor};
+
+/// How far the copies of a scene token are apart, in deviations of all scene tokens.
+const SPREAD: f64 = 0.2;
+
+/// What a model outgrows another by.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Growth {
+    /// The smaller model.
+    from: ModelConfig,
+    /// Edge of its patches over that of the larger model's.
+    finer: i64,
+    /// Scene tokens of the larger model for each of its own.
+    copies: i64,
+}
+
+impl Growth {
+    /// As much of the way from one model to the other as there is a rule for.
+    pub fn between(from: &ModelConfig, to: &ModelConfig) -> Self {
+        let times = |whole: i64, part: i64| if whole % part == 0 { whole / part } else { 1 };
+        Growth {
+            finer: times(from.patch_size, to.patch_size),
+            copies: times(to.latents, from.latents),
+            from: from.clone(),
+        }
+    }
+
+    /// What the smaller model becomes.
+    pub fn result(&self) -> ModelConfig {
+        ModelConfig {
+            patch_size: self.from.patch_size / self.finer,
+            latents: self.from.latents * self.copies,
+            ..self.from.clone()
+        }
+    }
+
+    /// What `weights`, which are called `name` in the smaller model, become. Draws from libtorch's random numbers.
+    pub fn of(&self, name: &str, weights: &Tensor) -> Tensor {
+        match name {
+            "ray_patch_embeds.1.weight" | "rgb_patch_embeds.1.weight" => {
+                for_smaller_patches(weights, self.from.patch_size, self.finer)
+            }
+            "scene_tokens" if self.copies > 1 => {
+                let copied = weights.repeat_interleave_self_int(self.copies, 0, None);
+                &copied + copied.randn_like() * (SPREAD * weights.std(false))
+            }
+            "gaussian_decoder.geo_param_readout.bias" => {
+                let shift = weights.zeros_like();
+                let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(for_each_of(self.copies));
+                weights + shift
+            }
+            _ => weights.shallow_clone(),
+        }
+    }
+}
+
+/// Of weights that look at patches of `patch` × `patch` pixels, [d, p·p·C], those that make of a patch of 1 / `times` the edge what these
+/// make of it enlarged (spec 3.4).
+fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
+    let (d, edge) = (weights.size()[0], patch / times);
+    let pixels = weights.view([d, edge, times, edge, times, -1]);
+    pixels.sum_dim_intlist([2i64, 4].as_slice(), false, None::<Kind>).view([d, -1])
+}
+
+/// What is added to the logit of an opacity of ½ for `copies` Gaussians on one another to cover as much: ln(2^(1/n) − 1) (spec 4.7).
+fn for_each_of(copies: i64) -> f64 {
+    ((1. / copies as f64).exp2() - 1.).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::patchify;
+    use tch::Device;
+
+    #[test]
+    fn a_small_patch_is_looked_at_as_if_enlarged() {
+        let numbers = |size: &[i64], seed: f64| {
+            let count = size.iter().product();
+            (Tensor::linspace(0., seed, count, (Kind::Double, Device::Cpu)) * 1e3).sin().view(size)
+        };
+        for (patch, times) in [(8, 2), (12, 3), (4, 4), (6, 1)] {
+            let weights = numbers(&[5, patch * patch * 3], 1.);
+            let edge = patch / times;
+            let small = numbers(&[1, 2, 2 * edge, 3 * edge, 3], 2.);
+            let enlarged =
+                small.repeat_interleave_self_int(times, 2, None).repeat_interleave_self_int(times, 3, None);
+            let expected = patchify(&enlarged, patch).linear(&weights, None::<&Tensor>);
+            let of_small = for_smaller_patches(&weights, patch, times);
+            let found = patchify(&small, edge).linear(&of_small, None::<&Tensor>);
+            let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
+            assert!(found.size() == [1, 2, 6, 5] && error < 1e-9, "{patch}, {times}: {error:.1e}");
+        }
+    }
+
+    #[test]
+    fn copies_of_a_token_differ_a_little_and_cover_as_much_together() {
+        tch::manual_seed(4);
+        let of = |latents| ModelConfig { latents, ..Default::default() };
+        for copies in [1, 2, 3] {
+            let growth = Growth::between(&of(500), &of(500 * copies));
+            let tokens = Tensor::randn([500, 16], (Kind::Float, Device::Cpu)) * 3.;
+            let apart = growth.of("scene_tokens", &tokens).view([500, copies, 16]) - tokens.unsqueeze(1);
+            let apart = apart.square().mean(None::<Kind>).sqrt().double_value(&[]);
+            let expected = if copies == 1 { 0. } else { 3. * SPREAD };
+            assert!((apart - expected).abs() < 0.05 * expected + 1e-9, "{copies} copies: {apart}");
+
+            // Of two candidates that are half opaque.
+            let bias = Tensor::zeros([2 * PARAMETERS], (Kind::Double, Device::Cpu));
+            let grown = growth.of("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
+            let left = grown.select(1, OPACITY).sigmoid().neg() + 1.;
+            let covered: Tensor = 1. - left.pow_tensor_scalar(copies);
+            assert!(
+                covered.allclose(&covered.full_like(0.5), 1e-12, 0., false),
+                "{copies} copies: {covered:?}"
+            );
+            assert_eq!(grown.narrow(1, 0, OPACITY).abs().sum(None::<Kind>).double_value(&[]), 0.);
+        }
+    }
+
+    #[test]
+    fn what_there_is_no_rule_for_stays_as_it_was() {
+        let from = ModelConfig { patch_size: 8, latents: 16, ..Default::default() };
+        let to = |patch_size, latents| ModelConfig { patch_size, latents, ..from.clone() };
+        for (wanted, reached) in [
+            (to(8, 16), to(8, 16)),
+            (to(4, 48), to(4, 48)),
+            (to(3, 48), to(8, 48)),
+            (to(2, 24), to(2, 16)),
+            (to(16, 8), to(8, 16)),
+        ] {
+            assert_eq!(Growth::between(&from, &wanted).result(), reached);
+        }
+    }
+}
