@@ -3,10 +3,10 @@
 
     .venv/bin/python scripts/ablations.py [--out OUT] [--seeds 3] [--only VARIANT ...]
 
-Films four made-up worlds, trains the model of configs/tiny.toml, with patches of 16 pixels and the paper's consistency loss, and each
-variant, on two thirds of every video's pictures, scored by the others. Runs in OUT (runs/ablations by default), as many side by side
-as there are cores, and prints two Markdown tables: how good each became, and how it learned. What is done stays done: the same command
-goes on where it was stopped.
+Films four made-up worlds, trains the model of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's
+consistency loss, and each variant, on two thirds of every video's pictures, scored by the others. Runs in OUT (runs/ablations by
+default), as many side by side as there are cores, and prints two Markdown tables: how good each became, and how it learned. What is
+done stays done: the same command goes on where it was stopped.
 """
 
 import argparse
@@ -21,9 +21,10 @@ from pathlib import Path
 from core_runs import PROGRAM, REPOSITORY, row, train
 
 CONFIG = REPOSITORY / "configs/tiny.toml"
-# What all of them have. Small patches are for weights that know large ones.
+# What all of them have. Small patches and many scene tokens are for weights that know large and few ones.
 SETTINGS = [
     "model.patch_size=16",
+    "model.latents=256",
     "data.image_size=[64, 64]",
     "data.context_views=8",
     "data.fewest_context_views=0",

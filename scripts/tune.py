@@ -22,8 +22,8 @@ from core_runs import PROGRAM, REPOSITORY, core_seconds, environment, row, train
 STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
-# Where the model begins with nothing; small patches are for weights that know large ones.
-BASE = ["model.patch_size=16"]
+# Where the model begins with nothing; small patches and many scene tokens are for weights that know large and few ones.
+BASE = ["model.patch_size=16", "model.latents=256"]
 VARIANTS = {
     "tiny": [],
     "4 to 8 context views": ["data.context_views=8"],
