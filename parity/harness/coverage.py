@@ -8,6 +8,7 @@ CASES_OF = {
     "src/model/camera_code.rs": ["camera_code"],
     "src/model/decoder.rs": ["heads", "decoder"],
     "src/model/encoder.rs": ["encoder"],
+    "src/model/growth.rs": ["growth"],
     "src/model/merge.rs": ["merge"],
     "src/model/mixer.rs": ["mixer"],
     "src/model/precision.rs": ["linear"],

@@ -45,14 +45,10 @@ impl Growth {
                 for_smaller_patches(weights, self.from.patch_size, self.finer)
             }
             "scene_tokens" if self.copies > 1 => {
-                let copied = weights.repeat_interleave_self_int(self.copies, 0, None);
-                &copied + copied.randn_like() * (SPREAD * weights.std(false))
+                let [m, d] = [0, 1].map(|dimension| weights.size()[dimension]);
+                more_tokens(weights, &Tensor::randn([self.copies * m, d], (weights.kind(), weights.device())))
             }
-            "gaussian_decoder.geo_param_readout.bias" => {
-                let shift = weights.zeros_like();
-                let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(for_each_of(self.copies));
-                weights + shift
-            }
+            "gaussian_decoder.geo_param_readout.bias" => shared_opacities(weights, self.copies),
             _ => weights.shallow_clone(),
         }
     }
@@ -60,15 +56,25 @@ impl Growth {
 
 /// Of weights that look at patches of `patch` × `patch` pixels, [d, p·p·C], those that make of a patch of 1 / `times` the edge what these
 /// make of it enlarged (spec 3.4).
-fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
+pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
     let (d, edge) = (weights.size()[0], patch / times);
     let pixels = weights.view([d, edge, times, edge, times, -1]);
     pixels.sum_dim_intlist([2i64, 4].as_slice(), false, None::<Kind>).view([d, -1])
 }
 
-/// What is added to the logit of an opacity of ½ for `copies` Gaussians on one another to cover as much: ln(2^(1/n) − 1) (spec 4.7).
-fn for_each_of(copies: i64) -> f64 {
-    ((1. / copies as f64).exp2() - 1.).ln()
+/// Of scene tokens [M, d] and normal numbers [n·M, d], n·M tokens: each n times, a little apart (spec 4.7).
+pub(crate) fn more_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
+    let copies = noise.size()[0] / tokens.size()[0];
+    tokens.repeat_interleave_self_int(copies, 0, None) + noise * (SPREAD * tokens.std(false))
+}
+
+/// Of the parameter head's bias, [10·K], that by which `copies` Gaussians on one another, each half opaque before, cover half of what is
+/// behind them (spec 4.7).
+pub(crate) fn shared_opacities(bias: &Tensor, copies: i64) -> Tensor {
+    let shift = bias.zeros_like();
+    let shared = ((1. / copies as f64).exp2() - 1.).ln();
+    let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(shared);
+    bias + shift
 }
 
 #[cfg(test)]

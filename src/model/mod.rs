@@ -41,6 +41,7 @@ pub(crate) use attention::{attention, by_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
 pub(crate) use encoder::Encoder;
+pub(crate) use growth::{for_smaller_patches, more_tokens, shared_opacities};
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};

@@ -30,6 +30,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "self_attention_block" => self_attention_block(request),
         "mixer" => mixer(request),
         "encoder" => encoder(request),
+        "growth" => growth(request),
         "heads" => heads(request),
         "merge" => merge(request),
         "decoder" => decoder(request),
@@ -153,6 +154,15 @@ fn tokens(request: &Request) -> Result<Answer> {
     let tokens =
         module.forward(request.input("images")?, request.input("c2w")?, request.input("intrinsics")?);
     with_params([("tokens", tokens)], params)
+}
+
+fn growth(request: &Request) -> Result<Answer> {
+    let (patch, times) = (request.number("patch_size")?, request.number("times")?);
+    outputs([
+        ("patch_weights", model::for_smaller_patches(request.input("patch_weights")?, patch, times)),
+        ("scene_tokens", model::more_tokens(request.input("scene_tokens")?, request.input("noise")?)),
+        ("bias", model::shared_opacities(request.input("bias")?, request.number("copies")?)),
+    ])
 }
 
 fn rays(request: &Request) -> Result<Answer> {
