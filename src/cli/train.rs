@@ -41,8 +41,9 @@ pub struct Train {
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
     resume: String,
-    /// Weights to begin with instead of fresh ones, of a model of the same shape, or of one whose patches are two,
-    /// three or more times as wide or whose scene tokens as few; all Gaussians are shown from the first step on
+    /// Weights to begin with instead of fresh ones, of a model of the same shape, or of one with patches two, three
+    /// or more times as wide, or with a half, a third or less of the scene tokens; all Gaussians are shown from the
+    /// first step on
     #[arg(long, value_name = "FILE")]
     from: Option<PathBuf>,
     /// cpu, cuda or cuda:N
