@@ -8,7 +8,7 @@ use tch::{Kind, Tensor};
 const SPREAD: f64 = 0.2;
 
 /// What a model outgrows another by.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug)]
 pub(crate) struct Growth {
     /// The smaller model.
     from: ModelConfig,
@@ -45,7 +45,7 @@ impl Growth {
                 for_smaller_patches(weights, self.from.patch_size, self.finer)
             }
             "scene_tokens" if self.copies > 1 => {
-                let [m, d] = [0, 1].map(|dimension| weights.size()[dimension]);
+                let (m, d) = weights.size2().expect("[M, d]");
                 more_tokens(weights, &Tensor::randn([self.copies * m, d], (weights.kind(), weights.device())))
             }
             "gaussian_decoder.geo_param_readout.bias" => shared_opacities(weights, self.copies),

@@ -135,13 +135,17 @@ impl Trainer {
             theirs.heads = ours.heads;
         }
         let growth = Growth::between(&theirs, &ours);
-        let [found, expected] = [growth.result(), ours].map(|model| Config { model, ..Default::default() });
+        let [found, expected] =
+            [growth.result(), ours.clone()].map(|model| Config { model, ..Default::default() });
         let changed = changed_keys(&found.to_toml(), &expected.to_toml());
         if !changed.is_empty() {
             let expected = "the model that the configuration describes";
             return Err(Error::input(path, "the model", changed.join(", "), expected));
         }
         self.config.curriculum.full_capacity = true;
+        if theirs == ours {
+            return file.load_into(&self.vs);
+        }
         let mut smaller = nn::VarStore::new(self.vs.device());
         GlobalSplat::to_be_filled(&mut smaller, &theirs, Precision::F32)?;
         file.load_into(&smaller)?;
