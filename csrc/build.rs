@@ -95,6 +95,7 @@ fn main() {
             "raster/raster.cpp",
             "raster/attend.cpp",
             "raster/fit.cpp",
+            "raster/optim.cpp",
             "raster/parallel.cpp",
             "raster/kernels.cpp",
         ])

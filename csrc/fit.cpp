@@ -7,6 +7,7 @@
 
 #include "globalsplat-csrc/src/fit.rs.h"
 #include "raster/fit.h"
+#include "raster/optim.h"
 #include "threads.h"
 
 namespace globalsplat {

@@ -10,6 +10,8 @@
 #include <vector>
 
 #include "globalsplat-csrc/src/optim.rs.h"
+#include "raster/optim.h"
+#include "threads.h"
 
 namespace globalsplat {
 namespace {
@@ -59,6 +61,25 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
   const Tensor steps = at::full({}, double(of.steps), x[0].options().dtype(at::kFloat));
   at::_fused_adamw_(x, g, m, v, {}, std::vector<Tensor>(x.size(), steps), of.learning_rate, of.beta1, of.beta2, of.weight_decay,
                     of.epsilon, /*amsgrad=*/false, /*maximize=*/false);
+}
+
+void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first, const MuonNumbers& of) {
+  const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first);
+  TORCH_CHECK(g.size() == x.size() && m.size() == x.size(), "every matrix must have a gradient and a running mean of it");
+  std::vector<raster::MuonMatrix> matrices;
+  for (size_t k = 0; k < x.size(); ++k) {
+    for (const Tensor* t : {&x[k], &g[k], &m[k]})
+      TORCH_CHECK(t->device().is_cpu() && t->is_contiguous() && t->scalar_type() == at::kFloat && t->sizes() == x[k].sizes(),
+                  "a matrix, its gradient and the running mean of it must be alike, float32 on the CPU, and contiguous");
+    TORCH_CHECK(x[k].dim() == 2 && x[k].numel() > 0 && of.parts > 0 && x[k].size(0) % of.parts == 0, "a matrix has shape ", x[k].sizes(),
+                ", expected two sizes, the first a multiple of ", of.parts);
+    const int64_t rows = x[k].size(0) / of.parts, columns = x[k].size(1);
+    for (int64_t part = 0; part < of.parts; ++part) {
+      const int64_t begin = part * rows * columns;
+      matrices.push_back({x[k].data_ptr<float>() + begin, g[k].const_data_ptr<float>() + begin, m[k].data_ptr<float>() + begin, rows, columns});
+    }
+  }
+  raster::muon({of.learning_rate, of.learning_rate * of.weight_decay, of.beta}, matrices, threads());
 }
 
 }  // namespace globalsplat

@@ -10,6 +10,7 @@
 namespace globalsplat {
 
 struct AdamWNumbers;  // shared with Rust, see src/optim.rs
+struct MuonNumbers;
 
 // The norm of all numbers together. `out` receives a new scalar tensor that the caller owns.
 void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out);
@@ -23,5 +24,9 @@ void forget_gradients(rust::Slice<const size_t> tensors);
 // A step of AdamW (spec 8.5) on tensors of one device, contiguous and of one type, by libtorch's own fused kernel.
 void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first,
                  rust::Slice<const size_t> second, const AdamWNumbers& of);
+
+// A step of Muon (spec 8.5) on matrices of float32 numbers on the CPU, contiguous, each `parts` matrices of one height on one another; and
+// on the running means of their gradients. Throws where they are others.
+void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first, const MuonNumbers& of);
 
 }  // namespace globalsplat

@@ -8,7 +8,7 @@ use globalsplat::data::fit;
 use globalsplat::eval::psnr;
 use globalsplat::io::{read_image, tile_horizontally, write_png};
 use globalsplat::loss::{mse, ssim};
-use globalsplat::optim::{AdamW, ParameterGroup};
+use globalsplat::optim::{Optimizer, ParameterGroup, Rule};
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, render};
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, RawGaussians};
 use globalsplat::{Error, Result};
@@ -34,7 +34,7 @@ fn main() -> Result<()> {
     let (photo, camera) = load(Path::new(photo))?;
     let cameras = Cameras::single(&camera);
     let gaussians = scattered(&camera);
-    let mut optimizer = AdamW::new(groups(&gaussians));
+    let mut optimizer = Optimizer::new(groups(&gaussians));
 
     // [3, H, W], with the way back to every number of every Gaussian.
     let draw = || -> Result<Tensor> {
@@ -95,6 +95,7 @@ fn groups(gaussians: &RawGaussians) -> Vec<ParameterGroup> {
         _ => 3e-2,
     };
     let group = |(name, t): (&str, &Tensor)| ParameterGroup {
+        rule: Rule::AdamW,
         parameters: vec![(name.into(), t.shallow_clone())],
         learning_rate: learning_rate(name),
         weight_decay: 0.,

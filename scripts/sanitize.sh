@@ -37,7 +37,7 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in raster/{raster,attend,fit,parallel,kernels}.cpp cuda/frame.cpp checks/{checks,refusals,schedules}.cpp; do
+    for source in raster/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/frame.cpp checks/{checks,refusals,schedules}.cpp; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/raster
     done
     compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/raster

@@ -9,8 +9,10 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <array>
 #include <atomic>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -24,6 +26,7 @@
 #include "../raster/attend.h"
 #include "../raster/fit.h"
 #include "../raster/kernels.h"
+#include "../raster/optim.h"
 #include "../raster/parallel.h"
 #include "../raster/rows.h"
 #include "refusals.h"
@@ -236,6 +239,33 @@ int64_t fits(const std::vector<int>& thread_counts) {
   return count;
 }
 
+// Steps of Muon on matrices of all shapes.
+int64_t matrices(const std::vector<int>& thread_counts) {
+  const std::array<std::array<int64_t, 2>, 6> shapes = {{{1, 1}, {1, 7}, {7, 1}, {20, 33}, {128, 128}, {200, 65}}};
+  const auto stepped = [&](int threads) {
+    begin("a step of Muon");
+    Random random(12);
+    std::vector<std::vector<float>> numbers;
+    std::vector<raster::MuonMatrix> all;
+    for (const auto& [rows, columns] : shapes) {
+      for (int of = 0; of < 3; ++of) {
+        const std::vector<double> drawn = random.uniform(size_t(rows * columns), -1, 1);
+        numbers.emplace_back(drawn.begin(), drawn.end());
+      }
+      float* const gradient = numbers.back().data();
+      all.push_back({numbers[numbers.size() - 3].data(), gradient, numbers[numbers.size() - 2].data(), rows, columns});
+    }
+    raster::muon({0.1, 0.01, 0.95}, all, threads);
+    std::vector<float> after;
+    for (const auto& of : numbers) after.insert(after.end(), of.begin(), of.end());
+    return after;
+  };
+  const std::vector<float> one = stepped(1);
+  expect(std::all_of(one.begin(), one.end(), [](float number) { return std::abs(number) < 10; }), "a step of Muon has no numbers");
+  for (const int threads : thread_counts) expect(same(stepped(threads), one), "threads change a step of Muon");
+  return int64_t(thread_counts.size());
+}
+
 std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
   std::vector<raster::Bf16> cut;
   for (const float number : numbers) {
@@ -319,7 +349,7 @@ int64_t bits(bool is_short) {
   std::vector<int> thread_counts = {2, 3, 16};
   if (!is_short)
     for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
-  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts) + attentions(thread_counts);
+  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts) + matrices(thread_counts) + attentions(thread_counts);
   size_t turn = 0;  // the short form has one degree for each scene, and all degrees for all of them
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);

@@ -26,14 +26,6 @@ Rows<Number> head_of(const Heads<Number>& all, const AttentionShape& shape, int6
   return {all.data + head / shape.heads * all.scene + head % shape.heads * shape.width, all.row};
 }
 
-// A thread's own, on whole cache lines.
-float* room(int64_t count) {
-  thread_local std::vector<float> numbers;
-  numbers.resize(std::max(numbers.size(), size_t(count) + 16));
-  const auto address = reinterpret_cast<uintptr_t>(numbers.data());
-  return numbers.data() + (64 - address % 64) % 64 / sizeof(float);
-}
-
 // Calls task(some of a head's queries with all of its keys and values, head, where these queries begin) on up to `threads` threads.
 // Queries come in whole `step`s.
 template <class Number, class Task>

@@ -18,20 +18,6 @@ GS_INLINE Vector<float> power_of_two(Vector<float> x) {
   return exp2_where(Mask<float>(~less(x, broadcast<float>(-126))), x);
 }
 
-// What is left of a task's room.
-class Room {
- public:
-  explicit Room(float* from) : next_(from) {}
-  float* take(int64_t count) {
-    float* const taken = next_;
-    next_ += (count + 15) / 16 * 16;
-    return taken;
-  }
-
- private:
-  float* next_;
-};
-
 static_assert(kForwardKeys % kProductColumns == 0 && kBackwardKeys % kProductColumns == 0 && kBackwardKeys % kProductRows == 0 &&
               kBackwardQueries % kProductRows == 0 && kAttentionQueries % kProductRows == 0);
 

@@ -11,9 +11,8 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int kRows = 16;                   // that are one task
-constexpr int64_t kNumbers = int64_t(1) << 14;  // of Adam, likewise
-constexpr double kSigma = 1.5;              // of SSIM's window, pixels
+constexpr int kRows = 16;       // that are one task
+constexpr double kSigma = 1.5;  // of SSIM's window, pixels
 
 template <class T>
 const T* window() {
@@ -92,18 +91,9 @@ double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int 
          });
 }
 
-template <class T>
-void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads) {
-  parallel_for(threads, (count + kNumbers - 1) / kNumbers, [&](int64_t task) {
-    kernels().of<T>().adam(step, numbers, task * kNumbers, std::min((task + 1) * kNumbers, count));
-  });
-}
-
 template double photometric(const FitJob<float>&, double, double, float*, int);
 template double photometric(const FitJob<double>&, double, double, double*, int);
 template double depth_smoothness(const DepthJob<float>&, double, float*, int);
 template double depth_smoothness(const DepthJob<double>&, double, double*, int);
-template void adam(const AdamStep&, const AdamNumbers<float>&, int64_t, int);
-template void adam(const AdamStep&, const AdamNumbers<double>&, int64_t, int);
 
 }  // namespace globalsplat::raster

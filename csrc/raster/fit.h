@@ -1,5 +1,4 @@
-// What fitting pictures to photos needs beside drawing them: how far they are apart, and how uneven depths are, with gradients,
-// and a step of Adam.
+// What fitting pictures to photos needs beside drawing them: how far they are apart, and how uneven depths are, with gradients.
 // Shared among threads; the bits don't depend on their number.
 #pragma once
 
@@ -36,9 +35,5 @@ struct DepthJob {
 // respect to the depths, [views, H, W], if it isn't null.
 template <class T>
 double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads);
-
-// Updates `count` numbers and their moments.
-template <class T>
-void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads);
 
 }  // namespace globalsplat::raster

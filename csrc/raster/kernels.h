@@ -42,6 +42,7 @@ struct Kernels {
                             const PackedBf16Queries& to);
   void (*attend_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
                                Rows<Bf16> dv, float* room);
+  void (*muon)(const MuonStep&, const MuonMatrix&, float* room);  // muon.h
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

@@ -4,6 +4,7 @@
 #include "blend.h"
 #include "cover.h"
 #include "kernels.h"
+#include "muon.h"
 #include "project.h"
 #include "smooth.h"
 #include "ssim.h"
@@ -26,6 +27,7 @@ const Kernels table = {
     attend_bf16,
     pack_queries_bf16,
     attend_backward_bf16,
+    muon,
     multiply_adds,
 };
 

@@ -11,6 +11,7 @@
 #include <system_error>
 #include <thread>
 #include <utility>
+#include <vector>
 
 namespace globalsplat::raster {
 namespace {
@@ -101,6 +102,13 @@ Pool& pool() {
 void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task) {
   if (threads > 1 && count > 1 && pool().try_run(threads, count, task)) return;
   for (int64_t i = 0; i < count; ++i) task(i);
+}
+
+float* room(int64_t count) {
+  thread_local std::vector<float> numbers;
+  numbers.resize(std::max(numbers.size(), size_t(count) + 16));
+  const auto address = reinterpret_cast<uintptr_t>(numbers.data());
+  return numbers.data() + (64 - address % 64) % 64 / sizeof(float);
 }
 
 }  // namespace globalsplat::raster

@@ -12,4 +12,7 @@ namespace globalsplat::raster {
 // What a task throws reaches the caller, once no task is running; those that hadn't begun are left out.
 void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task);
 
+// `count` numbers that are this thread's until it asks again, on whole cache lines.
+float* room(int64_t count);
+
 }  // namespace globalsplat::raster

@@ -7,6 +7,20 @@
 
 namespace globalsplat::raster::GS_ISA {
 
+// What is left of a task's room.
+class Room {
+ public:
+  explicit Room(float* from) : next_(from) {}
+  float* take(int64_t count) {
+    float* const taken = next_;
+    next_ += (count + 15) / 16 * 16;
+    return taken;
+  }
+
+ private:
+  float* next_;
+};
+
 // Rows and vectors of columns whose sums are in registers at a time: as many as there are registers for, beside a row of the second
 // matrix and a number of the first.
 #if defined(__AVX512F__) || defined(__aarch64__)

@@ -198,4 +198,25 @@ struct AdamNumbers {
   T* second;
 };
 
+// What all matrices of one step of Muon share, and a matrix, its gradient and the running mean of that; see muon.h. Row-major.
+struct MuonStep {
+  double rate, decay, beta;
+};
+struct MuonMatrix {
+  float* value;
+  const float* gradient;
+  float* first;
+  int64_t rows, columns;
+};
+
+// Of the matrix with as few rows as possible: numbers from one row to the next, of itself and of its products with itself. Rows that
+// are a power of two apart would share few lines of the caches.
+inline constexpr int64_t muon_stride(int64_t columns) { return (columns + 63) / 64 * 64 + 16; }
+
+// Numbers that a step of a matrix works with.
+inline constexpr int64_t muon_room(int64_t rows, int64_t columns) {
+  const int64_t few = rows < columns ? rows : columns, many = rows < columns ? columns : rows;
+  return (2 * (few + 6) + muon_stride(few)) * muon_stride(many) + 3 * (few + 6) * muon_stride(few) + 128;
+}
+
 }  // namespace globalsplat::raster

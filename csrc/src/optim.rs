@@ -23,6 +23,18 @@ mod ffi {
         epsilon: f64,
     }
 
+    /// What a step of Muon does to all of its matrices alike.
+    struct MuonNumbers {
+        /// So many lie on one another in each, of the same height.
+        parts: i64,
+        /// How far it goes, about.
+        learning_rate: f64,
+        /// Of the value, taken away, times the learning rate.
+        weight_decay: f64,
+        /// How much of the running mean stays.
+        beta: f64,
+    }
+
     unsafe extern "C++" {
         include!("optim.h");
 
@@ -54,6 +66,17 @@ mod ffi {
             first: &[usize],
             second: &[usize],
             of: &AdamWNumbers,
+        ) -> Result<()>;
+
+        /// See `csrc/optim.h`.
+        ///
+        /// # Safety
+        /// Addresses of live tensors that nothing else reads or writes meanwhile.
+        unsafe fn muon(
+            values: &[usize],
+            gradients: &[usize],
+            first: &[usize],
+            of: &MuonNumbers,
         ) -> Result<()>;
     }
 }

@@ -39,7 +39,8 @@ CASES_OF = {
         "rasterizer_thin_float32",
     ],
     "src/train/curriculum.rs": ["stages"],
-    "src/optim/adamw.rs": ["adamw"],
+    "src/optim/muon.rs": ["muon"],
+    "src/optim/optimizer.rs": ["adamw", "muon"],
     "src/train/schedule.rs": ["learning_rate"],
     "src/train/subsets.rs": ["subsets"],
 }

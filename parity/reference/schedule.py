@@ -51,3 +51,23 @@ def adamw_step(parameter, gradient, first, second, count, rate, decay, beta1=0.9
     second = beta2 * second + (1.0 - beta2) * gradient**2
     direction = (first / (1.0 - beta1**count)) / (torch.sqrt(second / (1.0 - beta2**count)) + eps)
     return parameter * (1.0 - rate * decay) - rate * direction, first, second
+
+
+def levelled(matrix):
+    """The matrix with every singular value s, as a share of the norm of all, five times replaced by a s + b s^3 + c s^5."""
+    u, s, vh = torch.linalg.svd(matrix, full_matrices=False)
+    s = s / (matrix.norm() + 1e-7)
+    for _ in range(5):
+        s = 3.4445 * s - 4.7750 * s**3 + 2.0315 * s**5
+    return (u * s) @ vh
+
+
+def muon_step(parameter, gradient, mean, rate, decay, parts=1, beta=0.95):
+    """One update by Muon of `parts` matrices on one another -> new (parameter, mean).
+
+    m <- b m + (1 - b) g,   u = (1 - b) g + b m,   p <- p (1 - rate decay) - rate 0.2 sqrt(max(R, C)) levelled(u)
+    """
+    mean = beta * mean + (1.0 - beta) * gradient
+    ahead = (1.0 - beta) * gradient + beta * mean
+    steps = [0.2 * math.sqrt(max(part.shape)) * levelled(part) for part in ahead.chunk(parts)]
+    return parameter * (1.0 - rate * decay) - rate * torch.cat(steps), mean

@@ -482,6 +482,23 @@ def test_adamw_and_clipping_against_torch():
         assert torch.allclose(ours[name][0], theirs[name], atol=1e-6)
 
 
+def test_muon_against_torch():
+    """Torch rounds to bfloat16 on the way."""
+    generator = torch.Generator().manual_seed(0)
+    for shape in [(24, 40), (40, 24), (16, 16)]:
+        start = torch.randn(shape, generator=generator)
+        theirs = torch.nn.Parameter(start.clone())
+        rule = {"lr": 0.1, "weight_decay": 0.3, "momentum": 0.95, "adjust_lr_fn": "match_rms_adamw"}
+        optimizer = torch.optim.Muon([theirs], **rule)
+        ours, mean = start, torch.zeros_like(start)
+        for _ in range(4):
+            theirs.grad = torch.randn(shape, generator=generator)
+            optimizer.step()
+            ours, mean = schedule.muon_step(ours, theirs.grad, mean, 0.1, 0.3)
+        decayed = start * (1 - 0.1 * 0.3) ** 4
+        assert (ours - theirs).norm() < 0.02 * (ours - decayed).norm()
+
+
 def test_clipping():
     gradients = {"a": torch.tensor([3.0, 0.0]), "b": torch.tensor([[4.0]])}
     clipped, norm = schedule.clip_gradients(gradients)

@@ -8,7 +8,7 @@ mod train;
 
 pub use curriculum::CurriculumConfig;
 pub(crate) use keys::changed_keys;
-pub use train::TrainConfig;
+pub use train::{OptimizerKind, TrainConfig};
 
 use crate::data::DataConfig;
 use crate::error::{Error, Result};

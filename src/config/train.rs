@@ -4,6 +4,16 @@ use crate::error::{Error, Result};
 use crate::model::Precision;
 use serde::{Deserialize, Serialize};
 
+/// What updates the encoder's matrices; all else is updated by AdamW.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OptimizerKind {
+    /// AdamW, as the paper.
+    AdamW,
+    /// Muon.
+    Muon,
+}
+
 /// Optimizer, schedule and bookkeeping.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -23,6 +33,8 @@ pub struct TrainConfig {
     /// `f32`, or `bf16` for the encoder's matrix products and the network of L_perc, which is faster for wide models where the
     /// machine has instructions for it.
     pub precision: Precision,
+    /// `adamw`, or `muon` for the encoder's matrices.
+    pub optimizer: OptimizerKind,
     /// Peak learning rate.
     pub learning_rate: f64,
     /// Share of the steps over which the learning rate rises.
@@ -54,6 +66,7 @@ impl Default for TrainConfig {
             micro_batch: 0,
             checkpoint_rounds: false,
             precision: Precision::F32,
+            optimizer: OptimizerKind::AdamW,
             learning_rate: 5e-4,
             warmup: 0.03,
             weight_decay: 1e-6,

@@ -1,12 +1,13 @@
 //! Optimizers over named tensors in groups: for a network's weights as for Gaussians (tch's own can't save their state); and where
 //! their time goes.
 
-mod adamw;
+mod muon;
+mod optimizer;
 mod stopwatch;
 
-pub use adamw::{AdamW, ParameterGroup};
+pub use optimizer::{Optimizer, ParameterGroup, Rule};
 
 // For benchmarks.
 pub use stopwatch::Stopwatch;
 
-pub(crate) use adamw::forget_gradients;
+pub(crate) use optimizer::forget_gradients;

@@ -1,13 +1,13 @@
 //! The cases: which code answers which name.
 
 use super::{Answer, Request, Tensors};
-use crate::config::{CurriculumConfig, TrainConfig};
+use crate::config::{CurriculumConfig, OptimizerKind, TrainConfig};
 use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, Encoded, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
-use crate::optim::AdamW;
+use crate::optim::Optimizer;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians};
 use crate::train;
@@ -68,7 +68,8 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "subsets" => subsets(request),
         "learning_rate" => learning_rate(request),
         "stages" => stages(request),
-        "adamw" => adamw(request),
+        "adamw" => steps_of(OptimizerKind::AdamW, request),
+        "muon" => steps_of(OptimizerKind::Muon, request),
         "model" => whole_model(request),
         other => Err(Error::Request(format!("there is no parity case {other}"))),
     }
@@ -466,7 +467,7 @@ fn stages(request: &Request) -> Result<Answer> {
     outputs([("index", Tensor::from_slice(&index)), ("mix", Tensor::from_slice(&mix))])
 }
 
-fn adamw(request: &Request) -> Result<Answer> {
+fn steps_of(optimizer: OptimizerKind, request: &Request) -> Result<Answer> {
     let mut vs = nn::VarStore::new(request.device);
     for (name, value) in &request.params {
         let mut path = vs.root();
@@ -479,11 +480,12 @@ fn adamw(request: &Request) -> Result<Answer> {
     }
     vs.unfreeze();
     let config = TrainConfig {
+        optimizer,
         learning_rate: request.number("learning_rate")?,
         weight_decay: request.number("weight_decay")?,
         ..Default::default()
     };
-    let mut optimizer = AdamW::new(train::parameter_groups(&vs, &config));
+    let mut optimizer = Optimizer::new(train::parameter_groups(&vs, &config));
     let variables: Tensors = vs.variables().into_iter().collect();
     let gradients = |name: &str| request.input(&format!("grad.{name}"));
     let count = variables.keys().next().map_or(Ok(0), |name| gradients(name).map(|g| g.size()[0]))?;

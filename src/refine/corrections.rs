@@ -3,7 +3,7 @@
 
 use super::config::RefineConfig;
 use crate::data::{View, ViewBatch};
-use crate::optim::{AdamW, ParameterGroup};
+use crate::optim::{Optimizer, ParameterGroup, Rule};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use tch::{Kind, Tensor};
@@ -17,7 +17,7 @@ pub struct Corrections {
     poses: Option<Tensor>,
     /// Logarithms of factors of red, green and blue: [V, 3].
     exposures: Option<Tensor>,
-    optimizer: AdamW,
+    optimizer: Optimizer,
     rates: Vec<f64>,
     rates_end: f64,
     depth: f64,
@@ -51,11 +51,14 @@ impl Corrections {
         let exposures = exposures.then(|| leaf(3));
         let group = |name: &str, t: &Option<Tensor>, rate: f64| {
             let parameters = vec![(name.into(), t.as_ref()?.shallow_clone())];
-            Some((ParameterGroup { parameters, learning_rate: 0., weight_decay: 0. }, rate))
+            Some((
+                ParameterGroup { rule: Rule::AdamW, parameters, learning_rate: 0., weight_decay: 0. },
+                rate,
+            ))
         };
         let groups = [group("poses", &poses, config.poses), group("exposures", &exposures, config.exposures)];
         let (groups, rates) = groups.into_iter().flatten().unzip();
-        let optimizer = AdamW::new(groups);
+        let optimizer = Optimizer::new(groups);
         Corrections { poses, exposures, optimizer, rates, rates_end: config.others_end, depth }
     }
 

@@ -4,7 +4,7 @@ use super::config::RefineConfig;
 use super::leaves::Leaves;
 use super::relocate::relocate;
 use crate::model::{Encoded, GlobalSplat, Stage};
-use crate::optim::{AdamW, ParameterGroup};
+use crate::optim::{Optimizer, ParameterGroup, Rule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
@@ -28,7 +28,7 @@ pub trait Space {
 #[derive(Debug)]
 pub struct GaussianSpace {
     leaves: Leaves,
-    optimizer: AdamW,
+    optimizer: Optimizer,
     config: RefineConfig,
     depth: f64,
     /// Degrees of spherical harmonics, at the beginning and in the end.
@@ -41,14 +41,15 @@ impl GaussianSpace {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = Leaves::of(raw, degrees[1]);
-        let optimizer = AdamW::new(leaves.named().map(alone).into()).with_epsilon(EPSILON);
+        let optimizer = Optimizer::new(leaves.named().map(alone).into()).with_epsilon(EPSILON);
         GaussianSpace { leaves, optimizer, config: config.clone(), depth, degrees }
     }
 }
 
 /// A group of its own, whose learning rate is set before each step.
 fn alone((name, t): (&str, &Tensor)) -> ParameterGroup {
-    ParameterGroup { parameters: vec![(name.into(), t.shallow_clone())], learning_rate: 0., weight_decay: 0. }
+    let parameters = vec![(name.into(), t.shallow_clone())];
+    ParameterGroup { rule: Rule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
 }
 
 impl Space for GaussianSpace {
@@ -90,7 +91,7 @@ pub struct TokenSpace<'a> {
     network: &'a GlobalSplat,
     stage: Stage,
     tokens: Encoded,
-    optimizer: AdamW,
+    optimizer: Optimizer,
     learning_rate: f64,
 }
 
@@ -99,7 +100,7 @@ impl<'a> TokenSpace<'a> {
     pub fn new(network: &'a GlobalSplat, stage: Stage, tokens: &Encoded, config: &RefineConfig) -> Self {
         let tokens = tokens.map(|t| t.detach().copy().set_requires_grad(true));
         let groups = [("geometry", &tokens.geometry), ("appearance", &tokens.appearance)].map(alone);
-        let optimizer = AdamW::new(groups.into()).with_epsilon(EPSILON);
+        let optimizer = Optimizer::new(groups.into()).with_epsilon(EPSILON);
         TokenSpace { network, stage, tokens, optimizer, learning_rate: config.tokens }
     }
 }

@@ -219,7 +219,8 @@ impl Trainer {
     pub(super) fn load(&mut self, checkpoint: &Path, state: &State) -> Result<()> {
         let file = checkpoint.join(MODEL_FILE);
         WeightsFile::open(&file)?.load_into(&self.vs)?;
-        self.optimizer.load_state(&read_weights(&checkpoint.join(OPTIMIZER_FILE))?.tensors)?;
+        let file = checkpoint.join(OPTIMIZER_FILE);
+        self.optimizer.load_state(&file, &read_weights(&file)?.tensors)?;
         (self.step, self.samples) = (state.step, state.samples);
         Ok(())
     }

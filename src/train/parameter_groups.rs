@@ -1,21 +1,34 @@
-//! Which of a network's weights decay.
+//! Which of a network's weights decay, and how each is updated.
 
-use crate::config::TrainConfig;
-use crate::optim::ParameterGroup;
+use crate::config::{OptimizerKind, TrainConfig};
+use crate::optim::{ParameterGroup, Rule};
 use tch::{Tensor, nn};
 
-/// The trained variables of `vs`: weights of two or more dimensions decay; biases, norms, LayerScale and learned tokens don't
-/// (spec 8.5).
+/// Queries, keys and values of self-attention, which are one layer.
+const QKV: &str = ".qkv.weight";
+
+/// The trained variables of `vs`: weights of two or more dimensions decay; biases, norms, LayerScale and learned tokens don't. With Muon
+/// the encoder's matrices are updated by it, all else by AdamW (spec 8.5).
 pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<ParameterGroup> {
     let trained = vs.variables().into_iter().filter(|(_, value)| value.requires_grad());
     let decays = |(name, value): &(String, Tensor)| name.ends_with(".weight") && value.dim() >= 2;
     let (decaying, others): (Vec<_>, Vec<_>) = trained.partition(decays);
-    let group = |parameters, weight_decay| ParameterGroup {
+    let is_muons = |name: &str| config.optimizer == OptimizerKind::Muon && name.starts_with("slot_encoder.");
+    let (matrices, decaying): (Vec<_>, Vec<_>) = decaying.into_iter().partition(|(name, _)| is_muons(name));
+    let (threefold, matrices): (Vec<_>, Vec<_>) =
+        matrices.into_iter().partition(|(name, _)| name.ends_with(QKV));
+    let group = |rule, parameters, weight_decay| ParameterGroup {
+        rule,
         parameters,
         learning_rate: config.learning_rate,
         weight_decay,
     };
-    vec![group(decaying, config.weight_decay), group(others, 0.)]
+    vec![
+        group(Rule::AdamW, decaying, config.weight_decay),
+        group(Rule::AdamW, others, 0.),
+        group(Rule::Muon { parts: 1 }, matrices, config.weight_decay),
+        group(Rule::Muon { parts: 3 }, threefold, config.weight_decay),
+    ]
 }
 
 /// The trained variables of `vs` in the order in which the backward pass gives their gradients, about: of the decoder, of the encoder's
@@ -40,6 +53,7 @@ fn turn(name: &str) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::{GlobalSplat, ModelConfig};
     use tch::{Device, nn::Init};
 
     #[test]
@@ -54,13 +68,36 @@ mod tests {
             vs.root().zeros_no_train("constant", &[2, 2]),
         ];
         let groups = parameter_groups(&vs, &TrainConfig { weight_decay: 0.1, ..Default::default() });
-        let names = |group: &ParameterGroup| {
-            let mut names: Vec<String> = group.parameters.iter().map(|(name, _)| name.clone()).collect();
-            names.sort();
-            names
-        };
         assert_eq!((names(&groups[0]), groups[0].weight_decay), (vec!["layer.weight".into()], 0.1));
         let others: Vec<String> = ["layer.bias", "norm.weight", "tokens"].map(String::from).into();
         assert_eq!((names(&groups[1]), groups[1].weight_decay), (others, 0.));
+    }
+
+    fn names(group: &ParameterGroup) -> Vec<String> {
+        let mut names: Vec<String> = group.parameters.iter().map(|(name, _)| name.clone()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn muon_updates_the_encoders_matrices_and_nothing_else() {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let model = ModelConfig { rounds: 1, self_attention_blocks: 1, ..Default::default() };
+        let _model = GlobalSplat::new(&vs.root(), &model).expect("a model");
+        let of = |optimizer| parameter_groups(&vs, &TrainConfig { optimizer, ..Default::default() });
+        let [adamw, muon] = [OptimizerKind::AdamW, OptimizerKind::Muon].map(of);
+        let counts =
+            |groups: &[ParameterGroup]| groups.iter().map(|g| g.parameters.len()).collect::<Vec<_>>();
+        assert_eq!(counts(&adamw)[2..], [0, 0]);
+        // Two layers before the rounds; ten of each stream's round, one of which makes queries, keys and values; the mixer's two.
+        assert_eq!(counts(&muon)[2..], [2 + 2 * 9 + 2, 2]);
+        assert_eq!(counts(&muon).iter().sum::<usize>(), counts(&adamw).iter().sum::<usize>());
+        for (group, parts) in muon[2..].iter().zip([1, 3]) {
+            assert_eq!((group.rule, group.weight_decay), (Rule::Muon { parts }, 1e-6));
+            for (name, value) in &group.parameters {
+                assert!(name.starts_with("slot_encoder.") && value.dim() == 2, "{name}");
+                assert_eq!(value.size()[0] == 3 * value.size()[1], parts == 3, "{name}");
+            }
+        }
     }
 }

@@ -14,7 +14,7 @@ use crate::data::{BadData, Loader, News, Part, Sample, SceneGroups};
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, Share};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
-use crate::optim::{AdamW, Stopwatch};
+use crate::optim::{Optimizer, Stopwatch};
 use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::collections::BTreeMap;
@@ -33,7 +33,7 @@ pub struct Trainer {
     pub(super) model: GlobalSplat,
     /// The model for further threads; made when they are first needed.
     pub(super) twins: Vec<Twin>,
-    pub(super) optimizer: AdamW,
+    pub(super) optimizer: Optimizer,
     pub(super) perceptual: Option<PerceptualLoss>,
     /// Steps done.
     pub(super) step: u64,
@@ -83,7 +83,7 @@ impl Trainer {
         let vs = nn::VarStore::new(device);
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
         model.set_precision(config.train.precision);
-        let optimizer = AdamW::new(parameter_groups(&vs, &config.train));
+        let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
         let group = Group::alone();
         let buckets = Buckets::new(&group, &[]);

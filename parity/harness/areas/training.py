@@ -88,7 +88,7 @@ def adamw(rng):
 @twin("adamw")
 def adamw_twin(config, params, inputs):
     # "token" stands for a learnable token of the model, which is told by its name.
-    published = {"token": "scene_tokens"}
+    published = {"token": "scene_tokens", "slot_encoder.token": "slot_encoder.slot_regs"}
     after = {}
     for name, value in params.items():
         decays = reference.schedule.is_decayed(published.get(name, name), value)
@@ -98,5 +98,38 @@ def adamw_twin(config, params, inputs):
             value, first, second = reference.schedule.adamw_step(
                 value, gradient, first, second, count, config["learning_rate"], decay
             )
+        after[name] = value
+    return after
+
+
+@case
+def muon(rng):
+    """Matrices of the encoder, flat and upright, one of three layers in one, and what AdamW updates beside them."""
+    for steps in (1, 6):
+        params = {
+            "slot_encoder.flat.weight": normal(rng, 5, 9),
+            "slot_encoder.upright.weight": normal(rng, 40, 12),
+            "slot_encoder.attn.qkv.weight": normal(rng, 24, 8),
+            "slot_encoder.flat.bias": normal(rng, 5),
+            "slot_encoder.token": normal(rng, 1, 3, 5),
+            "decoder.weight": normal(rng, 4, 7),
+        }
+        gradients = {f"grad.{name}": normal(rng, steps, *value.shape) for name, value in params.items()}
+        config = {"learning_rate": 0.5, "weight_decay": 0.3}
+        yield Draw(f"{steps} steps", gradients, config, params, gradients=False)
+
+
+@twin("muon")
+def muon_twin(config, params, inputs):
+    rate, decay = config["learning_rate"], config["weight_decay"]
+    adamw = [name for name in params if not (name.startswith("slot_encoder.") and name.endswith(".weight"))]
+    after = adamw_twin(
+        config, {name: params[name] for name in adamw}, {f"grad.{name}": inputs[f"grad.{name}"] for name in adamw}
+    )
+    for name in params.keys() - after.keys():
+        value, mean = params[name], torch.zeros_like(params[name])
+        for gradient in inputs[f"grad.{name}"]:
+            parts = 3 if "qkv" in name else 1
+            value, mean = reference.schedule.muon_step(value, gradient, mean, rate, decay, parts)
         after[name] = value
     return after

@@ -1,10 +1,12 @@
-//! AdamW (Loshchilov & Hutter 2019), with a state that can be saved (spec 8.5).
+//! AdamW (Loshchilov & Hutter 2019), and Muon (Jordan et al. 2024) for matrices, with a state that can be saved (spec 8.5).
 
+use super::muon::{self, Matrices};
 use crate::error::{Error, Result};
 use crate::render::handed_over;
 use globalsplat_csrc::fit::{AdamArguments, adam};
 use globalsplat_csrc::optim::{self as ffi, AdamWNumbers, fused_adamw, norm, scale};
 use std::collections::BTreeMap;
+use std::path::Path;
 use tch::{Device, Tensor};
 
 const BETA1: f64 = 0.9;
@@ -13,9 +15,23 @@ const EPS: f64 = 1e-8;
 /// Added to the norm that gradients are divided by, as in torch's `clip_grad_norm_`.
 const CLIP_EPS: f64 = 1e-6;
 
+/// By which a group is updated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rule {
+    /// Each number by running means of its gradient and of the square of that.
+    AdamW,
+    /// Matrices as such, by a running mean of their gradients: along the nearest that turns and doesn't stretch.
+    Muon {
+        /// So many lie on one another in each of the group's tensors [parts · rows, columns], and are updated by themselves.
+        parts: i64,
+    },
+}
+
 /// Tensors that are updated alike.
 #[derive(Debug)]
 pub struct ParameterGroup {
+    /// How.
+    pub rule: Rule,
     /// Leaves that take gradients, by names that no other group uses.
     pub parameters: Vec<(String, Tensor)>,
     /// How far a step goes, about.
@@ -31,20 +47,26 @@ struct Parameter {
     value: Tensor,
     /// No numbers where another part of the optimizer has them.
     first: Tensor,
-    second: Tensor,
+    /// Of the squares, which AdamW alone keeps.
+    second: Option<Tensor>,
     group: usize,
     /// The part of the optimizer that updates it.
     part: usize,
 }
 
 impl Parameter {
-    /// One update on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, `root2` √(1 − β₂ᵗ).
-    fn update(&mut self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
+    /// What is kept of its gradients, by name.
+    fn moments(&self) -> impl Iterator<Item = (&'static str, &Tensor)> {
+        std::iter::once(("first", &self.first)).chain(self.second.iter().map(|second| ("second", second)))
+    }
+
+    /// One update by AdamW on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, `root2` √(1 − β₂ᵗ).
+    fn update(&self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
         let arguments = AdamArguments {
             value: address(&self.value),
             gradient: address(gradient),
             first: address(&self.first),
-            second: address(&self.second),
+            second: address(self.second.as_ref().expect("AdamW's")),
             rate,
             root: root2,
             decay,
@@ -64,7 +86,7 @@ fn address(t: &Tensor) -> usize {
 }
 
 /// The same for several.
-fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
+pub(super) fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
     tensors.into_iter().map(address).collect()
 }
 
@@ -75,15 +97,16 @@ pub(crate) fn forget_gradients<'a>(leaves: impl IntoIterator<Item = &'a Tensor>)
 }
 
 /// What a group's parameters have in common.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 struct Settings {
+    rule: Rule,
     learning_rate: f64,
     weight_decay: f64,
 }
 
 /// The optimizer. Whatever the groups, parameters are gone through in the order of their names.
 #[derive(Debug)]
-pub struct AdamW {
+pub struct Optimizer {
     parameters: Vec<Parameter>,
     groups: Vec<Settings>,
     epsilon: f64,
@@ -92,7 +115,7 @@ pub struct AdamW {
     part: usize,
 }
 
-impl AdamW {
+impl Optimizer {
     /// For the parameters of `groups`, moments at zero.
     ///
     /// # Panics
@@ -101,19 +124,21 @@ impl AdamW {
         let (mut parameters, mut settings) = (BTreeMap::new(), vec![]);
         for (group, of) in groups.into_iter().enumerate() {
             for (name, value) in of.parameters {
-                let (first, second) = (value.zeros_like().detach(), value.zeros_like().detach());
+                let zeros = || value.zeros_like().detach();
+                let (first, second) = (zeros(), (of.rule == Rule::AdamW).then(zeros));
                 let parameter = Parameter { name: name.clone(), value, first, second, group, part: 0 };
                 assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
             }
-            settings.push(Settings { learning_rate: of.learning_rate, weight_decay: of.weight_decay });
+            let ParameterGroup { rule, learning_rate, weight_decay, .. } = of;
+            settings.push(Settings { rule, learning_rate, weight_decay });
         }
         let parameters = parameters.into_values().collect();
-        AdamW { parameters, groups: settings, epsilon: EPS, steps: 0, part: 0 }
+        Optimizer { parameters, groups: settings, epsilon: EPS, steps: 0, part: 0 }
     }
 
     /// With `epsilon` in place of 1e-8 added to the root of the second moments.
     pub fn with_epsilon(self, epsilon: f64) -> Self {
-        AdamW { epsilon, ..self }
+        Optimizer { epsilon, ..self }
     }
 
     /// Of the groups, in their order, from the next step on.
@@ -137,7 +162,7 @@ impl AdamW {
             p.part = least;
             if least != part {
                 let none = || Tensor::empty([0], (p.value.kind(), p.value.device()));
-                (p.first, p.second) = (none(), none());
+                (p.first, p.second) = (none(), p.second.as_ref().map(|_| none()));
             }
         }
     }
@@ -154,7 +179,7 @@ impl AdamW {
 
     /// Running means of the gradients and of their squares, to be changed in place.
     pub fn moments(&self) -> impl Iterator<Item = &Tensor> {
-        self.parameters.iter().flat_map(|p| [&p.first, &p.second])
+        self.parameters.iter().flat_map(Parameter::moments).map(|(_, moment)| moment)
     }
 
     /// Of every group, from the next step on.
@@ -163,7 +188,7 @@ impl AdamW {
     }
 
     /// The gradients that the last backward pass left, by the parameters' names and in their order. What is done to them in
-    /// place is done to what [`AdamW::gradient_norm`] and [`AdamW::step`] see.
+    /// place is done to what [`Optimizer::gradient_norm`] and [`Optimizer::step`] see.
     pub fn gradients(&self) -> impl Iterator<Item = (&str, Tensor)> {
         let gradients = self.parameters.iter().map(|p| (p.name.as_str(), p.value.grad()));
         gradients.filter(|(_, gradient)| gradient.defined())
@@ -193,52 +218,69 @@ impl AdamW {
         }
     }
 
-    /// One update from the gradients that are there, by the groups' learning rates: on the CPU in one pass over memory, on a GPU in
-    /// one launch for many parameters.
+    /// One update from the gradients that are there, by the groups' rules and learning rates: on the CPU in one pass over memory, on
+    /// a GPU in one launch for many parameters.
     pub fn step(&mut self) {
         self.steps += 1;
-        match self.parameters.iter().all(|p| p.value.device() == Device::Cpu) {
-            true => self.update_on_the_cpu(),
-            false => self.update_fused(),
-        }
-    }
-
-    /// The step that [`AdamW::step`] has counted.
-    fn update_on_the_cpu(&mut self) {
-        let correction1 = 1. - BETA1.powi(self.steps as i32);
-        let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
-        for p in self.parameters.iter_mut().filter(|p| p.part == self.part) {
-            let gradient = p.value.grad();
-            if gradient.defined() {
-                let Settings { learning_rate, weight_decay } = self.groups[p.group];
-                let (rate, decay) = (learning_rate / correction1, learning_rate * weight_decay);
-                p.update(&gradient.contiguous(), rate, root2, decay, self.epsilon);
+        let is_here = self.parameters.iter().all(|p| p.value.device() == Device::Cpu);
+        for group in 0..self.groups.len() {
+            match self.groups[group].rule {
+                Rule::AdamW if is_here => self.update_on_the_cpu(group),
+                Rule::AdamW => self.update_fused(group),
+                Rule::Muon { parts } => self.update_matrices(group, parts),
             }
         }
     }
 
-    /// The same by libtorch's own kernel, group by group.
-    fn update_fused(&mut self) {
-        for (group, &Settings { learning_rate, weight_decay }) in self.groups.iter().enumerate() {
-            let of_group = self.parameters.iter().filter(|p| p.group == group && p.part == self.part);
-            let with_gradient = of_group.filter(|p| p.value.grad().defined());
-            let (parameters, gradients): (Vec<_>, Vec<_>) =
-                with_gradient.map(|p| (p, p.value.grad().contiguous())).unzip();
-            let values = addresses(parameters.iter().map(|p| &p.value));
-            let first = addresses(parameters.iter().map(|p| &p.first));
-            let second = addresses(parameters.iter().map(|p| &p.second));
-            let numbers = AdamWNumbers {
-                steps: self.steps,
-                learning_rate,
-                weight_decay,
-                beta1: BETA1,
-                beta2: BETA2,
-                epsilon: self.epsilon,
-            };
-            // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-            let done = unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) };
-            done.expect("parameters, their gradients and their moments are alike");
+    /// Parameters of a group that are updated here and have gradients, and these.
+    fn with_gradients(&self, group: usize) -> (Vec<&Parameter>, Vec<Tensor>) {
+        let of_group = self.parameters.iter().filter(|p| p.group == group && p.part == self.part);
+        let with_gradient = of_group.map(|p| (p, p.value.grad())).filter(|(_, gradient)| gradient.defined());
+        with_gradient.map(|(p, gradient)| (p, gradient.contiguous())).unzip()
+    }
+
+    /// The step that [`Optimizer::step`] has counted, of a group.
+    fn update_on_the_cpu(&self, group: usize) {
+        let correction1 = 1. - BETA1.powi(self.steps as i32);
+        let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
+        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let (rate, decay) = (learning_rate / correction1, learning_rate * weight_decay);
+        let (parameters, gradients) = self.with_gradients(group);
+        for (p, gradient) in parameters.iter().zip(&gradients) {
+            p.update(gradient, rate, root2, decay, self.epsilon);
         }
+    }
+
+    /// The same by libtorch's own kernel.
+    fn update_fused(&self, group: usize) {
+        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let (parameters, gradients) = self.with_gradients(group);
+        let values = addresses(parameters.iter().map(|p| &p.value));
+        let first = addresses(parameters.iter().map(|p| &p.first));
+        let second = addresses(parameters.iter().filter_map(|p| p.second.as_ref()));
+        let numbers = AdamWNumbers {
+            steps: self.steps,
+            learning_rate,
+            weight_decay,
+            beta1: BETA1,
+            beta2: BETA2,
+            epsilon: self.epsilon,
+        };
+        // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
+        let done = unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) };
+        done.expect("parameters, their gradients and their moments are alike");
+    }
+
+    /// The step of a group of matrices.
+    fn update_matrices(&self, group: usize, parts: i64) {
+        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let (parameters, gradients) = self.with_gradients(group);
+        let matrices = Matrices {
+            values: parameters.iter().map(|p| &p.value).collect(),
+            gradients: gradients.iter().collect(),
+            means: parameters.iter().map(|p| &p.first).collect(),
+        };
+        muon::update(&matrices, parts, learning_rate, weight_decay);
     }
 
     /// Updates that were done.
@@ -266,26 +308,30 @@ impl AdamW {
     ) -> Result<BTreeMap<String, Tensor>> {
         let mut state = BTreeMap::from([("steps".to_string(), Tensor::from_slice(&[self.steps]))]);
         for p in &self.parameters {
-            for (name, moment) in [("first", &p.first), ("second", &p.second)] {
+            for (name, moment) in p.moments() {
                 state.insert(format!("{name}.{}", p.name), of(moment, &p.value.size(), p.part)?);
             }
         }
         Ok(state)
     }
 
-    /// Takes a state back that [`AdamW::state`] gave for the same model.
+    /// Takes a state back that [`Optimizer::state`] gave for the same model and rules, and that `file` holds.
     ///
     /// # Errors
     /// A moment that is missing or has another shape.
-    pub fn load_state(&mut self, state: &BTreeMap<String, Tensor>) -> Result<()> {
-        let find = |key: String, shape: Vec<i64>| match state.get(&key) {
-            Some(t) if t.size() == shape => Ok(t),
-            _ => Err(Error::Request(format!("the optimizer's state has no {key} of shape {shape:?}"))),
+    pub fn load_state(&mut self, file: &Path, state: &BTreeMap<String, Tensor>) -> Result<()> {
+        let find = |key: String, shape: Vec<i64>| {
+            let moment = state.get(&key);
+            moment.filter(|moment| moment.size() == shape).ok_or_else(|| {
+                let found = moment.map_or("missing".into(), |moment| format!("shape {:?}", moment.size()));
+                Error::input(file, key, found, format!("shape {shape:?}, by the model and train.optimizer"))
+            })
         };
         self.steps = find("steps".into(), vec![1])?.int64_value(&[0]);
-        for p in &mut self.parameters {
-            p.first.copy_(find(format!("first.{}", p.name), p.value.size())?);
-            p.second.copy_(find(format!("second.{}", p.name), p.value.size())?);
+        for p in &self.parameters {
+            for (name, moment) in p.moments() {
+                moment.shallow_clone().copy_(find(format!("{name}.{}", p.name), p.value.size())?);
+            }
         }
         Ok(())
     }
@@ -303,13 +349,13 @@ mod tests {
 
     fn group(parameters: &[(&str, &Tensor)], learning_rate: f64, weight_decay: f64) -> ParameterGroup {
         let parameters = parameters.iter().map(|(name, t)| (name.to_string(), t.shallow_clone())).collect();
-        ParameterGroup { parameters, learning_rate, weight_decay }
+        ParameterGroup { rule: Rule::AdamW, parameters, learning_rate, weight_decay }
     }
 
     /// The two ways to make a step, of which a machine without a GPU takes the first.
-    const WAYS: [fn(&mut AdamW); 2] = [AdamW::step, |adamw| {
+    const WAYS: [fn(&mut Optimizer); 2] = [Optimizer::step, |adamw| {
         adamw.steps += 1;
-        adamw.update_fused();
+        (0..adamw.groups.len()).for_each(|group| adamw.update_fused(group));
     }];
 
     #[test]
@@ -319,10 +365,10 @@ mod tests {
         }
     }
 
-    fn steps_follow_the_equations(step: fn(&mut AdamW)) {
+    fn steps_follow_the_equations(step: fn(&mut Optimizer)) {
         let (weight, bias) = (leaf(&[2.]), leaf(&[2.]));
         let groups = vec![group(&[("weight", &weight)], 1e-2, 0.1), group(&[("bias", &bias)], 3e-2, 0.)];
-        let mut adamw = AdamW::new(groups);
+        let mut adamw = Optimizer::new(groups);
         let (mut m, mut v, mut expected) = (0f64, 0f64, [2f64, 2f64]);
         for (i, gradient) in [0.5f64, -1.5, 0.25].into_iter().enumerate() {
             adamw.zero_grad();
@@ -347,7 +393,7 @@ mod tests {
                 (name, (values * 3.).sin().set_requires_grad(true))
             });
             let named = leaves.each_ref().map(|(name, t)| (*name, t));
-            let mut adamw = AdamW::new(vec![group(&named[..2], 1e-2, 0.3), group(&named[2..], 3e-2, 0.)])
+            let mut adamw = Optimizer::new(vec![group(&named[..2], 1e-2, 0.3), group(&named[2..], 3e-2, 0.)])
                 .with_epsilon(1e-6);
             for i in 0..6 {
                 adamw.zero_grad();
@@ -376,7 +422,7 @@ mod tests {
         let named: Vec<(String, &Tensor)> =
             leaves.iter().enumerate().map(|(i, t)| (format!("{i}"), t)).collect();
         let named: Vec<(&str, &Tensor)> = named.iter().map(|(name, t)| (name.as_str(), *t)).collect();
-        let mut adamw = AdamW::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
+        let mut adamw = Optimizer::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
         leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
         let (_, mut ops) = ops_of(|| WAYS[1](&mut adamw));
         // On the CPU the op itself reads how many steps each parameter has done.
@@ -388,7 +434,7 @@ mod tests {
     #[test]
     fn gradients_are_clipped_together() {
         let (a, b) = (leaf(&[0.]), leaf(&[0.]));
-        let adamw = AdamW::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
+        let adamw = Optimizer::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
         (&a * 3. + &b * 4.).sum(Kind::Float).backward();
         let norm = adamw.gradient_norm().double_value(&[]);
         assert!((norm - 5.).abs() < 1e-6);
@@ -401,7 +447,7 @@ mod tests {
     #[test]
     fn gradients_can_be_changed_before_they_are_used() {
         let (a, b) = (leaf(&[1.]), leaf(&[1.]));
-        let mut adamw = AdamW::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
+        let mut adamw = Optimizer::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
         (&a * 3. + &b * 0.).sum(Kind::Float).backward();
         for (name, mut gradient) in adamw.gradients() {
             // As an all-reduce would: in place.

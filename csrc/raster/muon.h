@@ -1,0 +1,91 @@
+// One step of Muon (Jordan et al. 2024) on a matrix θ of R × C numbers: along the nearest matrix whose singular values are alike, about,
+// found by five rounds of Newton and Schulz, each nothing but products:
+//
+//   m ← m + (1 − β)(g − m),  u = g + β(m − g),  X = u / (‖u‖ + 1e-7)
+//   five times  X ← a X + (b S + c S²) X,  S = X Xᵀ
+//   θ ← (1 − decay) θ − rate · 0.2 · √max(R, C) · X
+//
+// which has numbers as large as AdamW's steps have (Liu et al. 2025); decay is times the learning rate (spec 8.5). Of a matrix with
+// more rows than columns X is the transpose.
+#pragma once
+
+#include "product.h"
+#include "types.h"
+
+namespace globalsplat::raster::GS_ISA {
+
+inline constexpr int kMuonRounds = 5;
+inline constexpr float kMuonA = 3.4445f, kMuonB = -4.7750f, kMuonC = 2.0315f;
+
+inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
+  using V = Vector<float>;
+  constexpr int lanes = Simd<float>::lanes;
+  const bool upright = of.rows > of.columns;
+  const int64_t few = upright ? of.columns : of.rows, many = upright ? of.rows : of.columns;
+  // Padded with zeros, which stay zeros.
+  const int64_t rows = whole_product_rows(few), row = muon_stride(many), square_row = muon_stride(few);
+  const int wide = int((many + 15) / 16 * 16), narrow = int((few + 15) / 16 * 16);
+  const auto place = [&](int64_t i, int64_t j) { return upright ? j * row + i : i * row + j; };
+
+  Room room(memory);
+  float* x = room.take(rows * row);
+  float* next = room.take(rows * row);
+  float* const panels = room.take(square_row * wide);
+  float* const square = room.take(rows * square_row);  // S
+  float* const factor = room.take(rows * square_row);  // c S
+  float* const sum = room.take(rows * square_row);     // b S + c S²
+
+  for (int64_t k = 0; k < rows * row; ++k) x[k] = 0;
+  const float beta = float(step.beta), fresh = float(1 - step.beta);
+  for (int64_t i = 0; i < of.rows; ++i)
+    for (int64_t j = 0; j < of.columns; ++j) {
+      const int64_t k = i * of.columns + j;
+      const float g = of.gradient[k], m = of.first[k] + fresh * (g - of.first[k]);
+      of.first[k] = m;
+      x[place(i, j)] = g + beta * (m - g);
+    }
+  double squares = 0;
+  for (int64_t i = 0; i < few; ++i) {
+    V of_row{};
+    for (int j = 0; j < wide; j += lanes) {
+      const V numbers = load<float>(x + i * row + j);
+      of_row = add_product(numbers, numbers, of_row);
+    }
+    alignas(64) float parts[lanes];
+    store<float>(parts, of_row);
+    for (const float part : parts) squares += double(part);
+  }
+  const float scale = float(1 / (__builtin_sqrt(squares) + 1e-7));
+  for (int64_t k = 0; k < few * row; ++k) x[k] *= scale;
+
+  for (int round = 0; round < kMuonRounds; ++round) {
+    pack_panels({x, row}, few, wide, panels);
+    for (int64_t first = 0; first < few; first += kProductColumns)
+      for (int64_t i = 0; i < rows; i += kProductRows)
+        multiply_panel<kProductVectors, true>({x + i * row, row, 1}, panels + first * wide, kProductColumns, many,
+                                              square + i * square_row + first, square_row, nullptr);
+    for (int64_t i = 0; i < rows; ++i)
+      for (int j = 0; j < narrow; ++j) {
+        const int64_t k = i * square_row + j;
+        factor[k] = kMuonC * square[k];
+        sum[k] = kMuonB * square[k];
+      }
+    for (int64_t i = 0; i < rows; i += kProductRows)
+      multiply_rows<false>({factor + i * square_row, square_row, 1}, square, square_row, few, sum + i * square_row, square_row, narrow);
+    for (int64_t k = 0; k < rows * row; ++k) next[k] = kMuonA * x[k];
+    for (int64_t i = 0; i < rows; i += kProductRows)
+      multiply_rows<false>({sum + i * square_row, square_row, 1}, x, row, few, next + i * row, row, wide);
+    float* const done = x;
+    x = next;
+    next = done;
+  }
+
+  const float keep = float(1 - step.decay), rate = float(step.rate * 0.2 * __builtin_sqrt(double(many)));
+  for (int64_t i = 0; i < of.rows; ++i)
+    for (int64_t j = 0; j < of.columns; ++j) {
+      float& value = of.value[i * of.columns + j];
+      value = keep * value - rate * x[place(i, j)];
+    }
+}
+
+}  // namespace globalsplat::raster::GS_ISA

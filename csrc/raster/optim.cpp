@@ -1,0 +1,32 @@
+#include "optim.h"
+
+#include <algorithm>
+
+#include "kernels.h"
+#include "parallel.h"
+
+namespace globalsplat::raster {
+namespace {
+
+constexpr int64_t kNumbers = int64_t(1) << 14;  // of Adam that are one task
+
+}  // namespace
+
+template <class T>
+void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads) {
+  parallel_for(threads, (count + kNumbers - 1) / kNumbers, [&](int64_t task) {
+    kernels().of<T>().adam(step, numbers, task * kNumbers, std::min((task + 1) * kNumbers, count));
+  });
+}
+
+void muon(const MuonStep& step, const std::vector<MuonMatrix>& matrices, int threads) {
+  parallel_for(threads, int64_t(matrices.size()), [&](int64_t task) {
+    const MuonMatrix& matrix = matrices[size_t(task)];
+    kernels().muon(step, matrix, room(muon_room(matrix.rows, matrix.columns)));
+  });
+}
+
+template void adam(const AdamStep&, const AdamNumbers<float>&, int64_t, int);
+template void adam(const AdamStep&, const AdamNumbers<double>&, int64_t, int);
+
+}  // namespace globalsplat::raster
