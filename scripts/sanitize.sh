@@ -49,7 +49,7 @@ for sanitizer in $sanitizers; do
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster attend fit parallel kernels frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
+    for part in $isas raster attend fit optim parallel kernels frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
     # shellcheck disable=SC2086
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done

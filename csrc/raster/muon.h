@@ -24,7 +24,7 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   const int64_t few = upright ? of.columns : of.rows, many = upright ? of.rows : of.columns;
   // Padded with zeros, which stay zeros.
   const int64_t rows = whole_product_rows(few), row = muon_stride(many), square_row = muon_stride(few);
-  const int wide = int((many + 15) / 16 * 16), narrow = int((few + 15) / 16 * 16);
+  const int wide = int((many + lanes - 1) / lanes * lanes), narrow = int((few + lanes - 1) / lanes * lanes);
   const auto place = [&](int64_t i, int64_t j) { return upright ? j * row + i : i * row + j; };
 
   Room room(memory);
@@ -51,9 +51,7 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
       const V numbers = load<float>(x + i * row + j);
       of_row = add_product(numbers, numbers, of_row);
     }
-    alignas(64) float parts[lanes];
-    store<float>(parts, of_row);
-    for (const float part : parts) squares += double(part);
+    squares += sum_of_lanes<float>(of_row);
   }
   const float scale = float(1 / (__builtin_sqrt(squares) + 1e-7));
   for (int64_t k = 0; k < few * row; ++k) x[k] *= scale;

@@ -216,7 +216,7 @@ inline constexpr int64_t muon_stride(int64_t columns) { return (columns + 63) / 
 // Numbers that a step of a matrix works with.
 inline constexpr int64_t muon_room(int64_t rows, int64_t columns) {
   const int64_t few = rows < columns ? rows : columns, many = rows < columns ? columns : rows;
-  return (2 * (few + 6) + muon_stride(few)) * muon_stride(many) + 3 * (few + 6) * muon_stride(few) + 128;
+  return (2 * (few + 6) + muon_stride(few)) * muon_stride(many) + 3 * (few + 6) * muon_stride(few);
 }
 
 }  // namespace globalsplat::raster

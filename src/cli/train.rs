@@ -41,7 +41,7 @@ pub struct Train {
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
     resume: String,
-    /// Weights to begin with instead of fresh ones, of a model of the same shape, or of one with patches two, three
+    /// Weights to begin with, where RUN has no checkpoint, instead of fresh ones, of a model of the same shape, or of one with patches two, three
     /// or more times as wide, or with a half, a third or less of the scene tokens; all Gaussians are shown from the
     /// first step on
     #[arg(long, value_name = "FILE")]
@@ -90,7 +90,7 @@ impl Train {
         }
         let mut trainer = Trainer::new(&config, scenes, device)?;
         if let Some(weights) = &self.from {
-            trainer.begin_with(weights)?;
+            trainer = trainer.with_weights(weights);
         }
 
         let mut trainer = trainer.with_ranks(group);

@@ -104,7 +104,7 @@ struct Settings {
     weight_decay: f64,
 }
 
-/// The optimizer. Whatever the groups, parameters are gone through in the order of their names.
+/// The optimizer. Whatever the groups, gradients are gone through in the order of their parameters' names.
 #[derive(Debug)]
 pub struct Optimizer {
     parameters: Vec<Parameter>,
@@ -149,16 +149,18 @@ impl Optimizer {
     }
 
     /// Makes this the part `part` of `parts`: it updates its share of the parameters, and forgets the others' moments. Parameters go
-    /// to parts whole, the largest first, each to the part that has least (ZeRO's first stage, Rajbhandari et al. 2020, by tensors).
+    /// to parts whole, those with the largest moments first, each to the part that has least (ZeRO's first stage, Rajbhandari et al. 2020,
+    /// by tensors).
     pub fn become_part(&mut self, part: usize, parts: usize) {
         self.part = part;
         let mut order: Vec<usize> = (0..self.parameters.len()).collect();
-        order.sort_by_key(|&i| std::cmp::Reverse(self.parameters[i].value.numel()));
+        let size = |p: &Parameter| p.moments().map(|(_, moment)| moment.numel()).sum::<usize>();
+        order.sort_by_key(|&i| std::cmp::Reverse(size(&self.parameters[i])));
         let mut sizes = vec![0; parts];
         for i in order {
             let least = (0..parts).min_by_key(|&part| sizes[part]).expect("a part");
             let p = &mut self.parameters[i];
-            sizes[least] += p.value.numel();
+            sizes[least] += size(p);
             p.part = least;
             if least != part {
                 let none = || Tensor::empty([0], (p.value.kind(), p.value.device()));
@@ -218,8 +220,8 @@ impl Optimizer {
         }
     }
 
-    /// One update from the gradients that are there, by the groups' rules and learning rates: on the CPU in one pass over memory, on
-    /// a GPU in one launch for many parameters.
+    /// One update from the gradients that are there, by the groups' rules and learning rates: by AdamW on the CPU in one pass over memory,
+    /// on a GPU in one launch for many parameters.
     pub fn step(&mut self) {
         self.steps += 1;
         let is_here = self.parameters.iter().all(|p| p.value.device() == Device::Cpu);

@@ -355,7 +355,7 @@ fn begin(
             trainer.load(checkpoint, &state)?;
             Ok(checkpoints.into_iter().find(|of| of == checkpoint))
         }
-        Resume::Never if checkpoints.is_empty() => Ok(None),
+        Resume::Auto | Resume::Never if checkpoints.is_empty() => trainer.take_weights().map(|()| None),
         Resume::Never => {
             let expected = "none with --resume never (choose another --out)";
             Err(Error::input(out, "the run", "one with checkpoints", expected))
@@ -372,18 +372,8 @@ fn begin(
                     }
                 }
             }
-            match checkpoints.len() {
-                0 => Ok(None),
-                count => {
-                    let found = format!("broken, all {count} of them");
-                    Err(Error::input(
-                        out,
-                        "the run's checkpoints",
-                        found,
-                        "a whole one (choose another --out)",
-                    ))
-                }
-            }
+            let found = format!("broken, all {} of them", checkpoints.len());
+            Err(Error::input(out, "the run's checkpoints", found, "a whole one (choose another --out)"))
         }
     }
 }

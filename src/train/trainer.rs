@@ -18,7 +18,7 @@ use crate::optim::{Optimizer, Stopwatch};
 use crate::ranks::{Buckets, Group};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
@@ -35,6 +35,8 @@ pub struct Trainer {
     pub(super) twins: Vec<Twin>,
     pub(super) optimizer: Optimizer,
     pub(super) perceptual: Option<PerceptualLoss>,
+    /// The file that has the first weights, if they aren't fresh.
+    weights: Option<PathBuf>,
     /// Steps done.
     pub(super) step: u64,
     /// Samples drawn: the position in the data.
@@ -95,6 +97,7 @@ impl Trainer {
             twins: vec![],
             optimizer,
             perceptual,
+            weights: None,
             step,
             samples,
             scenes,
@@ -121,13 +124,21 @@ impl Trainer {
         Trainer { shards_optimizer: true, ..self }
     }
 
-    /// Takes the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may be of a smaller model: of larger patches,
-    /// whose edge is a multiple of this model's, or of fewer scene tokens, of whose number this model's is a multiple. All Gaussians are
-    /// shown from the first step on: weights that were trained to the last stage know nothing of the first any more.
+    /// [`run`](super::run) begins, where it has no checkpoint yet, with the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may
+    /// be of a smaller model: of larger patches, whose edge is a multiple of this model's, or of fewer scene tokens, of whose number this
+    /// model's is a multiple. All Gaussians are shown from the first step on: weights that were trained to the last stage know nothing of
+    /// the first any more.
+    pub fn with_weights(mut self, path: &Path) -> Self {
+        self.config.curriculum.full_capacity = true;
+        Trainer { weights: Some(path.into()), ..self }
+    }
+
+    /// Takes the weights that a run begins with.
     ///
     /// # Errors
     /// A file that can't be read, or whose model has another shape: its keys are named.
-    pub fn begin_with(&mut self, path: &Path) -> Result<()> {
+    pub(super) fn take_weights(&mut self) -> Result<()> {
+        let Some(path) = &self.weights else { return Ok(()) };
         let file = ModelFile::open(path, &[])?;
         let (ours, mut theirs) = (self.config.model.clone(), file.config.model.clone());
         if file.assumed.is_some() {
@@ -142,7 +153,6 @@ impl Trainer {
             let expected = "the model that the configuration describes";
             return Err(Error::input(path, "the model", changed.join(", "), expected));
         }
-        self.config.curriculum.full_capacity = true;
         if theirs == ours {
             return file.load_into(&self.vs);
         }
@@ -334,13 +344,10 @@ impl Trainer {
         let (step, samples, updates) = self.group.from_first(position)?;
         (self.step, self.samples) = (step, samples);
         self.optimizer.set_steps(updates);
-        let parameters = in_backward_order(&self.vs);
+        // Those that aren't trained, too.
+        let variables: BTreeMap<String, Tensor> = self.vs.variables().into_iter().collect();
         let moments = self.optimizer.moments();
-        parameters
-            .iter()
-            .map(|(_, value)| value)
-            .chain(moments)
-            .try_for_each(|t| self.group.copy_from(0, t))?;
+        variables.values().chain(moments).try_for_each(|t| self.group.copy_from(0, t))?;
         if self.shards_optimizer {
             self.optimizer.become_part(self.group.rank(), self.group.ranks());
         }
