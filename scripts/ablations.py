@@ -21,7 +21,7 @@ from pathlib import Path
 from core_runs import PROGRAM, REPOSITORY, row, train
 
 CONFIG = REPOSITORY / "configs/tiny.toml"
-# What all of them have. Small patches and many scene tokens are for weights that know large and few ones.
+# What all of them have. Small patches, many scene tokens and Muon are for weights that know large and few ones.
 SETTINGS = [
     "model.patch_size=16",
     "model.latents=256",
@@ -38,6 +38,7 @@ SETTINGS = [
     "loss.consistency_depth=1e-2",
     "curriculum.boundaries=[240, 480, 720, 960]",
     "curriculum.transition=80",
+    "train.optimizer=adamw",
     "train.steps=2400",
     "train.batch=1",
     "train.learning_rate=2e-3",

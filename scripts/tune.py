@@ -22,8 +22,9 @@ from core_runs import PROGRAM, REPOSITORY, core_seconds, environment, row, train
 STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
-# Where the model begins with nothing; small patches and many scene tokens are for weights that know large and few ones.
-BASE = ["model.patch_size=16", "model.latents=256"]
+# Where the model begins with nothing; small patches and many scene tokens are for weights that know large and few ones, and Muon is
+# for those.
+BASE = ["model.patch_size=16", "model.latents=256", "train.optimizer=adamw"]
 VARIANTS = {
     "tiny": [],
     "4 to 8 context views": ["data.context_views=8"],
@@ -41,6 +42,7 @@ VARIANTS = {
     "3 rounds": ["model.rounds=3"],
     "batch 1": ["train.batch=1"],
     "batch 4": ["train.batch=4"],
+    "Muon": ["train.optimizer=muon"],
     "learning rate 2e-3": ["train.learning_rate=2e-3"],
     "learning rate 4e-3": ["train.learning_rate=4e-3"],
     "longer curriculum": ["stages=2"],
