@@ -1,6 +1,7 @@
 //! Optimizers over named tensors in groups: for a network's weights as for Gaussians (tch's own can't save their state); and where
 //! their time goes.
 
+mod address;
 mod muon;
 mod optimizer;
 mod stopwatch;

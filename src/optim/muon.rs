@@ -1,7 +1,7 @@
 //! Muon (Jordan et al. 2024): a matrix goes along the nearest one to the running mean of its gradients whose singular values are alike,
 //! so that directions of which gradients say little are learned as fast as others (spec 8.5).
 
-use super::optimizer::addresses;
+use super::address::addresses;
 use globalsplat_csrc::optim::{self as ffi, MuonNumbers};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, no_grad};

@@ -1,5 +1,6 @@
 //! AdamW (Loshchilov & Hutter 2019), and Muon (Jordan et al. 2024) for matrices, with a state that can be saved (spec 8.5).
 
+use super::address::{address, addresses};
 use super::muon::{self, Matrices};
 use crate::error::{Error, Result};
 use crate::render::handed_over;
@@ -78,16 +79,6 @@ impl Parameter {
         let done = unsafe { adam(&arguments) };
         done.expect("a parameter, its gradient and its moments are alike");
     }
-}
-
-/// By which the C++ side knows a tensor, as long as it lives.
-fn address(t: &Tensor) -> usize {
-    t.as_ptr() as usize
-}
-
-/// The same for several.
-pub(super) fn addresses<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Vec<usize> {
-    tensors.into_iter().map(address).collect()
 }
 
 /// Forgets the gradients of `leaves`.
