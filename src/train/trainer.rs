@@ -124,10 +124,10 @@ impl Trainer {
         Trainer { shards_optimizer: true, ..self }
     }
 
-    /// [`run`](super::run) begins, where it has no checkpoint yet, with the weights in a file that [`ModelFile`] reads in place of the fresh ones. They may
-    /// be of a smaller model: of larger patches, whose edge is a multiple of this model's, or of fewer scene tokens, of whose number this
-    /// model's is a multiple. All Gaussians are shown from the first step on: weights that were trained to the last stage know nothing of
-    /// the first any more.
+    /// [`run`](super::run) begins, where it has no checkpoint yet, with the weights in a file that [`ModelFile`] reads in place of the fresh
+    /// ones. They may be of a smaller model: of larger patches, whose edge is a multiple of this model's, or of fewer scene tokens, of whose
+    /// number this model's is a multiple. All Gaussians are shown from the first step on: weights that were trained to the last stage know
+    /// nothing of the first any more.
     pub fn with_weights(mut self, path: &Path) -> Self {
         self.config.curriculum.full_capacity = true;
         Trainer { weights: Some(path.into()), ..self }
