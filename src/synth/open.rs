@@ -87,7 +87,13 @@ pub(super) fn landscape(make: &mut Maker, sky: &Sky) -> Place {
     }
     sun(make, sky);
     let half = 0.5 * wide;
-    Place { least: vec3(-half, 0.3, -half), most: vec3(half, 9., half), eye: (1.2, 2.2), roomy: 0.4 }
+    Place {
+        least: vec3(-half, 0.3, -half),
+        most: vec3(half, 9., half),
+        eye: (1.2, 2.2),
+        roomy: 0.4,
+        walls: None,
+    }
 }
 
 /// What is seen through the windows of a room of `size`.

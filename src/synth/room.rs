@@ -75,7 +75,14 @@ pub(super) fn room(make: &mut Maker, sky: &mut Sky) -> Place {
     }
     furnish(make, size, &walls);
     light(make, size, sky, has_openings);
-    Place { least: vec3(0.25, 0.5, 0.25), most: size - 0.25, eye: (1., 1.75), roomy: 0.3 }
+    let walls = 0.25;
+    Place {
+        least: vec3(walls, 0.5, walls),
+        most: size - walls,
+        eye: (1., 1.75),
+        roomy: 0.3,
+        walls: Some(walls),
+    }
 }
 
 /// Windows and doors.
@@ -344,5 +351,7 @@ pub(super) fn box_of_shapes(make: &mut Maker, sky: &mut Sky) -> Place {
         make.put(mesh, &material, Affine3A::from_rotation_translation(turn, spot));
     }
     light(make, size, sky, false);
-    Place { least: Vec3::splat(0.3), most: size - 0.3, eye: (0.6, size.y - 0.4), roomy: 0.3 }
+    let walls = 0.3;
+    let eye = (0.6, size.y - 0.4);
+    Place { least: Vec3::splat(walls), most: size - walls, eye, roomy: 0.3, walls: Some(walls) }
 }

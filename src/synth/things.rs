@@ -520,6 +520,21 @@ pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
         make.put(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
     }
     let place = standing(spot + below * Vec3::Y, make.turn());
+    to_be_looked_at(make, size, place);
+    Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length(), front: None }
+}
+
+/// Something on a wall at `spot`, to be looked at from where `front` points to.
+pub(super) fn hung(make: &mut Maker, spot: Vec3, front: Vec3) -> Exhibit {
+    let size = vec3(make.scaled(0.3, 1.2), make.scaled(0.2, 1.), make.scaled(0.3, 1.2));
+    // What is up where it stands is off the wall here.
+    let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(make.turn());
+    to_be_looked_at(make, size, Affine3A::from_rotation_translation(off_the_wall, spot));
+    Exhibit { middle: spot + 0.4 * size.y * front, radius: 0.5 * size.length(), front: Some(front) }
+}
+
+/// What is worth a video of its own, of `size` metres more or less: where `place` has its origin, and up from there.
+fn to_be_looked_at(make: &mut Maker, size: Vec3, place: Affine3A) {
     match make.within(0..6) {
         0 => {
             let (mesh, material) = (plain(make, size), make.material(Purpose::Thing));
@@ -535,7 +550,6 @@ pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
             heap(make, size, place, count);
         }
     }
-    Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length() }
 }
 
 /// Anything that stands in a room, along a wall or in the open floor.

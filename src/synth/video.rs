@@ -8,7 +8,7 @@ use super::tracer::{SampleChoice, Tracer};
 use super::walk::{Exhibit, Place, walk};
 use super::{open, room, things};
 use crate::scene::{Camera, ImageSize, Intrinsics};
-use glam::{DMat4, Vec2, Vec3, vec2};
+use glam::{DMat4, Vec2, Vec3, vec2, vec3};
 use image::RgbImage;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -18,7 +18,9 @@ use std::sync::Arc;
 /// Rays a pixel, along a side.
 const RAYS: u32 = 2;
 /// Share of worlds in which there is a thing to walk around.
-const EXHIBITS: f64 = 0.35;
+const EXHIBITS: f64 = 0.4;
+/// Share of these things that hang on a wall, where there are walls.
+const HUNG: f64 = 0.35;
 /// Worlds that are made until there is a way through one.
 const WORLDS: u64 = 20;
 
@@ -136,14 +138,32 @@ fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
         55..75 => room::box_of_shapes(make, &mut sky),
         _ => open::landscape(make, &sky),
     };
-    let middle = 0.5 * (place.least + place.most);
-    let exhibit = make.chance(EXHIBITS).then(|| things::exhibit(make, middle.with_y(0.)));
+    let exhibit = make.chance(EXHIBITS).then(|| match place.walls {
+        Some(behind) if make.chance(HUNG) => {
+            let (spot, front) = on_a_wall(make, place, behind);
+            things::hung(make, spot, front)
+        }
+        _ => things::exhibit(make, (0.5 * (place.least + place.most)).with_y(0.)),
+    });
     (place, exhibit, sky)
+}
+
+/// Where something may hang, and the direction away from the wall.
+fn on_a_wall(make: &mut Maker, place: Place, behind: f32) -> (Vec3, Vec3) {
+    let (least, most) = (place.least - behind, place.most + behind);
+    let share = vec3(make.within(0.2..0.8), make.within(0.3..0.75), make.within(0.2..0.8));
+    let spot = least + share * (most - least);
+    match make.within(0..4) {
+        0 => (spot.with_x(least.x), Vec3::X),
+        1 => (spot.with_x(most.x), Vec3::NEG_X),
+        2 => (spot.with_z(least.z), Vec3::Z),
+        _ => (spot.with_z(most.z), Vec3::NEG_Z),
+    }
 }
 
 fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
     let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = f64::from(make.scaled(0.55, 1.3)) * width.min(height);
+    let focal = f64::from(make.scaled(0.55, 1.6)) * width.min(height);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
     let camera = |c2w| Camera { intrinsics, c2w, width: size.width, height: size.height };
     poses.into_iter().map(camera).collect()

@@ -22,14 +22,18 @@ pub(super) struct Place {
     pub eye: (f32, f32),
     /// Free space that a camera needs around it, in metres.
     pub roomy: f32,
+    /// How far behind the box's sides walls are, where there are walls, in metres.
+    pub walls: Option<f32>,
 }
 
-/// A thing that is there to be looked at from all sides.
+/// A thing that is there to be looked at.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exhibit {
     pub middle: Vec3,
     /// Of a ball that it fits into, more or less, in metres.
     pub radius: f32,
+    /// Away from the wall that it hangs on; none where it is seen from all sides.
+    pub front: Option<Vec3>,
 }
 
 /// How a camera moves as time goes from 0 to 1.
@@ -112,18 +116,27 @@ pub(super) fn walk(
 
 /// Around something, by hand, from a few steps away.
 fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Path {
-    let Exhibit { middle, radius } = exhibit;
+    let Exhibit { middle, radius, front } = exhibit;
     let away = 1.2 * radius + make.scaled(0.3, 2.);
-    let height = (middle.y + make.within(-0.2..0.9) * away).max(place.least.y + 0.2);
-    let (sin, cos) = make.turn().sin_cos();
+    let height = (middle.y + make.within(-0.4..0.9) * away).max(place.least.y + 0.2);
+    let side = make.one_of(&[-1., 1.]);
+    let (from, orbit) = match front {
+        // From one side before it to the other.
+        Some(_) => {
+            let from = make.within(0.2..1.2);
+            (side * from, -side * (from + make.within(0.2..1.2)))
+        }
+        None => (make.turn(), side * make.scaled(0.8, 6.)),
+    };
     let wander = |make: &mut Maker| make.within(-0.3..0.3) * patience * away;
     Path {
-        start: (middle + away * vec3(cos, 0., sin)).with_y(height),
+        start: (middle + away * turned(front.unwrap_or(Vec3::X), from)).with_y(height),
         target: middle,
         target_motion: 0.2 * radius * make.direction(),
         motion: vec3(wander(make), wander(make), wander(make)),
-        orbit: make.one_of(&[-1., 1.]) * patience * make.scaled(0.8, 6.),
-        swing: (Vec3::Y * away * make.within(0. ..0.15), make.within(2. ..9.)),
+        orbit: patience * orbit,
+        // Some look at it from below and from above, too.
+        swing: (Vec3::Y * away * patience * make.scaled(0.02, 0.7), make.within(2. ..9.)),
         wide: away,
         ..Path::by_hand(make)
     }
@@ -250,4 +263,30 @@ fn pose((position, towards, roll): (Vec3, Vec3, f32)) -> DMat4 {
     let (right, down) = (cos * level + sin * below, cos * below - sin * level);
     let column = |v: DVec3| DVec4::from((v, 0.));
     DMat4::from_cols(column(right), column(down), column(forward), position.as_dvec3().extend(1.))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    #[test]
+    fn things_are_seen_from_below_and_above_and_from_before_their_wall() {
+        let mut make = Maker::new(ChaCha8Rng::seed_from_u64(1), vec![]);
+        let (least, most) = (Vec3::splat(-9.), Vec3::splat(9.));
+        let place = Place { least, most, eye: (1., 2.), roomy: 0.3, walls: Some(0.3) };
+        let (mut up_and_down, mut before) = (0, 0);
+        for i in 0..400 {
+            let front = (i % 2 == 0).then_some(Vec3::X);
+            let path = around(&mut make, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
+            let seen: Vec<(Vec3, Vec3, f32)> = (0..=16).map(|i| path.at(i as f32 / 16.)).collect();
+            let pitches = seen.iter().map(|(_, towards, _)| towards.normalize().y.asin());
+            let (lowest, highest) = pitches.fold((f32::MAX, f32::MIN), |(a, b), y| (a.min(y), b.max(y)));
+            up_and_down += i32::from(lowest < 0. && highest > 0. && highest - lowest > 0.35);
+            before += i32::from(front.is_some() && seen.iter().all(|(position, ..)| position.x > 0.));
+        }
+        assert!(up_and_down > 60, "{up_and_down} of 400");
+        assert!(before > 180, "{before} of 200");
+    }
 }
