@@ -62,7 +62,8 @@ fn depths_and_poses_carry_one_view_into_the_next() {
     let mut compared = 0;
     for index in 0..6 {
         let video = Video::new(11, index, &settings(24, SIDE));
-        let frames = [6, 16];
+        // Not so far apart that much of what one sees is hidden from the other.
+        let frames = [6, 12];
         let [from, to] = frames.map(|i| &video.cameras()[i]);
         let (photos, depths) = (frames.map(|i| video.photo(i)), frames.map(|i| video.depth(i)));
         let (mut differences, mut unmoved, mut apart) = (vec![], vec![], vec![]);
@@ -91,7 +92,7 @@ fn depths_and_poses_carry_one_view_into_the_next() {
         compared += 1;
         apart.sort_by(f64::total_cmp);
         let (half, most) = (apart[apart.len() / 2], apart[apart.len() * 7 / 10]);
-        assert!(half < 0.008 && most < 0.05, "video {index}: depths are {half} apart for half of the pixels");
+        assert!(half < 0.008 && most < 0.02, "video {index}: depths are {half} apart for half of the pixels");
         let mean = |of: &[i32]| of.iter().map(|&x| f64::from(x)).sum::<f64>() / of.len() as f64;
         let (moved, unmoved) = (mean(&differences), mean(&unmoved));
         assert!(
