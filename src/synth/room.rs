@@ -75,13 +75,13 @@ pub(super) fn room(make: &mut Maker, sky: &mut Sky) -> Place {
     }
     furnish(make, size, &walls);
     light(make, size, sky, has_openings);
-    let walls = 0.25;
+    let behind = 0.25;
     Place {
-        least: vec3(walls, 0.5, walls),
-        most: size - walls,
+        least: vec3(behind, 0.5, behind),
+        most: size - behind,
         eye: (1., 1.75),
         roomy: 0.3,
-        walls: Some(walls),
+        walls: Some(behind),
     }
 }
 
@@ -351,7 +351,7 @@ pub(super) fn box_of_shapes(make: &mut Maker, sky: &mut Sky) -> Place {
         make.put(mesh, &material, Affine3A::from_rotation_translation(turn, spot));
     }
     light(make, size, sky, false);
-    let walls = 0.3;
+    let behind = 0.3;
     let eye = (0.6, size.y - 0.4);
-    Place { least: Vec3::splat(walls), most: size - walls, eye, roomy: 0.3, walls: Some(walls) }
+    Place { least: Vec3::splat(behind), most: size - behind, eye, roomy: 0.3, walls: Some(behind) }
 }
