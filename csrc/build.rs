@@ -6,7 +6,7 @@ use std::{
 };
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 11] = [
+const BRIDGES: [&str; 12] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
@@ -18,6 +18,7 @@ const BRIDGES: [&str; 11] = [
     "src/processor.rs",
     "src/ranks.rs",
     "src/render.rs",
+    "src/room.rs",
 ];
 
 /// What every C++ file is compiled with.

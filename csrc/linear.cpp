@@ -37,7 +37,8 @@ const std::optional<c10::TypedOperatorHandle<Product>>& product() {
 
 // xs [m, k] · weightsᵀ [n, k] + bias, if there is one. Beside the result there may be the weights in oneDNN's order.
 Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
-  expect_room_for_code(int64_t(sizeof(float)) * (xs.size(0) * weights.size(0) + weights.numel()));
+  expect_room_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
+  if (xs.scalar_type() == at::kBFloat16) return at::linear(xs, weights, bias);
   return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 
@@ -54,8 +55,10 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
     Tensor d_xs, d_weights, d_bias;
     if (ctx->needs_input_grad(0)) d_xs = multiply(g, weights.t(), {});
     if (ctx->needs_input_grad(1)) {
-      for (int64_t first = 0; first < g.size(0); first += kRows) {
-        const int64_t rows = std::min(kRows, g.size(0) - first);
+      // Sums of bfloat16 parts would be rounded once more each.
+      const int64_t at_once = g.scalar_type() == at::kBFloat16 ? g.size(0) : kRows;
+      for (int64_t first = 0; first < g.size(0); first += at_once) {
+        const int64_t rows = std::min(at_once, g.size(0) - first);
         const Tensor part = multiply(g.narrow(0, first, rows).t(), xs.narrow(0, first, rows).t(), {});
         d_weights = d_weights.defined() ? d_weights.add_(part) : part;
       }
@@ -65,7 +68,7 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
   }
 };
 
-bool is_numbers(const Tensor& t) { return t.device().is_cpu() && t.scalar_type() == at::kFloat; }
+bool is_on_cpu(const Tensor& t, at::ScalarType kind) { return t.device().is_cpu() && t.scalar_type() == kind; }
 
 }  // namespace
 
@@ -83,11 +86,14 @@ bool linear_is_faster() {
 
 size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
   const auto borrowed = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
-  TORCH_CHECK(linear_is_faster(), "products of float32 are libtorch's on this processor");
   const Tensor &xs = borrowed(xs_address), &weights = borrowed(weights_address);
   std::optional<Tensor> bias;
   if (bias_address != 0) bias = borrowed(bias_address);
-  TORCH_CHECK(is_numbers(xs) && is_numbers(weights) && (!bias || is_numbers(*bias)), "linear layers must be float32 on the CPU");
+  const at::ScalarType kind = xs.scalar_type();
+  TORCH_CHECK(kind == at::kFloat || kind == at::kBFloat16, "linear layers are of float32 or bfloat16, not of ", kind);
+  TORCH_CHECK(kind != at::kFloat || linear_is_faster(), "products of float32 are libtorch's on this processor");
+  TORCH_CHECK(is_on_cpu(xs, kind) && is_on_cpu(weights, kind) && (!bias || is_on_cpu(*bias, kind)),
+              "linear layers must be on the CPU, and of one kind of numbers");
   TORCH_CHECK(weights.dim() == 2 && xs.dim() > 0 && xs.size(-1) == weights.size(1) && xs.numel() > 0 && weights.numel() > 0 &&
                   (!bias || bias->sizes() == weights.sizes().slice(0, 1)),
               "numbers have shape ", xs.sizes(), " and weights ", weights.sizes(), ", expected [.., k] and [n, k], and a bias [n]");

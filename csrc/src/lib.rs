@@ -11,3 +11,4 @@ pub mod optim;
 pub mod processor;
 pub mod ranks;
 pub mod render;
+pub mod room;

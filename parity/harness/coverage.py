@@ -11,7 +11,7 @@ CASES_OF = {
     "src/model/growth.rs": ["growth"],
     "src/model/merge.rs": ["merge"],
     "src/model/mixer.rs": ["mixer"],
-    "src/model/precision.rs": ["linear"],
+    "src/model/precision.rs": ["linear", "linear_bf16"],
     "src/model/rotation.rs": ["rotation_matrix", "quaternion"],
     "src/model/stream.rs": ["stream_round", "self_attention_block"],
     "src/model/tokens.rs": ["patchify", "rgb_tokens", "ray_tokens", "tokens"],

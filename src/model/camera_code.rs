@@ -1,6 +1,6 @@
 //! The camera code: one vector per view that tells a Plücker ray's view from another's (spec 3.3).
 
-use super::layers::default_linear;
+use super::layers::{default_linear, gelu};
 use std::f64::consts::PI;
 use tch::{Tensor, nn, nn::Module};
 
@@ -35,8 +35,8 @@ impl CameraCode {
         let (w, h) = (width as f64, height as f64);
         let features = [(entry(0, 0) / w).log(), (entry(1, 1) / h).log(), entry(0, 2) / w, entry(1, 2) / h];
         let features = Tensor::stack(&features, -1); // [B, V, 4]
-        let intrinsics = self.intrinsics_in.forward(&features).gelu("none");
-        let intrinsics = self.intrinsics_out.forward(&intrinsics).gelu("none");
+        let intrinsics = gelu(self.intrinsics_in.forward(&features));
+        let intrinsics = gelu(self.intrinsics_out.forward(&intrinsics));
 
         let centre = c2w.narrow(-2, 0, 3).select(-1, 3); // [B, V, 3]
         let phases: Vec<Tensor> = FREQUENCIES.iter().map(|f| &centre * (f * PI)).collect();

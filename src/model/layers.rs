@@ -2,8 +2,9 @@
 
 use super::parts::{does, part};
 use super::precision::Precision;
+use globalsplat_csrc::room::expect_room_for_code;
 use std::cell::Cell;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Device, Tensor, nn, nn::Module};
 
 /// Of encoder linears and learnable tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
@@ -106,10 +107,20 @@ impl Mlp {
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
         part("MLPs", || {
-            let mut hidden = precision.linear(&self.expand, xs);
-            hidden = if hidden.requires_grad() { hidden.gelu("none") } else { hidden.gelu_("none") };
+            let hidden = gelu(precision.linear(&self.expand, xs));
             does(0, 0, &[&hidden, &hidden]);
             precision.linear(&self.contract, &hidden)
         })
     }
+}
+
+/// x Φ(x) with the normal distribution Φ, in place where nobody asks for gradients.
+///
+/// # Panics
+/// Where the system has no memory for oneDNN's code, by which libtorch does it on a CPU.
+pub(super) fn gelu(mut xs: Tensor) -> Tensor {
+    if xs.device() == Device::Cpu {
+        expect_room_for_code(0).unwrap_or_else(|error| panic!("{error}"));
+    }
+    if xs.requires_grad() { xs.gelu("none") } else { xs.gelu_("none") }
 }

@@ -61,12 +61,24 @@ impl Precision {
 
 /// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
-    let is_for_one_dnn =
-        xs.device() == Device::Cpu && xs.kind() == Kind::Float && xs.numel() > 0 && linear_is_faster();
-    let out = if is_for_one_dnn { by_one_dnn(xs, weights, bias) } else { xs.linear(weights, bias) };
+    let is_on_cpu = xs.device() == Device::Cpu && xs.numel() > 0;
+    let out = if is_on_cpu && is_for_one_dnn(xs.kind()) {
+        by_one_dnn(xs, weights, bias)
+    } else {
+        xs.linear(weights, bias)
+    };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
     does(flops, owed(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
+}
+
+/// On a CPU. Libtorch gives it bf16, too, but doesn't see to it that there is memory for its code.
+fn is_for_one_dnn(kind: Kind) -> bool {
+    match kind {
+        Kind::BFloat16 => true,
+        Kind::Float => linear_is_faster(),
+        _ => false,
+    }
 }
 
 fn by_one_dnn(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {

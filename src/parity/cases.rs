@@ -185,7 +185,8 @@ fn camera_code(request: &Request) -> Result<Answer> {
 fn linear(request: &Request) -> Result<Answer> {
     let bias = request.inputs.get("bias").map(Tensor::shallow_clone);
     let layer = nn::Linear { ws: request.input("weight")?.shallow_clone(), bs: bias };
-    outputs([("out", Precision::F32.linear(&layer, request.input("xs")?))])
+    let precision = if request.config.get("bf16").is_some() { Precision::Bf16 } else { Precision::F32 };
+    outputs([("out", precision.linear(&layer, request.input("xs")?).to_kind(Kind::Float))])
 }
 
 fn attention(request: &Request) -> Result<Answer> {

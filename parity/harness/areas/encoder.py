@@ -35,6 +35,22 @@ def linear(rng):
         yield Draw(label, numbers, differentiate=tuple(numbers))
 
 
+@case
+def linear_bf16(rng):
+    """Of bfloat16 numbers, which the reference takes as they are and computes with as exactly as ever."""
+    why = "what comes out has 8 bits, and so have gradients, and what they are made of: a lone number may be off by 1/256 a rounding"
+    tolerance = Tolerance(4e-3, 8e-3, why=why)
+    for drawn in linear(rng):
+        cut_to_bf16(drawn.inputs)
+        yield replace(drawn, config={"bf16": True}, module="linear", tolerance=tolerance)
+
+
+def cut_to_bf16(inputs):
+    """The upper half of each number's bits stays."""
+    for numbers in inputs.values():
+        numbers.view(np.uint32)[...] &= 0xFFFF0000
+
+
 @twin("linear")
 def linear_twin(config, params, inputs):
     layer = {f"layer.{name}": value for name, value in inputs.items()}
@@ -112,9 +128,7 @@ def attention_bf16(rng):
         (2, 40, 130, 2, 40),
     ]:
         inputs = attention_inputs(rng, batch, queries, keys, heads * width)
-        for numbers in inputs.values():
-            # The upper half of a number's bits, cut.
-            numbers.view(np.uint32)[...] &= 0xFFFF0000
+        cut_to_bf16(inputs)
         yield replace(attention_draw(inputs, heads, tolerance=tolerance), config={"heads": heads, "bf16": True})
 
 
