@@ -61,7 +61,9 @@ impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
         let (is_first, count) = (group.is_first(), group.ranks());
-        let config = Config::read(&self.config, &self.set)?;
+        let mut config = Config::read(&self.config, &self.set)?;
+        // What is kept beside the run tells what it was.
+        config.train.precision = config.train.precision.on(device).into();
         memory::keep_for(&config.train);
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,
