@@ -529,16 +529,6 @@ fn scenes_of_training_among_those_held_out_are_told() {
 }
 
 #[test]
-fn the_precision_that_a_run_chose_is_kept_with_it() {
-    let (folder, room) = room();
-    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    succeed(&text(&train(&config, &run, &["train.steps=1", "train.precision=auto"])));
-    let kept: toml::Table = std::fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap();
-    let chosen = globalsplat::model::Precision::fastest_on(tch::Device::Cpu);
-    assert_eq!(kept["train"]["precision"].as_str(), Some(chosen.to_string().as_str()));
-}
-
-#[test]
 fn a_run_begins_with_the_weights_that_are_named() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);

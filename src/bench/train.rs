@@ -113,7 +113,7 @@ pub fn bench_train(
     let mut parts = Parts::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
-    let precision = config.train.precision.on(device);
+    let precision = config.train.precision;
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
     let yardstick = Yardstick::new(precision, device);
     tch::set_num_threads(threads / slices_at_once as i32);

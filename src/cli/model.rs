@@ -2,7 +2,7 @@
 
 use super::ranks;
 use globalsplat::config::Config;
-use globalsplat::model::{Precision, PrecisionChoice, Stage};
+use globalsplat::model::{Precision, Stage};
 use globalsplat::reconstruct::{Input, LoadedModel, ModelFile, SHIPPED_MODEL, ViewsAs};
 use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
@@ -11,9 +11,14 @@ use tch::Device;
 
 /// What `--precision` asks for: `auto` is the faster one on `device`. The slower one is told of.
 pub fn precision(asked: &str, device: Device) -> Result<Precision> {
-    let asked: PrecisionChoice = asked.parse().map_err(|e| Error::Request(format!("--precision: {e}")))?;
-    let precision = asked.on(device);
-    if precision != Precision::fastest_on(device) && precision == Precision::Bf16 && ranks::is_first() {
+    let fastest = Precision::fastest_on(device);
+    if asked == "auto" {
+        return Ok(fastest);
+    }
+    let precision = asked.parse().map_err(|_| {
+        Error::Request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
+    })?;
+    if precision == Precision::Bf16 && fastest == Precision::F32 && ranks::is_first() {
         eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
     }
     Ok(precision)

@@ -61,9 +61,7 @@ impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
         let (is_first, count) = (group.is_first(), group.ranks());
-        let mut config = Config::read(&self.config, &self.set)?;
-        // What is kept beside the run tells what it was.
-        config.train.precision = config.train.precision.on(device).into();
+        let config = Config::read(&self.config, &self.set)?;
         memory::keep_for(&config.train);
         let resume = match self.resume.as_str() {
             "auto" => Resume::Auto,

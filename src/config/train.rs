@@ -1,7 +1,7 @@
 //! The optimizer's numbers, and how a run keeps books.
 
 use crate::error::{Error, Result};
-use crate::model::PrecisionChoice;
+use crate::model::Precision;
 use serde::{Deserialize, Serialize};
 
 /// What updates the encoder's matrices; all else is updated by AdamW.
@@ -31,8 +31,8 @@ pub struct TrainConfig {
     /// pass: less memory, a fifth more time.
     pub checkpoint_rounds: bool,
     /// `f32`, or `bf16` for the encoder's matrix products and the network of L_perc, which is faster for wide models where the
-    /// machine has instructions for it; `auto` is bf16 there, and f32 elsewhere.
-    pub precision: PrecisionChoice,
+    /// machine has instructions for it.
+    pub precision: Precision,
     /// `adamw`, or `muon` for the encoder's matrices.
     pub optimizer: OptimizerKind,
     /// Peak learning rate.
@@ -65,7 +65,7 @@ impl Default for TrainConfig {
             batch: 16,
             micro_batch: 0,
             checkpoint_rounds: false,
-            precision: PrecisionChoice::F32,
+            precision: Precision::F32,
             optimizer: OptimizerKind::AdamW,
             learning_rate: 5e-4,
             warmup: 0.03,

@@ -27,8 +27,8 @@ pub use encoder::Encoded;
 pub use merge::Stage;
 pub(crate) use parts::part;
 pub use parts::{Event, told};
+pub use precision::Precision;
 pub(crate) use precision::convolve;
-pub use precision::{Precision, PrecisionChoice};
 pub use shapes::MODULES;
 
 // For training, which goes through the model in parts and from smaller models to larger ones.

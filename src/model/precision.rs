@@ -13,7 +13,7 @@ use tch::{Device, Kind, Tensor, nn};
 /// float32, whatever this says: weights and their gradients, norms, the sums inside of softmax and products, residual streams;
 /// tokens and geometry heads, whose products are few and which read and say where things are; geometry and rendering; the
 /// differences of features.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 24 bits of mantissa.
@@ -55,39 +55,6 @@ impl Precision {
                 let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
                 product(&self.operand(xs), &self.operand(&layer.ws), bias.as_ref())
             }
-        }
-    }
-}
-
-/// The precision that is asked for.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PrecisionChoice {
-    /// [`Precision::fastest_on`] the device.
-    Auto,
-    /// [`Precision::F32`].
-    #[default]
-    F32,
-    /// [`Precision::Bf16`].
-    Bf16,
-}
-
-impl PrecisionChoice {
-    /// What it is on `device`.
-    pub fn on(self, device: Device) -> Precision {
-        match self {
-            PrecisionChoice::Auto => Precision::fastest_on(device),
-            PrecisionChoice::F32 => Precision::F32,
-            PrecisionChoice::Bf16 => Precision::Bf16,
-        }
-    }
-}
-
-impl From<Precision> for PrecisionChoice {
-    fn from(precision: Precision) -> Self {
-        match precision {
-            Precision::F32 => PrecisionChoice::F32,
-            Precision::Bf16 => PrecisionChoice::Bf16,
         }
     }
 }
@@ -170,15 +137,14 @@ impl fmt::Display for Precision {
     }
 }
 
-impl FromStr for PrecisionChoice {
+impl FromStr for Precision {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
-            "auto" => Ok(PrecisionChoice::Auto),
-            "f32" => Ok(PrecisionChoice::F32),
-            "bf16" => Ok(PrecisionChoice::Bf16),
-            _ => Err(format!("{text} is no precision, expected auto, f32 or bf16")),
+            "f32" => Ok(Precision::F32),
+            "bf16" => Ok(Precision::Bf16),
+            _ => Err(format!("{text} is no precision, expected f32 or bf16")),
         }
     }
 }

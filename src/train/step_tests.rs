@@ -182,7 +182,7 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
     let sample = sample();
     let threads = tch::get_num_threads();
     for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
-        let mut config = config(small(), TrainConfig { precision: precision.into(), ..Default::default() });
+        let mut config = config(small(), TrainConfig { precision, ..Default::default() });
         config.loss.consistency_depth = 0.;
         let by = |threads: i32| {
             tch::set_num_threads(threads);
@@ -257,7 +257,7 @@ fn the_network_of_l_perc_has_the_model_s_precision() {
     Vgg19::new(&vs.root());
     vs.save(&file).expect("weights");
     for (precision, kind) in [(Precision::F32, Kind::Float), (Precision::Bf16, Kind::BFloat16)] {
-        let mut config = config(small(), TrainConfig { precision: precision.into(), ..Default::default() });
+        let mut config = config(small(), TrainConfig { precision, ..Default::default() });
         config.loss.perceptual = PerceptualKind::Vgg19;
         config.loss.perceptual_weights = file.display().to_string();
         let scenes = Arc::new(Vec::<Capture>::new());
@@ -297,7 +297,6 @@ fn a_step_moves_nothing_but_what_is_told() {
     for (micro_batch, checkpoint_rounds, precision) in
         [(0, false, Precision::F32), (2, false, Precision::Bf16), (1, true, Precision::F32)]
     {
-        let precision = precision.into();
         let train = TrainConfig { micro_batch, checkpoint_rounds, precision, ..Default::default() };
         of_model(&config(small(), train), |trainer| {
             let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;

@@ -79,13 +79,12 @@ impl Trainer {
     /// # Errors
     /// A model that can't be built, or no weights for the perceptual loss.
     pub fn new(config: &Config, scenes: Arc<dyn SceneGroups>, device: Device) -> Result<Self> {
-        let precision = config.train.precision.on(device);
         let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?
-            .map(|network| network.with_precision(precision));
+            .map(|network| network.with_precision(config.train.precision));
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
-        model.set_precision(precision);
+        model.set_precision(config.train.precision);
         let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
         let group = Group::alone();
