@@ -414,6 +414,7 @@ fn a_run_goes_from_photos_to_a_splat() {
         globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!((&report["weights"], &report["views"]), (&json!("models/tiny.safetensors"), &json!(5)));
+    assert_eq!(report["precision"], "f32", "they are narrow");
     let told = String::from_utf8_lossy(&output.stderr);
     let expected = "room_000: 5 of 9 photos are shown, spread over the camera's path; 40×40 pixels are cut and resized to ";
     assert!(told.starts_with(expected) && told.lines().count() == 1, "{told}");

@@ -24,7 +24,7 @@ pub struct Attention {
     /// Heads
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..))]
     heads: u16,
-    /// Of queries, keys and values: f32, bf16, or auto: bf16 where the processor has instructions for it
+    /// Of queries, keys and values: f32, bf16, or auto: bf16 for wide models where the processor has instructions for it
     #[arg(long, default_value = "f32")]
     precision: String,
     /// Threads that share the work; by default all cores
@@ -51,7 +51,8 @@ impl Attention {
             .into());
         }
         let sizes = [self.queries.into(), self.keys.into(), self.width.into(), self.heads.into()];
-        let precision = model::precision(&self.precision, Device::Cpu)?;
+        let asked = model::asked_precision(&self.precision)?;
+        let precision = model::precision(asked, Device::Cpu, self.width.into());
         let report = bench_attention(sizes, precision, self.repeats as usize)?;
         if self.json {
             print_json(&serde_json::to_value(&report)?);

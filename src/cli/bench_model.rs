@@ -25,7 +25,7 @@ pub struct Model {
     /// Passes that are measured
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
-    /// Matrix products in f32, bf16, or auto: bf16 where the device has instructions for it
+    /// Matrix products in f32, bf16, or auto: bf16 for wide models where the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
     /// cpu, cuda or cuda:N
@@ -39,8 +39,9 @@ pub struct Model {
 impl Model {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
-        let precision = model::precision(&self.precision, device)?;
+        let asked = model::asked_precision(&self.precision)?;
         let mut config = read_config(self.config.as_deref(), &self.set)?;
+        let precision = model::precision(asked, device, config.model.width);
         config.data.context_views = self.views.into();
         let report = bench_model(&config, precision, self.repeats as usize, device)?;
         if self.json {

@@ -83,7 +83,7 @@ pub struct Eval {
     /// Also write a picture: photo, render and depth side by side, a row per view
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
-    /// f32, bf16 for the model's matrix products, or auto: bf16 where the device has instructions for it
+    /// f32, bf16 for the model's matrix products, or auto: bf16 for wide models where the device has instructions for it
     #[arg(long, default_value = "auto", conflicts_with_all = ["splat", "renders"])]
     precision: String,
     /// cpu, cuda or cuda:N
@@ -210,8 +210,8 @@ impl Eval {
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
-        let precision = model::precision(&self.precision, device)?;
-        let load = |path: &PathBuf| model::load(Some(path), precision, device);
+        let asked = model::asked_precision(&self.precision)?;
+        let load = |path: &PathBuf| model::load(Some(path), asked, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 

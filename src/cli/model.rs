@@ -9,27 +9,33 @@ use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
 
-/// What `--precision` asks for: `auto` is the faster one on `device`. The slower one is told of.
-pub fn precision(asked: &str, device: Device) -> Result<Precision> {
-    let fastest = Precision::fastest_on(device);
+/// What `--precision` asks for; nothing is `auto`.
+pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
     if asked == "auto" {
-        return Ok(fastest);
+        return Ok(None);
     }
     let precision = asked.parse().map_err(|_| {
         Error::Request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
     })?;
-    if precision == Precision::Bf16 && fastest == Precision::F32 && ranks::is_first() {
-        eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
-    }
-    Ok(precision)
+    Ok(Some(precision))
 }
 
-/// Reads the model in `weights`, or the one that comes with this program, which computes in `precision` from then on.
-pub fn load(weights: Option<&Path>, precision: Precision, device: Device) -> Result<LoadedModel> {
+/// The precision that is `asked` for, or [`Precision::best_on`] `device` for tokens of `width` numbers. The slower one is told of.
+pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precision {
+    let precision = asked.unwrap_or_else(|| Precision::best_on(device, width));
+    if precision == Precision::Bf16 && Precision::fastest_on(device) == Precision::F32 && ranks::is_first() {
+        eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
+    }
+    precision
+}
+
+/// Reads the model in `weights`, or the one that comes with this program, which computes in [`precision`] from then on.
+pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) -> Result<LoadedModel> {
     let file = match weights {
         Some(weights) => ModelFile::open(weights, &[])?,
         None => ModelFile::shipped()?,
     };
+    let precision = precision(asked, device, file.config.model.width);
     let loaded = file.lend(device, precision)?;
     if !ranks::is_first() {
         return Ok(loaded);

@@ -44,7 +44,7 @@ pub struct Reconstruct {
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
     refine: Option<f64>,
-    /// f32, bf16 for matrix products, or auto: bf16 where the device has instructions for it
+    /// f32, bf16 for matrix products, or auto: bf16 for wide models where the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
     /// cpu, cuda or cuda:N
@@ -87,10 +87,10 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_splat(&self.out)?;
-        let precision = model::precision(&self.precision, device)?;
+        let asked = model::asked_precision(&self.precision)?;
         let started = process_age();
         let mut watch = Stopwatch::default();
-        let loaded = watch.time("weights", || model::load(self.weights.as_deref(), precision, device))?;
+        let loaded = watch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = watch.time("photos", || open_capture(&self.scene))?;
         let data = &loaded.config.data;
         let input = match self.views_at {
@@ -128,7 +128,7 @@ impl Reconstruct {
                 "image_size": input.photo_size(data.image_size),
                 "views": views,
                 "gaussians": count,
-                "precision": precision,
+                "precision": loaded.model.precision(),
                 "load_seconds": parts["weights"],
                 "seconds": seconds,
                 "seconds_of": parts,

@@ -231,7 +231,7 @@ impl Refine {
             return Err(Error::Request(why.into()).into());
         }
         if self.from == Some(From::Weights) || needs_model {
-            let loaded = model::load(self.weights.as_deref(), Precision::F32, Device::Cpu)?;
+            let loaded = model::load(self.weights.as_deref(), Some(Precision::F32), Device::Cpu)?;
             let data = &loaded.config.data;
             let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
             let all: Vec<usize> = (0..photos.len()).collect();

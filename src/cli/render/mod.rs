@@ -138,7 +138,7 @@ impl Render {
         let (Some(weights), Some(capture)) = (&self.weights, capture) else {
             return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
         };
-        let loaded = model::load(Some(weights), Precision::F32, Device::Cpu)?;
+        let loaded = model::load(Some(weights), Some(Precision::F32), Device::Cpu)?;
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
         Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
