@@ -5,8 +5,8 @@
 
 namespace globalsplat {
 
-// Whether linear() of float32 is faster here than libtorch's own, which gives these products to MKL: that leaves half of the vector units idle on
-// processors that aren't Intel's, oneDNN doesn't.
+// Whether linear() of float32 is faster here than libtorch's own, which gives these products to MKL: that leaves half of the vector units
+// idle on processors that aren't Intel's, oneDNN doesn't.
 bool linear_is_faster();
 
 // xs weightsᵀ + bias, by oneDNN, to which libtorch gives bfloat16 itself: xs [.., k], weights [n, k] and bias [n], float32 or bfloat16 on

@@ -185,8 +185,12 @@ fn camera_code(request: &Request) -> Result<Answer> {
 fn linear(request: &Request) -> Result<Answer> {
     let bias = request.inputs.get("bias").map(Tensor::shallow_clone);
     let layer = nn::Linear { ws: request.input("weight")?.shallow_clone(), bs: bias };
-    let precision = if request.config.get("bf16").is_some() { Precision::Bf16 } else { Precision::F32 };
-    outputs([("out", precision.linear(&layer, request.input("xs")?).to_kind(Kind::Float))])
+    outputs([("out", precision(request).linear(&layer, request.input("xs")?).to_kind(Kind::Float))])
+}
+
+/// What products take, which are of float32 numbers unless the case says otherwise.
+fn precision(request: &Request) -> Precision {
+    if request.config.get("bf16").is_some() { Precision::Bf16 } else { Precision::F32 }
 }
 
 fn attention(request: &Request) -> Result<Answer> {
@@ -198,8 +202,7 @@ fn attention(request: &Request) -> Result<Answer> {
             .into_iter()
             .collect::<Result<_>>()?,
     };
-    let is_bf16 = request.config.get("bf16").is_some();
-    let kind = if is_bf16 { Kind::BFloat16 } else { inputs[0].kind() };
+    let kind = precision(request).kind();
     let [q, k, v] = [0, 1, 2].map(|n| inputs[n].to_kind(kind));
     let seen = model::attention(&q, &k, &v, request.number("heads")?);
     outputs([("seen", seen.to_kind(inputs[0].kind()))])
