@@ -3,10 +3,11 @@
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
 use super::leaves::is_followed;
+use super::memory::Memory;
 use super::mixer::Mixer;
 use super::parts::part;
 use super::precision::Precision;
-use super::stream::{REGISTERS, StreamRound, normalized};
+use super::stream::{REGISTERS, StreamRound};
 use tch::{Tensor, nn};
 
 /// Query tokens before the scene tokens; not decoded.
@@ -100,31 +101,21 @@ impl Encoder {
         is_followed(&self.memory_registers)
     }
 
-    /// What all rounds read, [B, 4 + V·P, token width]: learned tokens, then those of images, of which `views` gives as many at a
-    /// time as it likes ([B, .., token width], `count` in all). Normalized.
-    pub fn memory(&self, count: i64, views: impl IntoIterator<Item = Tensor>) -> Tensor {
-        let mut views = views.into_iter().peekable();
-        let [batch, width] = views.peek().map(|t| [t.size()[0], t.size()[2]]).expect("a view");
-        let registers = self.memory_registers.expand([batch, -1, -1], false);
-        if self.is_followed() {
-            // Every round's gradient comes back, and is added up in float32.
-            return normalized(&Tensor::cat(&std::iter::once(registers).chain(views).collect::<Vec<_>>(), 1));
+    /// What all rounds read: learned tokens, then those of images, of which `view` gives those of every one of `views`, [B, P, token
+    /// width], some twice where nobody asks for gradients.
+    pub fn memory(&self, views: i64, view: impl Fn(i64) -> Tensor) -> Memory {
+        let registers = &self.memory_registers;
+        if !self.is_followed() {
+            return Memory::of_views(registers, views, view, self.precision);
         }
-        // There is no room for all twice.
-        let size = [batch, MEMORY_REGISTERS + count, width];
-        let memory = Tensor::empty(size, (self.precision.kind(), registers.device()));
-        let mut first = 0;
-        for tokens in std::iter::once(registers).chain(views) {
-            let count = tokens.size()[1];
-            memory.narrow(1, first, count).copy_(&normalized(&tokens));
-            first += count;
-        }
-        memory
+        let mut tokens: Vec<_> = (0..views).map(view).collect();
+        tokens.insert(0, registers.expand([tokens[0].size()[0], -1, -1], false));
+        Memory::new(&Tensor::cat(&tokens, 1))
     }
 
     /// `scene_tokens` [M, d], `memory` as [`Encoder::memory`] gives it.
-    pub fn forward(&self, scene_tokens: &Tensor, memory: &Tensor) -> Encoded {
-        let mut slots = self.start(scene_tokens, memory.size()[0]);
+    pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory) -> Encoded {
+        let mut slots = self.start(scene_tokens, memory.common.size()[0]);
         for round in 0..self.rounds() {
             slots = self.round(round, &slots, memory);
         }
@@ -142,7 +133,7 @@ impl Encoder {
     }
 
     /// Both streams read and think, each by itself, then they meet.
-    pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Tensor) -> Slots {
+    pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Memory) -> Slots {
         let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory, self.precision);
         match (&self.appearance, &slots.appearance) {
             (Some(branch), Some(appearance)) => {

@@ -11,6 +11,7 @@ mod encoder;
 mod growth;
 mod layers;
 mod leaves;
+mod memory;
 mod merge;
 mod mixer;
 mod parts;
@@ -24,6 +25,7 @@ mod tokens;
 pub use config::{ModelConfig, Streams};
 pub use decoder::{Decoded, RawOutputs};
 pub use encoder::Encoded;
+pub use memory::Memory;
 pub use merge::Stage;
 pub(crate) use parts::part;
 pub use parts::{Event, told};
@@ -45,7 +47,7 @@ pub(crate) use growth::{for_smaller_patches, more_tokens, shared_opacities};
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
-pub(crate) use stream::{SelfAttentionBlock, StreamRound, normalized};
+pub(crate) use stream::{SelfAttentionBlock, StreamRound};
 pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
@@ -119,29 +121,26 @@ impl GlobalSplat {
     }
 
     /// What the encoder reads of image tokens [B, V, P, token width].
-    fn memory_of(&self, tokens: &Tensor) -> Tensor {
+    fn memory_of(&self, tokens: &Tensor) -> Memory {
         let tokens = tokens.flatten(1, 2);
-        self.encoder.memory(tokens.size()[1], [tokens])
+        self.encoder.memory(1, |_| tokens.shallow_clone())
     }
 
     /// The first third and the beginning of the second. Image tokens of many views are large: where nobody asks for gradients, it
     /// goes view by view.
-    pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
+    pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Memory {
         if self.encoder.is_followed() {
             return self.memory_of(&self.tokens(images, c2w, intrinsics));
         }
-        let size = images.size();
-        let patch = self.config.patch_size;
         let of_view = |view| {
             let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
             self.tokens(&images, &c2w, &intrinsics).squeeze_dim(1)
         };
-        let count = size[1] * (size[3] / patch) * (size[4] / patch);
-        self.encoder.memory(count, (0..size[1]).map(of_view))
+        self.encoder.memory(images.size()[1], of_view)
     }
 
     /// The rest of the second third.
-    pub fn encode_memory(&self, memory: &Tensor) -> Encoded {
+    pub fn encode_memory(&self, memory: &Memory) -> Encoded {
         self.encoder.forward(&self.scene_tokens, memory)
     }
 

@@ -34,9 +34,8 @@ impl Precision {
         if has_bf16 { Precision::Bf16 } else { Precision::F32 }
     }
 
-    /// For tokens of `width` numbers: the fastest one on `device` where products are as large as the main model's. Smaller models gain
-    /// little time by bf16, and read many small patches, whose scores it blurs: the one that comes with the program loses up to half
-    /// a dB.
+    /// For tokens of `width` numbers: the fastest one on `device` where products are as large as the main model's. Smaller models are
+    /// quick anyway, and read many small patches: the one that comes with the program loses up to a tenth of a dB in bf16.
     pub fn best_on(device: Device, width: i64) -> Self {
         const WIDE: i64 = 256;
         if width >= WIDE { Precision::fastest_on(device) } else { Precision::F32 }

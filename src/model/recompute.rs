@@ -3,6 +3,7 @@
 
 use super::encoder::{Encoded, Encoder, Slots};
 use super::leaves::{leaf, pull_back};
+use super::memory::Memory;
 use tch::{Tensor, no_grad};
 
 /// What is left of an encoder's forward pass for its backward pass.
@@ -11,9 +12,9 @@ pub(crate) struct KeptRounds<'a> {
     encoder: &'a Encoder,
     /// Before the first round, with their way back to scene tokens and image tokens.
     slots: Slots,
-    memory: Tensor,
+    memory: Memory,
     /// All rounds read the same memory, so its gradient is the sum of theirs.
-    memory_leaf: Tensor,
+    memory_leaf: Memory,
     /// Before every round, and after the last one.
     between: Vec<Slots>,
 }
@@ -23,10 +24,10 @@ impl Encoder {
     pub(crate) fn forward_keeping_rounds(
         &self,
         scene_tokens: &Tensor,
-        memory: Tensor,
+        memory: Memory,
     ) -> (Encoded, KeptRounds<'_>) {
-        let slots = self.start(scene_tokens, memory.size()[0]);
-        let memory_leaf = leaf(&memory);
+        let slots = self.start(scene_tokens, memory.common.size()[0]);
+        let memory_leaf = memory.leaf();
         let mut between = vec![slots.map(leaf)];
         for round in 0..self.rounds() {
             let after = no_grad(|| self.round(round, &between[round], &memory_leaf));
@@ -46,7 +47,7 @@ impl KeptRounds<'_> {
             pull_back(&again.beside(&after));
         }
         let mut start = self.slots.beside(&self.between[0]);
-        start.push((&self.memory, &self.memory_leaf));
+        start.push((&self.memory.tokens, &self.memory_leaf.tokens));
         pull_back(&start);
     }
 }

@@ -2,8 +2,9 @@
 
 use super::attention::attention;
 use super::config::ModelConfig;
-use super::layers::{ENCODER_STD, LAYER_NORM_EPS, LayerScale, Mlp, layer_norm, linear, normalize};
-use super::parts::{does, part};
+use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear, normalize};
+use super::memory::Memory;
+use super::parts::part;
 use super::precision::Precision;
 use tch::{Device, Tensor, nn};
 
@@ -14,16 +15,6 @@ const CROSS_LAYER_SCALE: f64 = 1e-3;
 const SELF_LAYER_SCALE: f64 = 1e-2;
 /// In so many parts heads look at the memory, one after the other.
 const HEAD_GROUPS: i64 = 2;
-
-/// What all rounds' norms of `memory` have in common, before their γ and β.
-pub(crate) fn normalized(memory: &Tensor) -> Tensor {
-    part("norms", || {
-        let out =
-            memory.layer_norm([memory.size()[2]], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
-        does(0, 0, &[memory, &out]);
-        out
-    })
-}
 
 /// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
 #[derive(Debug)]
@@ -69,8 +60,8 @@ impl StreamRound {
         own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::products))
     }
 
-    /// `slots` [B, S, d] with the registers last, `memory` [B, m, token width] as [`normalized`] gives it; result [B, S, d].
-    pub fn forward(&self, slots: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
+    /// `slots` [B, S, d] with the registers last; result [B, S, d].
+    pub fn forward(&self, slots: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
         // Registers change in self-attention, and where streams are mixed.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
@@ -90,7 +81,11 @@ impl StreamRound {
 
     /// Cross-attention of `query` [B, n, d]. Where nobody asks for gradients a CPU goes through some heads after the other: keys and
     /// values of all of them are larger than the memory that they are made of.
-    fn look(&self, query: &Tensor, memory: &Tensor, precision: Precision) -> Tensor {
+    ///
+    /// The memory is γ ⊙ (y + c) + β, with y what tokens differ by and c what they have in common (spec 4.2). Softmax doesn't see what
+    /// is added to all keys alike, and weights of values add up to 1. So keys are W_k (γ ⊙ y) and values W_v (γ ⊙ y), and what c, β and
+    /// the values' bias add comes after attention. The keys' own bias does nothing.
+    fn look(&self, query: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
         let is_for_all =
             query.requires_grad() || query.device() != Device::Cpu || self.heads % HEAD_GROUPS != 0;
         let groups = if is_for_all { 1 } else { HEAD_GROUPS };
@@ -98,25 +93,37 @@ impl StreamRound {
         let seen: Vec<Tensor> = (0..groups)
             .map(|group| {
                 let read = self.read(group * width, width);
-                let read = part("keys and values", || precision.linear(&read, memory)).chunk(2, -1);
+                let read = part("keys and values", || precision.linear(&read, &memory.tokens)).chunk(2, -1);
                 let query = query.narrow(-1, group * width, width);
                 part("cross-attention", || attention(&query, &read[0], &read[1], self.heads / groups))
             })
             .collect();
-        Tensor::cat(&seen, -1)
+        Tensor::cat(&seen, -1) + self.read_by_all(memory)
     }
 
-    /// Keys beside values, `width` numbers from `first` on of each, of a memory that is normalized already: W (γ ⊙ x + β) + b =
-    /// (W diag γ) x + (W β + b), so all rounds share what they have of their norms in common, and read it in one product.
+    /// Keys beside values without what all have in common, `width` numbers from `first` on of each: W (γ ⊙ y) = (W diag γ) y, so
+    /// all rounds share what their norms have in common, and read it in one product.
     fn read(&self, first: i64, width: i64) -> nn::Linear {
-        let norm = &self.memory_norm;
-        let [gamma, beta] = [&norm.ws, &norm.bs].map(|t| t.as_ref().expect("an affine norm"));
-        let rows = |of: [&Tensor; 2]| {
-            Tensor::cat(&of.map(|t| t.narrow(0, first, width)), 0).to_kind(gamma.kind()) // [2 width, ..]
-        };
-        let weights = rows([&self.key.ws, &self.value.ws]);
-        let biases = rows([&self.key.bs, &self.value.bs].map(|bias| bias.as_ref().expect("a bias")));
-        nn::Linear { ws: &weights * gamma, bs: Some(weights.mv(beta) + biases) }
+        let [gamma, _] = self.memory_affine();
+        let rows = [&self.key.ws, &self.value.ws].map(|ws| ws.narrow(0, first, width));
+        let weights = Tensor::cat(&rows, 0).to_kind(gamma.kind()); // [2 width, token width]
+        nn::Linear { ws: weights * gamma, bs: None }
+    }
+
+    /// What all values have in common, W_v (γ ⊙ c + β) + b_v, [B, 1, d] in float32.
+    fn read_by_all(&self, memory: &Memory) -> Tensor {
+        let [gamma, beta] = self.memory_affine();
+        let exact = |t: &Tensor| t.to_kind(gamma.kind());
+        let value = nn::Linear { ws: exact(&self.value.ws), bs: self.value.bs.as_ref().map(exact) };
+        let of_values =
+            part("keys and values", || Precision::F32.linear(&value, &(&memory.common * gamma + beta)));
+        // A gradient of 0, where there would be none: everything that is learned has one.
+        of_values + self.key.bs.as_ref().map(exact).expect("a bias") * 0.
+    }
+
+    /// γ and β of the memory's norm, [token width] each.
+    fn memory_affine(&self) -> [&Tensor; 2] {
+        [&self.memory_norm.ws, &self.memory_norm.bs].map(|t| t.as_ref().expect("an affine norm"))
     }
 }
 
@@ -160,5 +167,42 @@ impl SelfAttentionBlock {
         let xs = self.attention_scale.add(xs, &mixed);
         let thought = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
         self.mlp_scale.add(&xs, &thought)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::memory::tests::alike;
+    use super::*;
+    use tch::{Kind, no_grad};
+
+    #[test]
+    fn tokens_that_are_alike_are_told_apart_in_bf16() {
+        let config = ModelConfig { width: 32, heads: 2, rgb_width: 16, ray_width: 8, ..Default::default() };
+        let vs = nn::VarStore::new(Device::Cpu);
+        let round = StreamRound::new(&vs.root(), &config);
+        // Scores that differ, and biases, as after training.
+        for (name, mut value) in vs.variables() {
+            let trained = if name.ends_with("bias") { &value + 0.5 } else { &value * 50 };
+            if ["mem_k", "mem_v"].iter().any(|layer| name.starts_with(layer)) || name == "mem_ln.bias" {
+                no_grad(|| value.copy_(&trained));
+            }
+        }
+        let query =
+            Tensor::linspace(-3., 3., 2 * 9 * 32, (Kind::Float, Device::Cpu)).sin().view([2, 9, 32]) * 3;
+        let memory = Memory::new(&alike(300));
+        let whole = Memory { tokens: &memory.tokens + &memory.common, common: memory.common.zeros_like() };
+        let seen = |memory: &Memory, precision: Precision| {
+            let query = query.to_kind(precision.kind());
+            no_grad(|| round.look(&query, memory, precision))
+        };
+        let exact = seen(&memory, Precision::F32);
+        let size = (&exact - exact.mean_dim(1, true, None)).norm(); // of what queries see differently
+        let error = |found: Tensor| ((found - &exact).norm() / &size).double_value(&[]);
+        let same = error(seen(&whole, Precision::F32));
+        // Scores of tokens as they are lose digits in float32, too.
+        assert!(same < 1e-3, "nothing depends on what is called common, but {same:.1e}");
+        let [near, far] = [&memory, &whole].map(|memory| error(seen(memory, Precision::Bf16)));
+        assert!(near < 3e-2 && far > 20. * near, "{near:.1e}, and {far:.1e} of tokens as they are");
     }
 }

@@ -211,7 +211,7 @@ fn attention(request: &Request) -> Result<Answer> {
 fn stream_round(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
-    let (slots, memory) = (request.input("slots")?, model::normalized(request.input("memory")?));
+    let (slots, memory) = (request.input("slots")?, model::Memory::new(request.input("memory")?));
     with_params([("slots", module.forward(slots, &memory, Precision::F32))], params)
 }
 
@@ -237,7 +237,7 @@ fn encoder(request: &Request) -> Result<Answer> {
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
     let tokens = request.input("tokens")?;
-    let memory = encoder.memory(tokens.size()[1], [tokens.shallow_clone()]);
+    let memory = encoder.memory(1, |_| tokens.shallow_clone());
     let encoded = encoder.forward(&scene_tokens, &memory);
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
