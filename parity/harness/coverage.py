@@ -49,6 +49,7 @@ EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
     "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
+    "src/model/memory.rs": "what encoder.rs and stream.rs read, and held with them; view by view by its own test",
     "src/model/parts.rs": "tells what is done, and does nothing",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
     "src/model/shapes.rs": "a configuration read off shapes; parity/tests/test_checkpoints.py holds it against models made here",

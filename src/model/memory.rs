@@ -23,9 +23,11 @@ pub struct Memory {
 impl Memory {
     /// Of `tokens` [B, m, token width] in float32: every round's gradient comes back to them, and is added up in float32.
     pub(crate) fn new(tokens: &Tensor) -> Self {
-        let tokens = normalized(tokens);
-        let common = tokens.detach().mean_dim(1, true, None);
-        Memory { tokens: tokens - &common, common }
+        part("norms", || {
+            let tokens = normalized(tokens);
+            let common = tokens.detach().mean_dim(1, true, None);
+            Memory { tokens: tokens - &common, common }
+        })
     }
 
     /// The same of `registers` [1, r, token width] and `views` views, of which `view` gives the tokens [B, P, token width], one after
@@ -39,14 +41,17 @@ impl Memory {
     ) -> Self {
         let view = |n| normalized(&view(n));
         let few = (0..views).step_by((views as usize).div_ceil(VIEWS_OF_MEAN)).map(view);
-        let (sizes, means): (Vec<_>, Vec<_>) = few.map(|t| (t.size(), t.mean_dim(1, false, None))).unzip();
+        let mean = |t: &Tensor| part("norms", || t.mean_dim(1, false, None));
+        let (sizes, means): (Vec<_>, Vec<_>) = few.map(|t| (t.size(), mean(&t))).unzip();
         let common = Tensor::stack(&means, 1).mean_dim(1, true, None);
 
         let (batch, patches, width) = (sizes[0][0], sizes[0][1], sizes[0][2]);
         let learned = registers.size()[1];
         let size = [batch, learned + views * patches, width];
         let tokens = Tensor::empty(size, (precision.kind(), common.device()));
-        let put = |first, of: Tensor| tokens.narrow(1, first, of.size()[1]).copy_(&(of - &common));
+        let put = |first, of: Tensor| {
+            part("norms", || tokens.narrow(1, first, of.size()[1]).copy_(&(of - &common)));
+        };
         put(0, normalized(registers));
         (0..views).for_each(|n| put(learned + n * patches, view(n)));
         Memory { tokens, common }
@@ -73,16 +78,15 @@ pub(super) mod tests {
     use super::*;
     use tch::{Device, Kind};
 
-    /// [2, `count`, 24], uneven, all of them near one another.
+    /// Numbers that nobody else draws, between −1 and 1; others for another `step`.
+    pub(in super::super) fn uneven(step: f64, size: &[i64]) -> Tensor {
+        let numbers = Tensor::arange(size.iter().product::<i64>(), (Kind::Double, Device::Cpu));
+        (numbers.square() * step).sin().to_kind(Kind::Float).view(size)
+    }
+
+    /// [2, `count`, 24], all of them near one another.
     pub(in super::super) fn alike(count: i64) -> Tensor {
-        let numbers = |step: f64, size: i64| {
-            Tensor::arange(size, (Kind::Double, Device::Cpu))
-                .square()
-                .multiply_scalar(step)
-                .sin()
-                .to_kind(Kind::Float)
-        };
-        numbers(0.7, 24) + 0.05 * numbers(1., 2 * count * 24).view([2, count, 24])
+        uneven(0.7, &[24]) + 0.05 * uneven(1., &[2, count, 24])
     }
 
     #[test]
@@ -99,7 +103,7 @@ pub(super) mod tests {
             let (at_once, one_by_one) = of_views(views);
             let whole = |memory: &Memory| &memory.tokens + &memory.common;
             assert!(largest(whole(&at_once) - whole(&one_by_one)) < 1e-6, "{views} views");
-            // A fiftieth of the tokens, as they are made, is their own.
+            // A twentieth of the tokens, as they are made, is their own.
             let [own, apart] = [&at_once, &one_by_one].map(|memory| largest(memory.tokens.shallow_clone()));
             assert!(apart < 1.5 * own && apart < 0.2 * largest(whole(&at_once)), "{own} {apart}");
         }

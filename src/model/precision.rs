@@ -10,7 +10,7 @@ use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
 /// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
-/// float32, whatever this says: weights and their gradients, norms, the sums inside of softmax and products, residual streams;
+/// float32, whatever this says: what values have in common; weights and their gradients, norms, the sums inside of softmax and products, residual streams;
 /// tokens and geometry heads, whose products are few and which read and say where things are; geometry and rendering; the
 /// differences of features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -35,7 +35,7 @@ impl Precision {
     }
 
     /// For tokens of `width` numbers: the fastest one on `device` where products are as large as the main model's. Smaller models are
-    /// quick anyway, and read many small patches: the one that comes with the program loses up to a tenth of a dB in bf16.
+    /// quick anyway, and read many small patches: the one that comes with the program loses a tenth of a dB in bf16.
     pub fn best_on(device: Device, width: i64) -> Self {
         const WIDE: i64 = 256;
         if width >= WIDE { Precision::fastest_on(device) } else { Precision::F32 }

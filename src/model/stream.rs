@@ -4,7 +4,7 @@ use super::attention::attention;
 use super::config::ModelConfig;
 use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear, normalize};
 use super::memory::Memory;
-use super::parts::part;
+use super::parts::{does, part};
 use super::precision::Precision;
 use tch::{Device, Tensor, nn};
 
@@ -98,7 +98,12 @@ impl StreamRound {
                 part("cross-attention", || attention(&query, &read[0], &read[1], self.heads / groups))
             })
             .collect();
-        Tensor::cat(&seen, -1) + self.read_by_all(memory)
+        let (seen, by_all) = (Tensor::cat(&seen, -1), self.read_by_all(memory));
+        part("residual sums", || {
+            let out = &seen + &by_all;
+            does(0, 0, &[&seen, &out]);
+            out
+        })
     }
 
     /// Keys beside values without what all have in common, `width` numbers from `first` on of each: W (γ ⊙ y) = (W diag γ) y, so
@@ -172,9 +177,9 @@ impl SelfAttentionBlock {
 
 #[cfg(test)]
 mod tests {
-    use super::super::memory::tests::alike;
+    use super::super::memory::tests::{alike, uneven};
     use super::*;
-    use tch::{Kind, no_grad};
+    use tch::no_grad;
 
     #[test]
     fn tokens_that_are_alike_are_told_apart_in_bf16() {
@@ -183,13 +188,12 @@ mod tests {
         let round = StreamRound::new(&vs.root(), &config);
         // Scores that differ, and biases, as after training.
         for (name, mut value) in vs.variables() {
-            let trained = if name.ends_with("bias") { &value + 0.5 } else { &value * 50 };
+            let trained = uneven(1.3, &value.size());
             if ["mem_k", "mem_v"].iter().any(|layer| name.starts_with(layer)) || name == "mem_ln.bias" {
                 no_grad(|| value.copy_(&trained));
             }
         }
-        let query =
-            Tensor::linspace(-3., 3., 2 * 9 * 32, (Kind::Float, Device::Cpu)).sin().view([2, 9, 32]) * 3;
+        let query = uneven(0.9, &[2, 9, 32]) * 3.;
         let memory = Memory::new(&alike(300));
         let whole = Memory { tokens: &memory.tokens + &memory.common, common: memory.common.zeros_like() };
         let seen = |memory: &Memory, precision: Precision| {

@@ -113,7 +113,7 @@ pub fn reconstruct<'a>(
         (encoded, decoded)
     };
     let (encoded, decoded) = tch::no_grad(|| match lent {
-        // A pass needs every weight once.
+        // A pass needs nearly every weight once.
         Some(lent) => told(
             move |event| {
                 if let Event::Begins(_) = event {
