@@ -10,9 +10,9 @@ use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
 /// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
-/// float32, whatever this says: what values have in common; weights and their gradients, norms, the sums inside of softmax and products, residual streams;
-/// tokens and geometry heads, whose products are few and which read and say where things are; geometry and rendering; the
-/// differences of features.
+/// float32, whatever this says: weights and their gradients, norms, what values have in common, the sums inside of softmax and
+/// products, residual streams; tokens and geometry heads, whose products are few and which read and say where things are; geometry
+/// and rendering; the differences of features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
