@@ -50,7 +50,8 @@ fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
     let mut refusals = 0;
     for i in 0..limits {
         std::fs::write(file, &before).unwrap();
-        let output = limited(starts + (enough - starts) * i / limits, arguments);
+        let limit = starts + (enough - starts) * i / limits;
+        let output = limited(limit, arguments);
         let (code, err) = (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
         let left = std::fs::read(file).unwrap();
         if code == Some(0) {
@@ -61,7 +62,7 @@ fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
         assert_eq!(code, Some(1), "{:?}: {err}", output.status);
         // What was told of the photos before may stand there, too, and nothing else.
         let lines: Vec<&str> = err.lines().filter(|line| !line.contains(" photos are shown, ")).collect();
-        assert!(matches!(lines[..], [error] if error.starts_with("globalsplat: ")), "{err}");
+        assert!(matches!(lines[..], [error] if error.starts_with("globalsplat: ")), "{limit} KiB: {err}");
         assert!(!err.contains("panicked"), "{err}");
         assert_eq!(left, before);
     }
