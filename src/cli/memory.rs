@@ -65,6 +65,7 @@ pub fn end_as_failed() {
     globalsplat::error::leave_out_stack_traces();
     faults::tell_from_refusals();
     grow_stack();
+    expect_room_for_small_pieces();
 }
 
 /// Has the process keep the memory that it gives back, for commands that ask for the same again and again: the system zeroes every
@@ -116,20 +117,25 @@ fn is_given(bytes: usize) -> bool {
 
 /// The stack of the main thread grows as it is needed; where it can't any more, the system ends the process with a signal. It
 /// never shrinks, so that what is had here stays.
-///
-/// And on the way to its first large tensor the process takes small pieces that libraries don't bear to be refused: glibc aborts, in
-/// words of its own, where it has no place for the destructor of a thread's variable. So there has to be room for them, too.
 fn grow_stack() {
     const BYTES: usize = 1 << 20;
-    const SMALL_PIECES: usize = 16 << 20;
     #[inline(never)]
     fn grow() {
         std::hint::black_box([0_u8; BYTES]);
     }
-    if !is_given(BYTES + (BYTES >> 2) + SMALL_PIECES) {
+    if !is_given(BYTES + (BYTES >> 2)) {
         end(None);
     }
     grow();
+}
+
+/// On the way to its first large tensor the process takes small pieces that libraries don't bear to be refused: glibc aborts, in words
+/// of its own, where it has no place for the destructor of a thread's variable.
+fn expect_room_for_small_pieces() {
+    const BYTES: usize = 16 << 20;
+    if !is_given(BYTES) {
+        end(None);
+    }
 }
 
 /// Libraries that don't ask whether they were given memory, as oneDNN doesn't always, read next to address 0.

@@ -101,16 +101,15 @@ impl Encoder {
         is_followed(&self.memory_registers)
     }
 
-    /// What all rounds read: learned tokens, then those of images, of which `view` gives those of every one of `views`, [B, P, token
-    /// width], some twice where nobody asks for gradients.
-    pub fn memory(&self, views: i64, view: impl Fn(i64) -> Tensor) -> Memory {
-        let registers = &self.memory_registers;
-        if !self.is_followed() {
-            return Memory::of_views(registers, views, view, self.precision);
-        }
-        let mut tokens: Vec<_> = (0..views).map(view).collect();
-        tokens.insert(0, registers.expand([tokens[0].size()[0], -1, -1], false));
-        Memory::new(&Tensor::cat(&tokens, 1))
+    /// What all rounds read: learned tokens, then those of images, `tokens` [B, V·P, token width].
+    pub fn memory(&self, tokens: &Tensor) -> Memory {
+        let registers = self.memory_registers.expand([tokens.size()[0], -1, -1], false);
+        Memory::new(&Tensor::cat(&[&registers, tokens], 1))
+    }
+
+    /// The same where nobody asks for gradients, of `views` views one after the other, as [`Memory::of_views`] asks for them.
+    pub fn memory_of_views(&self, views: i64, view: impl Fn(i64) -> Tensor) -> Memory {
+        Memory::of_views(&self.memory_registers, views, view, self.precision)
     }
 
     /// `scene_tokens` [M, d], `memory` as [`Encoder::memory`] gives it.

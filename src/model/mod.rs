@@ -122,8 +122,7 @@ impl GlobalSplat {
 
     /// What the encoder reads of image tokens [B, V, P, token width].
     fn memory_of(&self, tokens: &Tensor) -> Memory {
-        let tokens = tokens.flatten(1, 2);
-        self.encoder.memory(1, |_| tokens.shallow_clone())
+        self.encoder.memory(&tokens.flatten(1, 2))
     }
 
     /// The first third and the beginning of the second. Image tokens of many views are large: where nobody asks for gradients, it
@@ -136,7 +135,7 @@ impl GlobalSplat {
             let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
             self.tokens(&images, &c2w, &intrinsics).squeeze_dim(1)
         };
-        self.encoder.memory(images.size()[1], of_view)
+        self.encoder.memory_of_views(images.size()[1], of_view)
     }
 
     /// The rest of the second third.

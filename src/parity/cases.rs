@@ -236,8 +236,7 @@ fn encoder(request: &Request) -> Result<Answer> {
         let scene_tokens = model::scene_tokens(vs, &config);
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
-    let tokens = request.input("tokens")?;
-    let memory = encoder.memory(1, |_| tokens.shallow_clone());
+    let memory = encoder.memory(request.input("tokens")?);
     let encoded = encoder.forward(&scene_tokens, &memory);
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
