@@ -17,6 +17,16 @@ namespace globalsplat::raster::GS_ISA {
 inline constexpr int kMuonRounds = 5;
 inline constexpr float kMuonA = 3.4445f, kMuonB = -4.7750f, kMuonC = 2.0315f;
 
+// A symmetric matrix of `size` rows: make(i, first) makes kProductRows rows from row i on of the panel of columns that begins at `first`,
+// which is asked for down to the diagonal. What is below it is mirrored.
+template <class Make>
+GS_INLINE void make_symmetric(int64_t size, float* matrix, int64_t stride, const Make& make) {
+  for (int64_t first = 0; first < size; first += kProductColumns)
+    for (int64_t i = 0; i < size && i < first + kProductColumns; i += kProductRows) make(i, first);
+  for (int64_t i = 1; i < size; ++i)
+    for (int64_t j = 0; j < i; ++j) matrix[i * stride + j] = matrix[j * stride + i];
+}
+
 inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
@@ -24,7 +34,8 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   const int64_t few = upright ? of.columns : of.rows, many = upright ? of.rows : of.columns;
   // Padded with zeros, which stay zeros.
   const int64_t rows = whole_product_rows(few), row = muon_stride(many), square_row = muon_stride(few);
-  const int wide = int((many + lanes - 1) / lanes * lanes), narrow = int((few + lanes - 1) / lanes * lanes);
+  const int wide = int((many + lanes - 1) / lanes * lanes);
+  const int64_t panel_columns = (few + kProductColumns - 1) / kProductColumns * kProductColumns;
   const auto place = [&](int64_t i, int64_t j) { return upright ? j * row + i : i * row + j; };
 
   Room room(memory);
@@ -36,6 +47,7 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   float* const sum = room.take(rows * square_row);     // b S + c S²
 
   for (int64_t k = 0; k < rows * row; ++k) x[k] = 0;
+  for (int64_t k = few * square_row; k < rows * square_row; ++k) square[k] = 0;  // what no panel but the last is made down to
   const float beta = float(step.beta), fresh = float(1 - step.beta);
   for (int64_t i = 0; i < of.rows; ++i)
     for (int64_t j = 0; j < of.columns; ++j) {
@@ -58,18 +70,19 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
 
   for (int round = 0; round < kMuonRounds; ++round) {
     pack_panels({x, row}, few, wide, panels);
-    for (int64_t first = 0; first < few; first += kProductColumns)
-      for (int64_t i = 0; i < rows; i += kProductRows)
-        multiply_panel<kProductVectors, true>({x + i * row, row, 1}, panels + first * wide, kProductColumns, many,
-                                              square + i * square_row + first, square_row, nullptr);
+    make_symmetric(few, square, square_row, [&](int64_t i, int64_t first) {
+      multiply_panel<kProductVectors, true>({x + i * row, row, 1}, panels + first * wide, kProductColumns, many,
+                                            square + i * square_row + first, square_row, nullptr);
+    });
     for (int64_t i = 0; i < rows; ++i)
-      for (int j = 0; j < narrow; ++j) {
-        const int64_t k = i * square_row + j;
+      for (int64_t k = i * square_row; k < i * square_row + panel_columns; ++k) {
         factor[k] = kMuonC * square[k];
         sum[k] = kMuonB * square[k];
       }
-    for (int64_t i = 0; i < rows; i += kProductRows)
-      multiply_rows<false>({factor + i * square_row, square_row, 1}, square, square_row, few, sum + i * square_row, square_row, narrow);
+    make_symmetric(few, sum, square_row, [&](int64_t i, int64_t first) {
+      multiply_panel<kProductVectors, false>({factor + i * square_row, square_row, 1}, square + first, square_row, few,
+                                             sum + i * square_row + first, square_row, nullptr);
+    });
     for (int64_t k = 0; k < rows * row; ++k) next[k] = kMuonA * x[k];
     for (int64_t i = 0; i < rows; i += kProductRows)
       multiply_rows<false>({sum + i * square_row, square_row, 1}, x, row, few, next + i * row, row, wide);
