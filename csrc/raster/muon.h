@@ -47,7 +47,8 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   float* const sum = room.take(rows * square_row);     // b S + c S²
 
   for (int64_t k = 0; k < rows * row; ++k) x[k] = 0;
-  for (int64_t k = few * square_row; k < rows * square_row; ++k) square[k] = 0;  // what no panel but the last is made down to
+  // Only the last panel is made down to the rows of padding.
+  for (int64_t k = few * square_row; k < rows * square_row; ++k) square[k] = 0;
   const float beta = float(step.beta), fresh = float(1 - step.beta);
   for (int64_t i = 0; i < of.rows; ++i)
     for (int64_t j = 0; j < of.columns; ++j) {
