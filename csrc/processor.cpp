@@ -1,5 +1,6 @@
 #include "processor.h"
 
+#include <ATen/Context.h>
 #include <ATen/cpu/Utils.h>
 #include <ATen/detail/CUDAHooksInterface.h>
 
@@ -29,5 +30,7 @@ Bf16 bf16_of_cpu() {
 
 // Convolutions and matrix products need the same: compute capability 8.0.
 bool gpu_has_bf16() { return at::detail::getCUDAHooks().supportsBFloat16ConvolutionWithCuDNNv8(); }
+
+bool flush_denormals() { return at::globalContext().setFlushDenormal(true); }
 
 }  // namespace globalsplat

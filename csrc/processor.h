@@ -1,4 +1,4 @@
-// Whether there are instructions for bf16: without them its products are slower than those of float32.
+// What the processor has, and how it computes.
 #pragma once
 
 #include <cstdint>
@@ -7,10 +7,14 @@ namespace globalsplat {
 
 enum class Bf16 : uint8_t;
 
-// Of the CPU, as libtorch sees it.
+// Whether there are instructions for bf16, as libtorch sees it: without them its products are slower than those of float32.
 Bf16 bf16_of_cpu();
 
-// Of the current GPU.
+// The same of the current GPU.
 bool gpu_has_bf16();
+
+// Has this thread, and those that it starts from now on, take numbers for 0 that are too small to have all their digits. Whether the
+// processor can.
+bool flush_denormals();
 
 }  // namespace globalsplat

@@ -1,4 +1,4 @@
-//! Whether there are instructions for bf16.
+//! What the processor has, and how it computes.
 
 pub use ffi::*;
 
@@ -23,5 +23,8 @@ mod ffi {
 
         /// Of the current GPU.
         fn gpu_has_bf16() -> bool;
+
+        /// See `csrc/processor.h`.
+        fn flush_denormals() -> bool;
     }
 }

@@ -4,6 +4,7 @@ use clap::Args;
 use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
+use globalsplat::model::are_denormals_flushed;
 use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::SHIPPED_MODEL;
 use globalsplat::render::cpu::simd_level;
@@ -40,6 +41,7 @@ impl Doctor {
         let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
         let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
+        let denormals = if are_denormals_flushed() { "taken for 0" } else { "kept" };
         if self.json {
             let found: serde_json::Map<_, _> = weights
                 .into_iter()
@@ -52,6 +54,7 @@ impl Doctor {
                 "simd": simd,
                 "threads": threads,
                 "cores": cores,
+                "denormals": denormals,
                 "driver": or_error(&driver, |driver| json!(cuda_version(driver.version))),
                 "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared, &unusable)),
                 "nvrtc": or_error(&nvrtc, |nvrtc| json!({
@@ -73,6 +76,7 @@ impl Doctor {
         line("devices", &devices.join(", "));
         line("rasterizer", &format!("{simd} (GLOBALSPLAT_SIMD forces another)"));
         line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
+        line("denormals", &format!("{denormals} (many processors are slow with numbers below 1.2e-38)"));
         let of = |built: bool, without: &'static str| if built { "built in" } else { without };
         line(
             "torchrun",

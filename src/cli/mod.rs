@@ -123,6 +123,8 @@ pub fn main() -> ExitCode {
         }
     };
     memory::end_as_failed();
+    // Before there are other threads.
+    globalsplat::model::flush_denormals();
     #[cfg(target_os = "linux")]
     let _heeding = neighbours::heed();
     // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.

@@ -7,6 +7,7 @@ mod attention;
 mod camera_code;
 mod config;
 mod decoder;
+mod denormals;
 mod encoder;
 mod growth;
 mod layers;
@@ -24,6 +25,7 @@ mod tokens;
 
 pub use config::{ModelConfig, Streams};
 pub use decoder::{Decoded, RawOutputs};
+pub use denormals::{are_denormals_flushed, flush_denormals};
 pub use encoder::Encoded;
 pub use memory::Memory;
 pub use merge::Stage;
