@@ -1,0 +1,102 @@
+"""What scene tokens read of a capture's photos: by what keys are told apart, and how many patches a head looks at.
+
+    python parity/what_is_read.py --weights models/tiny.safetensors --capture DIR     DIR with a cameras.json
+
+The model is the parity checks' reference. A key is linear in an image token after its norm, and so is a value: what
+rays and colours each make of it is the root of its mean square over patches and channels, less what all patches have in
+common. A head looks at as many patches as e^entropy of its weights, the median over scene tokens, and at those of one
+view as if there were no others.
+"""
+
+import argparse
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import reference.model
+import reference.stream
+import torch
+from harness import draw
+from harness.names import reference_config
+from PIL import Image
+from reference.layers import layer_norm, linear
+from reference.normalize import normalize_scene
+from reference.tokens import view_tokens
+from safetensors import safe_open
+
+
+def read_model(path):
+    """The weights in float32, and the configuration of the whole run that they carry."""
+    with safe_open(path, "pt") as file:
+        config = tomllib.loads(file.metadata()["globalsplat.config"])
+        return {name: file.get_tensor(name).float() for name in file.keys()}, config
+
+
+def read_capture(folder, height, width):
+    """-> images [1, V, 3, H, W], normalized c2w [1, V, 4, 4], intrinsics [1, V, 3, 3] in pixels of these images."""
+    described = json.loads((folder / "cameras.json").read_text())
+    views = described["views"]
+    photos = [Image.open(folder / view["image"]).convert("RGB").resize((width, height)) for view in views]
+    images = torch.tensor(np.stack(photos)).permute(0, 3, 1, 2) / 255.0
+    c2w, _, _ = normalize_scene(torch.tensor([view["c2w"] for view in views]))
+    intrinsics = torch.tensor([view["intrinsic"] for view in views])
+    rows, columns = described["image_shape"]
+    intrinsics = intrinsics * torch.tensor([width / columns, height / rows, 1.0])[:, None]
+    return images[None], c2w[None], intrinsics[None]
+
+
+def perplexity(weights):
+    return torch.exp(torch.special.entr(weights).sum(-1))
+
+
+def look(config, params, name, slots, memory, views):
+    """A line about the read of one round of one stream, whose inputs these are."""
+    ray_width, heads = config["dim_rays"], config["num_heads"]
+    normed = layer_norm(params, f"{name}.mem_ln", memory)[0, 4:]  # of patches, without the registers
+    apart = normed - normed.mean(0)
+
+    def made_of(layer, half):
+        return (apart[:, half] @ params[f"{name}.{layer}.weight"][:, half].T).square().mean().sqrt().item()
+
+    rays, colours = slice(0, ray_width), slice(ray_width, None)
+    keys = (normed @ params[f"{name}.mem_k.weight"].T).view(len(normed), heads, -1)
+    queries = linear(params, f"{name}.lat_q", layer_norm(params, f"{name}.slots_ln", slots))[0]
+    scene = slice(draw.AUXILIARIES, draw.AUXILIARIES + config["latent_rep_token_amount"])
+    queries = queries[scene].view(-1, heads, keys.shape[-1])
+    scores = torch.einsum("qhc,khc->hqk", queries, keys) / keys.shape[-1] ** 0.5
+    patches = perplexity(scores.softmax(-1)).median().item()
+    in_view = perplexity(scores.unflatten(-1, (views, -1)).softmax(-1)).median().item()
+    made = [made_of(layer, half) for layer in ("mem_k", "mem_v") for half in (rays, colours)]
+    numbers = [f"{number:>12.3f}" for number in made] + [f"{number:>12.1f}" for number in (patches, in_view)]
+    print(f"{name.removeprefix('slot_encoder.'):<14} {' '.join(numbers)}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", type=Path, required=True)
+    parser.add_argument("--capture", type=Path, required=True)
+    options = parser.parse_args()
+    params, run = read_model(options.weights)
+    config = reference_config(draw.MAIN_16K | run["model"])
+    inputs = read_capture(options.capture, *run["data"]["image_size"])
+    with torch.no_grad():
+        halves = view_tokens(config, params, *inputs).split([config["dim_rays"], config["dim_rgb_feat"]], -1)
+    rays, colours = (half.norm(dim=-1).mean().item() for half in halves)
+    print(f"image tokens: rays, with the camera code, are {rays:.0f} long, colours {colours:.0f}")
+    columns = ["keys, rays", "colours", "values, rays", "colours", "patches", "in a view"]
+    print(f"{'':<14} {' '.join(f'{column:>12}' for column in columns)}")
+
+    read = reference.stream.read_memory
+
+    def looked_at(params, name, slots, memory, *others):
+        look(config, params, name, slots, memory, inputs[0].shape[1])
+        return read(params, name, slots, memory, *others)
+
+    reference.stream.read_memory = looked_at
+    with torch.no_grad():
+        reference.model.forward(config, params, *inputs, run["curriculum"]["final_stage"], 1.0)
+
+
+if __name__ == "__main__":
+    main()
