@@ -14,12 +14,12 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import reference.model
 import reference.stream
 import torch
 from harness import draw
 from harness.names import reference_config
 from PIL import Image
+from reference.encoder import encode
 from reference.layers import layer_norm, linear
 from reference.normalize import normalize_scene
 from reference.tokens import view_tokens
@@ -60,7 +60,7 @@ def look(config, params, name, slots, memory, views):
         return (apart[:, half] @ params[f"{name}.{layer}.weight"][:, half].T).square().mean().sqrt().item()
 
     rays, colours = slice(0, ray_width), slice(ray_width, None)
-    keys = (normed @ params[f"{name}.mem_k.weight"].T).view(len(normed), heads, -1)
+    keys = linear(params, f"{name}.mem_k", normed).view(len(normed), heads, -1)
     queries = linear(params, f"{name}.lat_q", layer_norm(params, f"{name}.slots_ln", slots))[0]
     scene = slice(draw.AUXILIARIES, draw.AUXILIARIES + config["latent_rep_token_amount"])
     queries = queries[scene].view(-1, heads, keys.shape[-1])
@@ -80,8 +80,8 @@ def main():
     params, run = read_model(options.weights)
     config = reference_config(draw.MAIN_16K | run["model"])
     inputs = read_capture(options.capture, *run["data"]["image_size"])
-    with torch.no_grad():
-        halves = view_tokens(config, params, *inputs).split([config["dim_rays"], config["dim_rgb_feat"]], -1)
+    tokens = view_tokens(config, params, *inputs)
+    halves = tokens.split([config["dim_rays"], config["dim_rgb_feat"]], -1)
     rays, colours = (half.norm(dim=-1).mean().item() for half in halves)
     print(f"image tokens: rays, with the camera code, are {rays:.0f} long, colours {colours:.0f}")
     columns = ["keys, rays", "colours", "values, rays", "colours", "patches", "in a view"]
@@ -94,8 +94,7 @@ def main():
         return read(params, name, slots, memory, *others)
 
     reference.stream.read_memory = looked_at
-    with torch.no_grad():
-        reference.model.forward(config, params, *inputs, run["curriculum"]["final_stage"], 1.0)
+    encode(config, params, tokens)
 
 
 if __name__ == "__main__":
