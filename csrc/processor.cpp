@@ -31,6 +31,6 @@ Bf16 bf16_of_cpu() {
 // Convolutions and matrix products need the same: compute capability 8.0.
 bool gpu_has_bf16() { return at::detail::getCUDAHooks().supportsBFloat16ConvolutionWithCuDNNv8(); }
 
-bool flush_denormals() { return at::globalContext().setFlushDenormal(true); }
+void flush_denormals() { at::globalContext().setFlushDenormal(true); }
 
 }  // namespace globalsplat

@@ -13,8 +13,8 @@ Bf16 bf16_of_cpu();
 // The same of the current GPU.
 bool gpu_has_bf16();
 
-// Has this thread, and those that it starts from now on, take numbers for 0 that are too small to have all their digits. Whether the
-// processor can.
-bool flush_denormals();
+// Has this thread, and those that it starts from now on, take numbers for 0 that are too small to have all their digits. Where the
+// processor can't, they stay.
+void flush_denormals();
 
 }  // namespace globalsplat

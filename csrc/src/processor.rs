@@ -25,6 +25,6 @@ mod ffi {
         fn gpu_has_bf16() -> bool;
 
         /// See `csrc/processor.h`.
-        fn flush_denormals() -> bool;
+        fn flush_denormals();
     }
 }

@@ -47,8 +47,8 @@ CASES_OF = {
 
 EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
-    "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/denormals.rs": "how the processor takes numbers that no result depends on, which its own test looks at",
+    "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
     "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
     "src/model/memory.rs": "what encoder.rs and stream.rs read, and held with them; view by view by its own test",
     "src/model/parts.rs": "tells what is done, and does nothing",

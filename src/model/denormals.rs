@@ -9,13 +9,12 @@ use std::hint::black_box;
 use std::thread;
 
 /// Has this thread take them for 0 from now on, and with it all threads that it starts, which on Linux inherit it. So it is for a
-/// program's first thread, before there are others.
+/// program's first thread, before there are others. Where the processor can't, they stay.
 ///
 /// Rust takes for granted that nobody does this: what it computes as it compiles may still have such numbers in it. The same
 /// sum may therefore be 0 here and 1e-40 there; who cares about 1e-40 should leave it alone.
 pub fn flush_denormals() {
-    // Where the processor can't, they stay.
-    let _ = ffi::flush_denormals();
+    ffi::flush_denormals();
 }
 
 /// Whether a thread that this one starts takes them for 0.
