@@ -42,8 +42,11 @@ fn the_weights_that_come_with_the_program_are_those_of_tiny() {
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
+    assert_eq!(shipped.config.data.extents, tiny.data.extents);
     assert_eq!(shipped.stage, tiny.curriculum.final_stage());
-    assert_eq!(read("fine_tune").model, tiny.model, "what goes on from them");
+    let fine_tune = read("fine_tune");
+    assert_eq!(fine_tune.model, tiny.model, "what goes on from them");
+    assert_eq!(fine_tune.data.extents, tiny.data.extents);
     let folder = folder().with_file_name("models");
     let files = std::fs::read_dir(&folder).expect("models/").map(|entry| entry.expect("an entry").path());
     let weights: Vec<PathBuf> =

@@ -128,6 +128,8 @@ impl Reconstruct {
                 "image_size": input.photo_size(data.image_size),
                 "views": views,
                 "gaussians": count,
+                "extent": reconstruction.extent,
+                "extents": data.extents,
                 "precision": loaded.model.precision(),
                 "load_seconds": parts["weights"],
                 "seconds": seconds,
@@ -138,8 +140,12 @@ impl Reconstruct {
             }));
         } else {
             let megabytes = bytes as f64 / 1e6;
+            let passes = match data.extents.len() {
+                1 => "forward pass".into(),
+                sizes => format!("{sizes} sizes of the scene tried in"),
+            };
             println!(
-                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; forward pass {seconds:.2} s, peak memory {:.2} GB",
+                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {passes} {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),
                 peak_memory_bytes() as f64 / 1e9
             );

@@ -50,6 +50,9 @@ pub struct DataConfig {
     pub captures: Vec<String>,
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,
+    /// In how many sizes a scene is shown to a model that is used, and in which: what the largest distance between two cameras
+    /// becomes. Of their splats the one that shows the model's own photos best is kept (spec 9.9). Training has 1 alone.
+    pub extents: Vec<f64>,
     /// Views the model sees of a scene in a training step, at most.
     pub context_views: usize,
     /// Where it isn't 0, every step draws how many views the model sees of its scenes: from this to `context_views`.
@@ -88,6 +91,7 @@ impl Default for DataConfig {
         DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
+            extents: vec![1.],
             context_views: 24,
             fewest_context_views: 0,
             target_views: 12,
@@ -119,7 +123,7 @@ impl DataConfig {
     /// Everything that validation's scores depend on.
     pub(crate) fn validation_settings(&self) -> String {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
-        let views = (self.image_size, self.context_views, self.target_views, self.window);
+        let views = (self.image_size, &self.extents, self.context_views, self.target_views, self.window);
         serde_json::to_string(&(scenes, views)).expect("numbers and strings")
     }
 
@@ -155,6 +159,10 @@ impl DataConfig {
         if self.fewest_context_views > self.context_views {
             let expected = format!("0 to the {} of data.context_views", self.context_views);
             return Err(Error::setting("data.fewest_context_views", self.fewest_context_views, expected));
+        }
+        if self.extents.is_empty() || !self.extents.iter().all(|extent| *extent > 0. && extent.is_finite()) {
+            let expected = "one or more numbers above 0";
+            return Err(Error::setting("data.extents", format!("{:?}", self.extents), expected));
         }
         let JitterConfig { brightness, contrast, saturation, hue } = self.jitter;
         for (field, value, largest) in [

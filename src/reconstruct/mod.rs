@@ -20,9 +20,10 @@ use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::LentWeights;
+use crate::loss::mse;
 use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
-use crate::render::transform;
-use crate::scene::{Gaussians, Similarity, normalize};
+use crate::render::{render_views, transform};
+use crate::scene::{Camera, Gaussians, Normalization, Similarity, normalize};
 use glam::DMat4;
 use std::time::{Duration, Instant};
 use tch::Device;
@@ -58,11 +59,13 @@ pub struct Reconstruction {
     pub tokens: Encoded,
     /// One scene, in the normalized world.
     pub gaussians: Gaussians,
+    /// The largest distance between two cameras in the normalized world.
+    pub extent: f64,
     /// Normalized world to the capture's.
     pub world_from_normalized: Similarity,
     /// The other cameras that were normalized along, camera-to-world.
     pub target_poses: Vec<DMat4>,
-    /// From views in memory to Gaussians.
+    /// From views in memory to Gaussians, in all sizes of the scene together.
     pub forward_time: Duration,
 }
 
@@ -73,18 +76,20 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model over `photos`, which become the views that it sees ([`Input`]). `targets` are poses (camera-to-world, in the
-/// capture's world) of target views: they take part in the normalization, as in the paper's protocol. A photo does so once,
-/// whatever it becomes.
+/// Runs the model over `photos`, which become the views that it sees ([`Input`]): once for each of `data.extents` of its
+/// configuration, the sizes in which it is shown the scene. The splat that shows the photos best is kept. `targets` are poses
+/// (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the paper's protocol.
+/// A photo does so once, whatever it becomes.
 ///
 /// # Errors
-/// Fewer than two photos, images that the model's patches don't divide, cameras without a mean direction.
+/// Fewer than two photos, images that the model's patches don't divide, cameras without a mean direction, photos that can't be
+/// rendered.
 pub fn reconstruct<'a>(
     model: impl Into<Model<'a>>,
     photos: &[View],
     targets: &[DMat4],
 ) -> Result<Reconstruction> {
-    let Model { network, config, stage, device, input, lent } = model.into();
+    let model = model.into();
     if photos.len() < 2 {
         return Err(Error::Request(format!(
             "a reconstruction needs two views or more, found {}",
@@ -94,16 +99,42 @@ pub fn reconstruct<'a>(
     let poses: Vec<DMat4> =
         photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
-    let (photo_poses, target_poses) = normalization.c2w.split_at(photos.len());
-    let (mut views, mut poses) = (vec![], vec![]);
-    for (photo, &pose) in photos.iter().zip(photo_poses) {
-        views.extend(input.views(photo)?);
-        poses.resize(views.len(), pose);
+    let views = photos.iter().map(|photo| model.input.views(photo)).collect::<Result<Vec<_>>>()?;
+
+    let extents = &model.config.data.extents;
+    let start = Instant::now();
+    let mut best: Option<(f64, Reconstruction)> = None;
+    for &extent in extents {
+        let Normalization { c2w, world_from_normalized } = normalization.of_extent(extent);
+        let (photo_poses, target_poses) = c2w.split_at(photos.len());
+        let (tokens, gaussians) = pass(model, &views, photo_poses)?;
+        let error = if extents.len() > 1 { error_of(&gaussians, photos, photo_poses)? } else { 0. };
+        if best.as_ref().is_none_or(|(least, _)| error.total_cmp(least).is_lt()) {
+            let target_poses = target_poses.to_vec();
+            let forward_time = start.elapsed();
+            let made = Reconstruction {
+                tokens,
+                gaussians,
+                extent,
+                world_from_normalized,
+                target_poses,
+                forward_time,
+            };
+            best = Some((error, made));
+        }
     }
+    let (_, made) = best.ok_or_else(|| Error::setting("data.extents", "[]", "one or more numbers"))?;
+    Ok(Reconstruction { forward_time: start.elapsed(), ..made })
+}
+
+/// What the model makes of `views`, those of each photo, seen from the photos' `poses` in a normalized world.
+fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, Gaussians)> {
+    let Model { network, config, stage, device, lent, .. } = model;
+    let posed =
+        views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
+    let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
     let ViewBatch { images, c2w, intrinsics, .. } = view_batch(&views, &poses, device);
     config.model.check_image(images.size()[3], images.size()[4])?;
-
-    let start = Instant::now();
     let pass = || {
         let memory = network.memory(&images, &c2w, &intrinsics);
         drop(images);
@@ -125,12 +156,15 @@ pub fn reconstruct<'a>(
         None => pass(),
     });
     // Bringing the Gaussians to the host also waits for a GPU.
-    let gaussians = decoded.gaussians.to_device(tch::Device::Cpu);
-    Ok(Reconstruction {
-        tokens: encoded,
-        gaussians,
-        world_from_normalized: normalization.world_from_normalized,
-        target_poses: target_poses.to_vec(),
-        forward_time: start.elapsed(),
-    })
+    Ok((encoded, decoded.gaussians.to_device(Device::Cpu)))
+}
+
+/// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.
+fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
+    let cameras: Vec<Camera> =
+        photos.iter().zip(poses).map(|(photo, &c2w)| Camera { c2w, ..photo.camera }).collect();
+    let rendered = render_views(gaussians, &cameras)?;
+    let errors =
+        rendered.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
+    Ok(errors.sum::<f64>() / photos.len() as f64)
 }

@@ -44,6 +44,22 @@ pub struct Normalization {
     pub world_from_normalized: Similarity,
 }
 
+impl Normalization {
+    /// The same in a world in which the largest distance between two camera centres is `extent` in place of 1 (spec 9.9).
+    pub fn of_extent(&self, extent: f64) -> Self {
+        let moved = |pose: &DMat4| {
+            let mut pose = *pose;
+            pose.w_axis = (pose.w_axis.truncate() * extent).extend(1.);
+            pose
+        };
+        let scale = self.world_from_normalized.scale / extent;
+        Normalization {
+            c2w: self.c2w.iter().map(moved).collect(),
+            world_from_normalized: Similarity { scale, ..self.world_from_normalized },
+        }
+    }
+}
+
 /// Moves the mean camera to the origin, looking along z, and makes the largest distance between two camera centres 1.
 ///
 /// # Errors
@@ -84,4 +100,31 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     let world_from_normalized =
         Similarity { rotation: DMat3::from_mat4(average), translation: mean(3), scale };
     Ok(Normalization { c2w, world_from_normalized })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn in_any_size_the_cameras_are_the_captures() {
+        let pose = |x: f64, z: f64, turn: f64| {
+            DMat4::from_translation(DVec3::new(x, 0.5 * x, z)) * DMat4::from_rotation_y(turn)
+        };
+        let original = [pose(0., 0., 0.), pose(3., 0.4, 0.2), pose(-1., 4., -0.3)];
+        for extent in [0.25, 1., 3.] {
+            let Normalization { c2w, world_from_normalized } =
+                normalize(&original).unwrap().of_extent(extent);
+            let centres: Vec<DVec3> = c2w.iter().map(|pose| pose.w_axis.truncate()).collect();
+            let distances = [(0, 1), (0, 2), (1, 2)].map(|(a, b)| centres[a].distance(centres[b]));
+            assert!((distances.into_iter().fold(0., f64::max) - extent).abs() < 1e-12, "{distances:?}");
+            for (pose, before) in c2w.iter().zip(&original) {
+                let Similarity { rotation, translation, scale } = world_from_normalized;
+                let centre = scale * (rotation * pose.w_axis.truncate()) + translation;
+                assert!(centre.distance(before.w_axis.truncate()) < 1e-12);
+                let axes = rotation * DMat3::from_mat4(*pose);
+                assert!(axes.abs_diff_eq(DMat3::from_mat4(*before), 1e-12));
+            }
+        }
+    }
 }

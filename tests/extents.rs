@@ -1,0 +1,76 @@
+//! A scene is shown in several sizes, and the splat that shows the photos best is kept (spec 9.9).
+
+mod common;
+
+use common::program::{arg, refuse, succeed, tiny_config};
+use globalsplat::data::{View, open_capture, write_room};
+use globalsplat::loss::{mse, psnr_of_mse};
+use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, shipped_model};
+use globalsplat::render::render_views;
+use serde_json::Value;
+use tch::Device;
+
+/// What the model makes of `photos` shown in `extents`.
+fn made_of(photos: &[View], model: &mut LoadedModel, extents: &[f64]) -> Reconstruction {
+    model.config.data.extents = extents.to_vec();
+    reconstruct(&*model, photos, &[]).unwrap()
+}
+
+/// PSNR of the splat in the capture's world, where its own cameras see it.
+fn psnr(made: &Reconstruction, photos: &[View]) -> f64 {
+    let cameras: Vec<_> = photos.iter().map(|photo| photo.camera).collect();
+    let pictures = render_views(&made.in_world(), &cameras).unwrap();
+    let errors =
+        pictures.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
+    psnr_of_mse(errors.sum::<f64>() / photos.len() as f64)
+}
+
+#[test]
+fn the_splat_that_shows_the_photos_best_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    write_room(folder.path(), 3, 8, [96, 96].into()).unwrap();
+    let mut model = shipped_model(Device::Cpu).unwrap();
+    let size = model.config.data.image_size;
+    let photos =
+        load_context(&open_capture(folder.path()).unwrap(), "none".parse().unwrap(), None, size).unwrap();
+
+    let extents = [0.2, 0.5, 1., 2., 5.];
+    let alone = extents.map(|extent| psnr(&made_of(&photos, &mut model, &[extent]), &photos));
+    let best = (0..extents.len()).max_by(|&a, &b| alone[a].total_cmp(&alone[b])).unwrap();
+    assert!(alone.iter().all(|&psnr| psnr == alone[best] || psnr < alone[best] - 0.05), "{alone:?} tell");
+    for order in [[0, 1, 2, 3, 4], [4, 3, 2, 1, 0]] {
+        let kept = made_of(&photos, &mut model, &order.map(|i| extents[i]));
+        assert_eq!(kept.extent, extents[best], "{alone:?}");
+        assert!((psnr(&kept, &photos) - alone[best]).abs() < 1e-4);
+    }
+}
+
+#[test]
+fn reconstruct_tells_which() {
+    let folder = tempfile::tempdir().unwrap();
+    let (room, out) = (folder.path().join("room"), folder.path().join("room.ply"));
+    write_room(&room, 3, 8, [96, 96].into()).unwrap();
+    let shipped = shipped_model(Device::Cpu).unwrap().config.data.extents;
+    assert!(shipped.len() > 1);
+    let arguments = ["reconstruct", "--scene", arg(&room), "--out", arg(&out)];
+    let told: Value = serde_json::from_str(&succeed(&[&arguments[..], &["--json"]].concat())).unwrap();
+    assert_eq!(serde_json::from_value::<Vec<f64>>(told["extents"].clone()).unwrap(), shipped);
+    assert!(shipped.contains(&told["extent"].as_f64().unwrap()));
+    assert!(succeed(&arguments).contains(&format!("{} sizes of the scene tried in", shipped.len())));
+}
+
+#[test]
+fn a_scene_has_a_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let room = folder.path().join("room");
+    write_room(&room, 3, 8, [32, 32].into()).unwrap();
+    let config = tiny_config(folder.path(), &room);
+    let run = folder.path().join("run");
+    for (extents, found) in [("[]", "[]"), ("[1, 0]", "[1.0, 0.0]"), ("[inf]", "[inf]"), ("[nan]", "[NaN]")] {
+        let set = format!("data.extents={extents}");
+        let error = refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", &set]);
+        let expected = format!("data.extents is {found}, expected one or more numbers above 0");
+        assert!(error.contains(&expected), "{error}");
+    }
+    assert!(!run.exists(), "nothing was begun");
+}
