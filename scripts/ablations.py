@@ -26,6 +26,7 @@ SETTINGS = [
     "model.patch_size=16",
     "model.latents=256",
     "data.image_size=[64, 64]",
+    "data.extents=[1]",
     "data.context_views=8",
     "data.fewest_context_views=0",
     "data.window=[8, 12]",
