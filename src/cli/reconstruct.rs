@@ -128,8 +128,8 @@ impl Reconstruct {
                 "image_size": input.photo_size(data.image_size),
                 "views": views,
                 "gaussians": count,
-                "extent": reconstruction.extent,
-                "extents": data.extents,
+                "extent": reconstruction.placement.extent,
+                "forward": reconstruction.placement.forward,
                 "precision": loaded.model.precision(),
                 "load_seconds": parts["weights"],
                 "seconds": seconds,
@@ -140,10 +140,8 @@ impl Reconstruct {
             }));
         } else {
             let megabytes = bytes as f64 / 1e6;
-            let passes = match data.extents.len() {
-                1 => "forward pass".into(),
-                sizes => format!("{sizes} sizes of the scene tried in"),
-            };
+            let passes =
+                if data.extents.len() == 1 { "forward pass" } else { "scene shown in several sizes," };
             println!(
                 "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {passes} {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),

@@ -50,8 +50,8 @@ pub struct DataConfig {
     pub captures: Vec<String>,
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,
-    /// In how many sizes a scene is shown to a model that is used, and in which: what the largest distance between two cameras
-    /// becomes. Of their splats the one that shows the model's own photos best is kept (spec 9.9). Training has 1 alone.
+    /// In which sizes a scene is shown to a model that is used: what the largest distance between two cameras becomes. Of several,
+    /// and of what lies around the best, the splat that shows the photos best is kept (spec 9.9). Training has 1 alone.
     pub extents: Vec<f64>,
     /// Views the model sees of a scene in a training step, at most.
     pub context_views: usize,

@@ -4,6 +4,7 @@
 mod context;
 mod input;
 mod model_file;
+mod placing;
 mod published;
 mod spread;
 
@@ -20,12 +21,12 @@ use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::LentWeights;
-use crate::loss::mse;
 use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
-use crate::render::{render_views, transform};
-use crate::scene::{Camera, Gaussians, Normalization, Similarity, normalize};
+use crate::render::transform;
+use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::DMat4;
-use std::time::{Duration, Instant};
+use placing::best_placed;
+use std::time::Duration;
 use tch::Device;
 
 /// A model to be used: one from a file, or one that is being trained.
@@ -59,13 +60,13 @@ pub struct Reconstruction {
     pub tokens: Encoded,
     /// One scene, in the normalized world.
     pub gaussians: Gaussians,
-    /// The largest distance between two cameras in the normalized world.
-    pub extent: f64,
+    /// Where in the normalized world the cameras were.
+    pub placement: Placement,
     /// Normalized world to the capture's.
     pub world_from_normalized: Similarity,
     /// The other cameras that were normalized along, camera-to-world.
     pub target_poses: Vec<DMat4>,
-    /// From views in memory to Gaussians, in all sizes of the scene together.
+    /// From views in memory to Gaussians, all passes together.
     pub forward_time: Duration,
 }
 
@@ -76,10 +77,10 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model over `photos`, which become the views that it sees ([`Input`]): once for each of `data.extents` of its
-/// configuration, the sizes in which it is shown the scene. The splat that shows the photos best is kept. `targets` are poses
-/// (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the paper's protocol.
-/// A photo does so once, whatever it becomes.
+/// Runs the model over `photos`, which become the views that it sees ([`Input`]). Where its configuration has several
+/// `data.extents` it is shown the scene in each of these sizes, and nudged, and the splat that shows the photos best is kept.
+/// `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the
+/// paper's protocol. A photo does so once, whatever it becomes.
 ///
 /// # Errors
 /// Fewer than two photos, images that the model's patches don't divide, cameras without a mean direction, photos that can't be
@@ -100,31 +101,7 @@ pub fn reconstruct<'a>(
         photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
     let views = photos.iter().map(|photo| model.input.views(photo)).collect::<Result<Vec<_>>>()?;
-
-    let extents = &model.config.data.extents;
-    let start = Instant::now();
-    let mut best: Option<(f64, Reconstruction)> = None;
-    for &extent in extents {
-        let Normalization { c2w, world_from_normalized } = normalization.of_extent(extent);
-        let (photo_poses, target_poses) = c2w.split_at(photos.len());
-        let (tokens, gaussians) = pass(model, &views, photo_poses)?;
-        let error = if extents.len() > 1 { error_of(&gaussians, photos, photo_poses)? } else { 0. };
-        if best.as_ref().is_none_or(|(least, _)| error.total_cmp(least).is_lt()) {
-            let target_poses = target_poses.to_vec();
-            let forward_time = start.elapsed();
-            let made = Reconstruction {
-                tokens,
-                gaussians,
-                extent,
-                world_from_normalized,
-                target_poses,
-                forward_time,
-            };
-            best = Some((error, made));
-        }
-    }
-    let (_, made) = best.ok_or_else(|| Error::setting("data.extents", "[]", "one or more numbers"))?;
-    Ok(Reconstruction { forward_time: start.elapsed(), ..made })
+    best_placed(model, photos, &views, &normalization)
 }
 
 /// What the model makes of `views`, those of each photo, seen from the photos' `poses` in a normalized world.
@@ -157,14 +134,4 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, 
     });
     // Bringing the Gaussians to the host also waits for a GPU.
     Ok((encoded, decoded.gaussians.to_device(Device::Cpu)))
-}
-
-/// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.
-fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
-    let cameras: Vec<Camera> =
-        photos.iter().zip(poses).map(|(photo, &c2w)| Camera { c2w, ..photo.camera }).collect();
-    let rendered = render_views(gaussians, &cameras)?;
-    let errors =
-        rendered.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
-    Ok(errors.sum::<f64>() / photos.len() as f64)
 }

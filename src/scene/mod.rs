@@ -13,7 +13,7 @@ pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
 pub(crate) use camera::{check_pose, nearest_rigid};
 pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
-pub use normalize::{Normalization, Similarity, normalize};
+pub use normalize::{Normalization, Placement, Similarity, normalize};
 pub(crate) use rays::plucker_rays;
 pub use smooth_path::smooth_path;
 pub use trajectory::{orbit_around_cameras, orbit_around_point};

@@ -44,18 +44,37 @@ pub struct Normalization {
     pub world_from_normalized: Similarity,
 }
 
+/// Where in a normalized world a scene's cameras are, and how far apart (spec 9.9). That of spec 2.1 and 2.2 has the extent 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placement {
+    /// The largest distance between two camera centres, above 0.
+    pub extent: f64,
+    /// The mean camera's place on the z axis, along which it looks.
+    pub forward: f64,
+}
+
+impl Placement {
+    /// So much further forward, and larger by a factor that has this logarithm.
+    pub fn nudged(&self, [forward, larger]: [f64; 2]) -> Self {
+        Placement { extent: self.extent * larger.exp(), forward: self.forward + forward }
+    }
+}
+
 impl Normalization {
-    /// The same in a world in which the largest distance between two camera centres is `extent` in place of 1 (spec 9.9).
-    pub fn of_extent(&self, extent: f64) -> Self {
+    /// The same cameras, placed otherwise; these here have an extent of 1 and stand at 0.
+    pub fn placed(&self, Placement { extent, forward }: Placement) -> Self {
+        let offset = DVec3::Z * forward;
         let moved = |pose: &DMat4| {
             let mut pose = *pose;
-            pose.w_axis = (pose.w_axis.truncate() * extent).extend(1.);
+            pose.w_axis = (pose.w_axis.truncate() * extent + offset).extend(1.);
             pose
         };
-        let scale = self.world_from_normalized.scale / extent;
+        let Similarity { rotation, translation, scale } = self.world_from_normalized;
+        let scale = scale / extent;
+        let translation = translation - scale * (rotation * offset);
         Normalization {
             c2w: self.c2w.iter().map(moved).collect(),
-            world_from_normalized: Similarity { scale, ..self.world_from_normalized },
+            world_from_normalized: Similarity { rotation, translation, scale },
         }
     }
 }
@@ -107,17 +126,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn in_any_size_the_cameras_are_the_captures() {
+    fn in_any_place_the_cameras_are_the_captures() {
         let pose = |x: f64, z: f64, turn: f64| {
             DMat4::from_translation(DVec3::new(x, 0.5 * x, z)) * DMat4::from_rotation_y(turn)
         };
         let original = [pose(0., 0., 0.), pose(3., 0.4, 0.2), pose(-1., 4., -0.3)];
-        for extent in [0.25, 1., 3.] {
-            let Normalization { c2w, world_from_normalized } =
-                normalize(&original).unwrap().of_extent(extent);
+        for (extent, forward) in [(1., 0.), (0.25, 0.5), (3., -0.2)] {
+            let placed = normalize(&original).unwrap().placed(Placement { extent, forward });
+            let Normalization { c2w, world_from_normalized } = placed;
             let centres: Vec<DVec3> = c2w.iter().map(|pose| pose.w_axis.truncate()).collect();
             let distances = [(0, 1), (0, 2), (1, 2)].map(|(a, b)| centres[a].distance(centres[b]));
             assert!((distances.into_iter().fold(0., f64::max) - extent).abs() < 1e-12, "{distances:?}");
+            let mean = centres.iter().sum::<DVec3>() / 3.;
+            assert!(mean.abs_diff_eq(DVec3::Z * forward, 1e-12), "{mean}");
             for (pose, before) in c2w.iter().zip(&original) {
                 let Similarity { rotation, translation, scale } = world_from_normalized;
                 let centre = scale * (rotation * pose.w_axis.truncate()) + translation;
