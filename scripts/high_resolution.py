@@ -9,6 +9,7 @@ Prints a Markdown table for each capture. What is done stays done.
 
 import argparse
 from pathlib import Path
+from zlib import crc32
 
 from core_runs import row, told_once
 
@@ -22,7 +23,9 @@ def scored(arguments, capture, setting, phase, pictures):
     command += ["--views", str(arguments.views), "--pictures-at", str(pictures)]
     if setting != "small":
         command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
-    return told_once(arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json", *command)
+    # Other weights in the same place aren't these.
+    weights = f"{crc32(Path(arguments.weights).read_bytes()):08x}"
+    return told_once(arguments.out / f"{Path(folder).name}.{weights}.{setting}.{phase}.{pictures}.json", *command)
 
 
 def main():
@@ -38,7 +41,7 @@ def main():
     arguments.out.mkdir(parents=True, exist_ok=True)
     for capture in arguments.capture:
         print(f"\n{Path(capture[0]).name}:\n")
-        row("shown", "views", *(f"pictures of {size}×{size}" for size in arguments.pictures), "forward pass, s")
+        row("shown", "views", *(f"pictures of {size}×{size}" for size in arguments.pictures), "passes, s")
         row(*["---"] * (3 + len(arguments.pictures)))
         settings = [("small", 1)] + [(name, phase) for phase in arguments.phase for name in SETTINGS if name != "small"]
         for name, phase in settings:

@@ -23,7 +23,7 @@ STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
 # Where the model begins with nothing; small patches and many scene tokens are for weights that know large and few ones, and Muon is
-# for those. Scenes are shown in one size (spec 9.9), which is what the shapes differ in.
+# for those. What is judged sees a scene in one size, as a single pass tells more of a shape than the best of several (spec 9.9).
 BASE = ["model.patch_size=16", "model.latents=256", "train.optimizer=adamw", "data.extents=[1]"]
 VARIANTS = {
     "tiny": [],

@@ -51,7 +51,8 @@ pub struct DataConfig {
     /// [height, width] that images are fitted to.
     pub image_size: ImageSize,
     /// In which sizes a scene is shown to a model that is used: what the largest distance between two cameras becomes. Of several,
-    /// and of what lies around the best, the splat that shows the photos best is kept (spec 9.9). Training has 1 alone.
+    /// and of what lies around the best, the splat that shows the photos best is kept (spec 9.9): in validation, too. Training has 1
+    /// alone.
     pub extents: Vec<f64>,
     /// Views the model sees of a scene in a training step, at most.
     pub context_views: usize,
@@ -123,8 +124,13 @@ impl DataConfig {
     /// Everything that validation's scores depend on.
     pub(crate) fn validation_settings(&self) -> String {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
-        let views = (self.image_size, &self.extents, self.context_views, self.target_views, self.window);
-        serde_json::to_string(&(scenes, views)).expect("numbers and strings")
+        let views = (self.image_size, self.context_views, self.target_views, self.window);
+        // As runs tell it that began before there were extents.
+        let settings = match self.extents == [1.] {
+            true => serde_json::to_string(&(scenes, views)),
+            false => serde_json::to_string(&(scenes, views, &self.extents)),
+        };
+        settings.expect("numbers and strings")
     }
 
     /// `validation` with environment variables filled in.

@@ -56,7 +56,7 @@ pub struct Summary {
 /// What reconstructing a scene costs.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Efficiency {
-    /// Mean seconds of the forward pass from views in memory to Gaussians, without scenes that warmed up, where there are
+    /// Mean seconds of the forward pass, or passes, from views in memory to Gaussians, without scenes that warmed up, where there are
     /// others.
     pub forward_seconds: f64,
     /// Scenes that the mean is of.
@@ -86,7 +86,7 @@ pub struct SceneScores {
     /// Size of the splat as a PLY, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub splat_bytes: Option<u64>,
-    /// Of the forward pass, where a model was run.
+    /// Of the forward pass, or passes, where a model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_seconds: Option<f64>,
     /// Whether the scene was the process's first, whose time includes that of warming up.

@@ -36,7 +36,7 @@ pub struct Synthesis {
     pub gaussians: Option<i64>,
     /// Of the PLY that the splat is, or would be.
     pub splat_bytes: Option<u64>,
-    /// Of a model's forward pass.
+    /// Of a model's forward pass, or passes.
     pub forward_seconds: Option<f64>,
 }
 

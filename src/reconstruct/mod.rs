@@ -1,4 +1,4 @@
-//! Posed photos to a splat: a model from its file, views that are chosen and fitted, one forward pass, and the way back to the
+//! Posed photos to a splat: a model from its file, views that are chosen and fitted, a forward pass, and the way back to the
 //! capture's world.
 
 mod context;

@@ -2,8 +2,9 @@
 
 use super::{Model, Reconstruction, pass};
 use crate::data::View;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::loss::mse;
+use crate::model::Encoded;
 use crate::render::render_views;
 use crate::scene::{Camera, Gaussians, Normalization, Placement};
 use glam::DMat4;
@@ -19,7 +20,7 @@ const ROUNDS: [f64; 2] = [1., 0.5];
 /// shows `photos` best. `normalization` has the poses of photos and then of targets.
 ///
 /// # Errors
-/// Those of a pass and of rendering; no extents at all.
+/// Those of a pass and of rendering.
 pub(super) fn best_placed(
     model: Model,
     photos: &[View],
@@ -29,43 +30,52 @@ pub(super) fn best_placed(
     let extents = &model.config.data.extents;
     let several = extents.len() > 1;
     let start = Instant::now();
-    let attempt = |placement: Placement| -> Result<(f64, Reconstruction)> {
-        let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
-        let (photo_poses, target_poses) = c2w.split_at(photos.len());
-        let (tokens, gaussians) = pass(model, views, photo_poses)?;
-        let error = if several { error_of(&gaussians, photos, photo_poses)? } else { 0. };
-        let (target_poses, forward_time) = (target_poses.to_vec(), start.elapsed());
-        let made = Reconstruction {
-            tokens,
-            gaussians,
-            placement,
-            world_from_normalized,
-            target_poses,
-            forward_time,
-        };
-        Ok((error, made))
+    let attempt = |placement: Placement| -> Result<Attempt> {
+        let poses = &normalization.placed(placement).c2w[..photos.len()];
+        let (tokens, gaussians) = pass(model, views, poses)?;
+        let error = if several { error_of(&gaussians, photos, poses)? } else { 0. };
+        Ok(Attempt { error, placement, tokens, gaussians })
     };
 
-    let mut best: Option<(f64, Reconstruction)> = None;
-    for &extent in extents {
-        let tried = attempt(Placement { extent, forward: 0. })?;
-        if best.as_ref().is_none_or(|(least, _)| tried.0.total_cmp(least).is_lt()) {
-            best = Some(tried);
-        }
+    let mut attempts = extents.iter().map(|&extent| attempt(Placement { extent, forward: 0. }));
+    let mut best = attempts.next().expect("a configuration that was checked has an extent")?;
+    for tried in attempts {
+        best.give_way(tried?);
     }
-    let mut best = best.ok_or_else(|| Error::setting("data.extents", "[]", "one or more numbers above 0"))?;
     for share in ROUNDS.into_iter().filter(|_| several) {
         for nudge in NUDGES {
             for way in [share, -share] {
-                let tried = attempt(best.1.placement.nudged(nudge.map(|by| way * by)))?;
-                if tried.0 < best.0 {
-                    best = tried;
+                if best.give_way(attempt(best.placement.nudged(nudge.map(|by| way * by)))?) {
                     break;
                 }
             }
         }
     }
-    Ok(Reconstruction { forward_time: start.elapsed(), ..best.1 })
+    let Attempt { placement, tokens, gaussians, .. } = best;
+    let forward_time = start.elapsed();
+    let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
+    let target_poses = c2w[photos.len()..].to_vec();
+    Ok(Reconstruction { tokens, gaussians, placement, world_from_normalized, target_poses, forward_time })
+}
+
+/// What a pass made.
+struct Attempt {
+    /// Of its pictures beside the photos; 0 where there is no other attempt.
+    error: f64,
+    placement: Placement,
+    tokens: Encoded,
+    gaussians: Gaussians,
+}
+
+impl Attempt {
+    /// Becomes `other` if that is better, and tells. Any error is better than none that is a number.
+    fn give_way(&mut self, other: Attempt) -> bool {
+        let better = other.error < self.error || (self.error.is_nan() && !other.error.is_nan());
+        if better {
+            *self = other;
+        }
+        better
+    }
 }
 
 /// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.

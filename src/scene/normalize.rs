@@ -40,7 +40,7 @@ impl Similarity {
 pub struct Normalization {
     /// The poses in the normalized world, camera-to-world, in the order given.
     pub c2w: Vec<DMat4>,
-    /// Normalized world to the capture's own; its scale is the largest distance between two camera centres.
+    /// Normalized world to the capture's own; its scale is the largest distance between two camera centres there, by the extent here.
     pub world_from_normalized: Similarity,
 }
 

@@ -66,7 +66,7 @@ pub fn efficiency(entries: &[Entry]) -> Markup {
     html! {
         section {
             h2 { "Efficiency" }
-            p { "Time is one forward pass from views in memory to Gaussians; the first is discarded. Memory is the peak. "
+            p { "Time is the forward pass, or passes, from views in memory to Gaussians; the first scene's is discarded. Memory is the peak. "
                 "Times of different machines don't compare." }
             (table("Cost of a reconstruction", &head, body))
         }
