@@ -68,7 +68,7 @@ struct Attempt {
 }
 
 impl Attempt {
-    /// Becomes `other` if that is better, and tells. Any error is better than none that is a number.
+    /// Becomes `other` if that is better, and tells whether. Any number is better than NaN.
     fn give_way(&mut self, other: Attempt) -> bool {
         let better = other.error < self.error || (self.error.is_nan() && !other.error.is_nan());
         if better {
