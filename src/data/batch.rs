@@ -23,9 +23,13 @@ pub struct ViewBatch {
 /// Puts views of one size together; `poses` (camera-to-world) stand for the views' own, as after normalization.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
     let images: Vec<&Tensor> = views.iter().map(|view| &view.borrow().image).collect();
-    let cameras = views.iter().zip(poses).map(|(view, &c2w)| Camera { c2w, ..view.borrow().camera });
     let images = Tensor::stack(&images, 0).unsqueeze(0).to_device(device);
-    ViewBatch::with_images(images, &[view_matrices(&cameras.collect::<Vec<_>>(), device)])
+    ViewBatch::with_images(images, &[view_matrices(&cameras_at(views, poses), device)])
+}
+
+/// The cameras of `views`, at `poses` instead of their own.
+pub(crate) fn cameras_at<V: Borrow<View>>(views: &[V], poses: &[DMat4]) -> Vec<Camera> {
+    views.iter().zip(poses).map(|(view, &c2w)| Camera { c2w, ..view.borrow().camera }).collect()
 }
 
 /// c2w, w2c and intrinsics, [1, V, …] each.

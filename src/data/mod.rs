@@ -12,6 +12,7 @@ mod pixels;
 mod polyphase;
 mod room;
 
+pub(crate) use batch::cameras_at;
 pub use batch::{ViewBatch, view_batch};
 pub use capture::{Capture, View};
 pub use config::{DataConfig, JitterConfig, Sampling};

@@ -4,12 +4,12 @@ use super::memory::{device_memory_bytes, peak_memory_bytes};
 use super::perceptual::Perceptual;
 use super::scene::EvalScene;
 use super::scores::{CaptureScores, score};
-use crate::data::View;
+use crate::data::{View, cameras_at};
 use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
 use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
-use crate::scene::{Camera, ImageSize};
+use crate::scene::ImageSize;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 use tch::Tensor;
@@ -186,8 +186,7 @@ pub(super) fn synthesize_views(
 ) -> Result<(Reconstruction, Vec<Rendered>)> {
     let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
     let reconstruction = reconstruct(model, context, &poses)?;
-    let normalized = target.iter().zip(&reconstruction.target_poses);
-    let cameras: Vec<Camera> = normalized.map(|(view, &c2w)| Camera { c2w, ..view.camera }).collect();
+    let cameras = cameras_at(target, &reconstruction.target_poses);
     let rendered = render_views(&reconstruction.gaussians, &cameras)?;
     Ok((reconstruction, rendered))
 }

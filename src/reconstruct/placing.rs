@@ -1,12 +1,12 @@
 //! In which size and place a model sees a scene: the best of several, judged by the photos that it is shown (spec 9.9).
 
 use super::{Model, Reconstruction, pass};
-use crate::data::View;
+use crate::data::{View, cameras_at};
 use crate::error::Result;
 use crate::loss::mse;
 use crate::model::Encoded;
 use crate::render::render_views;
-use crate::scene::{Camera, Gaussians, Normalization, Placement};
+use crate::scene::{Gaussians, Normalization, Placement};
 use glam::DMat4;
 use std::time::Instant;
 
@@ -80,9 +80,7 @@ impl Attempt {
 
 /// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.
 fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
-    let cameras: Vec<Camera> =
-        photos.iter().zip(poses).map(|(photo, &c2w)| Camera { c2w, ..photo.camera }).collect();
-    let rendered = render_views(gaussians, &cameras)?;
+    let rendered = render_views(gaussians, &cameras_at(photos, poses))?;
     let errors =
         rendered.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
     Ok(errors.sum::<f64>() / photos.len() as f64)
