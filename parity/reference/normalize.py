@@ -3,6 +3,7 @@
 import torch
 
 SMALLEST_SCALE = 1e-12  # a camera constellation no wider than this keeps its scale
+SMALLEST_DIRECTION = 1e-6  # a mean of directions no longer than this points nowhere
 METRIC_FAR = 4.0 * 10.0  # far bound of the frustum loss before division by the scene scale
 
 
@@ -11,17 +12,17 @@ def unit(v):
 
 
 def average_pose(c2w):
-    """c2w [C, 4, 4] -> the mean camera [4, 4]: columns (right, down, forward), origin at the mean centre."""
-    forward = unit(c2w[:, :3, 2].mean(0))
-    down = c2w[:, :3, 1].mean(0)
-    right = unit(torch.linalg.cross(down, forward))
-    down = unit(torch.linalg.cross(forward, right))
+    """c2w [C, 4, 4] -> the mean camera [4, 4]: columns (right, down, forward), origin at the mean centre.
 
-    pose = torch.eye(4, dtype=c2w.dtype, device=c2w.device)
-    pose[:3, 0] = right
-    pose[:3, 1] = down
-    pose[:3, 2] = forward
+    Columns of the first camera where directions cancel out.
+    """
+    pose = c2w[0].clone()
     pose[:3, 3] = c2w[:, :3, 3].mean(0)
+    forward = c2w[:, :3, 2].mean(0)
+    right = torch.linalg.cross(c2w[:, :3, 1].mean(0), unit(forward))
+    if forward.norm() > SMALLEST_DIRECTION and right.norm() > SMALLEST_DIRECTION:
+        forward, right = unit(forward), unit(right)
+        pose[:3, :3] = torch.stack([right, unit(torch.linalg.cross(forward, right)), forward], dim=-1)
     return pose
 
 

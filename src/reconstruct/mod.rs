@@ -83,8 +83,7 @@ impl Reconstruction {
 /// paper's protocol. A photo does so once, whatever it becomes.
 ///
 /// # Errors
-/// Fewer than two photos, images that the model's patches don't divide, cameras without a mean direction, photos that can't be
-/// rendered.
+/// Fewer than two photos, images that the model's patches don't divide, photos that can't be rendered.
 pub fn reconstruct<'a>(
     model: impl Into<Model<'a>>,
     photos: &[View],

@@ -79,23 +79,29 @@ impl Normalization {
     }
 }
 
-/// Moves the mean camera to the origin, looking along z, and makes the largest distance between two camera centres 1.
+/// Moves the mean camera to the origin, looking along z, and makes the largest distance between two camera centres 1. Where directions
+/// cancel out, as of cameras all around a thing, the first camera's stand for the mean's.
 ///
 /// # Errors
-/// No cameras, or cameras whose directions cancel out, so that there is no mean direction.
+/// No cameras.
 pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     if c2w.is_empty() {
         return Err(Error::Request("a scene without cameras can't be normalized".into()));
     }
     let mean =
         |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;
-    let undirected =
-        || Error::Request("the cameras' viewing directions cancel out, so the scene has no front".into());
-    let direction = |v: DVec3| if v.length() > MIN_DIRECTION { Ok(v.normalize()) } else { Err(undirected()) };
-    let forward = direction(mean(2))?;
-    let right = direction(mean(1).cross(forward))?;
-    let down = forward.cross(right).normalize();
-    let average = DMat4::from_cols(right.extend(0.), down.extend(0.), forward.extend(0.), mean(3).extend(1.));
+    let direction = |v: DVec3| (v.length() > MIN_DIRECTION).then(|| v.normalize());
+    let axes = direction(mean(2)).and_then(|forward| {
+        let right = direction(mean(1).cross(forward))?;
+        Some(DMat3::from_cols(right, forward.cross(right).normalize(), forward))
+    });
+    let axes = axes.unwrap_or_else(|| DMat3::from_mat4(c2w[0]));
+    let average = DMat4::from_cols(
+        axes.x_axis.extend(0.),
+        axes.y_axis.extend(0.),
+        axes.z_axis.extend(0.),
+        mean(3).extend(1.),
+    );
 
     let inverse = average.inverse();
     let aligned: Vec<DMat4> = c2w.iter().map(|pose| inverse * *pose).collect();
@@ -116,14 +122,34 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
             pose
         })
         .collect();
-    let world_from_normalized =
-        Similarity { rotation: DMat3::from_mat4(average), translation: mean(3), scale };
+    let world_from_normalized = Similarity { rotation: axes, translation: mean(3), scale };
     Ok(Normalization { c2w, world_from_normalized })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::f64::consts::TAU;
+
+    #[test]
+    fn cameras_all_around_a_thing_have_the_first_ones_axes() {
+        for (count, tilt) in [(2, 0.), (8, 0.), (8, 0.6)] {
+            // Looking at the origin, level or from above.
+            let ring: Vec<DMat4> = (0..count)
+                .map(|i| {
+                    DMat4::from_rotation_y(0.3 + TAU * f64::from(i) / f64::from(count))
+                        * DMat4::from_rotation_x(tilt)
+                        * DMat4::from_translation(DVec3::NEG_Z)
+                })
+                .collect();
+            let Normalization { c2w, world_from_normalized } = normalize(&ring).unwrap();
+            assert!(DMat3::from_mat4(c2w[0]).abs_diff_eq(DMat3::IDENTITY, 1e-12), "{count}, {tilt}");
+            assert!(world_from_normalized.translation.with_y(0.).length() < 1e-12);
+            for (pose, before) in c2w.iter().zip(&ring) {
+                assert!(world_from_normalized.pose_before(before).abs_diff_eq(*pose, 1e-12));
+            }
+        }
+    }
 
     #[test]
     fn in_any_place_the_cameras_are_the_captures() {

@@ -9,7 +9,7 @@ use std::f64::consts::TAU;
 /// point that the mean camera looks at in `distance`. For captures taken by walking: the path stays where photos were.
 ///
 /// # Errors
-/// No cameras, or no mean direction among them.
+/// No cameras.
 pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) -> Result<Vec<Camera>> {
     let poses: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
     let normalization = super::normalize(&poses)?;

@@ -10,13 +10,16 @@ from ..tolerance import FLOAT64
 
 @case
 def scene_normalization(rng):
-    """One camera, and cameras all in one place, have no extent to divide by."""
+    """One camera, and cameras all in one place, have no extent to divide by; cameras all around a thing no direction in the mean."""
     for count in (1, 2, 7, 36):
         c2w = draw.poses(rng, count, turn=0.4, move=whole(rng, 1, 20))
         yield Draw(f"{count} cameras", {"c2w": c2w}, tolerance=FLOAT64)
     together = draw.poses(rng, 3)
     together[:, :3, 3] = together[0, :3, 3]
     yield Draw("3 cameras in one place", {"c2w": together}, tolerance=FLOAT64)
+    for tilt in (0.0, 0.6):
+        around = draw.ring(8, tilt)
+        yield Draw(f"8 cameras around a thing, tilted by {tilt}", {"c2w": around}, tolerance=FLOAT64)
 
 
 @twin("scene_normalization")
