@@ -313,6 +313,7 @@ fn nothing_but_bad_data_is_an_error() {
     let config = DataConfig { max_bad_share: 1., ..config() };
     let error = Loader::start(&config, 0, data, 1, 0).unwrap().next_scene().unwrap_err().to_string();
     assert!(error.contains("no scene can be trained on: 1 of 1 scenes were skipped: 1 too short"), "{error}");
+    assert!(error.contains("cameras.json: 5 views to show, expected 6 or more (data.window)"), "{error}");
     let none = Arc::new(Vec::<Capture>::new());
     assert!(Loader::start(&config, 0, none, 1, 0).unwrap_err().to_string().contains("no scenes"));
 }

@@ -82,8 +82,22 @@ pub(super) struct Ledger {
 struct Entries {
     counts: BadData,
     seen: BTreeSet<Place>,
+    /// What was wrong with the last one that was found.
+    last: Option<String>,
     /// What was found here since somebody asked.
     news: Vec<News>,
+}
+
+/// One line.
+impl fmt::Display for Entries {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}", self.counts)?;
+        match &self.last {
+            // Of broken ones the first is named.
+            Some(last) if self.counts.first.is_none() => write!(f, "; the last: {last}"),
+            _ => Ok(()),
+        }
+    }
 }
 
 impl Ledger {
@@ -123,7 +137,7 @@ impl Ledger {
     }
 
     fn count(&self, entries: &mut Entries, News { fault, places, why }: News) -> Result<()> {
-        let Entries { counts, seen, .. } = entries;
+        let Entries { counts, seen, last, .. } = entries;
         let new = places.into_iter().filter(|&place| seen.insert(place)).count() as u64;
         if new == 0 {
             return Ok(());
@@ -137,12 +151,10 @@ impl Ledger {
         if fault != Fault::Short {
             counts.first.get_or_insert_with(|| why.clone());
         }
+        *last = Some(why);
         if counts.total() as f64 > self.largest_share * counts.scenes as f64 {
-            let last = if counts.first.is_none() { format!("; the last: {why}") } else { String::new() };
-            return Err(Error::Failed(format!(
-                "{counts}{last}; data.max_bad_share allows {} of them",
-                self.largest_share
-            )));
+            let share = self.largest_share;
+            return Err(Error::Failed(format!("{entries}; data.max_bad_share allows {share} of them")));
         }
         Ok(())
     }
@@ -153,6 +165,12 @@ impl Ledger {
 
     pub fn take_news(&self) -> Vec<News> {
         std::mem::take(&mut self.entries.lock().expect("no thread panics here").news)
+    }
+
+    /// That there is nothing left.
+    pub fn exhausted(&self) -> Error {
+        let entries = self.entries.lock().expect("no thread panics here");
+        Error::Failed(format!("no scene can be trained on: {entries}"))
     }
 
     pub fn counts(&self) -> BadData {

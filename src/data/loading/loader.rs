@@ -290,7 +290,7 @@ impl Shared {
                 }
             }
         }
-        Err(Error::Failed(format!("no scene can be trained on: {}", self.ledger.counts())))
+        Err(self.ledger.exhausted())
     }
 
     fn load_scene(
