@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, read_image};
 use crate::scene::ImageSize;
 use crate::synth::{Texture, Video, VideoSettings};
+use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -53,22 +54,28 @@ impl MadeUp {
         let Some(fields) = path.to_str().and_then(|name| name.strip_prefix(Self::PREFIX)) else {
             return Ok(None);
         };
-        let refuse = |found: &str| Error::input(path, "the made-up videos", found, EXPECTED);
-        let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, 0, 0, 24, 128);
+        let refuse = |field: &str, found: &str| Error::input(path, field, found, EXPECTED);
+        let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, None, 0, 24, 128);
         let mut pictures = vec![];
+        let mut said = BTreeSet::new();
         for field in fields.split(',') {
-            let (name, value) = field.split_once('=').ok_or_else(|| refuse(field))?;
-            let number = || value.parse::<u64>().map_err(|_| refuse(field));
+            let (name, value) = field.split_once('=').unwrap_or((field, ""));
+            if !said.insert(name) {
+                return Err(refuse(name, "there twice"));
+            }
+            let number = || value.parse::<u64>().map_err(|_| refuse(name, &format!("{value:?}")));
             match name {
                 "seed" => seed = number()?,
-                "scenes" => scenes = number()?,
+                "scenes" => scenes = Some(number()?),
                 "first" => first = number()?,
                 "frames" => frames = number()?,
                 "size" => size = number()?,
+                "pictures" if value.is_empty() => return Err(refuse(name, "nothing")),
                 "pictures" => pictures = read_pictures(Path::new(value))?,
-                _ => return Err(refuse(field)),
+                _ => return Err(refuse("a field", &format!("{name:?}"))),
             }
         }
+        let scenes = scenes.ok_or_else(|| refuse("scenes", "missing"))?;
         for (name, value, range) in [
             ("scenes", scenes, Self::SCENES),
             ("first", first, Self::FIRST),
@@ -76,9 +83,8 @@ impl MadeUp {
             ("size", size, Self::SIZE),
         ] {
             if !range.contains(&value) {
-                let found = format!("one with {name}={value}");
-                let expected = format!("{EXPECTED}; {name} of {} to {}", range.start(), range.end());
-                return Err(Error::input(path, "the made-up videos", found, expected));
+                let expected = format!("{} to {}", range.start(), range.end());
+                return Err(Error::input(path, name, value, expected));
             }
         }
         let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
