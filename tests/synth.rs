@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::program::{arg, succeed, tiny_config};
+use common::program::{arg, refuse, succeed, tiny_config};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Dataset, MadeUp, Split};
 use globalsplat::scene::{Camera, ImageSize};
@@ -44,6 +44,42 @@ fn a_seed_makes_the_same_bytes() {
     let one = bytes("one", "1", "5");
     assert!(one == bytes("three", "3", "5"), "threads change the bytes");
     assert!(one != bytes("other", "1", "6"), "another seed is another world");
+}
+
+#[test]
+fn where_it_was_stopped_the_same_command_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("worlds");
+    let (chunk, indices) =
+        (out.join("000000.torch"), ["index.json", "evaluation_index.json"].map(|n| out.join(n)));
+    let synth = |[scenes, frames, size, seed]: [&'static str; 4]| {
+        let settings = ["--scenes", scenes, "--frames", frames, "--size", size, "--seed", seed, "--depth"];
+        [&["synth", "--out", arg(&out)][..], &settings].concat()
+    };
+    let arguments = synth(["2", "3", "24", "0"]);
+    succeed(&arguments);
+    let read = || indices.each_ref().map(|index| std::fs::read(index).unwrap());
+    let (before, depth) = (read(), out.join("depth/0_000001.npy"));
+    let (bytes, depths) = (std::fs::read(&chunk).unwrap(), std::fs::read(&depth).unwrap());
+
+    // Stopped before the index was written, and a file lost.
+    for lost in indices.iter().chain([&depth]) {
+        std::fs::remove_file(lost).unwrap();
+    }
+    let written = || chunk.metadata().unwrap().modified().unwrap();
+    let when = written();
+    succeed(&arguments);
+    assert_eq!(read(), before);
+    assert!(std::fs::read(&chunk).unwrap() == bytes && std::fs::read(&depth).unwrap() == depths);
+    assert_eq!(written(), when, "made anew");
+    // What is there is of other worlds, or of other photos of them.
+    std::fs::remove_file(&indices[0]).unwrap();
+    for other in [["1", "3", "24", "0"], ["2", "4", "24", "0"], ["2", "3", "25", "0"], ["2", "3", "24", "1"]]
+    {
+        let error = refuse(&synth(other));
+        assert!(error.contains("000000.torch: the output is a chunk already"), "{other:?}: {error}");
+    }
+    assert!(std::fs::read(&chunk).unwrap() == bytes, "lost");
 }
 
 /// Where a pixel of `from` that is `depth` metres away is seen by `to`, in pixels, and how far it is from there.
@@ -96,7 +132,7 @@ fn depths_and_poses_carry_one_view_into_the_next() {
         let mean = |of: &[i32]| of.iter().map(|&x| f64::from(x)).sum::<f64>() / of.len() as f64;
         let (moved, unmoved) = (mean(&differences), mean(&unmoved));
         assert!(
-            moved < 30. && moved < 1.1 * unmoved,
+            moved < 30. && moved < 0.6 * unmoved,
             "video {index}: {moved} of 255 apart, {unmoved} if not carried"
         );
     }
@@ -169,29 +205,32 @@ fn videos_are_data_like_any_other() {
     assert_eq!(depths.into_vec::<f32>().unwrap(), expected);
     let told = succeed(&["inspect", arg(&out), "--json"]);
     assert!(told.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{told}");
-    let (weights, scores) = (folder.path().join("weights.safetensors"), folder.path().join("scores"));
+    let weights = folder.path().join("weights.safetensors");
     succeed(&["export", "--config", arg(&tiny_config(folder.path(), &out)), "--out", arg(&weights)]);
     let index = out.join("evaluation_index.json");
-    succeed(&[
-        "eval",
-        "--weights",
-        arg(&weights),
-        "--data",
-        arg(&out),
-        "--index",
-        arg(&index),
-        "--out",
-        arg(&scores),
-    ]);
-    assert_eq!(
-        std::fs::read_dir(scores.join("scenes")).unwrap().count(),
-        4,
-        "scores and a picture of each scene"
-    );
+    let name = "synth:seed=3,first=7,scenes=2,frames=9,size=24";
+    let scores = ["of the written", "of the named"].map(|scores| folder.path().join(scores));
+    for (data, scores) in [arg(&out), name].into_iter().zip(&scores) {
+        succeed(&[
+            "eval",
+            "--weights",
+            arg(&weights),
+            "--data",
+            data,
+            "--index",
+            arg(&index),
+            "--out",
+            arg(scores),
+        ]);
+        assert_eq!(
+            std::fs::read_dir(scores.join("scenes")).unwrap().count(),
+            4,
+            "scores and a picture of each scene"
+        );
+    }
 
     let written = Dataset::open(&out, Split::Test).unwrap();
-    let named =
-        Dataset::open(Path::new("synth:seed=3,first=7,scenes=2,frames=9,size=24"), Split::Train).unwrap();
+    let named = Dataset::open(Path::new(name), Split::Train).unwrap();
     assert_eq!(written.scenes(), 2);
     let keys = |data: &Dataset| data.groups().iter().flat_map(|g| g.keys.clone()).collect::<Vec<_>>();
     assert_eq!(keys(&written), keys(&named));
@@ -215,14 +254,18 @@ fn names_of_made_up_videos_are_checked() {
     assert_eq!(named("synth:scenes=3").unwrap().unwrap().keys(), ["0_000000", "0_000001", "0_000002"]);
     assert_eq!(named("synth:seed=4,scenes=1,first=9").unwrap().unwrap().keys(), ["4_000009"]);
     for (name, found) in [
-        ("synth:", "is , expected"),
-        ("synth:seed=1", "one with scenes=0"),
-        ("synth:scenes=9000000", "scenes of 1 to 1000000"),
-        ("synth:scenes=some", "scenes=some"),
-        ("synth:scenes=1,colour=red", "colour=red"),
-        ("synth:scenes=1,size=8", "size of 16 to 8192"),
-        ("synth:scenes=1,frames=2", "frames of 3 to 10000"),
-        ("synth:scenes=1,pictures=nowhere", "nowhere"),
+        ("synth:", r#"a field is "", expected synth:seed=S,scenes=N"#),
+        ("synth:scenes=1,", r#"a field is "", expected"#),
+        ("synth:seed=1", "scenes is missing, expected"),
+        ("synth:scenes=9000000", "scenes is 9000000, expected 1 to 1000000"),
+        ("synth:scenes=some", r#"scenes is "some", expected"#),
+        ("synth:scenes", r#"scenes is "", expected"#),
+        ("synth:scenes=1,scenes=2", "scenes is there twice"),
+        ("synth:scenes=1,colour=red", r#"a field is "colour", expected"#),
+        ("synth:scenes=1,size=8", "size is 8, expected 16 to 8192"),
+        ("synth:scenes=1,frames=2", "frames is 2, expected 3 to 10000"),
+        ("synth:scenes=1,pictures=nowhere", "nowhere can't be read"),
+        ("synth:scenes=1,pictures=", "pictures is nothing, expected"),
     ] {
         let error = named(name).unwrap_err().to_string();
         assert!(error.contains(found), "{name}: {error}");

@@ -1,6 +1,7 @@
 use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
@@ -20,7 +21,8 @@ const CHUNK_BYTES: usize = 20_000_000;
 /// Make videos of made-up worlds, with exact cameras, to train and to judge by.
 ///
 /// Rooms and open scenes full of things of all shapes and surfaces, filmed on the way past them or around one, ray traced, in the
-/// chunks that RealEstate10K comes in, with an index.json and an evaluation_index.json. The same seed makes the same bytes.
+/// chunks that RealEstate10K comes in, with an index.json and an evaluation_index.json. The same seed makes the same bytes, and where
+/// it was stopped the same command goes on.
 /// Training makes them as it goes where data.captures names "synth:seed=1,scenes=10000".
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
@@ -89,26 +91,42 @@ impl Synth {
         }
         let bar = progress::bar(self.scenes, "videos");
         let (mut index, mut rows) = (BTreeMap::new(), vec![]);
-        let numbers: Vec<usize> = (0..self.scenes as usize).collect();
+        let mut note = |capture: &Capture| -> Result<(), Error> {
+            index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
+            if self.sheet.is_some() && rows.len() < SHEET.0 {
+                rows.push(sheet_row(capture)?);
+            }
+            bar.inc(1);
+            Ok(())
+        };
+        let depth_file = |capture: &Capture| depths.join(&capture.name).with_extension("npy");
+        let made_before = writer.go_on(
+            &videos.keys(),
+            || videos.capture(0),
+            |number, capture| {
+                let file = depth_file(capture);
+                if self.depth && !file.exists() {
+                    self.write_depths(&file, &videos.capture(number)?)?;
+                }
+                note(capture)
+            },
+        )?;
+        let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
         // So many worlds at once: most of making one is work for a single thread.
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
             let make = |&number| {
                 let capture = videos.capture(number)?;
                 if self.depth {
-                    self.write_depths(&depths, &capture)?;
+                    self.write_depths(&depth_file(&capture), &capture)?;
                 }
                 Ok(capture)
             };
-            numbers.par_iter().map(make).collect::<Result<Vec<_>>>()
+            numbers.par_iter().map(make).collect::<Result<Vec<_>, Error>>()
         });
         for captures in made {
             for capture in captures? {
                 writer.add(&capture)?;
-                index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
-                if self.sheet.is_some() && rows.len() < SHEET.0 {
-                    rows.push(sheet_row(&capture)?);
-                }
-                bar.inc(1);
+                note(&capture)?;
             }
         }
         let chunks = writer.finish()?;
@@ -132,10 +150,9 @@ impl Synth {
         Ok(())
     }
 
-    fn write_depths(&self, folder: &Path, capture: &Capture) -> Result<()> {
+    fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {
         let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
-        let shape = [self.frames, self.size, self.size];
-        Ok(write_npy(&folder.join(&capture.name).with_extension("npy"), &shape, &depths)?)
+        write_npy(file, &[self.frames, self.size, self.size], &depths)
     }
 
     fn write_rooms(&self) -> Result<()> {
@@ -159,7 +176,7 @@ impl Synth {
 }
 
 /// Pictures of a video side by side, from the first to the last.
-fn sheet_row(capture: &Capture) -> Result<Tensor> {
+fn sheet_row(capture: &Capture) -> Result<Tensor, Error> {
     let shown: Vec<usize> = (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
     let pictures: Vec<Tensor> = capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();
     Ok(tile_horizontally(&pictures))

@@ -47,7 +47,7 @@ impl Video {
     /// From the eye; each of them asks a lamp by a ray of its own.
     pub const RAYS_PER_PIXEL: u32 = RAYS * RAYS;
 
-    /// Video number `index` of those of `seed`: the same on every machine and for any number of threads.
+    /// Video number `index` of those of `seed`: the same for any number of threads.
     pub fn new(seed: u64, index: u64, settings: &VideoSettings) -> Video {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         (0..WORLDS)

@@ -1,6 +1,6 @@
 //! Captures into chunks.
 
-use super::{EXTENSION, camera_numbers};
+use super::{Chunk, EXTENSION, camera_numbers};
 use crate::data::capture::Capture;
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
@@ -47,6 +47,43 @@ impl ChunkWriter {
             chunks: 0,
             index: BTreeMap::new(),
         })
+    }
+
+    /// Takes over what is left where the same work was interrupted: chunks of the first of its scenes, which are called `keys` in
+    /// their order, and of which `make` makes the first anew, for comparison. `each` sees all that are there. Returns how many.
+    ///
+    /// # Errors
+    /// Chunks of other work, those of `make` and `each`.
+    pub fn go_on(
+        &mut self,
+        keys: &[String],
+        make: impl FnOnce() -> Result<Capture>,
+        mut each: impl FnMut(usize, &Capture) -> Result<()>,
+    ) -> Result<usize> {
+        let mut make = Some(make);
+        loop {
+            let file = self.folder.join(self.chunk_name());
+            if !file.exists() {
+                return Ok(self.index.len());
+            }
+            let other = || Error::input(&file, "the output", "a chunk already", "a folder without chunks");
+            let chunk = Chunk::read(&file)?;
+            for key in chunk.keys() {
+                let capture = chunk.capture(key)?;
+                let number = self.index.len();
+                if keys.get(number).is_none_or(|wanted| wanted != key) {
+                    return Err(other());
+                }
+                if let Some(make) = make.take()
+                    && !is_same(&capture, &make()?)?
+                {
+                    return Err(other());
+                }
+                each(number, &capture)?;
+                self.index.insert(key.to_owned(), self.chunk_name());
+            }
+            self.chunks += 1;
+        }
     }
 
     /// Adds a capture, by its name. JPEG and PNG files are taken as they are, bit for bit, unless their lens distorts, they
@@ -105,4 +142,9 @@ impl ChunkWriter {
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
         Ok(())
     }
+}
+
+/// Whether both have as many photos, and the same first one.
+fn is_same(a: &Capture, b: &Capture) -> Result<bool> {
+    Ok(a.len() == b.len() && a.encoded(0)? == b.encoded(0)?)
 }
