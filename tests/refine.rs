@@ -249,7 +249,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));
     assert!(with(&["--from", "nothing", "--space", "tokens"]).contains("nor tokens"));
     assert!(with(&["--space", "tokens", "--correct-poses"]).contains("corrects no photos"));
-    assert!(with(&["--views", "1"]).contains("two or more"));
+    assert!(with(&["--views", "1"]).contains("--views is 1, expected 2 or more"));
     // A splat of another world.
     let away = folder.path().join("away.ply");
     let mut splat = read_splat(&room.join("truth.ply")).unwrap();

@@ -1,4 +1,4 @@
-use super::{device, model, print_json, progress, ranks, stop_flag};
+use super::{check_views, device, model, print_json, progress, ranks, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
@@ -96,6 +96,7 @@ pub struct Eval {
 
 impl Eval {
     pub fn run(self) -> Result<()> {
+        check_views(self.views)?;
         match &self.scene {
             Some(scene) => self.run_scene(scene, device::parse(&self.device)?),
             None => self.run_dataset(),

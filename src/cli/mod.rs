@@ -184,6 +184,14 @@ fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
+/// Refuses fewer photos, by --views, than a scene can be made of.
+fn check_views(views: Option<usize>) -> Result<(), Error> {
+    match views {
+        Some(views @ ..2) => Err(Error::Request(format!("--views is {views}, expected 2 or more"))),
+        _ => Ok(()),
+    }
+}
+
 /// Prints a result as one JSON object.
 fn print_json(value: &serde_json::Value) {
     println!("{value}");

@@ -1,6 +1,6 @@
 use super::memory::keep_during;
 use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
-use super::{device, model, print_json};
+use super::{check_views, device, model, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
@@ -31,7 +31,7 @@ pub struct Reconstruct {
     /// The splat to write: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Use this many photos at most, spread over the path of the camera; by default as many as the model saw in training
+    /// Use this many photos at most, spread over the path of the camera; by default as many as the weights say, 24 for those that come with this program
     #[arg(long, value_name = "N")]
     views: Option<usize>,
     /// Show photos of this height, a multiple of what the model was trained with: of N times that a photo becomes N² views, which
@@ -81,6 +81,7 @@ impl Reconstruct {
     }
 
     pub fn run(self) -> Result<()> {
+        check_views(self.views)?;
         if let Some(seconds) = self.refine {
             return self.refined(seconds).run();
         }

@@ -1,5 +1,5 @@
 use super::progress::{self, Progress};
-use super::{memory, model, parse_size, print_json, stop_flag};
+use super::{check_views, memory, model, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
@@ -128,6 +128,7 @@ enum Start {
 impl Refine {
     pub fn run(self) -> Result<()> {
         memory::keep();
+        check_views(self.views)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let config = RefineConfig::with(&self.set, self.splat.is_some())?;
