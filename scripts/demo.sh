@@ -1,8 +1,11 @@
 #!/usr/bin/env bash
 # Photos to a splat by the weights that come with the program, one made sharp in half a minute, then a few minutes of training on
 # these scenes, on two CPU cores.
-#   CAPTURES  a capture, or a folder with captures up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else made-up worlds
-#   OUT       where everything goes; by default runs/demo
+#   scripts/demo.sh
+#   scripts/demo.sh --dry-run    the same commands in small, to see that they work
+#   CAPTURES  a capture, or a folder with captures or chunks up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else made-up
+#             worlds
+#   OUT       where everything goes; by default runs/demo. What an earlier demo left there is made anew
 #   DEVICE    what computes, cpu or cuda; by default cpu
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -11,18 +14,33 @@ out="${OUT:-runs/demo}"
 device="${DEVICE:-cpu}"
 captures="${CAPTURES:-${GLOBALSPLAT_CAPTURES:-none}}"
 captures="${captures%/}"
+worlds=4 frames=32 size=192 seconds=30 small=()
+if [ "${1:-}" = --dry-run ]; then
+    worlds=1 frames=9 size=32 seconds=0.1
+    small=(--set train.steps=2 --set train.validate_every=1 --set data.context_views=2 --set data.fewest_context_views=2)
+fi
+# Others' scenes and an earlier training would be gone on with.
+rm -rf "$out"/{worlds,evaluation,shipped,refined,training,trained,model.safetensors}
 mkdir -p "$out"
 
-# Folders in $1 that are captures; what lies inside of one isn't another.
+# Captures in the folder $1, and the first scenes of chunks in it; what lies inside of one isn't another.
 find_scenes() {
-    local folder found=""
+    local folder what found=""
     scenes=()
     while IFS= read -r folder; do
         case "$folder/" in "${found:-/dev/null}"/*) continue ;; esac
-        if "$globalsplat" inspect "$folder" >/dev/null 2>&1; then
-            scenes+=("$folder")
-            found="$folder"
-        fi
+        what="$("$globalsplat" inspect "$folder" --json 2>/dev/null)" || continue
+        case "$what" in
+        *'"kind":"capture"'*) scenes+=("$folder") ;;
+        *)
+            [ -e "$folder/index.json" ] || continue
+            # Of {"key": "chunk", …} the first few.
+            while IFS='"' read -r _ key _ chunk _; do
+                scenes+=("$folder/$chunk#$key")
+            done < <(grep -o '"[^"]*" *: *"[^"]*\.torch"' "$folder/index.json" | head -n 4)
+            ;;
+        esac
+        found="$folder"
     done < <(find -L "$1" -maxdepth 2 -type d | sort)
 }
 
@@ -41,26 +59,25 @@ show() {
     for scene in "${scenes[@]}"; do
         name="$(name_of "$scene")"
         "$globalsplat" reconstruct --device "$device" --weights "$1" --scene "$scene" --holdout every:3+1 --out "$2/$name.ply"
-        "$globalsplat" eval --device "$device" --weights "$1" --scene "$scene" --holdout every:3+1 --views 12 --sheet "$2/${name}_held_out.png" >/dev/null
+        "$globalsplat" eval --device "$device" --weights "$1" --scene "$scene" --holdout every:3+1 --views 24 --sheet "$2/${name}_held_out.png" >/dev/null
         "$globalsplat" render --splat "$2/$name.ply" --scene "$scene" --orbit --depth --size 256x256 --out "$2/${name}_orbit.gif" >/dev/null
     done
 }
 
 scenes=()
 [ "$captures" = none ] || find_scenes "$captures"
-train_on=("${scenes[@]}")
 if [ ${#scenes[@]} -eq 0 ]; then
     [ "$captures" = none ] || echo "demo: there is no capture in $captures" >&2
     echo "demo: worlds are made up and filmed" >&2
     captures="$out/worlds"
-    "$globalsplat" synth --out "$captures" --seed 7 --scenes 4 --frames 32 --size 192
-    for number in 0 1 2 3; do scenes+=("$captures/000000.torch#7_00000$number"); done
-    train_on=("$captures")
+    "$globalsplat" synth --out "$captures" --seed 7 --scenes "$worlds" --frames "$frames" --size "$size"
+    find_scenes "$captures"
     # Judged over all of them, on one page.
     "$globalsplat" eval --device "$device" --weights models/tiny.safetensors --data "$captures" --index "$captures/evaluation_index.json" \
         --name "weights that come with it" --out "$out/evaluation"
 fi
 show models/tiny.safetensors "$out/shipped"
+[ ! -e "$out/evaluation/report.html" ] || echo "LOOK: $out/evaluation/report.html has their scores, views and depths"
 first="$(name_of "${scenes[0]}")"
 echo "LOOK: $out/shipped/${first}_held_out.png has views never shown (photo, ours, depth), ${first}_orbit.gif a look around," \
     "${first}.ply the splat for any 3DGS viewer"
@@ -70,13 +87,24 @@ if "$globalsplat" doctor --json | grep -q '"viewer": *true'; then
 fi
 
 mkdir -p "$out/refined"
-"$globalsplat" refine --scene "${scenes[0]}" --holdout every:3+1 --seconds 30 --sheet "$out/refined/${first}_held_out.png" \
+"$globalsplat" refine --scene "${scenes[0]}" --holdout every:3+1 --seconds "$seconds" --sheet "$out/refined/${first}_held_out.png" \
     --out "$out/refined/$first.ply"
-echo "LOOK: $out/refined/${first}_held_out.png has the same views after 30 s that need no weights, only these photos"
+echo "LOOK: $out/refined/${first}_held_out.png has the same views after $seconds s that need no weights, only these photos"
 
+# A third is held out, and training shows six.
+train_on=()
+for scene in "${scenes[@]}"; do
+    photos="$("$globalsplat" inspect "$scene" --json | sed -n 's/.*"views":\([0-9]*\).*/\1/p')"
+    [ "$photos" -lt 9 ] || train_on+=("$scene")
+done
+if [ ${#train_on[@]} -eq 0 ]; then
+    echo "demo: to train on takes 9 photos of a scene, which none of these has" >&2
+    exit 0
+fi
 echo "demo: the weights are trained on for some minutes, on two thirds of these photos" >&2
 list="$(printf ', "%s"' "${train_on[@]}")"
-"$globalsplat" train --device "$device" --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" --out "$out/training"
+"$globalsplat" train --device "$device" --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" \
+    ${small[@]+"${small[@]}"} --out "$out/training"
 "$globalsplat" export --run "$out/training" --out "$out/model.safetensors"
 show "$out/model.safetensors" "$out/trained"
 echo "LOOK: $out/training/curves.svg has both curves, in training and held out; $out/trained the same views as $out/shipped, after training"
