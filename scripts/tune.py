@@ -4,7 +4,8 @@
     .venv/bin/python scripts/tune.py --worlds DIR --test DIR [--out OUT] [--seconds 300] [--captures DIR] [--only VARIANT ...]
 
 DIR hold videos that `globalsplat synth` made, 96 pixels wide. Every variant gets as many steps as fit in the seconds by its own
-time for a step, the curriculum's stages at the same shares of them. Prints a Markdown table: PSNR on worlds never seen, and, where
+time for a step, or, with --scenes N, as many as show it N scenes: what counts where models are too small to keep a GPU busy. The
+curriculum's stages are at the same shares of them. Prints a Markdown table: PSNR on worlds never seen, and, where
 captures are named, on the held-out views of each, mean over them. What is done stays done.
 """
 
@@ -38,11 +39,17 @@ VARIANTS = {
     "8 candidates": ["model.candidates=8", "curriculum.final_stage=3"],
     "patch 8": ["model.patch_size=8"],
     "patch 12": ["model.patch_size=12"],
+    "512 latents": ["model.latents=512"],
     "1 round": ["model.rounds=1"],
     "3 rounds": ["model.rounds=3"],
+    "4 rounds": ["model.rounds=4"],
+    "8 heads": ["model.heads=8"],
     "batch 1": ["train.batch=1"],
     "batch 4": ["train.batch=4"],
+    "batch 8": ["train.batch=8"],
     "Muon": ["train.optimizer=muon"],
+    "Muon, batch 8": ["train.optimizer=muon", "train.batch=8"],
+    "Muon, 4 rounds": ["train.optimizer=muon", "model.rounds=4"],
     "learning rate 2e-3": ["train.learning_rate=2e-3"],
     "learning rate 4e-3": ["train.learning_rate=4e-3"],
     "longer curriculum": ["stages=2"],
@@ -68,7 +75,7 @@ def steps_in(seconds, config, settings, batch):
     return int(10 * seconds / (more - few))
 
 
-def run(out, name, seconds, config, worlds, test, captures):
+def run(out, name, seconds, scenes, config, worlds, test, captures):
     """Steps, parameters, and PSNR of a variant: on made-up worlds and on captures."""
     settings = BASE + [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
     longer = value_of("stages", VARIANTS[name], 1.0)
@@ -77,7 +84,7 @@ def run(out, name, seconds, config, worlds, test, captures):
     folder.mkdir(parents=True, exist_ok=True)
     planned = folder / "steps"
     if not planned.is_file():
-        planned.write_text(str(steps_in(seconds, config, settings, batch)))
+        planned.write_text(str(scenes // batch if scenes else steps_in(seconds, config, settings, batch)))
     steps = int(planned.read_text())
     settings += [
         f"train.steps={steps}",
@@ -105,14 +112,17 @@ def main():
     parser.add_argument("--worlds", type=Path, required=True)
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/tune"))
-    parser.add_argument("--seconds", type=float, default=300, help="of a core, for each variant")
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument("--seconds", type=float, default=300, help="of a core, for each variant")
+    either.add_argument("--scenes", type=int, help="that each variant is shown")
     parser.add_argument("--captures", type=Path, nargs="*", default=[])
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
     arguments = parser.parse_args()
-    out = arguments.out.absolute()
+    budget = f"{arguments.scenes}_scenes" if arguments.scenes else f"{arguments.seconds:g}_seconds"
+    out = arguments.out.absolute() / budget
     config = REPOSITORY / "configs/tiny.toml"
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        several = (arguments.seconds, config, arguments.worlds.absolute(), arguments.test.absolute(), arguments.captures)
+        several = (arguments.seconds, arguments.scenes, config, arguments.worlds.absolute(), arguments.test.absolute(), arguments.captures)
         results = {name: pool.submit(run, out, name, *several) for name in arguments.only}
         row("variant", "10⁶ parameters", "scenes shown", "seconds of a core", "PSNR, made-up", "SSIM", "PSNR, photos")
         row(*["---"] * 7)
