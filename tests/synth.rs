@@ -247,6 +247,35 @@ fn videos_are_data_like_any_other() {
     }
 }
 
+/// Pictures of a folder are seen in some of the worlds, whether these are written or named.
+#[test]
+fn pictures_that_a_user_names_are_seen() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, pictures) = (folder.path().join("worlds"), folder.path().join("pictures"));
+    std::fs::create_dir(&pictures).unwrap();
+    image::RgbImage::from_pixel(8, 8, image::Rgb([255, 0, 255])).save(pictures.join("pink.png")).unwrap();
+    let size = ["--scenes", "8", "--frames", "3", "--size", "24"];
+    succeed(&[&["synth", "--out", arg(&out), "--pictures", arg(&pictures)][..], &size].concat());
+    let named = |more: &str| format!("synth:scenes=8,frames=3,size=24{more}");
+    // How many pixels of the first view of each scene are pink.
+    let pink = |data: &Path| -> Vec<f64> {
+        let data = Dataset::open(data, Split::Test).unwrap();
+        let first = |key: &String| {
+            let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
+            let view = group.open().unwrap().capture(key).unwrap().load(&[0], None).unwrap().remove(0);
+            let channel = |index| -> tch::Tensor { view.image.select(0, index) };
+            let excess = channel(0).minimum(&channel(2)) - channel(1) * 2.;
+            excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as f64
+        };
+        data.groups().iter().flat_map(|group| &group.keys).map(first).collect()
+    };
+    let plain = pink(named("").as_ref());
+    let (written, named) = (pink(&out), pink(named(&format!(",pictures={}", arg(&pictures))).as_ref()));
+    let more = named.iter().zip(&plain).filter(|(with, without)| **with > *without + 5.).count();
+    assert!(more >= 2, "{named:?}, {plain:?} without");
+    assert!(written.iter().zip(&named).all(|(a, b)| (a - b).abs() < 20.), "{written:?} {named:?}");
+}
+
 #[test]
 fn names_of_made_up_videos_are_checked() {
     let named = |name: &str| MadeUp::named(Path::new(name));

@@ -116,3 +116,79 @@ impl Hash {
         (sum - 2.) * 3f32.sqrt()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PLAIN: Sensor = Sensor {
+        gain: Vec3::ONE,
+        shoulder: 0.,
+        contrast: 1.,
+        saturation: 1.,
+        vignette: 0.,
+        noise: (0., 0.),
+        wandering: 0.,
+        wander: Noise::new(0),
+        seed: 3,
+    };
+    /// Radiance of middle grey: 0.5 in sRGB.
+    const MIDDLE: f32 = 0.2142;
+
+    fn grey(sensor: Sensor, radiance: f32, exposure: f32, place: Vec2) -> u8 {
+        sensor.bytes(Vec3::splat(radiance), exposure, place, 0, 0)[1]
+    }
+
+    #[test]
+    fn light_becomes_srgb() {
+        let bytes = [0., MIDDLE, 1., 9.].map(|radiance| grey(PLAIN, radiance, 1., Vec2::ZERO));
+        assert_eq!(bytes, [0, 128, 255, 255]);
+        assert_eq!(grey(PLAIN, MIDDLE / 2., 2., Vec2::ZERO), 128, "twice the exposure");
+        let corners = Sensor { vignette: 0.3, ..PLAIN };
+        assert_eq!(grey(corners, MIDDLE / 0.7, 1., Vec2::ONE), 128, "corners lose their share");
+        let red = Sensor { saturation: 0., ..PLAIN }.bytes(Vec3::X, 1., Vec2::ZERO, 0, 0);
+        assert!(red[0] == red[1] && red[1] == red[2], "{red:?} has a colour");
+    }
+
+    #[test]
+    fn bright_light_ends_softly_and_in_order() {
+        let sensor = Sensor { shoulder: 1., ..PLAIN };
+        let tones: Vec<f32> = (0..400).map(|i| sensor.tone(i as f32 / 100.)).collect();
+        assert!(tones.windows(2).all(|pair| pair[0] < pair[1]) && tones[399] < 1.);
+        assert_eq!(
+            tones[..=50],
+            (0..=50).map(|i| i as f32 / 100.).collect::<Vec<_>>(),
+            "linear up to a half"
+        );
+    }
+
+    #[test]
+    fn noise_is_as_strong_as_it_says_and_new_in_every_frame() {
+        let sensor = Sensor { noise: (0.02, 0.), ..PLAIN };
+        let bytes = |frame: u32| -> Vec<f32> {
+            let byte = |pixel| sensor.bytes(Vec3::splat(MIDDLE), 1., Vec2::ZERO, frame, pixel)[0];
+            (0..20_000).map(|pixel| f32::from(byte(pixel))).collect()
+        };
+        let mean = |of: &[f32]| of.iter().sum::<f32>() / of.len() as f32;
+        let (first, second) = (bytes(0), bytes(1));
+        let middle = mean(&first);
+        let together = |a: &[f32], b: &[f32]| {
+            mean(&a.iter().zip(b).map(|(a, b)| (a - middle) * (b - middle)).collect::<Vec<_>>())
+        };
+        let deviation = together(&first, &first).sqrt();
+        assert!(
+            (middle - 127.5).abs() < 0.2 && (deviation / 5.1 - 1.).abs() < 0.03,
+            "{middle} ± {deviation}"
+        );
+        assert!(together(&first, &second).abs() < 0.03 * 26., "the same noise twice");
+    }
+
+    #[test]
+    fn exposure_wanders_as_far_as_it_may() {
+        let sensor = Sensor { wandering: 0.25, ..PLAIN };
+        let stops: Vec<f32> = (0..50).map(|i| sensor.exposure(i as f32 / 50.).log2()).collect();
+        let most = stops.iter().fold(0f32, |most, stop| most.max(stop.abs()));
+        assert!((0.02..=0.25).contains(&most), "{most} doublings");
+        assert_eq!(PLAIN.exposure(0.3), 1.);
+    }
+}

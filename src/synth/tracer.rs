@@ -247,6 +247,11 @@ mod tests {
 
     /// A floor of reflectance `grey`, five metres each way, and whatever `more` adds.
     fn world(grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
+        under(DARK, grey, more)
+    }
+
+    /// The same under a sky.
+    fn under(sky: Sky, grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
         let texture =
             Arc::new(Texture::of_picture(&image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]))));
         let material = Material::matte(texture);
@@ -254,7 +259,7 @@ mod tests {
         let floor = Mesh::rectangle(Vec3::new(-5., 0., 5.), Vec3::X * 10., Vec3::Z * -10., 1.);
         parts.meshes.push((floor, material.clone()));
         more(&mut parts, &material);
-        Tracer::new(parts, DARK)
+        Tracer::new(parts, sky)
     }
 
     fn seen(tracer: &Tracer, at: Vec3) -> f32 {
@@ -291,6 +296,72 @@ mod tests {
             (seen(&tracer, Vec3::new(0.02, 0., 0.01)), seen(&tracer, Vec3::new(2., 0., 0.01)));
         // Twice the squared distance, and the angle's cosine.
         assert!((below / aside - 2. * 2f32.sqrt()).abs() < 0.05, "{below} {aside}");
+    }
+
+    #[test]
+    fn light_of_a_panel_falls_with_the_angle_that_it_leaves_at_too() {
+        let tracer = world(255, |parts, _| {
+            let (at, facing) = (Vec3::new(0., 2., 0.), Vec3::NEG_Y);
+            parts.lamps.push(Lamp::Panel {
+                at,
+                right: Vec3::ZERO,
+                up: Vec3::ZERO,
+                facing,
+                colour: Vec3::ONE,
+            });
+        });
+        let (below, aside) =
+            (seen(&tracer, Vec3::new(0.02, 0., 0.01)), seen(&tracer, Vec3::new(2., 0., 0.01)));
+        // Twice the squared distance, and both angles' cosines.
+        assert!((below / aside - 4.).abs() < 0.08, "{below} {aside}");
+    }
+
+    /// Nothing is brighter or darker than a sky that is the same everywhere, but for what it swallows.
+    #[test]
+    fn floors_under_an_even_sky_are_as_bright_as_they_are_white() {
+        let light = Vec3::splat(0.7);
+        let sky = Sky { zenith: light, horizon: light, ground: light, ..DARK };
+        for grey in [90u8, 186] {
+            let reflectance = ((f32::from(grey) / 255. + 0.055) / 1.055).powf(2.4);
+            let found = seen(&under(sky, grey, |_, _| {}), Vec3::new(0.3, 0., 0.2));
+            assert!((found / (0.7 * reflectance) - 1.).abs() < 0.02, "{grey}: {found}");
+        }
+    }
+
+    #[test]
+    fn mirrors_show_what_stands_before_them() {
+        let tracer = world(186, |parts, material| {
+            parts.lamps.push(Lamp::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(2.) });
+            let mirror = Mesh::rectangle(Vec3::new(2., 0., -1.), 2. * Vec3::Z, 2. * Vec3::Y, 1.);
+            parts.meshes.push((mirror, Material { mirror: 1., tint: Vec3::ZERO, ..material.clone() }));
+        });
+        let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
+        // By way of the mirror down to the floor.
+        let mirrored =
+            tracer.look(Vec3::new(0., 1., 0.3), Vec3::new(2., -0.5, 0.).normalize(), 1e-3, choice).x;
+        let floor = seen(&tracer, Vec3::new(0., 0., 0.3));
+        assert!(floor > 0.1 && (mirrored / floor - 1.).abs() < 0.02, "{mirrored} {floor}");
+    }
+
+    /// Blinn and Phong's lobe, where the eye is where a mirror would show the sun.
+    #[test]
+    fn glossy_things_have_highlights() {
+        let towards = Vec3::new(1., 1., 0.).normalize();
+        let look = |gloss: f32, eye: Vec3| {
+            let tracer = world(0, |parts, material| {
+                parts.lamps.push(Lamp::Sun { towards, spread: 0., colour: Vec3::splat(2.) });
+                let sheet = Mesh::rectangle(Vec3::new(-1., 0.5, 1.), 2. * Vec3::X, -2. * Vec3::Z, 1.);
+                parts.meshes.push((sheet, Material { gloss, polish: 30., ..material.clone() }));
+            });
+            let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
+            let at = Vec3::new(0.1, 0.5, 0.2);
+            tracer.look(at + eye, -eye.normalize(), 1e-3, choice).x
+        };
+        let mirrored = Vec3::new(-1., 1., 0.);
+        let expected = 0.5 * 38. / (8. * PI) * towards.y * 2.;
+        let found = look(0.5, mirrored) - look(0., mirrored);
+        assert!((found / expected - 1.).abs() < 0.02, "{found}, expected {expected}");
+        assert!(look(0.5, Vec3::new(1., 1., 0.)) < 0.1 * found, "seen from the sun");
     }
 
     #[test]
