@@ -7,7 +7,7 @@ use globalsplat::eval::{
     Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
     contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_file, write_png};
+use globalsplat::io::{check_writable_dir, check_writable_png, write_png};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
 use globalsplat::scene::ImageSize;
@@ -110,7 +110,7 @@ impl Eval {
 
     fn run_scene(&self, scene: &Path, device: Device) -> Result<()> {
         if let Some(sheet) = &self.sheet {
-            check_writable_file(sheet)?;
+            check_writable_png(sheet)?;
         }
         let capture = open_capture(scene)?;
         let loaded = self.load_model(device)?;

@@ -7,7 +7,7 @@ use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{
-    Splat, check_writable_file, check_writable_splat, read_splat, write_png, write_splat_for,
+    Splat, check_writable_png, check_writable_splat, read_splat, write_png, write_splat_for,
 };
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
@@ -141,7 +141,7 @@ impl Refine {
         }
         check_writable_splat(&self.out)?;
         if let Some(sheet) = &self.sheet {
-            check_writable_file(sheet)?;
+            check_writable_png(sheet)?;
         }
         let capture = open_capture(&self.scene)?;
         let (shown, held_out) = holdout.split(capture.len());

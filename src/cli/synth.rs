@@ -5,7 +5,7 @@ use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    check_writable_dir, check_writable_file, tile_horizontally, tile_vertically, write_npy, write_png,
+    check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
@@ -69,9 +69,8 @@ const SHEET: (usize, usize) = (16, 8);
 
 impl Synth {
     pub fn run(self) -> Result<()> {
-        check_writable_dir(&self.out)?;
         if let Some(sheet) = &self.sheet {
-            check_writable_file(sheet)?;
+            check_writable_png(sheet)?;
         }
         if self.gaussians { self.write_rooms() } else { self.write_videos() }
     }
@@ -82,6 +81,7 @@ impl Synth {
 
     fn write_videos(&self) -> Result<()> {
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
+        check_writable_dir(&self.out)?;
         let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
         let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
@@ -156,6 +156,7 @@ impl Synth {
     }
 
     fn write_rooms(&self) -> Result<()> {
+        check_writable_dir(&self.out)?;
         let bar = progress::bar(self.scenes, "scenes");
         let mut captures = vec![];
         for scene in 0..self.scenes {

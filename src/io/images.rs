@@ -1,6 +1,6 @@
 //! Images between files and tensors, and pictures for people.
 
-use super::write_atomically;
+use super::{check_writable_file, write_atomically};
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
 use image::codecs::jpeg::JpegEncoder;
@@ -154,6 +154,17 @@ pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
     let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
         .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
+}
+
+/// Whether a PNG could be written at `path`, as by [`check_writable_file`].
+///
+/// # Errors
+/// Another ending, and as there.
+pub fn check_writable_png(path: &Path) -> Result<()> {
+    if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
+        return Err(Error::input(path, "the picture's ending", "another", ".png"));
+    }
+    check_writable_file(path)
 }
 
 /// Writes [3, H, W] or [H, W] (grey), values in [0, 1].

@@ -21,8 +21,8 @@ pub use atomic::{check_writable_dir, check_writable_file, write_atomically};
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
 pub use film::{Film, find_ffmpeg};
 pub use images::{
-    Photo, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb, tile_horizontally,
-    tile_vertically, tiled_size, write_png,
+    Photo, check_writable_png, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb,
+    tile_horizontally, tile_vertically, tiled_size, write_png,
 };
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
