@@ -19,9 +19,16 @@ if [ "${1:-}" = --dry-run ]; then
     worlds=1 frames=9 size=32 seconds=0.1
     small=(--set train.steps=2 --set train.validate_every=1 --set data.context_views=2 --set data.fewest_context_views=2)
 fi
-# Others' scenes and an earlier training would be gone on with.
-rm -rf "$out"/{worlds,evaluation,shipped,refined,training,trained,model.safetensors}
+# Others' scenes and an earlier training would be gone on with. What no demo made is nobody's to remove.
+mark="$out/.made_by_the_demo"
+if [ -e "$mark" ]; then
+    rm -rf "$out"/{worlds,evaluation,shipped,refined,training,trained,model.safetensors}
+elif [ -n "$(ls -A "$out" 2>/dev/null)" ]; then
+    echo "demo: $out: it holds other things, expected an empty folder or an earlier demo's" >&2
+    exit 2
+fi
 mkdir -p "$out"
+touch "$mark"
 
 # Captures in the folder $1, and the first scenes of chunks in it; what lies inside of one isn't another.
 find_scenes() {
