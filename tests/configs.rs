@@ -43,6 +43,7 @@ fn the_weights_that_come_with_the_program_are_those_of_tiny() {
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
     assert_eq!(shipped.config.data.extents, tiny.data.extents);
+    assert_eq!(shipped.config.data.context_views, 24, "as reconstruct --help says");
     assert_eq!(shipped.stage, tiny.curriculum.final_stage());
     let fine_tune = read("fine_tune");
     assert_eq!(fine_tune.model, tiny.model, "what goes on from them");

@@ -31,7 +31,8 @@ pub struct Reconstruct {
     /// The splat to write: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Use this many photos at most, spread over the path of the camera; by default as many as the weights say, 24 for those that come with this program
+    /// Use this many photos at most, spread over the path of the camera; by default as many as the weights say, 24 for those that
+    /// come with this program
     #[arg(long, value_name = "N")]
     views: Option<usize>,
     /// Show photos of this height, a multiple of what the model was trained with: of N times that a photo becomes N² views, which
