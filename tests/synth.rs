@@ -4,7 +4,7 @@ mod common;
 
 use common::program::{arg, refuse, succeed, tiny_config};
 use glam::{DMat3, DVec3};
-use globalsplat::data::{Dataset, MadeUp, Split};
+use globalsplat::data::{Capture, Dataset, MadeUp, SceneGroup, Split};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
 use npyz::NpyFile;
@@ -260,14 +260,17 @@ fn pictures_that_a_user_names_are_seen() {
     // How many pixels of the first view of each scene are pink.
     let pink = |data: &Path| -> Vec<f64> {
         let data = Dataset::open(data, Split::Test).unwrap();
-        let first = |key: &String| {
-            let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
-            let view = group.open().unwrap().capture(key).unwrap().load(&[0], None).unwrap().remove(0);
+        let first = |capture: Capture| {
+            let view = capture.load(&[0], None).unwrap().remove(0);
             let channel = |index| -> tch::Tensor { view.image.select(0, index) };
             let excess = channel(0).minimum(&channel(2)) - channel(1) * 2.;
             excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as f64
         };
-        data.groups().iter().flat_map(|group| &group.keys).map(first).collect()
+        let of_group = |group: &SceneGroup| {
+            let open = group.open().unwrap();
+            group.keys.iter().map(|key| first(open.capture(key).unwrap())).collect::<Vec<_>>()
+        };
+        data.groups().iter().flat_map(of_group).collect()
     };
     let plain = pink(named("").as_ref());
     let (written, named) = (pink(&out), pink(named(&format!(",pictures={}", arg(&pictures))).as_ref()));

@@ -206,8 +206,9 @@ def ring(count, tilt):
     """Camera-to-world [count, 4, 4], float64: evenly around the origin, 1 away, looking at it from a height."""
     pose = np.zeros((count, 4, 4))
     for i, turn in enumerate(2 * np.pi * np.arange(count) / count):
-        down = np.array([0.0, np.cos(tilt), 0.0]) + np.sin(tilt) * np.array([np.sin(turn), 0.0, np.cos(turn)])
-        forward = np.array([0.0, -np.sin(tilt), 0.0]) + np.cos(tilt) * np.array([np.sin(turn), 0.0, np.cos(turn)])
+        level, below = np.array([np.sin(turn), 0.0, np.cos(turn)]), np.array([0.0, 1.0, 0.0])
+        down = np.cos(tilt) * below + np.sin(tilt) * level
+        forward = np.cos(tilt) * level - np.sin(tilt) * below
         pose[i, :3, :3] = np.stack([np.cross(down, forward), down, forward], axis=-1)
         pose[i, :3, 3] = -forward
     pose[:, 3, 3] = 1.0

@@ -25,13 +25,7 @@ impl Similarity {
     pub fn pose_before(&self, c2w: &DMat4) -> DMat4 {
         let rotation = self.rotation.transpose();
         let centre = rotation * (c2w.w_axis.truncate() - self.translation) / self.scale;
-        let axes = rotation * DMat3::from_mat4(*c2w);
-        DMat4::from_cols(
-            axes.x_axis.extend(0.),
-            axes.y_axis.extend(0.),
-            axes.z_axis.extend(0.),
-            centre.extend(1.),
-        )
+        DMat4::from_mat3_translation(rotation * DMat3::from_mat4(*c2w), centre)
     }
 }
 
@@ -96,14 +90,8 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
         Some(DMat3::from_cols(right, forward.cross(right).normalize(), forward))
     });
     let axes = axes.unwrap_or_else(|| DMat3::from_mat4(c2w[0]));
-    let average = DMat4::from_cols(
-        axes.x_axis.extend(0.),
-        axes.y_axis.extend(0.),
-        axes.z_axis.extend(0.),
-        mean(3).extend(1.),
-    );
 
-    let inverse = average.inverse();
+    let inverse = DMat4::from_mat3_translation(axes, mean(3)).inverse();
     let aligned: Vec<DMat4> = c2w.iter().map(|pose| inverse * *pose).collect();
     let centre = |pose: &DMat4| pose.w_axis.truncate();
     let mut scale = 0f64;

@@ -269,10 +269,14 @@ mod tests {
         (0..4).map(look).sum::<f32>() / 4.
     }
 
+    /// What an sRGB byte reflects, linear.
+    fn reflectance(grey: u8) -> f32 {
+        ((f32::from(grey) / 255. + 0.055) / 1.055).powf(2.4)
+    }
+
     /// Lambert: radiance is reflectance · irradiance · cos / π, whatever the number of lamps.
     #[test]
     fn matte_floors_are_as_bright_as_light_and_angle_say() {
-        let reflectance = ((186. / 255. + 0.055f32) / 1.055).powf(2.4);
         for lamps in 1..=4 {
             let tracer = world(186, |parts, _| {
                 for i in 0..lamps {
@@ -281,7 +285,7 @@ mod tests {
                 }
             });
             let cosines: f32 = (0..lamps).map(|i| Vec3::new(0.1 * i as f32, 1., 0.).normalize().y).sum();
-            let expected = reflectance * 2. * cosines / PI;
+            let expected = reflectance(186) * 2. * cosines / PI;
             let found = seen(&tracer, Vec3::new(0.3, 0., 0.2));
             assert!((found / expected - 1.).abs() < 0.02, "{lamps} lamps: {found}, expected {expected}");
         }
@@ -321,10 +325,9 @@ mod tests {
     fn floors_under_an_even_sky_are_as_bright_as_they_are_white() {
         let light = Vec3::splat(0.7);
         let sky = Sky { zenith: light, horizon: light, ground: light, ..DARK };
-        for grey in [90u8, 186] {
-            let reflectance = ((f32::from(grey) / 255. + 0.055) / 1.055).powf(2.4);
+        for grey in [90, 186] {
             let found = seen(&under(sky, grey, |_, _| {}), Vec3::new(0.3, 0., 0.2));
-            assert!((found / (0.7 * reflectance) - 1.).abs() < 0.02, "{grey}: {found}");
+            assert!((found / (0.7 * reflectance(grey)) - 1.).abs() < 0.02, "{grey}: {found}");
         }
     }
 
