@@ -340,17 +340,18 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
     let (splat, config) = (room.join("truth.ply"), tiny_config(folder.path(), &room));
     // A file where a folder has to be: no rights to bypass, even for root.
     let blocked = room.join("cameras.json").join("below.ply");
-    let picture = blocked.with_extension("png");
     let before = std::fs::read(room.join("cameras.json")).unwrap();
     for arguments in [
         &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&blocked)][..],
         &["render", "--splat", arg(&splat), "--scene", arg(&room), "--out", arg(&blocked)],
         &["export", "--config", arg(&config), "--out", arg(&blocked)],
         &["train", "--config", arg(&config), "--out", arg(&blocked)],
-        &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&picture)],
     ] {
-        assert_says(&refuse(arguments), &["cameras.json/below.p", " can't be written"]);
+        assert_says(&refuse(arguments), &["cameras.json/below.ply can't be written"]);
     }
+    let picture = blocked.with_extension("png");
+    let error = refuse(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&picture)]);
+    assert_says(&error, &["cameras.json/below.png can't be written"]);
     assert_eq!(std::fs::read(room.join("cameras.json")).unwrap(), before);
     let photo = folder.path().join("sheet.jpg");
     for command in [
