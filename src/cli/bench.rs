@@ -154,9 +154,11 @@ impl Raster {
         }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
-                let gaussians = read_splat(splat)?.gaussians;
+                let splat = read_splat(splat)?;
+                let frame = splat.frame();
                 let views = open_capture(scene)?.load_all(None)?;
-                let poses: Vec<_> = views.iter().map(|view| view.camera.c2w).collect();
+                let poses: Vec<_> = views.iter().map(|view| frame.pose_to_local(&view.camera.c2w)).collect();
+                let gaussians = frame.gaussians_to_local(&splat.gaussians, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),

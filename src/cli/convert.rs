@@ -1,11 +1,12 @@
-use super::{print_json, render::orbit_around_splat};
+use super::{print_json, render::orbit_around_splat, splat_out};
 use anyhow::Result;
 use clap::Args;
+use glam::DVec3;
 use globalsplat::data::open_capture;
 use globalsplat::eval::psnr_between;
-use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
+use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat};
 use globalsplat::render::HarmonicLimits;
-use globalsplat::scene::{Camera, ImageSize};
+use globalsplat::scene::{Camera, ImageSize, LocalFrame};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -44,6 +45,10 @@ pub struct Convert {
     /// Lose least for the cameras of this capture, and tell the loss by them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
+    /// Write coordinates relative to the centre of the scene, which goes to a file beside the splat: far from the world's origin, as in
+    /// UTM coordinates, float32 and the formats' own numbers lose detail
+    #[arg(long)]
+    local_origin: bool,
     /// Print what was done as one JSON object
     #[arg(long)]
     json: bool,
@@ -52,6 +57,7 @@ pub struct Convert {
 impl Convert {
     pub fn run(self) -> Result<()> {
         check_writable_splat(&self.to)?;
+        splat_out::check_origin(&self.to, self.local_origin)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let original = read_splat(&self.from)?;
         // Before the file is replaced, if it is the same.
@@ -68,7 +74,14 @@ impl Convert {
             None if !self.for_viewers => None,
             None => Some(fit(&[])?),
         };
-        write_splat(&self.to, &fitted.as_ref().unwrap_or(&original).with_sh_degree(degree))?;
+        let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
+        let origin = self.local_origin.then(|| match &capture {
+            Some(capture) => LocalFrame::from_cameras(&capture.cameras()).origin,
+            // A splat that has an origin keeps it.
+            None if original.origin != DVec3::ZERO => original.origin,
+            None => original.frame().origin,
+        });
+        splat_out::write(&self.to, &written, origin)?;
         let copy = read_splat(&self.to)?;
         let to = description(&self.to, &copy)?;
 
@@ -79,7 +92,7 @@ impl Convert {
         if capture.is_none() {
             self.tell_cut(&original, &fit(&[])?.gaussians.sh);
         }
-        let psnr = psnr_between(&original.gaussians, &copy.gaussians, &cameras)?;
+        let psnr = psnr_between(&original, &copy, &cameras)?;
         let views = cameras.len();
         if self.json {
             let told = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });

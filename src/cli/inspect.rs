@@ -1,6 +1,7 @@
 use super::print_json;
 use anyhow::Result;
 use clap::Args;
+use glam::DVec3;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
@@ -65,7 +66,8 @@ fn range(t: &Tensor) -> Value {
 fn splat(path: &Path) -> Result<Value> {
     let splat = read_splat(path)?;
     let g = &splat.gaussians;
-    let axis = |i: i64| range(&g.means.select(-1, i));
+    let axis = |i: usize| range(&(g.means.select(-1, i as i64).to_kind(Kind::Double) + splat.origin[i]));
+    let origin = (splat.origin != DVec3::ZERO).then(|| splat.origin.to_array());
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
@@ -74,6 +76,7 @@ fn splat(path: &Path) -> Result<Value> {
         "x": axis(0),
         "y": axis(1),
         "z": axis(2),
+        "local_origin": origin,
         "scales": range(&g.scales),
         "opacities": range(&g.opacities),
     }))

@@ -27,6 +27,7 @@ mod reconstruct;
 mod refine;
 mod render;
 mod report;
+mod splat_out;
 mod synth;
 mod train;
 mod view;

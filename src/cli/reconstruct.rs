@@ -1,12 +1,12 @@
 use super::memory::keep_during;
 use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
-use super::{check_views, device, model, print_json};
+use super::{check_views, device, model, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
+use globalsplat::io::check_writable_splat;
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
@@ -45,6 +45,10 @@ pub struct Reconstruct {
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
     refine: Option<f64>,
+    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
+    /// in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    local_origin: bool,
     /// f32, bf16 for matrix products, or auto: bf16 for wide models where the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
@@ -66,6 +70,7 @@ impl Reconstruct {
             space: SpaceName::Gaussians,
             scene: self.scene,
             out: self.out,
+            local_origin: self.local_origin,
             gaussians: DEFAULT_GAUSSIANS,
             seconds,
             steps: None,
@@ -89,6 +94,7 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_splat(&self.out)?;
+        splat_out::check_origin(&self.out, self.local_origin)?;
         let asked = model::asked_precision(&self.precision)?;
         let started = process_age();
         let mut watch = Stopwatch::default();
@@ -109,7 +115,8 @@ impl Reconstruct {
         let model = Model { input, ..Model::from(&loaded) };
         let reconstruction = watch.time("network", || reconstruct(model, &photos, &[]))?;
         watch.time("splat", || {
-            write_splat_for(&self.out, &Splat::of(&reconstruction.in_world())?, &capture.cameras())
+            let splat = reconstruction.to_splat()?;
+            splat_out::write_for(&self.out, &splat, &capture.cameras(), self.local_origin)
         })?;
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))

@@ -1,14 +1,12 @@
 use super::progress::{self, Progress};
-use super::{check_views, memory, model, parse_size, print_json, stop_flag};
+use super::{check_views, memory, model, parse_size, print_json, splat_out, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
 use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
-use globalsplat::io::{
-    Splat, check_writable_png, check_writable_splat, read_splat, write_png, write_splat_for,
-};
+use globalsplat::io::{Splat, check_writable_png, check_writable_splat, read_splat, write_png};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
@@ -61,6 +59,10 @@ pub struct Refine {
     /// The splat to write, of one of these endings
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
+    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
+    /// in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    pub local_origin: bool,
     /// How many Gaussians, where none were begun with, or a model's that are fewer
     #[arg(long, value_name = "N", default_value_t = DEFAULT_GAUSSIANS, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     pub gaussians: u32,
@@ -140,6 +142,7 @@ impl Refine {
             return Err(Error::Request(why.into()).into());
         }
         check_writable_splat(&self.out)?;
+        splat_out::check_origin(&self.out, self.local_origin)?;
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
@@ -185,7 +188,7 @@ impl Refine {
             (gaussians, after) = (first, before.clone());
             corrected.clear();
         }
-        write_splat_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras())?;
+        splat_out::write_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras(), self.local_origin)?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
             write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;

@@ -6,7 +6,7 @@ use super::scene::EvalScene;
 use super::scores::{CaptureScores, score};
 use crate::data::{View, cameras_at};
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
+use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, origin_file, read_image, read_splat, tensor_from_rgb};
 use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
 use crate::scene::ImageSize;
@@ -76,7 +76,7 @@ impl Method<'_> {
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
                 let cameras: Vec<_> = scene.target.iter().map(|view| view.camera).collect();
-                let rendered = render_views(&splat.gaussians, &cameras)?;
+                let rendered = splat.renderer().render(&cameras)?;
                 Ok(of_splat(&splat, rendered))
             }
             Method::Renders(folder) => {
@@ -127,7 +127,7 @@ impl Method<'_> {
     pub(super) fn files(&self) -> Option<String> {
         let files: Vec<PathBuf> = match self {
             Method::Model(_) => return None,
-            Method::Splat(file) => vec![file.clone()],
+            Method::Splat(file) => vec![file.clone(), origin_file(file)],
             Method::Renders(folder) => {
                 let pictures = std::fs::read_dir(folder).ok()?;
                 pictures.filter_map(|entry| Some(entry.ok()?.path())).collect()

@@ -13,7 +13,7 @@ use globalsplat::error::Error;
 use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
-use globalsplat::render::{Rendered, render_views};
+use globalsplat::render::{Rendered, SplatRenderer};
 use globalsplat::scene::{Camera, ImageSize};
 use output::Output;
 use serde_json::json;
@@ -107,14 +107,15 @@ impl Render {
         Output::check(out, self.fps)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = self.splat(capture.as_ref())?;
-        let shots = self.shots(&splat, capture.as_ref())?;
-        let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
+        let renderer = splat.renderer();
+        let shots = self.shots(&splat, &renderer, capture.as_ref())?;
+        let scale = if self.depth { Some(depth_scale(&renderer, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
         let mut output = Output::begin(out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
         for (name, camera) in shots.names.iter().zip(&shots.cameras) {
-            let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);
+            let rendered = renderer.render(std::slice::from_ref(camera))?.remove(0);
             output.add(name, self.parts(&rendered, scale), capture.as_ref())?;
             if stop.load(Ordering::Relaxed) {
                 let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
@@ -141,16 +142,16 @@ impl Render {
         let loaded = model::load(Some(weights), Some(Precision::F32), Device::Cpu)?;
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
-        Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
+        Ok(reconstruct(&loaded, &photos, &[])?.to_splat()?)
     }
 
-    fn shots(&self, splat: &Splat, capture: Option<&Capture>) -> Result<Shots> {
+    fn shots(&self, splat: &Splat, renderer: &SplatRenderer, capture: Option<&Capture>) -> Result<Shots> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let frames = self.frames.map(|frames| frames as usize);
         let shots = match (&self.path, capture) {
-            (Some(path), _) => Shots::along(path, size, frames, splat)?,
-            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, splat)?,
-            (None, Some(capture)) => Shots::of(capture, size, frames, splat)?,
+            (Some(path), _) => Shots::along(path, size, frames, renderer)?,
+            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, renderer)?,
+            (None, Some(capture)) => Shots::of(capture, size, frames, renderer)?,
             (None, None) => Shots::around(splat, size, frames),
         };
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
@@ -178,7 +179,7 @@ impl Render {
 }
 
 /// What all pictures together show, told by a few that are small: before the first is rendered, the last counts as well.
-fn depth_scale(splat: &Splat, cameras: &[Camera]) -> Result<DepthScale> {
+fn depth_scale(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<DepthScale> {
     const FEW: usize = 12;
     const SMALL: u32 = 128;
     let small = |camera: &Camera| {
@@ -187,6 +188,6 @@ fn depth_scale(splat: &Splat, cameras: &[Camera]) -> Result<DepthScale> {
     };
     let count = cameras.len().min(FEW);
     let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
-    let rendered = render_views(&splat.gaussians, &spread.collect::<Vec<_>>())?;
+    let rendered = renderer.render(&spread.collect::<Vec<_>>())?;
     Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
 }

@@ -4,7 +4,7 @@ use anyhow::Result;
 use glam::{DMat4, DVec3};
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
 use globalsplat::io::Splat;
-use globalsplat::render::render_views;
+use globalsplat::render::SplatRenderer;
 use globalsplat::scene::{
     Camera, ImageSize, Intrinsics, orbit_around_cameras, orbit_around_point, smooth_path,
 };
@@ -31,11 +31,11 @@ impl Shots {
         capture: &Capture,
         size: Option<ImageSize>,
         frames: Option<usize>,
-        splat: &Splat,
+        renderer: &SplatRenderer,
     ) -> Result<Self> {
         let cameras = resized(capture.cameras(), size);
         Ok(match frames {
-            Some(frames) => Shots::numbered(smoothed(&cameras, frames, splat)?),
+            Some(frames) => Shots::numbered(smoothed(&cameras, frames, renderer)?),
             None => Shots { names: capture.picture_names(), ..Shots::numbered(cameras) },
         })
     }
@@ -45,10 +45,10 @@ impl Shots {
         capture: &Capture,
         size: Option<ImageSize>,
         frames: Option<usize>,
-        splat: &Splat,
+        renderer: &SplatRenderer,
     ) -> Result<Self> {
         let cameras = resized(capture.cameras(), size);
-        let distance = median_depth(splat, &cameras)?;
+        let distance = median_depth(renderer, &cameras)?;
         let orbit = orbit_around_cameras(&cameras, distance, frames.unwrap_or(DEFAULT_FRAMES))?;
         Ok(Shots::numbered(orbit))
     }
@@ -60,11 +60,16 @@ impl Shots {
     }
 
     /// From the cameras at `path`, or so many on a smooth path through them.
-    pub fn along(path: &Path, size: Option<ImageSize>, frames: Option<usize>, splat: &Splat) -> Result<Self> {
+    pub fn along(
+        path: &Path,
+        size: Option<ImageSize>,
+        frames: Option<usize>,
+        renderer: &SplatRenderer,
+    ) -> Result<Self> {
         let CameraPath { cameras, frames_per_second } = read_camera_path(path, size)?;
         let cameras = resized(cameras, size);
         let shots = Shots::numbered(match frames {
-            Some(frames) => smoothed(&cameras, frames, splat)?,
+            Some(frames) => smoothed(&cameras, frames, renderer)?,
             None => cameras,
         });
         Ok(Shots { frames_per_second: frames_per_second.unwrap_or(FRAMES_PER_SECOND), ..shots })
@@ -84,15 +89,16 @@ fn resized(cameras: Vec<Camera>, size: Option<ImageSize>) -> Vec<Camera> {
     }
 }
 
-fn smoothed(cameras: &[Camera], frames: usize, splat: &Splat) -> Result<Vec<Camera>> {
-    Ok(smooth_path(cameras, median_depth(splat, cameras)?, frames)?)
+fn smoothed(cameras: &[Camera], frames: usize, renderer: &SplatRenderer) -> Result<Vec<Camera>> {
+    Ok(smooth_path(cameras, median_depth(renderer, cameras)?, frames)?)
 }
 
-/// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer.
-pub fn median_depth(splat: &Splat, cameras: &[Camera]) -> Result<f64> {
-    let rendered = render_views(&splat.gaussians, &cameras[cameras.len() / 2..][..1])?.remove(0);
+/// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer; the splat's typical size where it
+/// sees nothing.
+pub fn median_depth(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<f64> {
+    let rendered = renderer.render(&cameras[cameras.len() / 2..][..1])?.remove(0);
     let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
-    Ok(if seen.numel() == 0 { 1. } else { seen.median().double_value(&[]) })
+    Ok(if seen.numel() == 0 { renderer.frame().typical_distance() } else { seen.median().double_value(&[]) })
 }
 
 /// Around the middle of the splat's opaque part, far enough to see most of it.
@@ -104,7 +110,7 @@ pub fn orbit_around_splat(
     let g = &splat.gaussians;
     let means = g.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);
-    let total = weights.sum(Kind::Double).clamp_min(1e-12);
+    let total = weights.sum(Kind::Double).clamp_min(f64::MIN_POSITIVE);
     let centre = (&means * &weights).sum_dim_intlist([0i64].as_slice(), false, Kind::Double) / &total;
     let spread = ((&means - &centre).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double)
         * &weights)
@@ -112,10 +118,12 @@ pub fn orbit_around_splat(
         .divide(&total)
         .sqrt()
         .double_value(&[]);
-    let centre = DVec3::new(centre.double_value(&[0]), centre.double_value(&[1]), centre.double_value(&[2]));
+    let centre = splat.origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
+    // Gaussians in one place are as far apart as they are large.
+    let radius = 3. * if spread > 0. { spread } else { splat.frame().typical_distance() };
     let (w, h) = (f64::from(width), f64::from(height));
     let focal = w.min(h);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };
     let reference = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
-    orbit_around_point(centre, 3. * spread.max(1e-6), &reference, frames)
+    orbit_around_point(centre, radius, &reference, frames)
 }

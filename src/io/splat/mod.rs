@@ -4,28 +4,38 @@
 mod antimatter;
 mod compressed_ply;
 mod morton;
+mod origin;
 mod ply;
 mod ply_body;
 mod ply_header;
 mod spz;
 mod values;
 
+pub use origin::{check_writable_origin, origin_file};
+
 use crate::error::{Error, Result};
 use crate::io::atomic::check_writable_file;
-use crate::render::{HarmonicLimits, fit_harmonics};
-use crate::scene::{Camera, Gaussians};
+use crate::render::{HarmonicLimits, SplatRenderer, fit_harmonics};
+use crate::scene::{Camera, Gaussians, LocalFrame};
+use glam::DVec3;
+use origin::{read_origin, write_with_origin};
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
 /// What a splat's file holds: the Gaussians of one scene.
 #[derive(Debug)]
 pub struct Splat {
-    /// [1, N, ..], float32 on the host.
+    /// [1, N, ..], float32 on the host, with means relative to `origin`.
     pub gaussians: Gaussians,
+    /// Where in the world the coordinates of the means begin: world = origin + mean.
+    pub origin: DVec3,
 }
 
 impl Splat {
-    /// `gaussians` of one scene, without their gradients.
+    /// Float32 positions that are this share of the scene's typical size apart show in pictures.
+    const COARSE: f64 = 1e-4;
+
+    /// `gaussians` of one scene, in world coordinates, without their gradients.
     ///
     /// # Errors
     /// More scenes than one.
@@ -33,7 +43,7 @@ impl Splat {
         match gaussians.means.size()[0] {
             1 => {
                 let on_host = gaussians.map(|t| t.detach().to_device(Device::Cpu).to_kind(Kind::Float));
-                Ok(Splat { gaussians: on_host })
+                Ok(Splat { gaussians: on_host, origin: DVec3::ZERO })
             }
             scenes => Err(Error::Request(format!("a splat holds one scene, found {scenes}"))),
         }
@@ -50,7 +60,42 @@ impl Splat {
         let more = (bases - self.bases()).max(0);
         let sh = self.gaussians.sh.constant_pad_nd([0, 0, 0, more]).narrow(2, 0, bases).contiguous();
         let gaussians = self.gaussians.map(Tensor::shallow_clone);
-        Splat { gaussians: Gaussians { sh, ..gaussians } }
+        Splat { gaussians: Gaussians { sh, ..gaussians }, origin: self.origin }
+    }
+
+    /// Returns the same splat with means relative to `origin`, rounded to float32.
+    pub fn with_origin(&self, origin: DVec3) -> Self {
+        let mut gaussians = self.gaussians.map(Tensor::shallow_clone);
+        if origin != self.origin {
+            let by = Tensor::from_slice(&(self.origin - origin).to_array());
+            gaussians.means = (gaussians.means.to_kind(Kind::Double) + by).to_kind(Kind::Float);
+        }
+        Splat { gaussians, origin }
+    }
+
+    /// Returns the local frame that the splat is rendered in (spec 2.5).
+    pub fn frame(&self) -> LocalFrame {
+        LocalFrame::from_gaussians(&self.gaussians, self.origin)
+    }
+
+    /// Returns what renders the splat from cameras of the world.
+    pub fn renderer(&self) -> SplatRenderer {
+        SplatRenderer::new(&self.gaussians, self.origin, self.frame())
+    }
+
+    /// Says in a sentence what world coordinates in float32 would lose of the positions, where that shows in pictures.
+    pub fn world_loss(&self) -> Option<String> {
+        let frame = self.frame();
+        let farthest = frame.origin.abs().max_element();
+        let spacing = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
+        let share = spacing / frame.typical_distance();
+        (self.origin != DVec3::ZERO && share > Self::COARSE).then(|| {
+            format!(
+                "the scene is {farthest:.3e} units from the world's origin, where float32 positions are {spacing:.2e} apart: {:.2} % of \
+                 its size are lost",
+                100. * share
+            )
+        })
     }
 
     /// Spherical harmonics of a colour channel.
@@ -144,33 +189,41 @@ pub fn read_splat(path: &Path) -> Result<Splat> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     let recognized = FORMATS.iter().find(|format| (format.recognizes)(&bytes));
-    (recognized.unwrap_or(named).read)(path, &bytes)
+    let splat = (recognized.unwrap_or(named).read)(path, &bytes)?;
+    Ok(Splat { origin: read_origin(path)?, ..splat })
 }
 
-/// Writes a splat in the format that the ending of `path` tells, whole or not at all.
+/// Writes a splat in world coordinates, in the format that the ending of `path` tells, whole or not at all. The origin of an
+/// older splat there is removed.
 ///
 /// # Errors
 /// An ending that is no format's, Gaussians that the format can't hold, such as those with numbers that aren't finite, or the
 /// system's refusal to write.
 pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
-    (format_of(path)?.write)(path, splat)
+    write_local_splat(path, &splat.with_origin(DVec3::ZERO))
 }
 
-/// As [`write_splat`], in spherical harmonics that the format holds and that show `cameras` the same.
+/// Writes a splat as [`write_splat`] does, with coordinates relative to its origin, which goes to [`origin_file`] unless it is
+/// zero.
 ///
 /// # Errors
-/// As there.
-pub fn write_splat_for(path: &Path, splat: &Splat, cameras: &[Camera]) -> Result<()> {
-    write_splat(path, &fit_splat(path, splat, &HarmonicLimits::up_to(splat.sh_degree()), cameras)?)
+/// As [`write_splat`].
+pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
+    let format = format_of(path)?;
+    write_with_origin(path, splat.origin, || (format.write)(path, splat))
 }
 
-/// What `cameras` see of `splat` in spherical harmonics within `limits` that the format of `path` holds, too.
+/// Returns `splat` in spherical harmonics within `limits` that the format of `path` holds, too, and that show `cameras` the same.
 ///
 /// # Errors
 /// An ending that is no format's.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.and(&(format_of(path)?.limits)());
-    Ok(Splat { gaussians: fit_harmonics(&splat.gaussians, cameras, &limits) })
+    let frame = splat.frame();
+    let local = frame.gaussians_to_local(&splat.gaussians, splat.origin);
+    let Gaussians { opacities, sh, .. } = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
+    let gaussians = splat.gaussians.map(Tensor::shallow_clone);
+    Ok(Splat { gaussians: Gaussians { opacities, sh, ..gaussians }, origin: splat.origin })
 }
 
 /// Whether all of `numbers`, which are to be written at `path`, are finite.

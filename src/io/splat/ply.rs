@@ -10,6 +10,7 @@ use crate::error::{Error, Result};
 use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
 use crate::scene::RawGaussians;
+use glam::DVec3;
 use std::path::Path;
 use tch::Tensor;
 
@@ -54,7 +55,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
         quaternions: next(4),
         sh: Tensor::cat(&[dc, rest], 2),
     };
-    Ok(Splat { gaussians: raw.activate() })
+    Ok(Splat { gaussians: raw.activate(), origin: DVec3::ZERO })
 }
 
 /// Spherical harmonics of a colour channel, where there are so many f_rest.

@@ -3,6 +3,7 @@
 use super::{Splat, all_finite};
 use crate::error::{Error, Result};
 use crate::scene::Gaussians;
+use glam::DVec3;
 use std::path::Path;
 use tch::Tensor;
 
@@ -80,7 +81,7 @@ impl Values {
             opacities: tensor(&self.opacities, &[1, n]),
             sh: tensor(self.sh.as_flattened(), &[1, n, bases, 3]),
         };
-        Ok(Splat { gaussians })
+        Ok(Splat { gaussians, origin: DVec3::ZERO })
     }
 }
 

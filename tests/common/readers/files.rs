@@ -4,7 +4,7 @@ use super::{file, folder, load};
 use globalsplat::config::Config;
 use globalsplat::data::{Chunk, Dataset, Split, open_capture, points_of, read_camera_path};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
-use globalsplat::io::{decode_photo, read_splat, read_weights, write_splat};
+use globalsplat::io::{decode_photo, origin_file, read_splat, read_weights, write_local_splat, write_splat};
 use globalsplat::reconstruct::load_model;
 use globalsplat::train::latest_checkpoint;
 use std::path::Path;
@@ -117,6 +117,18 @@ pub fn ply(bytes: &[u8]) {
 
 pub fn compressed_ply(bytes: &[u8]) {
     let _ = read_splat(&file("compressed_ply", "splat.compressed.ply", bytes));
+}
+
+/// `bytes` are the origin of a splat of one Gaussian; a splat that is read has to come back with it when it was written.
+pub fn splat_origin(bytes: &[u8]) {
+    let splat = file("splat_origin", "splat.splat", &[0; 32]);
+    std::fs::write(origin_file(&splat), bytes).unwrap();
+    let Ok(splat) = read_splat(&splat) else { return };
+    let copy = file("splat_origin", "copy.splat", b"");
+    write_local_splat(&copy, &splat).unwrap();
+    assert_eq!(read_splat(&copy).unwrap().origin, splat.origin);
+    let _ = write_splat(&copy, &splat);
+    let _ = splat.world_loss();
 }
 
 pub fn spz(bytes: &[u8]) {
