@@ -641,7 +641,7 @@ fn convert_keeps_what_a_capture_sees() {
                     "{ending}: {beyond:?} beyond what viewers hold"
                 );
             }
-            globalsplat::eval::psnr_between(&splat.gaussians, &copy.gaussians, &cameras).unwrap().unwrap()
+            globalsplat::eval::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
         };
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
         assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
@@ -659,11 +659,9 @@ fn convert_keeps_what_a_capture_sees() {
         let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
         succeed(&[&refine[..], &[arg(to)]].concat());
     }
-    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap().gaussians);
+    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap());
     let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
-    let cut = fit_splat(&out, &Splat { gaussians: large.map(Tensor::copy) }, &HarmonicLimits::up_to(3), &[])
-        .unwrap()
-        .gaussians;
+    let cut = fit_splat(&out, &large, &HarmonicLimits::up_to(3), &[]).unwrap();
     let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
     assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
 }

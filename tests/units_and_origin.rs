@@ -5,8 +5,7 @@ mod common;
 
 use common::program::{arg, globalsplat, refuse, room, succeed};
 use common::{captures, skip};
-use glam::DMat3;
-use glam::DVec3;
+use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
 use globalsplat::eval::psnr;
 use globalsplat::io::{
@@ -17,40 +16,44 @@ use globalsplat::scene::{Camera, LocalFrame, Similarity};
 use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
-use tch::Kind;
 
-/// Units and origins, among them kilometres, UTM and ECEF coordinates.
-const PLACES: [(f64, [f64; 3]); 7] = [
-    (1e-6, [0.; 3]),
-    (1e-3, [0.; 3]),
-    (37., [0.; 3]),
-    (1e6, [0.; 3]),
-    (1., [448_265.12, 5_411_920.65, 135.4]),
-    (1e3, [1e8, -1e8, 1e8]),
-    (1., [-1e8, 3e7, 7e6]),
+/// Units, origins and rotations about y; among them kilometres, UTM and ECEF coordinates.
+const PLACES: [(f64, [f64; 3], f64); 7] = [
+    (1e-6, [0.; 3], 0.),
+    (1e-3, [0.; 3], 0.),
+    (37., [-4., 3., 5.], 0.9),
+    (1e6, [0.; 3], 0.),
+    (1., [448_265.12, 5_411_920.65, 135.4], 0.),
+    (1e3, [1e8, -1e8, 1e8], 0.),
+    (1., [-1e8, 3e7, 7e6], -2.),
 ];
 
-/// The capture at `from` with positions times `factor` plus `offset`, in the folder `to`.
-fn moved(from: &Path, to: &Path, factor: f64, offset: DVec3) {
-    let capture = open_capture(from).unwrap();
-    let names: Vec<String> = capture.names().map(String::from).collect();
-    let moved = |mut camera: Camera| {
-        camera.c2w.w_axis = (camera.c2w.w_axis.truncate() * factor + offset).extend(1.);
-        camera
-    };
-    for name in &names {
-        fs::create_dir_all(to.join(name).parent().unwrap()).unwrap();
-        fs::copy(from.join(name), to.join(name)).unwrap();
-    }
-    let cameras: Vec<Camera> = capture.cameras().into_iter().map(moved).collect();
-    write_cameras_json(&to.join("cameras.json"), &names, &cameras).unwrap();
+/// The similarity to such a place.
+fn to_place((scale, offset, angle): (f64, [f64; 3], f64)) -> Similarity {
+    Similarity { rotation: DMat3::from_rotation_y(angle), translation: DVec3::from_array(offset), scale }
 }
 
-/// The splat that a capture that was moved so sees the same of.
-fn moved_splat(splat: &Splat, factor: f64, offset: DVec3) -> Splat {
-    let to = Similarity { rotation: DMat3::IDENTITY, translation: DVec3::ZERO, scale: factor };
-    let gaussians = transform(&splat.gaussians, &to);
-    Splat { origin: splat.origin * factor + offset, ..Splat::of(&gaussians).unwrap() }
+/// Writes the capture at `from`, moved by `to`, in `folder`.
+fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
+    let capture = open_capture(from).unwrap();
+    let names: Vec<String> = capture.names().map(String::from).collect();
+    let moved = |camera: Camera| {
+        let centre = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
+        let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), centre);
+        Camera { c2w, ..camera }
+    };
+    for name in &names {
+        fs::create_dir_all(folder.join(name).parent().unwrap()).unwrap();
+        fs::copy(from.join(name), folder.join(name)).unwrap();
+    }
+    let cameras: Vec<Camera> = capture.cameras().into_iter().map(moved).collect();
+    write_cameras_json(&folder.join("cameras.json"), &names, &cameras).unwrap();
+}
+
+/// `splat`, of which a capture that was moved by `to` sees the same. Its origin is the translation.
+fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
+    let gaussians = transform(&splat.gaussians, &Similarity { translation: DVec3::ZERO, ..*to });
+    Splat { origin: to.translation, ..Splat::of(&gaussians).unwrap() }
 }
 
 fn told(arguments: &[&str]) -> Value {
@@ -75,51 +78,45 @@ fn least_psnr(a: &Path, b: &Path) -> f64 {
 #[test]
 fn a_splat_looks_the_same_in_any_unit_and_place() {
     let (folder, room) = room();
-    let truth = read_splat(&room.join("truth.ply")).unwrap();
+    let truth = room.join("truth.ply");
     let of = |name: &str| folder.path().join(name);
-    let render = |splat: &Path, scene: &Path, out: &Path| {
-        succeed(&["render", "--splat", arg(splat), "--scene", arg(scene), "--depth", "--out", arg(out)])
-    };
-    let eval = |splat: &Path, scene: &Path| {
-        told(&["eval", "--splat", arg(splat), "--scene", arg(scene), "--json"])["psnr"].as_f64().unwrap()
-    };
-    render(&room.join("truth.ply"), &room, &of("plain"));
-    let plain_psnr = eval(&room.join("truth.ply"), &room);
-    let converted = |from: &Path, to: &Path, scene: &Path| {
-        told(&["convert", arg(from), arg(to), "--scene", arg(scene), "--local-origin", "--json"])["psnr"]
-            .as_f64()
-    };
-    let plain_loss = converted(&room.join("truth.ply"), &of("plain.compressed.ply"), &room).unwrap();
-    for (factor, offset) in PLACES {
-        let what = format!("times {factor}, at {offset:?}");
-        let offset = DVec3::from_array(offset);
-        let (scene, splat) = (of("scene"), of("a.ply"));
-        moved(&room, &scene, factor, offset);
-        write_local_splat(&splat, &moved_splat(&truth, factor, offset)).unwrap();
-        assert_eq!(origin_file(&splat).is_file(), offset != DVec3::ZERO);
-        render(&splat, &scene, &of("pictures"));
-        let least = least_psnr(&of("plain"), &of("pictures"));
-        assert!(least >= 60., "{what}: {least:.2} dB");
-        assert!((eval(&splat, &scene) - plain_psnr).abs() < 0.05, "{what}");
-        let copy = of("a.compressed.ply");
-        let loss = converted(&splat, &copy, &scene).unwrap();
-        assert!((loss - plain_loss).abs() < 1., "{what}: {loss:.2} instead of {plain_loss:.2} dB");
-        // Whoever looks at it.
-        for cameras in [&["--orbit"][..], &["--orbit", "--scene", arg(&scene)], &["--path", arg(&scene)]] {
-            let out = of("orbit.png");
-            let frames = ["--frames", "3", "--size", "32x24"];
-            let begins = ["render", "--splat", arg(&splat), "--out", arg(&out)];
-            succeed(&[&begins[..], cameras, &frames].concat());
-            let seen = tensor_from_rgb(&read_image(&out).unwrap());
-            let plain_scene = cameras.iter().map(|a| if *a == arg(&scene) { arg(&room) } else { a });
-            let plain_splat = room.join("truth.ply");
-            let begins = ["render", "--splat", arg(&plain_splat), "--out", arg(&out)];
-            succeed(&[&begins[..], &plain_scene.collect::<Vec<_>>(), &frames].concat());
-            let least = psnr(&seen, &tensor_from_rgb(&read_image(&out).unwrap()));
-            assert!(least >= 60., "{what}, {cameras:?}: {least:.2} dB");
+    // Pictures of the capture's cameras, of a smooth path through them and of orbits, and what is scored and lost.
+    let looked_at = |splat: &Path, scene: &Path, name: &str| -> (PathBuf, f64, f64) {
+        let (pictures, copy) = (of(name), of("copy.compressed.ply"));
+        let (splat, scene) = (arg(splat), arg(scene));
+        succeed(&["render", "--splat", splat, "--scene", scene, "--depth", "--out", arg(&pictures)]);
+        for (name, cameras) in [
+            ("around", &["--orbit"][..]),
+            ("amid", &["--orbit", "--scene", scene]),
+            ("path", &["--path", scene]),
+        ] {
+            let out = pictures.join(format!("{name}.png"));
+            let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
+            succeed(&[&["render"], cameras, &others].concat());
         }
+        let scores = told(&["eval", "--splat", splat, "--scene", scene, "--json"]);
+        let loss = told(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
+        (pictures, scores["psnr"].as_f64().unwrap(), loss["psnr"].as_f64().unwrap())
+    };
+    let (plain, plain_psnr, plain_loss) = looked_at(&truth, &room, "plain");
+    let read = read_splat(&truth).unwrap();
+    for place in PLACES {
+        let to = to_place(place);
+        let (scene, splat) = (of("scene"), of("a.ply"));
+        write_moved(&room, &scene, &to);
+        write_local_splat(&splat, &moved_splat(&read, &to)).unwrap();
+        assert_eq!(origin_file(&splat).is_file(), to.translation != DVec3::ZERO);
+        let (pictures, psnr, loss) = looked_at(&splat, &scene, "pictures");
+        if place.2 != 0. {
+            // An orbit around a splat alone begins at an axis of the world.
+            fs::copy(plain.join("around.png"), pictures.join("around.png")).unwrap();
+        }
+        let least = least_psnr(&plain, &pictures);
+        assert!(least >= 60., "{place:?}: {least:.2} dB");
+        assert!((psnr - plain_psnr).abs() < 0.05, "{place:?}: {psnr:.2} instead of {plain_psnr:.2} dB");
+        assert!((loss - plain_loss).abs() < 1., "{place:?}: {loss:.2} instead of {plain_loss:.2} dB");
         fs::remove_dir_all(&scene).unwrap();
-        fs::remove_dir_all(of("pictures")).unwrap();
+        fs::remove_dir_all(&pictures).unwrap();
     }
 }
 
@@ -152,14 +149,15 @@ fn powers_of_two_change_no_bit() {
     for exponent in [-20, -3, 5, 20] {
         let factor = f64::from(exponent).exp2();
         let scene = of(&format!("scene{exponent}"));
-        moved(&room, &scene, factor, DVec3::ZERO);
+        let to = to_place((factor, [0.; 3], 0.));
+        write_moved(&room, &scene, &to);
         let (gaussians, same) = made(&scene, "scaled");
         assert!(gaussians.means.equal(&(&plain.means * factor)), "2^{exponent}");
         assert!(gaussians.scales.equal(&(&plain.scales * factor)), "2^{exponent}");
         assert!(gaussians.quaternions.equal(&plain.quaternions) && gaussians.sh.equal(&plain.sh));
         assert!(pictures == same, "2^{exponent}");
         let cameras = open_capture(&scene).unwrap().cameras();
-        let scaled = moved_splat(&truth, factor, DVec3::ZERO).renderer().render(&cameras).unwrap();
+        let scaled = moved_splat(&truth, &to).renderer().render(&cameras).unwrap();
         for (a, b) in seen.iter().zip(&scaled) {
             assert!(a.rgb.equal(&b.rgb) && a.alpha.equal(&b.alpha), "2^{exponent}");
             assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");
@@ -185,20 +183,20 @@ fn a_page_is_the_same_in_any_unit_and_place() {
         serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
     };
     let plain = contents(&room.join("truth.ply"), &room);
-    for (factor, offset) in PLACES {
-        let offset = DVec3::from_array(offset);
+    for place in PLACES.into_iter().filter(|(_, _, angle)| *angle == 0.) {
+        let to = to_place(place);
         let (scene, splat) = (of("scene"), of("a.ply"));
-        moved(&room, &scene, factor, offset);
-        write_local_splat(&splat, &moved_splat(&truth, factor, offset)).unwrap();
+        write_moved(&room, &scene, &to);
+        write_local_splat(&splat, &moved_splat(&truth, &to)).unwrap();
         let other = contents(&splat, &scene);
         for (path, least) in [("/distance", 1e-4), ("/frustum", 1e-4)] {
             let number = |value: &Value| value.pointer(path).unwrap().as_f64().unwrap();
-            assert!((number(&plain) / number(&other) - 1.).abs() < least, "{path}: {factor} {offset}");
+            assert!((number(&plain) / number(&other) - 1.).abs() < least, "{path}: {place:?}");
         }
         for (a, b) in plain["path"].as_array().unwrap().iter().zip(other["path"].as_array().unwrap()) {
             let numbers = |pose: &Value| -> Vec<f64> { serde_json::from_value(pose.clone()).unwrap() };
             for (a, b) in numbers(a).iter().zip(numbers(b)) {
-                assert!((a - b).abs() < 1e-3, "{factor} {offset}: {a} {b}");
+                assert!((a - b).abs() < 1e-3, "{place:?}: {a} {b}");
             }
         }
     }
@@ -210,10 +208,11 @@ fn a_local_origin_keeps_the_detail() {
     let (folder, room) = room();
     let truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
-    let offset = DVec3::new(448_265.12, 5_411_920.65, 135.4);
+    let to = to_place(PLACES[4]);
+    let offset = to.translation;
     let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
-    moved(&room, &scene, 1., offset);
-    write_local_splat(&local, &moved_splat(&truth, 1., offset)).unwrap();
+    write_moved(&room, &scene, &to);
+    write_local_splat(&local, &moved_splat(&truth, &to)).unwrap();
     let psnr = |splat: &Path| {
         told(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
     };
@@ -221,7 +220,7 @@ fn a_local_origin_keeps_the_detail() {
     let output = globalsplat(&["convert", arg(&local), arg(&world), "--scene", arg(&scene), "--json"]);
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(output.status.success() && said.lines().count() == 1, "{said}");
-    for part in ["world.ply", "5.412e6 units", "0.50 apart", "--local-origin"] {
+    for part in ["world.ply", "5.412e6 units", "every 0.5 units", "--local-origin"] {
         assert!(said.contains(part), "{said}");
     }
     assert!(!origin_file(&world).exists());
@@ -251,6 +250,11 @@ fn a_local_origin_keeps_the_detail() {
     succeed(&["convert", arg(&world), arg(&copy), "--local-origin"]);
     assert!(read_splat(&copy).unwrap().origin.distance(offset) < 10.);
 
+    // A name that is too long for the origin's is refused before the work.
+    let long = of(&format!("{}.ply", "x".repeat(240)));
+    let said = refuse(&["convert", arg(&local), arg(&long), "--local-origin"]);
+    assert!(said.contains(".origin.json can't be written"), "{said}");
+
     // Moved without its origin, it still opens, elsewhere.
     let lone = of("lone.ply");
     fs::copy(&local, &lone).unwrap();
@@ -264,31 +268,32 @@ fn a_local_origin_keeps_the_detail() {
 fn origins_that_are_none_are_refused() {
     let (folder, room) = room();
     let splat = room.join("truth.ply");
-    let (out, scene) = (folder.path().join("out.ply"), arg(&room));
-    let page = folder.path().join("out.html");
+    let refused = |bad: &str, command: &[&str]| {
+        fs::write(origin_file(&splat), bad).unwrap();
+        let said = refuse(command);
+        for part in ["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"] {
+            assert!(said.contains(part), "{bad}: {said}");
+        }
+    };
     for bad in [
         "",
         "[1, 2, 3]",
+        "{}",
         "{\"origin\": [1, 2]}",
         "{\"origin\": [1, 2, 1e999]}",
         "{\"origin\": [1, \"2\", 3]}",
-        "{}",
     ] {
-        fs::write(origin_file(&splat), bad).unwrap();
-        for command in [
-            &["render", "--splat", arg(&splat), "--scene", scene, "--out", arg(folder.path())][..],
-            &["render", "--splat", arg(&splat), "--scene", scene, "--html", arg(&page)],
-            &["eval", "--splat", arg(&splat), "--scene", scene],
-            &["convert", arg(&splat), arg(&out)],
-            &["refine", "--splat", arg(&splat), "--scene", scene, "--steps", "1", "--out", arg(&out)],
-            &["inspect", arg(&splat)],
-        ] {
-            let said = refuse(command);
-            assert!(
-                said.contains("truth.ply.origin.json: the JSON is ") && said.contains("expected {\"origin\""),
-                "{said}"
-            );
-        }
+        refused(bad, &["inspect", arg(&splat)]);
+    }
+    let (out, page, scene) = (folder.path().join("out.ply"), folder.path().join("out.html"), arg(&room));
+    for command in [
+        &["render", "--splat", arg(&splat), "--scene", scene, "--out", arg(folder.path())][..],
+        &["render", "--splat", arg(&splat), "--scene", scene, "--html", arg(&page)],
+        &["eval", "--splat", arg(&splat), "--scene", scene],
+        &["convert", arg(&splat), arg(&out)],
+        &["refine", "--splat", arg(&splat), "--scene", scene, "--steps", "1", "--out", arg(&out)],
+    ] {
+        refused("{\"origin\": null}", command);
     }
 }
 
@@ -306,14 +311,12 @@ fn real_captures_score_the_same_anywhere() {
         pictures
     };
     let plain = score(&capture, "plain.ply");
-    for (factor, offset) in [PLACES[0], PLACES[1], PLACES[4], PLACES[5]] {
+    for place in [PLACES[0], PLACES[4], PLACES[5]] {
         let scene = of("scene");
-        moved(&capture, &scene, factor, DVec3::from_array(offset));
+        write_moved(&capture, &scene, &to_place(place));
         let other = score(&scene, "moved.ply");
         let least = least_psnr(&plain, &other);
-        assert!(least >= 60., "times {factor}, at {offset:?}: {least:.2} dB");
-        let loaded = read_splat(&of("moved.ply")).unwrap();
-        assert_eq!(loaded.gaussians.means.kind(), Kind::Float);
+        assert!(least >= 60., "{place:?}: {least:.2} dB");
         fs::remove_dir_all(&scene).unwrap();
     }
 }

@@ -409,6 +409,7 @@ def operations(bench, only):
         "train, resumed": lambda: training("train, resumed", True),
         "export": aged("export", export),
         "reconstruct": aged("reconstruct", reconstruct),
+        "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
         "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
         "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
         "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),

@@ -9,7 +9,7 @@ use globalsplat::eval::{peak_memory_bytes, process_age};
 use globalsplat::io::check_writable_splat;
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
-use globalsplat::scene::ImageSize;
+use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -115,8 +115,9 @@ impl Reconstruct {
         let model = Model { input, ..Model::from(&loaded) };
         let reconstruction = watch.time("network", || reconstruct(model, &photos, &[]))?;
         watch.time("splat", || {
-            let splat = reconstruction.to_splat()?;
-            splat_out::write_for(&self.out, &splat, &capture.cameras(), self.local_origin)
+            let (splat, cameras) = (reconstruction.to_splat()?, capture.cameras());
+            let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+            splat_out::write_for(&self.out, &splat, &cameras, origin)
         })?;
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))

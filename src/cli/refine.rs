@@ -14,7 +14,7 @@ use globalsplat::refine::{
     gaussians_from_photos, load_photos, refine, scene_depth,
 };
 use globalsplat::render::{Rendered, render_views, transform};
-use globalsplat::scene::{Camera, Gaussians, RawGaussians, Similarity};
+use globalsplat::scene::{Camera, Gaussians, LocalFrame, RawGaussians, Similarity};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -188,7 +188,9 @@ impl Refine {
             (gaussians, after) = (first, before.clone());
             corrected.clear();
         }
-        splat_out::write_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras(), self.local_origin)?;
+        let cameras = capture.cameras();
+        let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+        splat_out::write_for(&self.out, &Splat::of(&gaussians)?, &cameras, origin)?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
             write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;

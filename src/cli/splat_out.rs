@@ -4,7 +4,7 @@ use glam::DVec3;
 use globalsplat::error::Result;
 use globalsplat::io::{Splat, check_writable_origin, fit_splat, write_local_splat, write_splat};
 use globalsplat::render::HarmonicLimits;
-use globalsplat::scene::{Camera, LocalFrame};
+use globalsplat::scene::Camera;
 use std::path::Path;
 
 /// Checks that the origin of a splat at `path` could be written, if it is to be (`is_local`).
@@ -15,11 +15,10 @@ pub fn check_origin(path: &Path, is_local: bool) -> Result<()> {
     if is_local { check_writable_origin(path) } else { Ok(()) }
 }
 
-/// Writes `splat` at `path` in spherical harmonics that the format holds and that show `cameras` the same, with coordinates relative
-/// to the centre of the cameras if `is_local`.
-pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], is_local: bool) -> Result<()> {
-    let splat = fit_splat(path, splat, &HarmonicLimits::up_to(splat.sh_degree()), cameras)?;
-    write(path, &splat, is_local.then(|| LocalFrame::from_cameras(cameras).origin))
+/// Writes as [`write`] does, in spherical harmonics that the format holds and that show `cameras` the same.
+pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: Option<DVec3>) -> Result<()> {
+    let limits = HarmonicLimits::up_to(splat.sh_degree());
+    write(path, &fit_splat(path, splat, &limits, cameras)?, local_origin)
 }
 
 /// Writes `splat` at `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are the world's, and what
@@ -29,7 +28,7 @@ pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<
         return write_local_splat(path, &splat.with_origin(origin));
     }
     if let Some(loss) = splat.world_loss() {
-        eprintln!("{}: {loss}; --local-origin keeps it", path.display());
+        eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
     write_splat(path, splat)
 }

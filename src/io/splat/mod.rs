@@ -83,7 +83,7 @@ impl Splat {
         SplatRenderer::new(&self.gaussians, self.origin, self.frame())
     }
 
-    /// Says in a sentence what world coordinates in float32 would lose of the positions, where that shows in pictures.
+    /// Says what float32 loses of the positions in world coordinates, where that shows in pictures.
     pub fn world_loss(&self) -> Option<String> {
         let frame = self.frame();
         let farthest = frame.origin.abs().max_element();
@@ -91,8 +91,8 @@ impl Splat {
         let share = spacing / frame.typical_distance();
         (self.origin != DVec3::ZERO && share > Self::COARSE).then(|| {
             format!(
-                "the scene is {farthest:.3e} units from the world's origin, where float32 positions are {spacing:.2e} apart: {:.2} % of \
-                 its size are lost",
+                "positions are rounded: {farthest:.3e} units from the origin, float32 has one every {spacing} units, {:.2} % of the \
+                 scene's typical distance",
                 100. * share
             )
         })
