@@ -364,6 +364,10 @@ def operations(bench, only):
     train = ["train", "--config", tiny, "--out", out, "--json"]
     export = ["export", "--config", tiny, "--out", out / "model.safetensors", "--json"]
     reconstruct = ["reconstruct", "--weights", weights, "--scene", room, "--out", out / "room.ply", "--json"]
+    far = inputs / "far.ply"
+    shutil.copy(splat, far)
+    (inputs / "far.ply.origin.json").write_text(json.dumps({"origin": [5e6, 4e5, 100.0]}))
+    convert = ["convert", far, out / "far.spz", "--local-origin", "--json"]
     score = ["eval", "--splat", splat, "--scene", room, "--json", "--sheet", out / "sheet.png"]
     report = ["report", inputs / "evaluation", "--out", out / "report.html", "--json"]
     orbit = ["render", "--splat", splat, "--size", "24x24", "--orbit", "--frames", 3, "--json", "--out"]
@@ -409,7 +413,7 @@ def operations(bench, only):
         "train, resumed": lambda: training("train, resumed", True),
         "export": aged("export", export),
         "reconstruct": aged("reconstruct", reconstruct),
-        "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
+        "convert --local-origin": aged("convert --local-origin", convert),
         "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
         "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
         "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),
