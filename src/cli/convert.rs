@@ -111,7 +111,7 @@ impl Convert {
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {
     Ok(json!({
-        "splat": path,
+        "splat": path.to_string_lossy(),
         "gaussians": splat.gaussians.count(),
         "sh_degree": splat.sh_degree(),
         "bytes": std::fs::metadata(path)?.len(),

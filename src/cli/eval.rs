@@ -333,13 +333,13 @@ impl Eval {
                 .iter()
                 .map(|(folder, e)| {
                     json!({
-                        "folder": folder, "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
+                        "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
                         "input": e.input, "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
                         "efficiency": e.efficiency, "failures": e.failures,
                     })
                 })
                 .collect();
-            print_json(&json!({ "report": report, "evaluations": summaries }));
+            print_json(&json!({ "report": report.to_string_lossy(), "evaluations": summaries }));
         } else {
             for (_, e) in evaluations {
                 let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));

@@ -32,6 +32,7 @@ impl Inspect {
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
+                std::fs::metadata(&self.path).map_err(Error::read(&self.path))?;
                 let expected = "a splat (.ply, .compressed.ply, .spz or .splat), a .safetensors, a .ckpt, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
             }
@@ -120,7 +121,8 @@ fn chunk(path: &Path) -> Result<Value> {
 fn dataset(path: &Path) -> Result<Value> {
     let dataset = Dataset::open(path, Split::Test)?;
     let groups = dataset.groups().iter();
-    let absent: Vec<_> = groups.filter(|group| !group.path().is_file()).map(|group| group.path()).collect();
+    let absent: Vec<_> =
+        groups.filter(|group| !group.path().is_file()).map(|group| group.path().to_string_lossy()).collect();
     Ok(json!({
         "kind": "data set",
         "scenes": dataset.scenes(),

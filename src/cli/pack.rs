@@ -50,7 +50,7 @@ impl Pack {
         bar.finish_and_clear();
         if self.json {
             print_json(
-                &json!({ "out": self.out, "scenes": captures.len(), "views": views, "chunks": chunks }),
+                &json!({ "out": self.out.to_string_lossy(), "scenes": captures.len(), "views": views, "chunks": chunks }),
             );
         } else {
             println!("{}: {} scenes, {views} views in {chunks} chunks", self.out.display(), captures.len());

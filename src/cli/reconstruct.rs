@@ -124,8 +124,8 @@ impl Reconstruct {
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());
         if self.json {
             print_json(&json!({
-                "splat": self.out,
-                "weights": model::name(self.weights.as_deref()),
+                "splat": self.out.to_string_lossy(),
+                "weights": model::name(self.weights.as_deref()).to_string_lossy(),
                 "photos": photos.len(),
                 "image_size": input.photo_size(data.image_size),
                 "views": views,

@@ -194,7 +194,7 @@ impl Refine {
         let (out, count) = (self.out.display(), gaussians.count());
         if self.json {
             let mut object = json!({
-                "splat": self.out, "gaussians": count, "photos": photos.len(), "steps": steps, "seconds": seconds,
+                "splat": self.out.to_string_lossy(), "gaussians": count, "photos": photos.len(), "steps": steps, "seconds": seconds,
                 "begin_seconds": begin_seconds, "corrections": corrected,
                 "shown": { "before": means(&before.shown), "after": means(&after.shown) },
             });

@@ -138,9 +138,11 @@ impl Synth {
         bar.finish_and_clear();
         let (out, scenes) = (self.out.display(), self.scenes);
         if self.json {
-            print_json(
-                &json!({ "out": self.out, "scenes": scenes, "chunks": chunks, "index": index.file, "depth": self.depth.then_some(depths), "sheet": self.sheet }),
-            );
+            print_json(&json!({
+                "out": self.out.to_string_lossy(), "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
+                "depth": self.depth.then_some(depths.to_string_lossy()),
+                "sheet": self.sheet.as_deref().map(Path::to_string_lossy),
+            }));
         } else {
             println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
             if let Some(sheet) = &self.sheet {
@@ -163,7 +165,7 @@ impl Synth {
             let path = self.out.join(format!("room_{scene:03}"));
             let seed = self.seed.wrapping_mul(1_000_003).wrapping_add(scene);
             write_room(&path, seed, self.frames as usize, self.image_size())?;
-            captures.push(path);
+            captures.push(path.to_string_lossy().into_owned());
             bar.inc(1);
         }
         bar.finish_and_clear();

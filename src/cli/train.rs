@@ -9,6 +9,7 @@ use globalsplat::io::check_writable_dir;
 use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -40,7 +41,7 @@ pub struct Train {
     out: PathBuf,
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
-    resume: String,
+    resume: OsString,
     /// Weights to begin with, where RUN has no checkpoint, instead of fresh ones, of a model of the same shape, or of one with patches two, three
     /// or more times as wide, or with a half, a third or less of the scene tokens; all Gaussians are shown from the
     /// first step on
@@ -63,10 +64,10 @@ impl Train {
         let (is_first, count) = (group.is_first(), group.ranks());
         let config = Config::read(&self.config, &self.set)?;
         memory::keep_for(&config.train);
-        let resume = match self.resume.as_str() {
-            "auto" => Resume::Auto,
-            "never" => Resume::Never,
-            path => Resume::From(path.into()),
+        let resume = match self.resume.to_str() {
+            Some("auto") => Resume::Auto,
+            Some("never") => Resume::Never,
+            _ => Resume::From(self.resume.clone().into()),
         };
         let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths()?)?);
         if scenes.sizes().is_empty() {
@@ -194,8 +195,8 @@ impl Train {
         write_curves(&curves, &self.out, (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr)))?;
         if self.json {
             let mut object = json!({
-                "checkpoint": outcome.checkpoint,
-                "curves": curves,
+                "checkpoint": outcome.checkpoint.to_string_lossy(),
+                "curves": curves.to_string_lossy(),
                 "seconds": seconds,
                 "skipped_steps": outcome.skipped,
                 "skipped_scenes": bad_data,

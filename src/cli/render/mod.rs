@@ -96,7 +96,7 @@ impl Render {
         view::write_page(page, &name, &splat, capture.as_ref())?;
         let (gaussians, bytes) = (splat.gaussians.count(), std::fs::metadata(page)?.len());
         if self.json {
-            print_json(&json!({ "page": page, "gaussians": gaussians, "bytes": bytes }));
+            print_json(&json!({ "page": page.to_string_lossy(), "gaussians": gaussians, "bytes": bytes }));
         } else {
             println!("{}: {gaussians} Gaussians, {:.1} MB", page.display(), bytes as f64 * 1e-6);
         }
@@ -125,6 +125,7 @@ impl Render {
         let written = output.finish()?;
         bar.finish_and_clear();
         if self.json {
+            let written: Vec<_> = written.iter().map(|file| file.to_string_lossy()).collect();
             print_json(
                 &json!({ "views": shots.cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
             );

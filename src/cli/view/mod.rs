@@ -44,7 +44,7 @@ impl View {
         let opened = open::that_detached(&page);
         if self.json {
             print_json(
-                &json!({ "page": page, "gaussians": splat.gaussians.count(), "opened": opened.is_ok() }),
+                &json!({ "page": page.to_string_lossy(), "gaussians": splat.gaussians.count(), "opened": opened.is_ok() }),
             );
         } else {
             println!("{}", page.display());
