@@ -2,7 +2,7 @@ use super::bench_attention::Attention;
 use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
-use super::{device, memory, parse_size, print_json, progress};
+use super::{device, memory, parse_size, print_json, progress, warnings::warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
@@ -154,10 +154,11 @@ impl Raster {
         }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
-                let gaussians = read_splat(splat)?.gaussians;
+                let splat = read_splat(splat)?;
+                warn(&splat.warnings);
                 let views = open_capture(scene)?.load_all(None)?;
                 let poses: Vec<_> = views.iter().map(|view| view.camera.c2w).collect();
-                (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
+                (splat.gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };

@@ -1,9 +1,11 @@
-use super::{print_json, render::orbit_around_splat};
+use super::{print_json, render::orbit_around_splat, warnings::warn};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::open_capture;
 use globalsplat::eval::psnr_between;
-use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
+use globalsplat::io::{
+    Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid, write_splat,
+};
 use globalsplat::render::HarmonicLimits;
 use globalsplat::scene::{Camera, ImageSize};
 use serde_json::{Value, json};
@@ -23,6 +25,9 @@ const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
 /// SPZ's coefficients are within ±1 and a .splat has one for each colour; viewers for browsers hold no more of a PLY's, either
 /// (--for-viewers). Where the capture is named, those that are left show its cameras what all did before; else what can't be held is
 /// cut off, which may cost much.
+///
+/// Gaussians that can't be drawn are left out and counted: those with numbers that aren't finite, which other commands refuse, and
+/// those whose rotation has length 0.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
@@ -53,7 +58,8 @@ impl Convert {
     pub fn run(self) -> Result<()> {
         check_writable_splat(&self.to)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
-        let original = read_splat(&self.from)?;
+        let original = read_splat_without_invalid(&self.from)?;
+        warn(&original.warnings);
         // Before the file is replaced, if it is the same.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.unwrap_or(original.sh_degree());

@@ -1,4 +1,4 @@
-use super::{check_views, device, model, print_json, progress, ranks, stop_flag};
+use super::{check_views, device, model, print_json, progress, ranks, stop_flag, warnings::warn};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
@@ -120,6 +120,7 @@ impl Eval {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
         let made = self.method(model).synthesize(&scene)?;
+        warn(&made.warnings);
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
         let scores = judge(&scene, &made, &perceptual)?;
@@ -314,6 +315,7 @@ impl Eval {
             if self.chooses_size() && enlarged > 0 {
                 eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
             }
+            evaluation.scenes.iter().for_each(|scene| warn(&scene.warnings));
             write_evaluation(&folder, &evaluation)?;
             write_csv(&folder.join("scores.csv"), &evaluation)?;
             evaluations.push((folder, evaluation));

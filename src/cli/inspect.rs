@@ -1,4 +1,4 @@
-use super::print_json;
+use super::{print_json, warnings::warn};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
@@ -65,6 +65,7 @@ fn range(t: &Tensor) -> Value {
 
 fn splat(path: &Path) -> Result<Value> {
     let splat = read_splat(path)?;
+    warn(&splat.warnings);
     let g = &splat.gaussians;
     let axis = |i: i64| range(&g.means.select(-1, i));
     Ok(json!({

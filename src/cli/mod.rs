@@ -30,6 +30,7 @@ mod report;
 mod synth;
 mod train;
 mod view;
+mod warnings;
 mod watch;
 mod weights_out;
 

@@ -1,5 +1,5 @@
 use super::progress::{self, Progress};
-use super::{check_views, memory, model, parse_size, print_json, stop_flag};
+use super::{check_views, memory, model, parse_size, print_json, stop_flag, warnings::warn};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
@@ -185,7 +185,9 @@ impl Refine {
             (gaussians, after) = (first, before.clone());
             corrected.clear();
         }
-        write_splat_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras())?;
+        let splat = Splat::of(&gaussians)?;
+        warn(&splat.warnings);
+        write_splat_for(&self.out, &splat, &capture.cameras())?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
             write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;
@@ -224,7 +226,9 @@ impl Refine {
     /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
     fn start(&self, capture: &Capture, photos: &[View]) -> Result<Start> {
         if let Some(path) = &self.splat {
-            return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
+            let splat = read_splat(path)?;
+            warn(&splat.warnings);
+            return Ok(Start::Gaussians(RawGaussians::of(&splat.gaussians)));
         }
         let needs_model = self.weights.is_some() || self.space != SpaceName::Gaussians;
         if self.from == Some(From::Nothing) && needs_model {

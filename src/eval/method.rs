@@ -38,6 +38,8 @@ pub struct Synthesis {
     pub splat_bytes: Option<u64>,
     /// Of a model's forward pass, or passes.
     pub forward_seconds: Option<f64>,
+    /// What was left out of the splat's file, a sentence each.
+    pub warnings: Vec<String>,
 }
 
 /// What a model took, in bytes.
@@ -91,6 +93,7 @@ impl Method<'_> {
                     gaussians: None,
                     splat_bytes: None,
                     forward_seconds: None,
+                    warnings: vec![],
                 })
             }
         }
@@ -151,6 +154,7 @@ fn of_splat(splat: &Splat, rendered: Vec<Rendered>) -> Synthesis {
         gaussians: Some(splat.gaussians.count()),
         splat_bytes: Some(splat.ply_bytes()),
         forward_seconds: None,
+        warnings: splat.warnings.clone(),
     }
 }
 

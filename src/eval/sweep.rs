@@ -274,6 +274,7 @@ impl Sweep<'_> {
             target: frames.target.clone(),
             enlarged: scene.enlarged,
             splat_bytes: made.splat_bytes,
+            warnings: made.warnings.clone(),
             forward_seconds: made.forward_seconds,
             warm_up: false,
             peak_memory_bytes: None,

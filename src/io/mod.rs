@@ -28,8 +28,8 @@ pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::write_sharded;
 pub use splat::{
-    Splat, check_writable_splat, find_splat, fit_splat, is_splat_name, read_splat, write_splat,
-    write_splat_for,
+    Splat, check_writable_splat, find_splat, fit_splat, is_splat_name, read_splat,
+    read_splat_without_invalid, write_splat, write_splat_for,
 };
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};

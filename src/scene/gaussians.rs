@@ -8,7 +8,7 @@ const OPACITY_MARGIN: f64 = 1e-6;
 pub(crate) const SH_C0: f64 = 0.28209479177387814;
 
 /// Scales are at least this, whose logarithm is finite.
-const MIN_SCALE: f64 = 1e-30;
+pub(crate) const MIN_SCALE: f64 = 1e-30;
 
 /// 3D Gaussians of B scenes with N each.
 #[derive(Debug)]

@@ -5,7 +5,7 @@ mod shots;
 
 pub(super) use shots::{median_depth, orbit_around_splat};
 
-use super::{model, parse_size, print_json, progress, stop_flag, view};
+use super::{model, parse_size, print_json, progress, stop_flag, view, warnings::warn};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout, open_capture};
@@ -137,7 +137,9 @@ impl Render {
 
     fn splat(&self, capture: Option<&Capture>) -> Result<Splat> {
         let (Some(weights), Some(capture)) = (&self.weights, capture) else {
-            return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
+            let splat = read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?;
+            warn(&splat.warnings);
+            return Ok(splat);
         };
         let loaded = model::load(Some(weights), Some(Precision::F32), Device::Cpu)?;
         let data = &loaded.config.data;

@@ -3,7 +3,7 @@ mod page;
 
 pub use page::{check_writable, has_viewer, write_page};
 
-use super::print_json;
+use super::{print_json, warnings::warn};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::open_capture;
@@ -36,6 +36,7 @@ impl View {
         page::check_has_viewer()?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = read_splat(&self.splat)?;
+        warn(&splat.warnings);
         let name = name_of(&self.splat);
         // The browser reads it when this program is gone.
         let page = tempfile::Builder::new().prefix(&format!("{name}-")).suffix(".html").tempfile()?;
