@@ -2,6 +2,7 @@
 //! files are mapped, so a tensor is read when it is asked for, once, and straight to where it belongs.
 
 use super::state_dict::{Contents, state_dict};
+use super::text::read_text;
 use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
@@ -144,8 +145,7 @@ impl WeightsFile {
     }
 
     fn open_shards(path: &Path) -> Result<Self> {
-        let text = std::fs::read(path).map_err(Error::read(path))?;
-        let index: ShardIndex = serde_json::from_slice(&text)
+        let index: ShardIndex = serde_json::from_str(&read_text(path)?)
             .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))?;
         let mut names: Vec<&String> = index.weight_map.values().collect();
         names.sort();
