@@ -123,12 +123,12 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
 #[test]
 fn folders_of_captures_are_found() {
     let Some(paths) = captures() else { return };
-    let found = find_captures(paths[0].parent().expect("a parent")).expect("captures");
+    let found = find_captures(paths[0].parent().expect("a parent")).expect("captures").captures;
     assert_eq!(found.len(), paths.len());
     let above = tempfile::tempdir().expect("a folder");
     std::os::unix::fs::symlink(paths[0].parent().expect("a parent"), above.path().join("re10k"))
         .expect("a link");
-    assert_eq!(find_captures(above.path()).expect("captures").len(), paths.len());
+    assert_eq!(find_captures(above.path()).expect("captures").captures.len(), paths.len());
     let mut names: Vec<_> = found.iter().map(|capture| capture.name.as_str()).collect();
     names.sort_unstable();
     assert!(paths.iter().map(|path| path.file_name().expect("a name")).eq(names));

@@ -2,7 +2,7 @@ use super::bench_attention::Attention;
 use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
-use super::{device, memory, parse_size, print_json, progress};
+use super::{device, memory, open_capture, parse_size, print_json, progress};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
@@ -10,7 +10,7 @@ use globalsplat::bench::{
     made_up_videos,
 };
 use globalsplat::config::Config;
-use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
+use globalsplat::data::{DataConfig, TrainingScenes, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
 use globalsplat::scene::ImageSize;

@@ -1,7 +1,6 @@
-use super::{print_json, render::orbit_around_splat};
+use super::{open_capture, print_json, render::orbit_around_splat};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
 use globalsplat::render::HarmonicLimits;

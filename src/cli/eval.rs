@@ -1,7 +1,7 @@
-use super::{check_views, device, model, print_json, progress, ranks, stop_flag};
+use super::{check_views, device, model, open_capture, print_json, progress, ranks, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
+use globalsplat::data::{Capture, Dataset, Holdout, Split};
 use globalsplat::error::Error;
 use globalsplat::eval::{
     Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
@@ -63,7 +63,7 @@ pub struct Eval {
     /// a whole word, else as its folder
     #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
     dataset: Option<String>,
-    /// Target views: every:N or every:N+K; by default as the model was trained
+    /// Target views: every:N, every:N+K, or none for the capture's own test part; by default as the model was trained
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
     /// Photos the model is shown, spread over the path of the camera; by default all that are not held out
@@ -258,6 +258,7 @@ impl Eval {
             return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
         }
         let dataset = Dataset::open(data, Split::Test)?;
+        warn_of_many(dataset.warnings().iter());
         let dataset_name = |index| Sweep::dataset_name(self.dataset.as_deref(), data, index);
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;

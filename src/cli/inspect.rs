@@ -1,7 +1,7 @@
-use super::print_json;
+use super::{open_capture, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
+use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split};
 use globalsplat::error::Error;
 use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
@@ -24,11 +24,16 @@ pub struct Inspect {
 
 impl Inspect {
     pub fn run(self) -> Result<()> {
+        let is_scene_of_chunk = !self.path.exists() && self.path.to_string_lossy().contains(".torch#");
         let object = match self.path.extension().and_then(|e| e.to_str()) {
+            _ if is_scene_of_chunk => capture(&self.path)?,
             _ if is_splat_name(&self.path) => splat(&self.path)?,
             _ if is_weights_name(&self.path) => weights(&self.path)?,
+            _ if !self.path.exists() => {
+                return Err(Error::Request(format!("{}: no such file or folder", self.path.display())).into());
+            }
             Some("torch") => chunk(&self.path)?,
-            Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
+            Some("json") => capture(&self.path)?,
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
@@ -138,6 +143,7 @@ fn capture(path: &Path) -> Result<Value> {
         "kind": "capture",
         "name": capture.name,
         "views": capture.len(),
+        "test_views": capture.has_test_part().then(|| capture.scored_views().len()),
         "image_size": [first.height, first.width],
         "focal_lengths": [first.intrinsics.fx, first.intrinsics.fy],
         "extent": globalsplat::scene::normalize(&poses)?.world_from_normalized.scale,

@@ -35,9 +35,11 @@ mod weights_out;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
+use globalsplat::data::Capture;
 use globalsplat::error::panic_message;
 use globalsplat::scene::ImageSize;
 use std::panic;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -189,6 +191,34 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
     match views {
         Some(views @ ..2) => Err(Error::Request(format!("--views is {views}, expected 2 or more"))),
         _ => Ok(()),
+    }
+}
+
+/// Opens a capture and says what is left out or changed of it.
+fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
+    let capture = globalsplat::data::open_capture(path)?;
+    warn(capture.warnings());
+    Ok(capture)
+}
+
+/// Says what is left out or changed of an input, a line each.
+fn warn(lines: &[String]) {
+    if ranks::is_first() {
+        lines.iter().for_each(|line| eprintln!("{line}"));
+    }
+}
+
+/// Says the first few of what is left out or changed of many inputs, and how many more lines there are.
+fn warn_of_many<'a>(lines: impl Iterator<Item = &'a String>) {
+    const SHOWN: usize = 5;
+    let lines: Vec<String> = lines.cloned().collect();
+    let (shown, others) = lines.split_at(lines.len().min(SHOWN));
+    warn(shown);
+    if !others.is_empty() {
+        warn(&[format!(
+            "and {} more lines of this kind: `globalsplat inspect` says those of a capture",
+            others.len()
+        )]);
     }
 }
 

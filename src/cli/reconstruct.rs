@@ -1,9 +1,9 @@
 use super::memory::keep_during;
 use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
-use super::{check_views, device, model, print_json};
+use super::{check_views, device, model, open_capture, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Capture, Holdout, open_capture};
+use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
 use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
@@ -39,7 +39,7 @@ pub struct Reconstruct {
     /// share its pixels out; time and memory grow with views, N²-fold at most
     #[arg(long, value_name = "PIXELS")]
     views_at: Option<u32>,
-    /// Views not to use: every:N, every:N+K or none
+    /// Views not to use: every:N, every:N+K, or none but the capture's own test part
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does

@@ -1,9 +1,9 @@
 use super::progress::{self, Progress};
-use super::{check_views, memory, model, parse_size, print_json, stop_flag};
+use super::{check_views, memory, model, open_capture, parse_size, print_json, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
-use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
+use globalsplat::data::{Capture, Holdout, View, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{
@@ -73,7 +73,7 @@ pub struct Refine {
     /// Other random numbers for another seed
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub seed: u64,
-    /// Views to keep out and to score by: every:N, every:N+K or none
+    /// Views to keep out and to score by: every:N, every:N+K, or none but the capture's own test part
     #[arg(long, value_name = "WHICH", default_value = "none")]
     pub holdout: String,
     /// Use so many of the other views at most, spread over the path of the camera
@@ -144,7 +144,7 @@ impl Refine {
             check_writable_png(sheet)?;
         }
         let capture = open_capture(&self.scene)?;
-        let (shown, held_out) = holdout.split(capture.len());
+        let (shown, held_out) = capture.split(holdout);
         let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX).max(1));
         let photos = load_photos(&capture, &shown, size)?;
         let held_out = load_photos(&capture, &held_out, size)?;

@@ -1,8 +1,8 @@
-use super::{memory, print_json, progress, ranks, stop_flag};
+use super::{memory, print_json, progress, ranks, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
+use globalsplat::data::{BadData, Capture, SceneGroups, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
 use globalsplat::io::check_writable_dir;
@@ -88,6 +88,8 @@ impl Train {
                 "{first}{more} of data.validation is trained on, too: its score tells nothing of unseen scenes"
             );
         }
+        let captures = scenes.captures().iter().flat_map(Capture::warnings);
+        warn_of_many(scenes.warnings().iter().chain(captures).chain(held_out.warnings()));
         let mut trainer = Trainer::new(&config, scenes, device)?;
         if let Some(weights) = &self.from {
             trainer = trainer.with_weights(weights);

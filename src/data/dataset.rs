@@ -1,9 +1,12 @@
 //! Data sets: many captures under one name (spec 10.8).
 
 use super::capture::Capture;
-use super::formats::{Chunk, INDEX_FILE, capture_folders, folder_name, open_capture};
+use super::formats::{
+    CaptureFolders, Chunk, INDEX_FILE, capture_folders, folder_name, is_capture, open_capture,
+};
 use super::made_up::MadeUp;
 use crate::error::{Error, Result};
+use crate::io::read_text;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -60,6 +63,7 @@ pub struct Dataset {
     /// The folder's name.
     pub name: String,
     groups: Vec<SceneGroup>,
+    warnings: Vec<String>,
 }
 
 /// A group in memory, images still encoded.
@@ -81,19 +85,27 @@ impl Dataset {
     /// are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = MadeUp::named(root)? {
-            return Ok(Dataset { name: root.to_string_lossy().into_owned(), groups: made_up_groups(videos) });
+            let (name, groups) = (root.to_string_lossy().into_owned(), made_up_groups(videos));
+            return Ok(Dataset { name, groups, warnings: vec![] });
         }
         let name = folder_name(root);
         let indexed =
             [root.to_owned(), root.join(split.folder())].into_iter().find(|f| f.join(INDEX_FILE).is_file());
-        let groups = match indexed {
-            Some(folder) => chunk_groups(&folder)?,
+        let (groups, warnings) = match indexed {
+            Some(folder) => (chunk_groups(&folder)?, vec![]),
             None => {
-                let part = Some(root.join(split.folder())).filter(|folder| folder.is_dir());
+                // A capture may have its photos in a folder of that name.
+                let part =
+                    Some(root.join(split.folder())).filter(|folder| folder.is_dir() && !is_capture(root));
                 capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
             }
         };
-        Ok(Dataset { name, groups })
+        Ok(Dataset { name, groups, warnings })
+    }
+
+    /// Returns a line for each folder that couldn't be looked into.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// Every group, in the order of their paths.
@@ -146,8 +158,7 @@ impl OpenGroup {
 
 fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
     let file = folder.join(INDEX_FILE);
-    let text = std::fs::read(&file).map_err(Error::read(&file))?;
-    let index: BTreeMap<String, String> = serde_json::from_slice(&text).map_err(|e| {
+    let index: BTreeMap<String, String> = serde_json::from_str(&read_text(&file)?).map_err(|e| {
         Error::input(&file, "the index", format!("unusable ({e})"), "{scene: chunk's file name}")
     })?;
     let mut chunks: BTreeMap<String, Vec<String>> = BTreeMap::new();
@@ -177,9 +188,9 @@ fn made_up_groups(videos: MadeUp) -> Vec<SceneGroup> {
     videos.keys().into_iter().enumerate().map(group).collect()
 }
 
-/// Of the captures in `root` those that aren't in `except`.
-fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
-    let mut folders = capture_folders(root)?;
+/// Of the captures in `root` those that aren't in `except`, and what couldn't be looked into.
+fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<String>)> {
+    let CaptureFolders { mut folders, warnings } = capture_folders(root)?;
     folders.retain(|folder| !folder.starts_with(except));
     if folders.is_empty() {
         let found = format!("without captures but those in {}", except.display());
@@ -195,5 +206,5 @@ fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
     };
     let keys: Vec<String> = folders.iter().zip(&names).map(|(folder, name)| key(folder, name)).collect();
     let group = |(path, key)| SceneGroup { path, source: Source::Folder, keys: vec![key] };
-    Ok(folders.into_iter().zip(keys).map(group).collect())
+    Ok((folders.into_iter().zip(keys).map(group).collect(), warnings))
 }

@@ -1,6 +1,6 @@
 //! Made-up videos, named where a data set is named: `synth:seed=1,scenes=10000`.
 
-use super::capture::{Capture, Frame, Photo, Purpose};
+use super::capture::{Capture, Changes, Frame, Photo, Purpose};
 use super::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::{PHOTO_EXTENSIONS, read_image};
@@ -116,7 +116,8 @@ impl MadeUp {
             distortion: Distortion::default(),
         };
         let frames = video.cameras().iter().enumerate().map(frame).collect();
-        Capture::new(self.key(number), PathBuf::from(&self.name), frames, Purpose::Photos)
+        let file = PathBuf::from(&self.name);
+        Capture::new(self.key(number), file, frames, Changes::default(), Purpose::Photos)
     }
 }
 

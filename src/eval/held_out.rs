@@ -17,6 +17,7 @@ pub struct HeldOut {
     config: DataConfig,
     scenes: Vec<HeldOutScene>,
     trained_on: Vec<String>,
+    warnings: Vec<String>,
     scores: Vec<HeldOutScores>,
 }
 
@@ -50,22 +51,26 @@ impl HeldOut {
     /// broken or has too few.
     pub fn find(config: &DataConfig, training: &TrainingScenes) -> Result<Self> {
         let mut scenes = vec![];
+        let holds_out = |capture: &&Capture| config.holdout != Holdout::None || capture.has_test_part();
+        for capture in training.captures().iter().filter(holds_out) {
+            split_views(capture, config.holdout)?;
+            scenes.push(HeldOutScene::Views(capture.clone()));
+        }
         if config.holdout != Holdout::None {
-            for capture in training.captures() {
-                split_views(capture, config.holdout)?;
-                scenes.push(HeldOutScene::Views(capture.clone()));
-            }
             let others = spread(training.others(), config.validation_scenes);
             scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInGroup(group, key)));
         }
-        let mut groups = vec![];
+        let (mut groups, mut warnings) = (vec![], vec![]);
         for path in config.validation_paths()? {
-            groups.extend_from_slice(Dataset::open(&path, Split::Test)?.groups());
+            let dataset = Dataset::open(&path, Split::Test)?;
+            groups.extend_from_slice(dataset.groups());
+            warnings.extend_from_slice(dataset.warnings());
         }
         let (trained, mut trained_on) = (places(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
             let capture = group.open()?.capture(&key)?;
             split_scene(&capture, config)?;
+            warnings.extend_from_slice(capture.warnings());
             let place = match group.is_folder() {
                 true => place(capture.file(), None),
                 false => place(group.path(), Some(&key)),
@@ -75,7 +80,7 @@ impl HeldOut {
             }
             scenes.push(HeldOutScene::Whole(group, key));
         }
-        Ok(HeldOut { config: config.clone(), scenes, trained_on, scores: vec![] })
+        Ok(HeldOut { config: config.clone(), scenes, trained_on, warnings, scores: vec![] })
     }
 
     /// Whether nothing is held out.
@@ -86,6 +91,11 @@ impl HeldOut {
     /// Scenes held out as a whole that are learned all the same: their scores tell nothing of scenes never seen.
     pub fn trained_on(&self) -> &[String] {
         &self.trained_on
+    }
+
+    /// Returns what is left out or changed of the scenes held out as a whole, a line each.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// What the last validation found.
@@ -239,6 +249,11 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
 /// camera's path, from the middle of a video that is longer than training's.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
+    if capture.has_test_part() {
+        let (shown, held_out) = split_views(capture, Holdout::None)?;
+        let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
+        return Ok((context, spread_over_path(&cameras, &held_out, config.target_views)));
+    }
     if cameras.len() < 3 {
         return Err(Error::input(capture.file(), "the number of views", cameras.len(), "three or more"));
     }

@@ -1,7 +1,7 @@
 //! Evaluation indices: which frames of which scenes are context, and which are targets.
 
 use crate::error::{Error, Result};
-use crate::io::write_json;
+use crate::io::{read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -38,9 +38,8 @@ impl EvaluationIndex {
     /// # Errors
     /// A file that can't be read, is no index, or has a scene with fewer than two context frames or no target.
     pub fn read(file: &Path) -> Result<Self> {
-        let text = std::fs::read(file).map_err(Error::read(file))?;
         let expected = "{scene: {\"context\": [frames], \"target\": [frames]} or null}";
-        let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_slice(&text)
+        let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_str(&read_text(file)?)
             .map_err(|e| Error::input(file, "the index", format!("unusable ({e})"), expected))?;
         let scenes: BTreeMap<_, _> =
             scenes.into_iter().filter_map(|(key, frames)| Some((key, frames?))).collect();

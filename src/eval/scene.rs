@@ -25,17 +25,18 @@ pub struct EvalScene {
 }
 
 impl EvalScene {
-    /// Every photo of `capture`, fitted to `size` or as it is, for splats and pictures.
+    /// Every photo of `capture`, or of its own test part if it has one, fitted to `size` or as it is, for splats and pictures.
     ///
     /// # Errors
     /// Photos that can't be read.
     pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Self> {
         let enlarged = size.is_some_and(|size| capture.has_smaller(size));
+        let (views, names) = (capture.scored_views(), capture.picture_names());
         Ok(EvalScene {
             name: capture.name.clone(),
             context: vec![],
-            target: capture.load_all(size)?,
-            picture_names: capture.picture_names(),
+            target: capture.load(&views, size)?,
+            picture_names: views.into_iter().map(|view| names[view].clone()).collect(),
             frames: None,
             enlarged,
         })
@@ -67,6 +68,10 @@ impl EvalScene {
 
     /// The frames of scene `key` in `index`, named by their numbers.
     fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
+        if !capture.is_complete() {
+            let expected = "all that it names, as an index counts them";
+            return Err(Error::input(capture.file(), "the photos", "not all there", expected));
+        }
         let frames = loader.index.frames(key, capture.len())?.clone();
         let context = match loader.photo_size {
             Some(size) => capture.load(&frames.context, Some(size))?,
@@ -85,7 +90,7 @@ impl EvalScene {
 
 /// Positions of the views that `holdout` leaves, and of those that it holds out.
 pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
-    let (context, held_out) = holdout.split(capture.len());
+    let (context, held_out) = capture.split(holdout);
     if held_out.is_empty() || context.len() < 2 {
         let split = format!("{} context and {} target views", context.len(), held_out.len());
         let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";

@@ -15,7 +15,7 @@ pub fn load_context(
     views: Option<usize>,
     size: ImageSize,
 ) -> Result<Vec<View>> {
-    let (shown, _) = holdout.split(capture.len());
+    let (shown, _) = capture.split(holdout);
     let chosen = match views {
         Some(views) => spread_over_path(&capture.cameras(), &shown, views),
         None => shown,

@@ -10,7 +10,7 @@ mod smooth_path;
 mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
-pub(crate) use camera::{check_pose, nearest_rigid};
+pub(crate) use camera::{check_pose, nearest_rigid_of_scaled};
 pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
 pub use normalize::{Normalization, Placement, Similarity, normalize};

@@ -5,10 +5,10 @@ mod shots;
 
 pub(super) use shots::{median_depth, orbit_around_splat};
 
-use super::{model, parse_size, print_json, progress, stop_flag, view};
+use super::{model, open_capture, parse_size, print_json, progress, stop_flag, view};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Holdout, open_capture};
+use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
 use globalsplat::model::Precision;
@@ -21,6 +21,10 @@ use shots::Shots;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::{Device, Tensor};
+
+/// What names of pictures that aren't of colours end in.
+const DEPTH: &str = "_depth";
+const ALPHA: &str = "_alpha";
 
 /// Render a splat, or what a model makes of a capture's photos, from the capture's cameras, along a path, or on an orbit.
 ///
@@ -150,20 +154,26 @@ impl Render {
         let shots = match (&self.path, capture) {
             (Some(path), _) => Shots::along(path, size, frames, splat)?,
             (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, splat)?,
-            (None, Some(capture)) => Shots::of(capture, size, frames, splat)?,
+            (None, Some(capture)) => Shots::of(capture, size, frames, splat, &self.suffixes())?,
             (None, None) => Shots::around(splat, size, frames),
         };
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
+    }
+
+    /// What the names of a camera's pictures end in.
+    fn suffixes(&self) -> Vec<&'static str> {
+        let depth = self.depth.then_some(DEPTH);
+        [""].into_iter().chain(depth).chain(self.alpha.then_some(ALPHA)).collect()
     }
 
     /// Colour and what else was asked for, [3, H, W], each with its file's suffix.
     fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<(&'static str, Tensor)> {
         let mut parts = vec![("", rendered.rgb.clamp(0., 1.))];
         if let Some(scale) = scale {
-            parts.push(("_depth", scale.colourize(&rendered.depth, &rendered.alpha)));
+            parts.push((DEPTH, scale.colourize(&rendered.depth, &rendered.alpha)));
         }
         if self.alpha {
-            parts.push(("_alpha", rendered.alpha.unsqueeze(0).expand([3, -1, -1], false)));
+            parts.push((ALPHA, rendered.alpha.unsqueeze(0).expand([3, -1, -1], false)));
         }
         parts
     }

@@ -1,5 +1,6 @@
 //! From where pictures are taken.
 
+use crate::cli::warn;
 use anyhow::Result;
 use glam::{DMat4, DVec3};
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
@@ -26,17 +27,18 @@ pub struct Shots {
 }
 
 impl Shots {
-    /// From the capture's cameras, or so many on a smooth path through them.
+    /// From the capture's cameras, or so many on a smooth path through them. Pictures of a camera are told apart by `suffixes`.
     pub fn of(
         capture: &Capture,
         size: Option<ImageSize>,
         frames: Option<usize>,
         splat: &Splat,
+        suffixes: &[&str],
     ) -> Result<Self> {
         let cameras = resized(capture.cameras(), size);
         Ok(match frames {
             Some(frames) => Shots::numbered(smoothed(&cameras, frames, splat)?),
-            None => Shots { names: capture.picture_names(), ..Shots::numbered(cameras) },
+            None => Shots { names: capture.picture_names_with(suffixes), ..Shots::numbered(cameras) },
         })
     }
 
@@ -61,7 +63,8 @@ impl Shots {
 
     /// From the cameras at `path`, or so many on a smooth path through them.
     pub fn along(path: &Path, size: Option<ImageSize>, frames: Option<usize>, splat: &Splat) -> Result<Self> {
-        let CameraPath { cameras, frames_per_second } = read_camera_path(path, size)?;
+        let CameraPath { cameras, frames_per_second, warnings } = read_camera_path(path, size)?;
+        warn(&warnings);
         let cameras = resized(cameras, size);
         let shots = Shots::numbered(match frames {
             Some(frames) => smoothed(&cameras, frames, splat)?,

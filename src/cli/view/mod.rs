@@ -3,10 +3,9 @@ mod page;
 
 pub use page::{check_writable, has_viewer, write_page};
 
-use super::print_json;
+use super::{open_capture, print_json};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
 use globalsplat::error::Error;
 use globalsplat::io::read_splat;
 use serde_json::json;

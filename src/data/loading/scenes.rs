@@ -48,6 +48,7 @@ fn decoded_bytes(capture: &Capture) -> u64 {
 pub struct TrainingScenes {
     captures: Vec<Capture>,
     others: Vec<SceneGroup>,
+    warnings: Vec<String>,
 }
 
 impl TrainingScenes {
@@ -56,9 +57,11 @@ impl TrainingScenes {
     /// # Errors
     /// Nothing known at one of `paths`, or a capture that breaks its format's rules. The others aren't opened yet.
     pub fn find(paths: &[PathBuf]) -> Result<Self> {
-        let mut found = TrainingScenes { captures: vec![], others: vec![] };
+        let mut found = TrainingScenes { captures: vec![], others: vec![], warnings: vec![] };
         for path in paths {
-            for group in Dataset::open(path, Split::Train)?.groups() {
+            let dataset = Dataset::open(path, Split::Train)?;
+            found.warnings.extend_from_slice(dataset.warnings());
+            for group in dataset.groups() {
                 match group.is_folder() {
                     true => found.captures.push(group.open()?.capture(&group.keys[0])?),
                     false => found.others.push(group.clone()),
@@ -66,6 +69,11 @@ impl TrainingScenes {
             }
         }
         Ok(found)
+    }
+
+    /// Returns a line for each folder that couldn't be looked into.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// Those that are kept.
