@@ -263,9 +263,12 @@ fn jpegs_cut_short_are_refused_by_name() {
             );
         }
         for cut in (jpeg.len() / 16..data.len() - 1).step_by(41).chain([data.len() - 2]) {
+            // A progressive file may end after any of its scans if it says so.
+            if (cut - 1..=cut).any(|at| matches!(data[at..], [0xff, 0xc4 | 0xda, ..])) {
+                continue;
+            }
             for end in [&[][..], end, &[0; 4096]] {
                 let error = decode(&[&data[..cut], end].concat());
-                // A progressive file may end after any of its scans if it says so; a cut there is none.
                 let error = match error {
                     Err(error) => error.to_string(),
                     Ok(_) => panic!("{kind} of {} bytes was taken with {cut} and {end:?}", jpeg.len()),
