@@ -4,6 +4,7 @@
 
 mod camera;
 mod gaussians;
+mod local_frame;
 mod normalize;
 mod rays;
 mod smooth_path;
@@ -13,6 +14,7 @@ pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
 pub(crate) use camera::{check_pose, nearest_rigid};
 pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
+pub use local_frame::LocalFrame;
 pub use normalize::{Normalization, Placement, Similarity, normalize};
 pub(crate) use rays::plucker_rays;
 pub use smooth_path::smooth_path;
