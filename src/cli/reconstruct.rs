@@ -76,6 +76,7 @@ impl Reconstruct {
             correct_poses: false,
             correct_exposures: false,
             sheet: None,
+            lpips: false,
             set: vec![],
             json: self.json,
         }

@@ -16,6 +16,7 @@ mod perceptual;
 mod published;
 mod report;
 mod scene;
+mod score_views;
 mod scores;
 mod scores_file;
 mod sweep;
@@ -38,6 +39,7 @@ pub use published::{
 };
 pub use report::{write_curves, write_report};
 pub use scene::EvalScene;
+pub use score_views::score_views;
 pub use scores::{Baselines, CaptureScores, ViewScore, score};
 pub use scores_file::{comparison_path, read_evaluation, write_csv, write_evaluation};
 pub use sweep::Sweep;

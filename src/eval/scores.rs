@@ -67,16 +67,26 @@ pub fn score(
         let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
         views.push(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None });
     }
-    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
-    Ok(CaptureScores {
-        scene: scene.to_string(),
-        psnr: mean(|v| v.psnr),
-        ssim: mean(|v| v.ssim),
-        lpips_vgg: None,
-        lpips_alex: None,
-        gaussians,
-        views,
-    })
+    Ok(CaptureScores::of(scene, views, gaussians))
+}
+
+impl CaptureScores {
+    /// Takes the means over `views`, one at least.
+    pub(super) fn of(scene: &str, views: Vec<ViewScore>, gaussians: Option<i64>) -> Self {
+        let mean = |value: fn(&ViewScore) -> Option<f64>| {
+            let values: Option<Vec<f64>> = views.iter().map(value).collect();
+            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        CaptureScores {
+            scene: scene.to_string(),
+            psnr: mean(|view| Some(view.psnr)).unwrap_or(f64::NAN),
+            ssim: mean(|view| Some(view.ssim)).unwrap_or(f64::NAN),
+            lpips_vgg: mean(|view| view.lpips_vgg),
+            lpips_alex: mean(|view| view.lpips_alex),
+            gaussians,
+            views,
+        }
+    }
 }
 
 /// What answering without looking would score for the target views of a scene.
