@@ -203,7 +203,7 @@ fn work_that_is_ended_early_keeps_what_there_is() {
     };
     for nothing_yet in [
         |event: &RefineEvent| matches!(event, RefineEvent::Loading(_)),
-        |event| *event == RefineEvent::Starting(0),
+        |event: &RefineEvent| *event == RefineEvent::Starting(0),
     ] {
         let why = steps(nothing_yet).unwrap_err().to_string();
         assert!(why.starts_with("stopped before") && why.ends_with("nothing is written"), "{why}");
@@ -428,6 +428,8 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
 fn narrow_photos_are_taken_or_refused() {
     let (folder, room) = room();
     let out = folder.path().join("a.ply");
+    let options = ["--gaussians", "300", "--steps", "0", "--size", "400x11"];
+    succeed(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
     let options = ["--gaussians", "300", "--steps", "3", "--size", "400x11"];
     succeed(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
     for entry in std::fs::read_dir(room.join("images")).unwrap() {

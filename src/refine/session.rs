@@ -295,8 +295,7 @@ impl<'a> RefineSession<'a> {
         let (gaussians, learned) = self.optimize(&start, &initial, depth)?;
         let ended = self.clock.elapsed().as_secs_f64();
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
-        // Or a number that is none.
-        let is_initial = !(after.psnr >= before.psnr);
+        let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let asked = self.options.correct_poses || self.options.correct_exposures;
         let corrections = if asked && !is_initial { learned.told(&self.photos) } else { vec![] };
         Ok(RefineResult {

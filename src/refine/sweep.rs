@@ -74,28 +74,21 @@ pub fn sweep(views: &[View], points: &[Point], mut go_on: impl FnMut(usize) -> b
     let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
     let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE)).collect();
-    let candidates = farthest_first(&cameras, MOST);
-    let mut known: Vec<(usize, SceneDepth)> = vec![];
-    for &index in &candidates {
-        if !go_on(0) {
-            break;
-        }
-        known.push((index, SceneDepth::of(index, &coarse, points)));
-    }
-    let typical = typical_depth(known.iter().map(|(_, depth)| depth.median).collect(), extent(&cameras));
-    let mut swept: Vec<(usize, Swept)> = vec![];
-    for (index, SceneDepth { median, nearest }) in known {
-        let depth = median.unwrap_or(typical);
-        let is_new =
-            |(other, _): &(usize, Swept)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
-        if !swept.iter().all(is_new) {
-            continue;
-        }
+    let (mut depths, mut swept): (Vec<f64>, Vec<(usize, Swept)>) = (vec![], vec![]);
+    for index in farthest_first(&cameras, MOST) {
         if !go_on(swept.len()) {
             break;
         }
-        let others: Vec<&Small> = neighbours(index, &cameras, depth).into_iter().map(|i| &small[i]).collect();
-        swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
+        let SceneDepth { median, nearest } = SceneDepth::of(index, &coarse, points);
+        depths.extend(median);
+        let depth = median.unwrap_or_else(|| typical_depth(&depths, extent(&cameras)));
+        let is_new =
+            |(other, _): &(usize, Swept)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
+        if swept.iter().all(is_new) {
+            let others = neighbours(index, &cameras, depth);
+            let others: Vec<&Small> = others.into_iter().map(|other| &small[other]).collect();
+            swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
+        }
     }
     swept.sort_by_key(|(index, _)| *index);
     swept.into_iter().map(|(_, swept)| swept).collect()
@@ -166,11 +159,11 @@ fn measured(this: &Small, other: &Small) -> Measured {
     Measured { depth: 1. / median.max(plane), planes: (median / plane).round(), share }
 }
 
-/// The median of those depths that are known; where none is, the extent of the cameras, or 1 where they don't move.
-fn typical_depth(depths: Vec<Option<f64>>, extent: f64) -> f64 {
-    let mut known: Vec<f64> = depths.into_iter().flatten().collect();
-    known.sort_by(f64::total_cmp);
-    match known.get(known.len() / 2) {
+/// The median of the depths of other photos; where there are none, the extent of the cameras, or 1 where they don't move.
+fn typical_depth(depths: &[f64], extent: f64) -> f64 {
+    let mut sorted = depths.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    match sorted.get(sorted.len() / 2) {
         Some(&depth) => depth,
         None if extent > 0. => extent,
         None => 1.,
