@@ -18,6 +18,8 @@ const COARSE_SIDE: f64 = 64.;
 const COARSE_PLANES: i64 = 48;
 /// Of the picture's width: how far a pixel of the nearest plane moves in the photo taken nearest.
 const LARGEST_MOVE: f64 = 0.7;
+/// How much nearer than the scene the nearest plane is, at most, where photos alone tell it.
+const NEAREST: f64 = 24.;
 /// The farthest that pixels are put, in units of the nearest plane's distance.
 const FARTHEST: f64 = 500.;
 /// Photos whose pixels get depths, at the most: together they have seen what there is to see.
@@ -97,7 +99,7 @@ pub fn sweep(views: &[View], points: &[Point], mut go_on: impl FnMut(usize) -> b
 fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) -> Swept {
     let nearest = match (nearest, others.first()) {
         (Some(nearest), _) => nearest,
-        (None, Some(other)) => nearest_of_cameras(this, other),
+        (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
         // Nothing tells a depth: all of it lies at one.
         (None, None) => 2. / depth,
     };
