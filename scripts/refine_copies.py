@@ -2,7 +2,7 @@
 """What `globalsplat refine` makes of captures in which photos are there several times, from one place or from places near each other: PSNR
 of views held out. A burst, a pause of a video and copied files are such captures.
 
-    .venv/bin/python scripts/refine_copies.py --capture DIR [--holdout 3] [--steps 300] [--out OUT]
+    .venv/bin/python scripts/refine_copies.py --capture DIR [--holdout 3] [--steps 30] [--size 64x64] [--gaussians 2048] [--out OUT]
 
 The capture has a cameras.json. Every third of its photos is held out, the others are there 1, 2, 5 or 10 times, shifted at random by parts
 of the cameras' extent. Prints a Markdown table.
@@ -22,7 +22,7 @@ CASES = [(1, 0, 0.0), (2, 0, 0.0), (2, 0, 1e-7), (5, 0, 1e-4), (10, 0, 1e-3), (3
 
 
 def centre(view):
-    return [row[3] for row in view["c2w"][:3]]
+    return [numbers[3] for numbers in view["c2w"][:3]]
 
 
 def copied(view, jitter):
@@ -36,7 +36,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, required=True, metavar="DIR")
     parser.add_argument("--holdout", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", default="30")
+    parser.add_argument("--size", default="64x64")
+    parser.add_argument("--gaussians", default="2048")
     parser.add_argument("--out", type=Path, default=Path("runs/refine_copies"))
     arguments = parser.parse_args()
     described = json.loads((arguments.capture / "cameras.json").read_text())
@@ -55,7 +57,8 @@ def main():
         several += [copied(shown[0], apart * extent) for _ in range(more)]
         (folder / "cameras.json").write_text(json.dumps(described | {"views": several}))
         splat = folder / "splat.ply"
-        refined = told("refine", "--scene", folder, "--out", splat, "--steps", str(arguments.steps))
+        numbers = ["--steps", arguments.steps, "--size", arguments.size, "--gaussians", arguments.gaussians]
+        refined = told("refine", "--scene", folder, "--out", splat, *numbers)
         scores = told("eval", "--splat", splat, "--scene", arguments.capture)["views"]
         psnr = sum(scores[index]["psnr"] for index in held_out) / len(held_out)
         row(str(copies), str(more), f"{apart:g}", str(refined["photos"]), f"{psnr:.2f}")

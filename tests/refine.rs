@@ -208,7 +208,7 @@ fn work_that_is_ended_early_keeps_what_there_is() {
         let why = steps(nothing_yet).unwrap_err().to_string();
         assert!(why.starts_with("stopped before") && why.ends_with("nothing is written"), "{why}");
     }
-    assert_eq!(steps(|event| *event == RefineEvent::Starting(2)).unwrap(), 1);
+    assert_eq!(steps(|event| *event == RefineEvent::Starting(2)).unwrap(), 0);
     let tenth = |event: &RefineEvent| matches!(event, RefineEvent::Optimizing { steps: 10, .. });
     assert_eq!(steps(tenth).unwrap(), 10);
 }

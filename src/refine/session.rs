@@ -131,7 +131,8 @@ enum Start<'a> {
     Model(&'a LoadedModel, Box<Reconstruction>),
 }
 
-/// Photos and what is made of them, in the local frame of the capture's cameras. First [`RefineSession::load`], then [`RefineSession::start`], then [`RefineSession::run`].
+/// Photos and what is made of them, in the local frame of the capture's cameras. First [`RefineSession::load`], then
+/// [`RefineSession::start`], then [`RefineSession::run`].
 pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
@@ -292,7 +293,11 @@ impl<'a> RefineSession<'a> {
             self.add_eval_point(&initial)?;
         }
         let begun = self.clock.elapsed().as_secs_f64();
-        let (gaussians, learned) = self.optimize(&start, &initial, depth)?;
+        let (gaussians, learned) = if self.is_stopped {
+            (initial.map(Tensor::shallow_clone), Corrections::none())
+        } else {
+            self.optimize(&start, &initial, depth)?
+        };
         let ended = self.clock.elapsed().as_secs_f64();
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
