@@ -1,6 +1,6 @@
 //! View selection: which photos are compared with which, and which say the same as others. Like multi-view stereo it goes by
-//! parallax (the angle at which two cameras see a point) and by overlap, at the depth of the scene (Yao et al. 2018, "MVSNet"). How
-//! many photos were taken of a place changes nothing.
+//! parallax and by overlap, at the depth of the scene (Yao et al. 2018, "MVSNet"); parallax is the distance of two cameras in units of
+//! that depth, in radians. How many photos were taken of a place changes nothing.
 
 use crate::scene::Camera;
 use glam::DVec3;
@@ -8,6 +8,8 @@ use std::f64::consts::PI;
 
 /// Photos that each one is compared with, at most.
 const MAX_NEIGHBOURS: usize = 4;
+/// The parallax that is best for comparing, radians: depths are told apart, and both photos show the same.
+const BEST_PARALLAX: f64 = 2.5 * PI / 180.;
 /// The smallest parallax of two photos that are compared with each other, radians. Smaller ones tell less of the depth.
 const MIN_PARALLAX: f64 = PI / 180.;
 /// The smallest share of one photo that another has to show, where the scene's depth is known.
@@ -18,7 +20,7 @@ const MAX_HALVINGS: i32 = 16;
 const MIN_COSINE: f64 = 0.3;
 /// Photos whose parallax and turn together are at most this, radians, show the same.
 const NEAR_DUPLICATE: f64 = PI / 180.;
-/// Pixels along a side of the grid at which parallax and overlap are looked at.
+/// Pixels along a side of the grid at which overlap is looked at.
 const GRID: u32 = 5;
 
 /// Returns the function that maps a point to where `camera` sees it, if it does: u and v in pixels, and the depth along its axis.
@@ -78,25 +80,26 @@ pub fn are_near_duplicates(a: &Camera, b: &Camera, depth: f64) -> bool {
     distance(a, b) / depth + turn(a, b) <= NEAR_DUPLICATE
 }
 
-/// Returns the indices of the cameras whose photos tell most of the depths in photo `index`, the nearest first: those nearest with
-/// enough parallax at `depth`, to the photo and to each other, and enough overlap. Where all have less, the most that there is
+/// Returns the indices of the cameras whose photos tell most of the depths in photo `index`, the nearest first: those with the best
+/// parallax at `depth`, and enough of it to the photo and to each other, and enough overlap. Where all have less, the most that there is
 /// counts as enough. Cameras in the same place tell nothing: where all are, there are none.
 pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
     let this = &cameras[index];
     let points = grid(this, depth);
     let mut others: Vec<Neighbour> = (0..cameras.len())
         .filter(|&other| axis(&cameras[other]).dot(axis(this)) > MIN_COSINE)
-        .map(|other| Neighbour::of(other, &cameras[other], this, &points))
+        .map(|other| Neighbour::of(other, &cameras[other], this, depth, &points))
         .filter(|other| other.distance > 0.)
         .collect();
-    others.sort_by(|a, b| a.distance.total_cmp(&b.distance));
+    let off = |other: &Neighbour| (other.parallax / BEST_PARALLAX).ln().abs();
+    others.sort_by(|a, b| off(a).total_cmp(&off(b)));
     for min_overlap in [MIN_OVERLAP, 0.] {
         // Two are better than one, unless they are much nearer to each other.
         for count in [2, 1] {
             let halvings = if count == 2 { 1 } else { MAX_HALVINGS };
             for halving in 0..=halvings {
                 let min_parallax = MIN_PARALLAX * 0.5f64.powi(halving);
-                let chosen = spaced(&others, cameras, &points, min_parallax, min_overlap);
+                let chosen = spaced(&others, cameras, min_parallax * depth, min_overlap);
                 if chosen.len() >= count {
                     return chosen;
                 }
@@ -104,51 +107,43 @@ pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
         }
     }
     // So little parallax that it can't be measured.
-    others.last().map(|other| other.index).into_iter().collect()
+    others.first().map(|other| other.index).into_iter().collect()
 }
 
 struct Neighbour {
     index: usize,
     distance: f64,
-    /// Median over the grid, radians.
+    /// By its distance, radians.
     parallax: f64,
     /// Share of the grid that it sees.
     overlap: f64,
 }
 
 impl Neighbour {
-    fn of(index: usize, other: &Camera, this: &Camera, points: &[DVec3]) -> Self {
+    fn of(index: usize, other: &Camera, this: &Camera, depth: f64, points: &[DVec3]) -> Self {
         let sees = projection(other);
         let seen = points.iter().filter(|&&point| sees(point).is_some()).count();
-        Neighbour {
-            index,
-            distance: distance(other, this),
-            parallax: parallax(other, this, points),
-            overlap: seen as f64 / points.len() as f64,
-        }
+        let distance = distance(other, this);
+        let overlap = seen as f64 / points.len() as f64;
+        Neighbour { index, distance, parallax: distance / depth, overlap }
     }
 }
 
-/// The nearest of `others`, which are sorted by distance, that are apart from the photo and from each other.
-fn spaced(
-    others: &[Neighbour],
-    cameras: &[Camera],
-    points: &[DVec3],
-    min_parallax: f64,
-    min_overlap: f64,
-) -> Vec<usize> {
-    let mut chosen: Vec<usize> = vec![];
-    for other in others.iter().filter(|other| other.parallax >= min_parallax && other.overlap >= min_overlap)
+/// The first of `others` that are apart from the photo and from each other, the nearest first.
+fn spaced(others: &[Neighbour], cameras: &[Camera], min_distance: f64, min_overlap: f64) -> Vec<usize> {
+    let mut chosen: Vec<&Neighbour> = vec![];
+    for other in others.iter().filter(|other| other.distance >= min_distance && other.overlap >= min_overlap)
     {
         let camera = &cameras[other.index];
-        if chosen.iter().all(|&one| parallax(&cameras[one], camera, points) >= min_parallax) {
-            chosen.push(other.index);
+        if chosen.iter().all(|one| distance(&cameras[one.index], camera) >= min_distance) {
+            chosen.push(other);
         }
         if chosen.len() == MAX_NEIGHBOURS {
             break;
         }
     }
-    chosen
+    chosen.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index)));
+    chosen.into_iter().map(|other| other.index).collect()
 }
 
 /// Points at `depth` in front of a camera, spread over its picture.
@@ -159,19 +154,6 @@ fn grid(camera: &Camera, depth: f64) -> Vec<DVec3> {
     along(camera.height)
         .flat_map(|v| along(camera.width).map(move |u| camera.c2w.transform_point3(point(u, v))))
         .collect()
-}
-
-/// The median angle at which two cameras see the points, radians.
-fn parallax(a: &Camera, b: &Camera, points: &[DVec3]) -> f64 {
-    let mut angles: Vec<f64> = points
-        .iter()
-        .map(|&point| {
-            let (to_a, to_b) = (centre(a) - point, centre(b) - point);
-            to_a.cross(to_b).length().atan2(to_a.dot(to_b))
-        })
-        .collect();
-    angles.sort_by(f64::total_cmp);
-    angles[angles.len() / 2]
 }
 
 fn centre(camera: &Camera) -> DVec3 {
@@ -207,8 +189,8 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_are_the_nearest_with_parallax() {
-        // A parallax of 1.5° at depth 4 is 0.105.
+    fn neighbours_have_parallax() {
+        // At depth 4, parallax of 1° is 0.07, and of 2.5° 0.17.
         let even = along(&[0., 0.25, 0.5, 0.75, 1., 1.25]);
         assert_eq!(neighbours(2, &even, 4.), [1, 3, 0, 4]);
         // Photos of the same place, or nearly, count once, however near they are.
