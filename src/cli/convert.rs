@@ -1,4 +1,4 @@
-use super::{print_json, render::orbit_around_splat};
+use super::{cameras::orbit_around_splat, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::open_capture;

@@ -1,6 +1,6 @@
 //! What a page is told about its scene.
 
-use super::super::render::{median_depth, orbit_around_splat};
+use super::super::cameras::{median_depth, orbit_around_splat};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
