@@ -1,15 +1,15 @@
-use super::{check_views, device, model, print_json, progress, ranks, stop_flag};
+use super::{check_views, device, model, print_json, progress, ranks, say_shrunk, stop_flag};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
+use globalsplat::data::{Capture, Dataset, Holdout, Split, View, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
-    contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
+    Baselines, CaptureScores, ContactSheet, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual,
+    PhotoSource, Sweep, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_png, write_png};
+use globalsplat::io::{WeightsFile, check_writable_dir, check_writable_png, checksum};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
+use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, context_views};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::ops::RangeInclusive;
@@ -119,14 +119,19 @@ impl Eval {
         if self.chooses_size() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let made = self.method(model).synthesize(&scene)?;
+        let mut made = self.method(model).synthesize(scene)?;
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
-        let scores = judge(&scene, &made, &perceptual)?;
+        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(made.scene.target.len()));
+        let scores = judge(&mut made, &perceptual, |truth, picture, _| {
+            let row = sheet.as_mut().zip(picture.rendered.as_ref());
+            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&truth.image, rendered))
+        })?;
+        let scene = &made.scene;
         // Beside a model, what answering without one would score.
-        let baselines = model.map(|model| self.baselines(&capture, model, &scene)).transpose()?;
-        if let Some(sheet) = &self.sheet {
-            write_png(sheet, &contact_sheet(&scene.target, &made.rendered))?;
+        let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
+        if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
+            say_shrunk(path, sheet.write(path)?);
         }
         if let Some(line) = perceptual.why_absent(&scores) {
             eprintln!("{line}");
@@ -166,7 +171,7 @@ impl Eval {
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let picture_size = self.picture_size(model)?;
         let Some(model) = model else {
-            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size))?);
+            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size)));
         };
         let photo_size = model.input.photo_size(model.config.data.image_size);
         Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, picture_size)?)
@@ -175,10 +180,13 @@ impl Eval {
     /// What the photos that `model` is shown of `scene` would score, as large as the pictures are.
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
         let size = self.picture_size(Some(model))?;
-        if size == model.input.photo_size(model.config.data.image_size) {
-            return Ok(Baselines::of(&scene.name, &scene.context, &scene.target)?);
-        }
-        let photos = load_context(capture, self.holdout(model)?, self.views, size)?;
+        let photos = match size == model.input.photo_size(model.config.data.image_size) {
+            true => PhotoSource::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
+            false => {
+                let shown = context_views(capture, self.holdout(model)?, self.views);
+                PhotoSource::of(capture, &shown, Some(size))
+            }
+        };
         Ok(Baselines::of(&scene.name, &photos, &scene.target)?)
     }
 
@@ -236,6 +244,17 @@ impl Eval {
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
     }
 
+    /// Tells what is judged from others: weights by their name and all that their files hold. Every scene's splat or pictures are told
+    /// apart one by one, so of their folder it is the place.
+    fn fingerprint(&self) -> Result<String> {
+        let Some(weights) = &self.weights else {
+            return Ok(self.path().canonicalize()?.display().to_string());
+        };
+        let weights = WeightsFile::open(weights)?;
+        let name = weights.path().file_name().unwrap_or_default();
+        Ok(format!("{} {:08x}", name.display(), checksum(weights.files())?))
+    }
+
     fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {
         match (model, &self.splat) {
             (Some(model), _) => Method::Model(model),
@@ -264,6 +283,7 @@ impl Eval {
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = self.model(loaded.as_ref())?;
         let picture_size = self.picture_size(model)?;
+        let fingerprint = self.fingerprint()?;
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
@@ -282,7 +302,7 @@ impl Eval {
             let sweep = Sweep {
                 method: self.method(model),
                 name: self.name.clone().unwrap_or(stem + &setting),
-                fingerprint: fingerprint(path)? + &setting,
+                fingerprint: fingerprint.clone() + &setting,
                 dataset: &dataset,
                 root: data,
                 dataset_name,
@@ -390,15 +410,6 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
         .into()),
         None => Ok(folders),
     }
-}
-
-/// Tells this file, or folder, from others.
-fn fingerprint(path: &Path) -> Result<String> {
-    if path.is_dir() {
-        return Ok(path.canonicalize()?.display().to_string());
-    }
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    Ok(format!("{} {:08x}", path.file_name().unwrap_or_default().display(), crc32fast::hash(&bytes)))
 }
 
 fn print_table(scores: &CaptureScores) {

@@ -5,9 +5,11 @@
 
 mod bench;
 mod bench_attention;
+mod bench_common;
 mod bench_model;
 mod bench_refine;
 mod bench_train;
+mod cameras;
 mod convert;
 mod device;
 mod doctor;
@@ -195,4 +197,14 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
 /// Prints a result as one JSON object.
 fn print_json(value: &serde_json::Value) {
     println!("{value}");
+}
+
+/// Says that the pictures in the picture at `path` were shrunk, where the sides of the largest were divided by more than 1.
+fn say_shrunk(path: &std::path::Path, by: i64) {
+    if by > 1 {
+        eprintln!(
+            "{}: pictures are shrunk to 1/{by} of their sides: of so many, programs open no more pixels",
+            path.display()
+        );
+    }
 }

@@ -1,14 +1,12 @@
 use super::progress::{self, Progress};
-use super::{check_views, memory, model, parse_size, print_json, stop_flag};
+use super::{check_views, memory, model, parse_size, print_json, say_shrunk, stop_flag};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use glam::DMat4;
 use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
-use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
-use globalsplat::io::{
-    Splat, check_writable_png, check_writable_splat, read_splat, write_png, write_splat_for,
-};
+use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, judge_pictures};
+use globalsplat::io::{Splat, check_writable_png, check_writable_splat, read_splat, write_splat_for};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use globalsplat::refine::{
@@ -188,7 +186,11 @@ impl Refine {
         write_splat_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras())?;
         if let Some(sheet) = &self.sheet {
             let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
-            write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;
+            let mut rows = ContactSheet::new(views.len());
+            for (view, rendered) in views.iter().zip(&rendered(&gaussians, views)?) {
+                rows.add(&view.image, rendered)?;
+            }
+            say_shrunk(sheet, rows.write(sheet)?);
         }
         let Work { done_steps: steps, done_seconds: seconds, curve, .. } = work;
         let (out, count) = (self.out.display(), gaussians.count());

@@ -217,6 +217,23 @@ impl Capture {
         is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
     }
 
+    /// Computes the CRC-32 of what views `indices` are: their photos' files, as they are, and their cameras. Made-up photos are told
+    /// apart by their cameras alone.
+    ///
+    /// # Errors
+    /// A photo that can't be read.
+    pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
+        let mut hasher = crc32fast::Hasher::new();
+        for index in indices {
+            let Frame { photo, camera, distortion, .. } = &self.frames[index];
+            hasher.update(format!("{camera:?}{distortion:?}").as_bytes());
+            if !matches!(photo, Photo::Made { .. }) {
+                hasher.update(&photo.read()?);
+            }
+        }
+        Ok(hasher.finalize())
+    }
+
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<View> {
         let image = self.read_photo(frame, size, lens)?;
         let (planes, camera) = match size {

@@ -60,6 +60,7 @@ pub struct Dataset {
     /// The folder's name.
     pub name: String,
     groups: Vec<SceneGroup>,
+    made_by: Option<String>,
 }
 
 /// A group in memory, images still encoded.
@@ -81,7 +82,9 @@ impl Dataset {
     /// are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = MadeUp::named(root)? {
-            return Ok(Dataset { name: root.to_string_lossy().into_owned(), groups: made_up_groups(videos) });
+            let made_by = Some(videos.made_by());
+            let name = root.to_string_lossy().into_owned();
+            return Ok(Dataset { name, groups: made_up_groups(videos), made_by });
         }
         let name = folder_name(root);
         let indexed =
@@ -93,12 +96,18 @@ impl Dataset {
                 capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
             }
         };
-        Ok(Dataset { name, groups })
+        Ok(Dataset { name, groups, made_by: None })
     }
 
     /// Every group, in the order of their paths.
     pub fn groups(&self) -> &[SceneGroup] {
         &self.groups
+    }
+
+    /// Returns what made-up videos depend on beside their name: the program's version, and pictures that are seen in them. Of other
+    /// data sets it is nothing.
+    pub fn made_by(&self) -> Option<&str> {
+        self.made_by.as_deref()
     }
 
     /// The number of scenes.

@@ -1,15 +1,19 @@
 //! Validation: what training never shows is rendered and scored while it goes on (spec 8.8).
 
-use super::method::{colours, synthesize_views};
+use super::photo_source::PhotoSource;
 use super::scene::split_views;
 use super::scores::{CaptureScores, nearest_context_baseline, score};
-use crate::data::{Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View};
+use crate::data::{
+    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at,
+};
 use crate::error::{Error, Result};
-use crate::reconstruct::spread_over_path;
+use crate::reconstruct::{reconstruct, spread_over_path};
+use crate::render::render_views;
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use tch::Tensor;
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
@@ -151,7 +155,7 @@ impl HeldOut {
                     continue;
                 }
             };
-            match judge_views(trainer, &name, &context, &target) {
+            match judge_views(trainer, &name, context, target) {
                 Ok(scores) => found.scores.push((i, scores)),
                 Err(e) => {
                     found.failed = Some(e.to_string());
@@ -164,13 +168,20 @@ impl HeldOut {
 }
 
 /// What the model makes of the views `context` of scene `name`, held against `target`.
-fn judge_views(trainer: &Trainer, name: &str, context: &[View], target: &[View]) -> Result<HeldOutScores> {
-    let (reconstruction, rendered) = synthesize_views(trainer.as_model(), context, target)?;
-    let count = reconstruction.gaussians.count();
-    Ok(HeldOutScores {
-        ours: score(name, &colours(&rendered), target, Some(count))?,
-        nearest: nearest_context_baseline(name, context, target)?,
-    })
+fn judge_views(
+    trainer: &Trainer,
+    name: &str,
+    context: Vec<View>,
+    target: Vec<View>,
+) -> Result<HeldOutScores> {
+    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
+    let reconstruction = reconstruct(trainer.as_model(), &context, &poses)?;
+    let rendered =
+        render_views(&reconstruction.gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
+    let pictures: Vec<Tensor> = rendered.into_iter().map(|rendered| rendered.rgb).collect();
+    let ours = score(name, &pictures, &target, Some(reconstruction.gaussians.count()))?;
+    let [context, target] = [context, target].map(PhotoSource::Loaded);
+    Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
 
 impl Validator for HeldOut {

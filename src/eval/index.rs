@@ -1,5 +1,6 @@
 //! Evaluation indices: which frames of which scenes are context, and which are targets.
 
+use crate::data::Capture;
 use crate::error::{Error, Result};
 use crate::io::write_json;
 use serde::{Deserialize, Serialize};
@@ -19,6 +20,19 @@ impl SceneFrames {
     /// Of a video of `count` frames, three at least: every other one is shown, and every other one of the rest has to be matched.
     pub fn alternating(count: usize) -> Self {
         SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
+    }
+
+    /// Returns a checksum of these frames' photos, as their files are, and of their cameras.
+    ///
+    /// # Errors
+    /// A photo that can't be read.
+    pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
+        capture.checksum(self.context.iter().chain(&self.target).copied())
+    }
+
+    /// What pictures of the targets are called, without their ending: by their numbers, as chunks name frames.
+    pub(super) fn picture_names(&self) -> Vec<String> {
+        self.target.iter().map(|frame| format!("{frame:06}")).collect()
     }
 }
 

@@ -18,11 +18,11 @@ pub(super) struct Identity {
 
 /// A scene's scores on disk.
 #[derive(Serialize, Deserialize)]
-struct Kept {
+pub(super) struct Kept {
     #[serde(flatten)]
-    scores: SceneScores,
+    pub scores: SceneScores,
     /// What tells the files that were scored from others in their place.
-    files: Option<String>,
+    pub files: Option<String>,
 }
 
 /// The folder `scenes` of an evaluation.
@@ -78,18 +78,18 @@ impl Journal {
         Journal { scenes: out.join("scenes") }
     }
 
-    /// Scores of scene `key` from before, of the same `files`. What can't be read is none.
-    pub fn kept(&self, key: &str, files: Option<String>) -> Option<SceneScores> {
+    /// Returns the scores of scene `key` from before. What can't be read is none.
+    pub fn kept(&self, key: &str) -> Option<Kept> {
         let kept: Kept = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
-        (kept.scores.scores.scene == key && kept.files == files).then_some(kept.scores)
+        (kept.scores.scores.scene == key).then_some(kept)
     }
 
     /// Keeps the scores of scene `key`, which are of `files`.
     ///
     /// # Errors
     /// The system's refusal to write.
-    pub fn keep(&self, key: &str, scores: &SceneScores, files: Option<String>) -> Result<()> {
-        write_json(&self.file(key), &Kept { scores: scores.clone(), files })
+    pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
+        write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })
     }
 
     fn file(&self, key: &str) -> PathBuf {

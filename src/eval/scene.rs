@@ -1,44 +1,44 @@
 //! What a method is judged by: photos that it may see, and photos that it has to match.
 
 use super::index::{EvaluationIndex, SceneFrames};
+use super::photo_source::PhotoSource;
 use crate::data::{Capture, Holdout, SceneGroup, View};
 use crate::error::{Error, Result};
 use crate::reconstruct::load_context;
 use crate::scene::ImageSize;
 use std::sync::mpsc::SyncSender;
 
-/// A scene, its photos in memory.
+/// A scene, with the photos that a model is shown in memory.
 #[derive(Debug)]
 pub struct EvalScene {
     /// The capture's, or the key in an index.
     pub name: String,
     /// The photos that a model is shown; none where no model is judged.
     pub context: Vec<View>,
-    /// What has to be matched.
-    pub target: Vec<View>,
+    /// What has to be matched, loaded one by one.
+    pub target: PhotoSource,
     /// What pictures of the targets are called, without their ending.
     pub picture_names: Vec<String>,
     /// Their positions in the capture, where an index tells them.
     pub frames: Option<SceneFrames>,
+    /// A checksum of the photos and cameras that an index tells; 0 without one.
+    pub(super) checksum: u32,
     /// Whether photos of the capture were enlarged, to be shown or to be matched.
     pub enlarged: bool,
 }
 
 impl EvalScene {
     /// Every photo of `capture`, fitted to `size` or as it is, for splats and pictures.
-    ///
-    /// # Errors
-    /// Photos that can't be read.
-    pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Self> {
-        let enlarged = size.is_some_and(|size| capture.has_smaller(size));
-        Ok(EvalScene {
+    pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Self {
+        EvalScene {
             name: capture.name.clone(),
             context: vec![],
-            target: capture.load_all(size)?,
+            target: PhotoSource::of(capture, &(0..capture.len()).collect::<Vec<_>>(), size),
             picture_names: capture.picture_names(),
             frames: None,
-            enlarged,
-        })
+            checksum: 0,
+            enlarged: size.is_some_and(|size| capture.has_smaller(size)),
+        }
     }
 
     /// For a model: it is shown the photos that `holdout` leaves, or so many of them, spread over the camera's path, fitted to
@@ -58,9 +58,10 @@ impl EvalScene {
         Ok(EvalScene {
             name: capture.name.clone(),
             context: load_context(capture, holdout, views, photo_size)?,
-            target: capture.load(&held_out, Some(picture_size))?,
+            target: PhotoSource::of(capture, &held_out, Some(picture_size)),
             picture_names: held_out.iter().map(|&view| all[view].clone()).collect(),
             frames: None,
+            checksum: 0,
             enlarged: [photo_size, picture_size].into_iter().any(|size| capture.has_smaller(size)),
         })
     }
@@ -72,14 +73,25 @@ impl EvalScene {
             Some(size) => capture.load(&frames.context, Some(size))?,
             None => vec![],
         };
-        let mut target = capture.load(&frames.target, Some(loader.picture_size))?;
-        let picture_names: Vec<String> = frames.target.iter().map(|&frame| frame_name(frame)).collect();
-        for (view, name) in target.iter_mut().zip(&picture_names) {
-            view.name = name.clone();
-        }
+        let picture_names = frames.picture_names();
+        let target = PhotoSource::OnDisk {
+            capture: capture.clone(),
+            indices: frames.target.clone(),
+            names: picture_names.clone(),
+            size: Some(loader.picture_size),
+        };
         let mut sizes = loader.photo_size.into_iter().chain([loader.picture_size]);
         let enlarged = sizes.any(|size| capture.has_smaller(size));
-        Ok(EvalScene { name: key.into(), context, target, picture_names, frames: Some(frames), enlarged })
+        let checksum = frames.checksum(capture)?;
+        Ok(EvalScene {
+            name: key.into(),
+            context,
+            target,
+            picture_names,
+            frames: Some(frames),
+            checksum,
+            enlarged,
+        })
     }
 }
 
@@ -92,11 +104,6 @@ pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<us
         return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
     }
     Ok((context, held_out))
-}
-
-/// As chunks name a frame.
-fn frame_name(frame: usize) -> String {
-    format!("{frame:06}")
 }
 
 /// Reads the scenes of an index, beside the thread that judges them.

@@ -184,7 +184,15 @@ pub fn write_jpeg(path: &Path, picture: &Tensor) -> Result<()> {
 }
 
 fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
-    let bytes = encode_photo(&rgb_from_tensor(picture)?, as_jpeg)?;
+    write_image(path, &rgb_from_tensor(picture)?, as_jpeg)
+}
+
+/// Writes an image as a JPEG, or as a PNG.
+///
+/// # Errors
+/// The system's refusal to write, or a size that the format doesn't know.
+pub(super) fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Result<()> {
+    let bytes = encode_photo(image, as_jpeg)?;
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
@@ -192,6 +200,14 @@ fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
 pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
     let factor = (height / picture.size()[1]).max(1);
     picture.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
+}
+
+/// Shrinks `picture` [3, H, W] by a whole factor: every pixel is the mean of `factor`² pixels.
+pub fn shrink(picture: &Tensor, factor: i64) -> Tensor {
+    match factor {
+        1 => picture.shallow_clone(),
+        _ => picture.avg_pool2d(factor, factor, 0, false, true, None),
+    }
 }
 
 /// Pixels between pictures.
@@ -205,6 +221,27 @@ pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
 /// Pictures [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
 pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 1)
+}
+
+/// Puts images below each other, or else side by side, as [`tile_vertically`] and [`tile_horizontally`] do it.
+pub(super) fn tile_images(images: &[RgbImage], is_column: bool) -> RgbImage {
+    let gap = GAP as u32;
+    let largest = |side: fn(&RgbImage) -> u32| images.iter().map(side).max().unwrap_or(0);
+    let sum = |side: fn(&RgbImage) -> u32| {
+        (images.iter().map(side).sum::<u32>() + gap * images.len() as u32).saturating_sub(gap)
+    };
+    let (width, height) = match is_column {
+        true => (largest(RgbImage::width), sum(RgbImage::height)),
+        false => (sum(RgbImage::width), largest(RgbImage::height)),
+    };
+    let mut whole = RgbImage::from_pixel(width, height, Rgb([u8::MAX; 3]));
+    let mut at = 0;
+    for image in images {
+        let (x, y, side) = if is_column { (0, at, image.height()) } else { (at, 0, image.width()) };
+        image::imageops::replace(&mut whole, image, x.into(), y.into());
+        at += side + gap;
+    }
+    whole
 }
 
 /// How large `count` pictures of `size` are when [`tile_horizontally`] has put them side by side.

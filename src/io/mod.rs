@@ -2,12 +2,14 @@
 
 mod append;
 mod atomic;
+mod checksum;
 mod depth_colours;
 mod environment;
 mod event_file;
 mod event_reader;
 mod film;
 mod images;
+mod mosaic;
 mod npy;
 mod pretrained;
 mod shards;
@@ -18,12 +20,14 @@ mod weights;
 mod weights_file;
 
 pub use atomic::{check_writable_dir, check_writable_file, write_atomically};
+pub use checksum::checksum;
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
 pub use film::{Film, find_ffmpeg};
 pub use images::{
     Photo, check_writable_png, decode_photo, encode_photo, read_image, rgb_from_tensor, tensor_from_rgb,
     tile_horizontally, tile_vertically, tiled_size, write_png,
 };
+pub use mosaic::Mosaic;
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::write_sharded;
@@ -42,5 +46,6 @@ pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
 pub(crate) use event_reader::{EventReader, read_picture};
-pub(crate) use images::{PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, write_jpeg};
+pub(crate) use images::{PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, write_jpeg};
+pub(crate) use mosaic::shrink_factor;
 pub(crate) use pretrained::pretrained_folders;

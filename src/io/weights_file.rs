@@ -44,6 +44,8 @@ pub fn is_weights_name(path: &Path) -> bool {
 #[derive(Debug)]
 pub struct WeightsFile {
     path: PathBuf,
+    /// The index, if there is one, and the files with tensors.
+    files: Vec<PathBuf>,
     parts: Vec<Bytes>,
     tensors: BTreeMap<String, Place>,
     metadata: HashMap<String, String>,
@@ -140,7 +142,8 @@ impl WeightsFile {
             false => safetensors(bytes.get(), path)?,
         };
         let tensors = arrays.into_iter().map(|(name, array)| (name, Place { part: 0, array })).collect();
-        Ok(WeightsFile { path: path.to_owned(), parts: vec![bytes], tensors, metadata })
+        let path = path.to_owned();
+        Ok(WeightsFile { files: vec![path.clone()], path, parts: vec![bytes], tensors, metadata })
     }
 
     fn open_shards(path: &Path) -> Result<Self> {
@@ -151,6 +154,7 @@ impl WeightsFile {
         names.sort();
         names.dedup();
         let (mut parts, mut tensors, mut metadata) = (vec![], BTreeMap::new(), HashMap::new());
+        let mut files = vec![path.to_owned()];
         for name in names {
             if Path::new(name).components().count() != 1 || name.starts_with('.') {
                 return Err(Error::input(path, "weight_map", name, "the name of a file beside the index"));
@@ -163,19 +167,25 @@ impl WeightsFile {
             }
             metadata.extend(described);
             parts.push(bytes);
+            files.push(file);
         }
         match index.weight_map.iter().find(|(tensor, _)| !tensors.contains_key(*tensor)) {
             Some((tensor, name)) => {
                 let file = path.with_file_name(name);
                 Err(Error::input(&file, format!("tensor {tensor}"), "absent", "what the index says"))
             }
-            None => Ok(WeightsFile { path: path.to_owned(), parts, tensors, metadata }),
+            None => Ok(WeightsFile { path: path.to_owned(), files, parts, tensors, metadata }),
         }
     }
 
     /// The file, or the index of files.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Returns the files that the weights are in: one, or an index and the shards that it names.
+    pub fn files(&self) -> &[PathBuf] {
+        &self.files
     }
 
     /// The file's `__metadata__`; of a checkpoint the strings beside its state dict, and settings that shapes don't tell.

@@ -8,7 +8,7 @@ mod placing;
 mod published;
 mod spread;
 
-pub use context::load_context;
+pub use context::{context_views, load_context};
 pub use input::{Input, ViewsAs};
 pub use model_file::{
     CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, SHIPPED_MODEL, STAGE_KEY, load_model, model_weights,

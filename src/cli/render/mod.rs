@@ -3,8 +3,6 @@
 mod output;
 mod shots;
 
-pub(super) use shots::{median_depth, orbit_around_splat};
-
 use super::{model, parse_size, print_json, progress, stop_flag, view};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -111,7 +109,8 @@ impl Render {
         let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
-        let mut output = Output::begin(out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
+        let (count, size) = (shots.cameras.len(), self.size_of_all(&shots.cameras));
+        let mut output = Output::begin(out, count, size, shots.frames_per_second)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
         for (name, camera) in shots.names.iter().zip(&shots.cameras) {
             let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);

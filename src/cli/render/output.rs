@@ -1,8 +1,9 @@
 //! Where pictures go, one by one as they are rendered.
 
+use super::super::say_shrunk;
 use globalsplat::data::Capture;
 use globalsplat::error::{Error, Result};
-use globalsplat::io::{Film, check_writable_dir, check_writable_file, tile_horizontally, write_png};
+use globalsplat::io::{Film, Mosaic, check_writable_dir, check_writable_file, tile_horizontally, write_png};
 use globalsplat::scene::ImageSize;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
@@ -12,7 +13,7 @@ pub enum Output<'a> {
     /// A folder of PNGs, and those that are in it.
     Folder(&'a Path, Vec<PathBuf>),
     /// One PNG of all side by side.
-    Row(&'a Path, Vec<Tensor>),
+    Row(&'a Path, Mosaic),
     Film(&'a Path, Film),
 }
 
@@ -34,26 +35,23 @@ impl<'a> Output<'a> {
         check_writable_file(path)
     }
 
-    /// For frames of `size` at most, of all parts side by side.
-    pub fn begin(path: &'a Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
+    /// For `count` frames of `size` at most, of all parts side by side.
+    pub fn begin(path: &'a Path, count: usize, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         Ok(match kind(path) {
             Kind::Folder => Output::Folder(path, vec![]),
-            Kind::Row => Output::Row(path, vec![]),
+            Kind::Row => Output::Row(path, Mosaic::row(count)),
             Kind::Film => Output::Film(path, Film::begin(path, size, frames_per_second)?),
         })
     }
 
     /// Adds the picture `name`, of `parts` [3, H, W], each with its file's suffix.
     pub fn add(&mut self, name: &str, parts: Vec<(&str, Tensor)>, capture: Option<&Capture>) -> Result<()> {
-        let side_by_side = |parts: Vec<(&str, Tensor)>| {
-            tile_horizontally(&parts.into_iter().map(|(_, picture)| picture).collect::<Vec<_>>())
+        let pictures = |parts: Vec<(&str, Tensor)>| -> Vec<Tensor> {
+            parts.into_iter().map(|(_, picture)| picture).collect()
         };
         match self {
-            Output::Film(_, film) => film.add(&side_by_side(parts)),
-            Output::Row(_, pictures) => {
-                pictures.push(side_by_side(parts));
-                Ok(())
-            }
+            Output::Film(_, film) => film.add(&tile_horizontally(&pictures(parts))),
+            Output::Row(_, mosaic) => mosaic.add(&pictures(parts)),
             Output::Folder(path, written) => parts.into_iter().try_for_each(|(suffix, picture)| {
                 let file = path.join(format!("{name}{suffix}.png"));
                 let folder = file.parent().expect("it is in the output");
@@ -73,8 +71,9 @@ impl<'a> Output<'a> {
     pub fn finish(self) -> Result<Vec<PathBuf>> {
         match self {
             Output::Folder(_, written) => Ok(written),
-            Output::Row(path, pictures) => {
-                write_png(path, &tile_horizontally(&pictures))?;
+            Output::Row(path, mosaic) => {
+                say_shrunk(path, mosaic.shrunk_by());
+                mosaic.write(path)?;
                 Ok(vec![path.to_owned()])
             }
             Output::Film(path, film) => {
