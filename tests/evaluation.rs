@@ -4,6 +4,7 @@ mod common;
 
 use common::has_lpips;
 use common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
+use globalsplat::data::{Dataset, Split};
 use globalsplat::eval::read_evaluation;
 use globalsplat::io::{Weights, read_image, read_weights, write_png, write_sharded};
 use serde_json::{Value, json};
@@ -228,6 +229,23 @@ fn sharded_weights_are_told_apart_by_their_shards() {
     assert_eq!(run(&arguments(&plain), set.folder.path()).0, Some(0));
     let second = read_evaluation(&set.path("out")).unwrap();
     assert_ne!(first.summary.psnr, second.summary.psnr);
+}
+
+#[test]
+fn made_up_videos_are_told_apart_by_what_they_depend_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let made_by = |pictures: &str| {
+        let name = format!("synth:seed=1,scenes=1{pictures}");
+        Dataset::open(Path::new(&name), Split::Test).unwrap().made_by().map(String::from)
+    };
+    let with_pictures = |grey: f64| {
+        let picture = tch::Tensor::full([3, 16, 16], grey, (tch::Kind::Float, tch::Device::Cpu));
+        write_png(&folder.path().join("a.png"), &picture).unwrap();
+        made_by(&format!(",pictures={}", folder.path().display()))
+    };
+    let (black, grey) = (with_pictures(0.), with_pictures(0.5));
+    assert!(black != grey && with_pictures(0.5) == grey, "{black:?} and {grey:?}");
+    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != grey));
 }
 
 /// Largest resident size of this process' children that have ended, in bytes.

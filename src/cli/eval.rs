@@ -24,7 +24,7 @@ use tch::Device;
 ///
 /// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
 /// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
-/// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
+/// it was stopped, and scores again what was changed since. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
 /// anybody's pictures DIR/SCENE/000012.png, named by the frame. Started by torchrun, many processes share the scenes out:
 /// docs/distributed.md.
 #[derive(Args)]
@@ -80,7 +80,8 @@ pub struct Eval {
     /// others' pictures of a data set 256, and of one capture as its photos
     #[arg(long, value_name = "PIXELS")]
     pictures_at: Option<u32>,
-    /// Also write a picture: photo, render and depth side by side, a row per view
+    /// Also write a picture: photo, render and depth side by side, a row per view; shrunk where it would have more than 64 million
+    /// pixels
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
     /// f32, bf16 for the model's matrix products, or auto: bf16 for wide models where the device has instructions for it

@@ -40,6 +40,7 @@ use globalsplat::Error;
 use globalsplat::error::panic_message;
 use globalsplat::scene::ImageSize;
 use std::panic;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -199,11 +200,11 @@ fn print_json(value: &serde_json::Value) {
     println!("{value}");
 }
 
-/// Says that the pictures in the picture at `path` were shrunk, where the sides of the largest were divided by more than 1.
-fn say_shrunk(path: &std::path::Path, by: i64) {
+/// Says that the pictures in the picture at `path` are shrunk, if the sides of the largest are divided by more than 1.
+fn say_shrunk(path: &Path, by: i64) {
     if by > 1 {
         eprintln!(
-            "{}: pictures are shrunk to 1/{by} of their sides: of so many, programs open no more pixels",
+            "{}: pictures are shrunk to 1/{by} of their sides, to 64 million pixels at most in all",
             path.display()
         );
     }

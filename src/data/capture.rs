@@ -60,6 +60,11 @@ impl Photo {
     }
 }
 
+/// Memory for photos that are decoded at the same time, which are small once they are fitted to a model.
+const DECODED_BYTES: u64 = 1 << 30;
+/// What decoding takes: the decoder's pixels and those without distortion, in 8 bits.
+const DECODED_BYTES_PER_PIXEL: u64 = 8;
+
 /// Posed photos of one scene. The images are read when they are loaded.
 #[derive(Debug, Clone)]
 pub struct Capture {
@@ -190,12 +195,22 @@ impl Capture {
     /// An image that is missing, can't be decoded, or has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
         let lens = self.shared_lens(indices, size);
-        let views: Vec<_> = indices
-            .par_iter()
-            .map(|&index| self.load_view(&self.frames[index], size, lens.as_ref()))
-            .collect();
-        // Of several that can't be read the first one is told.
-        views.into_iter().collect()
+        let pixels = |&index: &usize| {
+            let Camera { width, height, .. } = self.frames[index].camera;
+            u64::from(width) * u64::from(height)
+        };
+        let largest = indices.iter().map(pixels).max().unwrap_or(0).max(1);
+        let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
+        let mut views = vec![];
+        for indices in indices.chunks(at_once) {
+            let load = |&index: &usize| self.load_view(&self.frames[index], size, lens.as_ref());
+            let loaded: Vec<_> = indices.par_iter().map(load).collect();
+            // Of several that can't be read the first one is told.
+            for view in loaded {
+                views.push(view?);
+            }
+        }
+        Ok(views)
     }
 
     /// [`Capture::load`] of every view.

@@ -1,6 +1,6 @@
 //! One view: truth, render, error and depth side by side.
 
-use crate::io::{colourize_depth, shrink, shrink_factor, tile_horizontally};
+use crate::io::{colourize_depth, shrink, shrink_factor, subsample, tile_horizontally};
 use crate::render::Rendered;
 use tch::{Kind, Tensor};
 
@@ -20,7 +20,8 @@ pub(super) fn comparison_image(truth: &Tensor, picture: &Tensor, rendered: Optio
     let heat = Tensor::stack(&[&error * 3., &error * 3. - 1., &error * 3. - 2.], 0).clamp(0., 1.);
     let mut pictures = vec![truth, picture, heat];
     if let Some(rendered) = rendered {
-        pictures.push(shrink(&colourize_depth(&rendered.depth, &rendered.alpha), factor));
+        let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
+        pictures.push(colourize_depth(&depth, &alpha));
     }
     tile_horizontally(&pictures)
 }

@@ -1,7 +1,7 @@
 //! Truth, render and depth side by side: what a person looks at first.
 
 use crate::error::Result;
-use crate::io::{Mosaic, colourize_depth, enlarge};
+use crate::io::{Mosaic, colourize_depth, enlarge, shrink, subsample};
 use crate::render::Rendered;
 use std::path::Path;
 use tch::Tensor;
@@ -24,9 +24,11 @@ impl ContactSheet {
     /// # Errors
     /// libtorch's refusal of pictures of different sizes.
     pub fn add(&mut self, truth: &Tensor, rendered: &Rendered) -> Result<()> {
-        let Rendered { rgb, depth, alpha } = rendered;
-        let pictures = [truth.shallow_clone(), rgb.clamp(0., 1.), colourize_depth(depth, alpha)];
-        self.0.add(&pictures.map(|picture| enlarge(&picture, HEIGHT)))
+        let factor = self.0.factor(3, truth);
+        let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
+        let [truth, rgb] = [truth, &rendered.rgb.clamp(0., 1.)].map(|picture| shrink(picture, factor));
+        let pictures = [truth, rgb, colourize_depth(&depth, &alpha)];
+        self.0.add_shrunk(&pictures.map(|picture| enlarge(&picture, HEIGHT)))
     }
 
     /// Writes the sheet as a PNG, and returns by how much the sides of the largest pictures were divided: 1 where nothing was shrunk.

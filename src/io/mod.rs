@@ -46,6 +46,8 @@ pub(crate) use atomic::{recover_dirs, remove_dir, replace_dir, write_json};
 pub(crate) use environment::expand_path;
 pub(crate) use event_file::EventFile;
 pub(crate) use event_reader::{EventReader, read_picture};
-pub(crate) use images::{PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, write_jpeg};
+pub(crate) use images::{
+    PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, subsample, write_jpeg,
+};
 pub(crate) use mosaic::shrink_factor;
 pub(crate) use pretrained::pretrained_folders;

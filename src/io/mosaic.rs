@@ -37,11 +37,25 @@ impl Mosaic {
     /// # Errors
     /// libtorch's refusal, as for another shape.
     pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
-        let size = parts[0].size();
-        let factor = shrink_factor(parts.len() as i64 * size[1] * size[2], self.most_pixels);
-        self.shrunk_by = self.shrunk_by.max(factor);
+        let factor = self.factor(parts.len(), &parts[0]);
         let parts: Vec<Tensor> = parts.iter().map(|part| shrink(part, factor)).collect();
-        self.images.push(rgb_from_tensor(&tile_horizontally(&parts))?);
+        self.add_shrunk(&parts)
+    }
+
+    /// Returns by how much the sides of a picture have to be divided that is one of `parts` of `part`'s size, [.., H, W].
+    pub fn factor(&mut self, parts: usize, part: &Tensor) -> i64 {
+        let [.., height, width] = part.size()[..] else { panic!("a picture has two sides") };
+        let factor = shrink_factor(parts as i64 * height * width, self.most_pixels);
+        self.shrunk_by = self.shrunk_by.max(factor);
+        factor
+    }
+
+    /// As [`Mosaic::add`], of parts that are shrunk by [`Mosaic::factor`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn add_shrunk(&mut self, parts: &[Tensor]) -> Result<()> {
+        self.images.push(rgb_from_tensor(&tile_horizontally(parts))?);
         Ok(())
     }
 

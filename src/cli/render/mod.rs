@@ -50,7 +50,8 @@ pub struct Render {
     /// Cameras of this capture, of any format, whose photos need not exist, or of a camera_path.json of nerfstudio's viewer
     #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
     path: Option<PathBuf>,
-    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side
+    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side, shrunk where it would have
+    /// more than 64 million pixels
     #[arg(long, value_name = "DIR|FILE", required_unless_present = "html")]
     out: Option<PathBuf>,
     /// Instead, a page to walk in, with the photos of --scene if there is one: one file that needs no other and no network

@@ -5,7 +5,7 @@ use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use globalsplat::data::{Capture, View};
+use globalsplat::data::Capture;
 use globalsplat::io::{Splat, encode_photo, rgb_from_tensor};
 use globalsplat::render::DEFAULT_EPS2D;
 use globalsplat::scene::{Camera, ImageSize, smooth_path};
@@ -110,10 +110,10 @@ fn rows(camera: &Camera) -> [f64; 12] {
 
 /// Cameras and their photos, spread over the capture where there are many.
 fn photographed(capture: &Capture) -> Result<Vec<PageCamera>> {
-    let count = capture.len().min(MOST_PHOTOS);
+    let (count, cameras) = (capture.len().min(MOST_PHOTOS), capture.cameras());
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
-        let view = shrunk(capture.load(&[index], None)?.remove(0))?;
+        let view = capture.load(&[index], shrunk(&cameras[index]))?.remove(0);
         let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
         let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
         Ok(PageCamera::of(view.name, &view.camera, Some(photo)))
@@ -121,12 +121,9 @@ fn photographed(capture: &Capture) -> Result<Vec<PageCamera>> {
     indices.map(photographed).collect()
 }
 
-fn shrunk(view: View) -> Result<View> {
-    let Camera { width, height, .. } = view.camera;
+/// The size to which a photo is shrunk; none where it is small enough.
+fn shrunk(&Camera { width, height, .. }: &Camera) -> Option<ImageSize> {
     let longest = width.max(height);
-    if longest <= LONGEST {
-        return Ok(view);
-    }
     let side = |side: u32| (side * LONGEST).div_ceil(longest);
-    Ok(view.fitted(ImageSize { width: side(width), height: side(height) })?)
+    (longest > LONGEST).then(|| ImageSize { width: side(width), height: side(height) })
 }
