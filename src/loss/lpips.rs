@@ -363,11 +363,11 @@ mod tests {
             });
             assert_eq!(network.strides().last(), Some(&LARGEST_STRIDE));
             // Sides that the strides divide and don't, and one with a last tile that AlexNet has no feature for.
-            for (height, width) in [(160, 288), (203, 241), (129, 193)] {
-                let picture = || Tensor::rand([2, 3, height, width], (Kind::Float, Device::Cpu));
+            for (height, width) in [(64, 288), (81, 241), (129, 193)] {
+                let picture = || Tensor::rand([1, 3, height, width], (Kind::Float, Device::Cpu));
                 let (a, b) = (picture(), picture());
                 let whole = Vec::<f64>::try_from(lpips.distance(&a, &b).to_kind(Kind::Double)).unwrap();
-                let tiled = lpips.distance_in_tiles(&a, &b, 32).to_kind(Kind::Double);
+                let tiled = lpips.distance_in_tiles(&a, &b, 96).to_kind(Kind::Double);
                 for (whole, tiled) in whole.into_iter().zip(Vec::<f64>::try_from(tiled).unwrap()) {
                     let error = (whole - tiled).abs() / whole.abs();
                     assert!(error < 1e-5, "{network:?} {height}×{width}: {whole} and {tiled}");
