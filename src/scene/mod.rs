@@ -11,8 +11,8 @@ mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
 pub(crate) use camera::{check_pose, nearest_rigid};
-pub(crate) use gaussians::SH_C0;
 pub use gaussians::{Gaussians, RawGaussians};
+pub(crate) use gaussians::{SH_C0, sigmoid};
 pub use normalize::{Normalization, Placement, Similarity, normalize};
 pub(crate) use rays::plucker_rays;
 pub use smooth_path::smooth_path;
