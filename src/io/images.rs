@@ -156,12 +156,17 @@ pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
         .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
 }
 
+/// Whether the ending of `path` is a PNG's.
+pub fn is_png_name(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png"))
+}
+
 /// Whether a PNG could be written at `path`, as by [`check_writable_file`].
 ///
 /// # Errors
 /// Another ending, and as there.
 pub fn check_writable_png(path: &Path) -> Result<()> {
-    if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
+    if !is_png_name(path) {
         return Err(Error::input(path, "the picture's ending", "another", ".png"));
     }
     check_writable_file(path)

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use memmap2::{Mmap, MmapMut, MmapOptions, UncheckedAdvice};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs::File;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -35,9 +35,34 @@ pub fn read_weights(path: &Path) -> Result<Weights> {
 
 /// Whether files of this name hold weights, as a rule.
 pub fn is_weights_name(path: &Path) -> bool {
-    let ending = path.extension().and_then(|ending| ending.to_str());
-    path.to_string_lossy().ends_with(INDEX_ENDING)
-        || matches!(ending, Some("safetensors" | "ckpt" | "pt" | "pth"))
+    let name = path.to_string_lossy().to_ascii_lowercase();
+    let endings = [INDEX_ENDING, ".safetensors", ".ckpt", ".pt", ".pth"];
+    endings.iter().any(|ending| name.ends_with(ending))
+}
+
+/// The files that [`WeightsFile::open`] reads at `path`: one, or an index and what it names.
+pub fn weights_files(path: &Path) -> Vec<PathBuf> {
+    let Some(index) = index_at(path) else { return vec![path.to_owned()] };
+    let shards = read_index(&index).map(|index| index.weight_map.into_values().collect::<BTreeSet<_>>());
+    let shards = shards.unwrap_or_default().into_iter().map(|name| index.with_file_name(name));
+    std::iter::once(index.clone()).chain(shards).collect()
+}
+
+/// The index of shards that `path` is, or that stands for it.
+fn index_at(path: &Path) -> Option<PathBuf> {
+    let ends_in = |ending: &str| path.to_string_lossy().to_ascii_lowercase().ends_with(ending);
+    if ends_in(INDEX_ENDING) {
+        return Some(path.to_owned());
+    }
+    // The name that shards were written under.
+    let index = path.with_extension(INDEX_ENDING.trim_start_matches('.'));
+    (!path.exists() && ends_in(".safetensors") && index.exists()).then_some(index)
+}
+
+fn read_index(path: &Path) -> Result<ShardIndex> {
+    let text = std::fs::read(path).map_err(Error::read(path))?;
+    serde_json::from_slice(&text)
+        .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))
 }
 
 /// Weights in one file or several, none of them read yet.
@@ -117,16 +142,10 @@ impl WeightsFile {
     /// # Errors
     /// A file that can't be read, is damaged or is none of these, or has tensors of a type that no weights have.
     pub fn open(path: &Path) -> Result<Self> {
-        if path.to_string_lossy().ends_with(INDEX_ENDING) {
-            return Self::open_shards(path);
+        match index_at(path) {
+            Some(index) => Self::open_shards(&index),
+            None => Self::of(Bytes::map(path)?, path),
         }
-        // The name that shards were written under.
-        let index = path.with_extension(INDEX_ENDING.trim_start_matches('.'));
-        if !path.exists() && path.extension().is_some_and(|ending| ending == "safetensors") && index.exists()
-        {
-            return Self::open_shards(&index);
-        }
-        Self::of(Bytes::map(path)?, path)
     }
 
     /// What the program carries; `path` is what errors call it.
@@ -144,9 +163,7 @@ impl WeightsFile {
     }
 
     fn open_shards(path: &Path) -> Result<Self> {
-        let text = std::fs::read(path).map_err(Error::read(path))?;
-        let index: ShardIndex = serde_json::from_slice(&text)
-            .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))?;
+        let index = read_index(path)?;
         let mut names: Vec<&String> = index.weight_map.values().collect();
         names.sort();
         names.dedup();
