@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::open_capture;
 use globalsplat::eval::psnr_between;
-use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
+use globalsplat::io::{Inputs, Splat, check_writable_splat, fit_splat, read_splat, write_splat};
 use globalsplat::render::HarmonicLimits;
 use globalsplat::scene::{Camera, ImageSize};
 use serde_json::{Value, json};
@@ -53,6 +53,9 @@ impl Convert {
     pub fn run(self) -> Result<()> {
         check_writable_splat(&self.to)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        let mut inputs = Inputs::default();
+        capture.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        inputs.check_file(&self.to)?;
         let original = read_splat(&self.from)?;
         // Before the file is replaced, if it is the same.
         let from = description(&self.from, &original)?;

@@ -4,10 +4,11 @@ use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
-    contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
+    Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, REPORT, Sweep,
+    TABLE, contact_sheet, evaluation_files, judge, machine, peak_memory_bytes, write_csv, write_evaluation,
+    write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_png, write_png};
+use globalsplat::io::{Inputs, check_writable_dir, check_writable_png, weights_files, write_png};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
 use globalsplat::scene::ImageSize;
@@ -113,6 +114,11 @@ impl Eval {
             check_writable_png(sheet)?;
         }
         let capture = open_capture(scene)?;
+        if let Some(sheet) = &self.sheet {
+            let mut inputs = self.inputs(std::iter::once(self.method(None)));
+            capture.add_inputs(&mut inputs);
+            inputs.check_file(sheet)?;
+        }
         let loaded = self.load_model(device)?;
         let model = self.model(loaded.as_ref())?;
         let scene = self.one_scene(&capture, model)?;
@@ -230,6 +236,37 @@ impl Eval {
         Ok(Some(Model { input, ..loaded.into() }))
     }
 
+    /// The files of what is judged, of a data set by `methods`, one for each scene.
+    fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> Inputs {
+        let mut inputs = Inputs::default();
+        match &self.weights {
+            Some(weights) => weights_files(weights).iter().for_each(|file| inputs.add(file)),
+            None => methods.for_each(|method| method.add_inputs(&mut inputs)),
+        }
+        inputs
+    }
+
+    /// Refuses an output that would replace what is read.
+    fn check_outputs<'a>(
+        &self,
+        dataset: &Dataset,
+        out: &Path,
+        evaluations: impl Iterator<Item = (&'a EvaluationIndex, &'a PathBuf)> + Clone,
+    ) -> Result<()> {
+        let method = self.method(None);
+        let scenes = || evaluations.clone().flat_map(|(index, _)| index.scenes.keys());
+        let mut inputs = self.inputs(scenes().map(|key| method.of_scene(key)));
+        dataset.add_inputs(out, &mut inputs);
+        evaluations.clone().for_each(|(index, _)| inputs.add(&index.file));
+        inputs.check_folder(out)?;
+        inputs.check_file(&out.join(REPORT))?;
+        for (index, folder) in evaluations {
+            let files = evaluation_files(folder, index.scenes.keys());
+            files.iter().try_for_each(|file| inputs.check_file(file))?;
+        }
+        Ok(())
+    }
+
     /// The file or folder that is judged.
     fn path(&self) -> &Path {
         let paths = [&self.weights, &self.splat, &self.renders];
@@ -261,6 +298,7 @@ impl Eval {
         let dataset_name = |index| Sweep::dataset_name(self.dataset.as_deref(), data, index);
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
+        self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = self.model(loaded.as_ref())?;
         let picture_size = self.picture_size(model)?;
@@ -315,14 +353,14 @@ impl Eval {
                 eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
             }
             write_evaluation(&folder, &evaluation)?;
-            write_csv(&folder.join("scores.csv"), &evaluation)?;
+            write_csv(&folder.join(TABLE), &evaluation)?;
             evaluations.push((folder, evaluation));
         }
         group.leave()?;
         if !group.is_first() {
             return Ok(());
         }
-        let report = out.join("report.html");
+        let report = out.join(REPORT);
         write_report(&report, &evaluations)?;
         self.tell(&report, &evaluations)
     }

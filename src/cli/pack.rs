@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{ChunkWriter, find_captures};
 use globalsplat::error::Error;
-use globalsplat::io::check_writable_dir;
+use globalsplat::io::{Inputs, check_writable_dir};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -38,6 +38,9 @@ impl Pack {
             captures.extend(find_captures(scene)?);
         }
         check_writable_dir(&self.out)?;
+        let mut inputs = Inputs::default();
+        captures.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        inputs.check_folder(&self.out)?;
         let mut writer = ChunkWriter::new(&self.out, self.chunk_size as usize * 1_000_000)?;
         let bar = progress::bar(captures.len() as u64, "scenes");
         let mut views = 0;

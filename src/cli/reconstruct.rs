@@ -6,7 +6,7 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
+use globalsplat::io::{Inputs, Splat, check_writable_splat, weights_files, write_splat_for};
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::ImageSize;
@@ -94,6 +94,11 @@ impl Reconstruct {
         let mut watch = Stopwatch::default();
         let loaded = watch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = watch.time("photos", || open_capture(&self.scene))?;
+        let mut inputs = Inputs::default();
+        capture.add_inputs(&mut inputs);
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.for_each(|file| inputs.add(&file));
+        inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {
             Some(height) => Input::at(height, ViewsAs::Polyphase, data.image_size)?,

@@ -7,7 +7,8 @@ use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
 use globalsplat::io::{
-    Splat, check_writable_png, check_writable_splat, read_splat, write_png, write_splat_for,
+    Inputs, Splat, check_writable_png, check_writable_splat, read_splat, weights_files, write_png,
+    write_splat_for,
 };
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
@@ -144,6 +145,7 @@ impl Refine {
             check_writable_png(sheet)?;
         }
         let capture = open_capture(&self.scene)?;
+        self.check_outputs(&capture)?;
         let (shown, held_out) = holdout.split(capture.len());
         let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX).max(1));
         let photos = load_photos(&capture, &shown, size)?;
@@ -219,6 +221,17 @@ impl Refine {
             println!("{line}");
         }
         Ok(())
+    }
+
+    /// Refuses outputs that would replace what is read, but for the splat that is begun with.
+    fn check_outputs(&self, capture: &Capture) -> Result<()> {
+        let mut inputs = Inputs::default();
+        capture.add_inputs(&mut inputs);
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.for_each(|file| inputs.add(&file));
+        inputs.check_file(&self.out)?;
+        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add(splat));
+        Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 
     /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.

@@ -5,7 +5,7 @@ use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
+    Inputs, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
@@ -82,6 +82,11 @@ impl Synth {
     fn write_videos(&self) -> Result<()> {
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
         check_writable_dir(&self.out)?;
+        let mut inputs = Inputs::default();
+        let on_walls = self.pictures.iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
+        on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
+        inputs.check_folder(&self.out)?;
+        self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
         let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
         let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
@@ -129,12 +134,13 @@ impl Synth {
                 note(&capture)?;
             }
         }
-        let chunks = writer.finish()?;
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
         index.write()?;
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &tile_vertically(&rows))?;
         }
+        // Last: a folder with the index of its chunks is finished, and nothing more is written there.
+        let chunks = writer.finish()?;
         bar.finish_and_clear();
         let (out, scenes) = (self.out.display(), self.scenes);
         if self.json {

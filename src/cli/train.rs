@@ -2,12 +2,12 @@ use super::{memory, print_json, progress, ranks, stop_flag};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
+use globalsplat::data::{BadData, Dataset, SceneGroups, Split, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::check_writable_dir;
+use globalsplat::io::{Inputs, check_writable_dir, weights_files};
 use globalsplat::loss::{Term, psnr_of_mse};
-use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
+use globalsplat::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -57,6 +57,9 @@ pub struct Train {
     json: bool,
 }
 
+/// Shows how the run went.
+const CURVES_FILE: &str = "curves.svg";
+
 impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
@@ -80,6 +83,7 @@ impl Train {
         }
         if is_first {
             check_writable_dir(&self.out)?;
+            self.check_outputs(&config, &scenes)?;
         }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
         if let ([first, others @ ..], true) = (held_out.trained_on(), is_first) {
@@ -124,6 +128,19 @@ impl Train {
             anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
         }
         self.report(&outcome, seconds, held_out.scores(), &bad_data)
+    }
+
+    /// Refuses a folder whose files would replace what is read. The configuration may be the run's own, of which the same is left.
+    fn check_outputs(&self, config: &Config, scenes: &TrainingScenes) -> Result<()> {
+        let mut inputs = Inputs::default();
+        scenes.add_inputs(&self.out, &mut inputs);
+        for path in config.data.validation_paths()? {
+            Dataset::open(&path, Split::Test)?.add_inputs(&self.out, &mut inputs);
+        }
+        self.from.iter().flat_map(|path| weights_files(path)).for_each(|file| inputs.add(&file));
+        inputs.check_folder(&self.out)?;
+        let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
+        Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)
     }
 
     fn train(
@@ -190,7 +207,7 @@ impl Train {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
-        let curves = self.out.join("curves.svg");
+        let curves = self.out.join(CURVES_FILE);
         write_curves(&curves, &self.out, (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr)))?;
         if self.json {
             let mut object = json!({

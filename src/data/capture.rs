@@ -2,7 +2,7 @@
 
 use super::pixels::{Distortion, Lens, Planes, fit, looked_at, undistort};
 use crate::error::{Error, Result};
-use crate::io;
+use crate::io::{self, Inputs};
 use crate::scene::{Camera, ImageSize, check_pose};
 use crate::synth::Video;
 use image::RgbImage;
@@ -173,15 +173,23 @@ impl Capture {
         picture_names(&self.names().collect::<Vec<_>>())
     }
 
-    /// Whether `path` is a photo of the capture.
-    pub fn has_photo(&self, path: &Path) -> bool {
-        let is_same = |photo: &Path| photo.canonicalize().ok() == path.canonicalize().ok();
-        let name = path.file_name();
-        path.is_file()
-            && self.frames.iter().any(|frame| match &frame.photo {
-                Photo::File(photo) => photo.file_name() == name && is_same(photo),
-                Photo::Part { .. } | Photo::Made { .. } => false,
-            })
+    /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
+    pub fn add_inputs(&self, inputs: &mut Inputs) {
+        let described = described_in(&self.file);
+        inputs.add(&described);
+        // A COLMAP model is in several files.
+        let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
+        let siblings = form.and_then(|_| std::fs::read_dir(described.parent()?).ok());
+        for sibling in siblings.into_iter().flatten().flatten() {
+            if Path::new(&sibling.file_name()).extension() == form {
+                inputs.add(&sibling.path());
+            }
+        }
+        for frame in &self.frames {
+            if let Photo::File(photo) = &frame.photo {
+                inputs.add_photo(photo);
+            }
+        }
     }
 
     /// Reads the views of `indices`, fitted to `size`, or as they are.
@@ -279,6 +287,13 @@ impl Capture {
         let pixels = undistort(photo.pixels, &frame.distortion, &frame.camera, None);
         io::encode_photo(&pixels, photo.is_jpeg)
     }
+}
+
+/// The file in `path`, which may have the key of one of its scenes after a `#`.
+fn described_in(path: &Path) -> PathBuf {
+    let text = path.to_string_lossy();
+    let prefixes = text.match_indices('#').rev().map(|(at, _)| PathBuf::from(&text[..at]));
+    std::iter::once(path.to_owned()).chain(prefixes).find(|file| file.is_file()).unwrap_or_default()
 }
 
 fn picture_names(names: &[&str]) -> Vec<String> {

@@ -4,6 +4,7 @@ use super::capture::Capture;
 use super::formats::{Chunk, INDEX_FILE, capture_folders, folder_name, open_capture};
 use super::made_up::MadeUp;
 use crate::error::{Error, Result};
+use crate::io::Inputs;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -101,6 +102,12 @@ impl Dataset {
         &self.groups
     }
 
+    /// Adds the files that the data set is read from to `inputs`, as far as what is written below the folder `output` could be one
+    /// of them.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        self.groups.iter().for_each(|group| group.add_inputs(output, inputs));
+    }
+
     /// The number of scenes.
     pub fn scenes(&self) -> usize {
         self.groups.iter().map(|group| group.keys.len()).sum()
@@ -117,6 +124,27 @@ impl SceneGroup {
             Source::Chunk => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
             Source::Folder => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
             Source::MadeUp(videos, index) => Ok(OpenGroup::Capture(Box::new(videos.capture(*index)?))),
+        }
+    }
+
+    /// Adds the files that the group is read from to `inputs`, as far as what is written below the folder `output` could be one of
+    /// them. A capture that can't be opened has none: whoever opens it says so.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        let resolved = |path: &Path| path.canonicalize().unwrap_or(path.to_owned());
+        match &self.source {
+            Source::Chunk => {
+                inputs.add(&self.path);
+                inputs.add(&self.path.with_file_name(INDEX_FILE));
+            }
+            Source::Folder => {
+                let (folder, output) = (resolved(&self.path), resolved(output));
+                if (folder.starts_with(&output) || output.starts_with(&folder))
+                    && let Ok(capture) = open_capture(&self.path)
+                {
+                    capture.add_inputs(inputs);
+                }
+            }
+            Source::MadeUp(..) => {}
         }
     }
 

@@ -6,7 +6,7 @@ use super::scene::EvalScene;
 use super::scores::{CaptureScores, score};
 use crate::data::{View, cameras_at};
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
+use crate::io::{Inputs, PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
 use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
 use crate::render::{Rendered, render_views};
 use crate::scene::ImageSize;
@@ -92,6 +92,18 @@ impl Method<'_> {
                     splat_bytes: None,
                     forward_seconds: None,
                 })
+            }
+        }
+    }
+
+    /// Adds the files of a splat or pictures to `inputs`.
+    pub fn add_inputs(&self, inputs: &mut Inputs) {
+        match self {
+            Method::Model(_) => {}
+            Method::Splat(file) => inputs.add(file),
+            Method::Renders(folder) => {
+                let pictures = std::fs::read_dir(folder).into_iter().flatten().flatten();
+                pictures.for_each(|picture| inputs.add_photo(&picture.path()));
             }
         }
     }

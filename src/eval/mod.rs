@@ -26,6 +26,7 @@ pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 pub use fidelity::psnr_between;
 pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
+pub use journal::evaluation_files;
 pub use machine::machine;
 pub use memory::peak_memory_bytes;
 pub(crate) use memory::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
@@ -39,5 +40,5 @@ pub use published::{
 pub use report::{write_curves, write_report};
 pub use scene::EvalScene;
 pub use scores::{Baselines, CaptureScores, ViewScore, score};
-pub use scores_file::{comparison_path, read_evaluation, write_csv, write_evaluation};
+pub use scores_file::{REPORT, TABLE, comparison_path, read_evaluation, write_csv, write_evaluation};
 pub use sweep::Sweep;

@@ -10,7 +10,7 @@ use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
+use globalsplat::io::{DepthScale, Inputs, Splat, read_splat, tiled_size, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{Rendered, render_views};
@@ -91,6 +91,7 @@ impl Render {
     fn page(&self, page: &Path) -> Result<()> {
         view::check_writable(page)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        self.inputs(capture.as_ref()).check_file(page)?;
         let splat = self.splat(capture.as_ref())?;
         let name = capture.as_ref().map_or_else(|| view::name_of(page), |capture| capture.name.clone());
         view::write_page(page, &name, &splat, capture.as_ref())?;
@@ -111,11 +112,14 @@ impl Render {
         let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
-        let mut output = Output::begin(out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
+        let mut inputs = self.inputs(capture.as_ref());
+        inputs.extend(shots.inputs.clone());
+        let film = (self.size_of_all(&shots.cameras), shots.frames_per_second);
+        let mut output = Output::begin(out, (&shots.names, &self.suffixes()), film, &inputs)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
-        for (name, camera) in shots.names.iter().zip(&shots.cameras) {
+        for camera in &shots.cameras {
             let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);
-            output.add(name, self.parts(&rendered, scale), capture.as_ref())?;
+            output.add(&self.parts(&rendered, scale))?;
             if stop.load(Ordering::Relaxed) {
                 let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
                 return Err(Error::Failed(format!("{out}: stopped after {done} of {of} views")).into());
@@ -156,14 +160,31 @@ impl Render {
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }
 
-    /// Colour and what else was asked for, [3, H, W], each with its file's suffix.
-    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<(&'static str, Tensor)> {
-        let mut parts = vec![("", rendered.rgb.clamp(0., 1.))];
+    /// The files that are read, which no output may replace.
+    fn inputs(&self, capture: Option<&Capture>) -> Inputs {
+        let mut inputs = Inputs::default();
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.chain(self.splat.clone()).for_each(|file| inputs.add(&file));
+        capture.inspect(|capture| capture.add_inputs(&mut inputs));
+        inputs
+    }
+
+    /// What the names of pictures' files end in: colour and what else was asked for.
+    fn suffixes(&self) -> Vec<&'static str> {
+        let more = [(self.depth, "_depth"), (self.alpha, "_alpha")];
+        std::iter::once("")
+            .chain(more.into_iter().filter_map(|(asked, suffix)| asked.then_some(suffix)))
+            .collect()
+    }
+
+    /// Colour and what else was asked for, [3, H, W], in the order of the suffixes.
+    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<Tensor> {
+        let mut parts = vec![rendered.rgb.clamp(0., 1.)];
         if let Some(scale) = scale {
-            parts.push(("_depth", scale.colourize(&rendered.depth, &rendered.alpha)));
+            parts.push(scale.colourize(&rendered.depth, &rendered.alpha));
         }
         if self.alpha {
-            parts.push(("_alpha", rendered.alpha.unsqueeze(0).expand([3, -1, -1], false)));
+            parts.push(rendered.alpha.unsqueeze(0).expand([3, -1, -1], false));
         }
         parts
     }

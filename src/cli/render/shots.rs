@@ -3,7 +3,7 @@
 use anyhow::Result;
 use glam::{DMat4, DVec3};
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
-use globalsplat::io::Splat;
+use globalsplat::io::{Inputs, Splat};
 use globalsplat::render::render_views;
 use globalsplat::scene::{
     Camera, ImageSize, Intrinsics, orbit_around_cameras, orbit_around_point, smooth_path,
@@ -23,6 +23,8 @@ pub struct Shots {
     pub names: Vec<String>,
     pub cameras: Vec<Camera>,
     pub frames_per_second: u32,
+    /// What a path was read from.
+    pub inputs: Inputs,
 }
 
 impl Shots {
@@ -61,19 +63,20 @@ impl Shots {
 
     /// From the cameras at `path`, or so many on a smooth path through them.
     pub fn along(path: &Path, size: Option<ImageSize>, frames: Option<usize>, splat: &Splat) -> Result<Self> {
-        let CameraPath { cameras, frames_per_second } = read_camera_path(path, size)?;
+        let CameraPath { cameras, frames_per_second, inputs } = read_camera_path(path, size)?;
         let cameras = resized(cameras, size);
         let shots = Shots::numbered(match frames {
             Some(frames) => smoothed(&cameras, frames, splat)?,
             None => cameras,
         });
-        Ok(Shots { frames_per_second: frames_per_second.unwrap_or(FRAMES_PER_SECOND), ..shots })
+        let frames_per_second = frames_per_second.unwrap_or(FRAMES_PER_SECOND);
+        Ok(Shots { frames_per_second, inputs, ..shots })
     }
 
     fn numbered(cameras: Vec<Camera>) -> Self {
         let digits = (cameras.len().max(2) - 1).to_string().len().max(3);
         let names = (0..cameras.len()).map(|i| format!("{i:0digits$}")).collect();
-        Shots { names, cameras, frames_per_second: FRAMES_PER_SECOND }
+        Shots { names, cameras, frames_per_second: FRAMES_PER_SECOND, inputs: Inputs::default() }
     }
 }
 

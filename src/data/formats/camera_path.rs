@@ -8,6 +8,7 @@ use super::transforms_json::{from_opengl, shown};
 use super::{cameras_json, open_for, recognize, transforms_json};
 use crate::data::capture::{Purpose, check_cameras};
 use crate::error::{Error, Result};
+use crate::io::Inputs;
 use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid};
 use serde_json::Value;
 use std::path::Path;
@@ -19,6 +20,8 @@ pub struct CameraPath {
     pub cameras: Vec<Camera>,
     /// How fast they follow each other, where the file tells.
     pub frames_per_second: Option<u32>,
+    /// What they were read from, and the photos of the capture that are there.
+    pub inputs: Inputs,
 }
 
 /// Reads the cameras of a capture of any format, as [`open_capture`](super::open_capture) finds it, or of a JSON file of any
@@ -29,14 +32,15 @@ pub struct CameraPath {
 /// As [`open_capture`](super::open_capture).
 pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
     let purpose = Purpose::Cameras(size);
-    let json = match path.is_file() && path.extension().is_some_and(|ending| ending == "json") {
-        false => None,
-        true => {
-            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
-            // What is no JSON is refused by whoever reads it.
-            Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
-        }
-    };
+    let json =
+        match path.is_file() && path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json")) {
+            false => None,
+            true => {
+                let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
+                // What is no JSON is refused by whoever reads it.
+                Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
+            }
+        };
     let has = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
     let capture = match (&json, recognize(path)) {
         (Some(json), _) if has("camera_path") => return of_viewer(path, json),
@@ -44,7 +48,9 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
         (Some(_), None) => cameras_json::read(path, purpose)?,
         _ => open_for(path, purpose)?,
     };
-    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None })
+    let mut inputs = Inputs::default();
+    capture.add_inputs(&mut inputs);
+    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None, inputs })
 }
 
 fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
@@ -98,5 +104,7 @@ fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
         }
         (None, None) => None,
     };
-    Ok(CameraPath { cameras, frames_per_second: rate.map(|rate| rate.round() as u32) })
+    let mut inputs = Inputs::default();
+    inputs.add(file);
+    Ok(CameraPath { cameras, frames_per_second: rate.map(|rate| rate.round() as u32), inputs })
 }

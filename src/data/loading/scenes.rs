@@ -3,8 +3,9 @@
 use crate::data::capture::Capture;
 use crate::data::dataset::{Dataset, SceneGroup, Split};
 use crate::error::Result;
+use crate::io::Inputs;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Scenes in groups, each of which is opened as a whole, as a file that holds several of them.
 pub trait SceneGroups: Send + Sync + fmt::Debug {
@@ -66,6 +67,12 @@ impl TrainingScenes {
             }
         }
         Ok(found)
+    }
+
+    /// Adds the files that they are read from to `inputs`, as far as what is written below the folder `output` could be one of them.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        self.captures.iter().for_each(|capture| capture.add_inputs(inputs));
+        self.others.iter().for_each(|group| group.add_inputs(output, inputs));
     }
 
     /// Those that are kept.
