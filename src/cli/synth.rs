@@ -113,7 +113,11 @@ impl Synth {
                 if self.depth && !file.exists() {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
-                note(capture)
+                // A sheet shows pictures as they were made, not the JPEGs of a chunk.
+                match self.sheet.is_some() && number < SHEET.0 {
+                    true => note(&videos.capture(number)?),
+                    false => note(capture),
+                }
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
