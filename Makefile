@@ -1,9 +1,13 @@
 # What a person runs: `make demo` and `make test`. Both set everything up first.
 
 SHELL := /bin/bash
+# Files and what programs print are UTF-8, whatever the locale is.
+export PYTHONUTF8 := 1
+# Each check takes all cores.
+.NOTPARALLEL:
 CARGO ?= cargo
 
-.PHONY: all setup venv weights build demo test checks parity bench docker clean
+.PHONY: all setup venv weights build demo demo-training test checks parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
@@ -20,27 +24,47 @@ weights:
 build: setup
 	@scripts/heartbeat.sh building $(CARGO) build --release --locked
 
-# Trains a small model, makes splats and pictures with it, and says where they are.
+# Photos to a splat, refined, and a page to walk in: in 3 minutes at most once the program is built.
 demo: build
 	@scripts/demo.sh
 
-# Every check; the last line says how many tests were skipped for want of something.
-test:
-	@scripts/count_skips.sh $(MAKE) --no-print-directory checks
+# Trains the shipped weights on a few scenes, and compares views before and after: about 10 minutes.
+demo-training: build
+	@scripts/demo.sh --training
 
-checks: venv
+# Every check, also after one has failed; the last line says how many tests were skipped for want of something.
+test:
+	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
+
+CHECKS := check-format check-lints check-library check-docs check-tests
+.PHONY: checks $(CHECKS)
+checks: $(CHECKS) parity
+$(CHECKS): venv
+
+check-format:
 	$(CARGO) fmt --all --check
+check-lints:
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+# The library without the packages that only the program needs.
+check-library:
 	$(CARGO) check --release --locked --lib --no-default-features
+check-docs:
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --no-deps
-	$(CARGO) test --release --locked
-	@$(MAKE) --no-print-directory parity
+check-tests:
+	$(CARGO) test --release --locked --no-fail-fast
 
 # Every module, loss and kernel against plain torch, and whether wrong answers would be noticed. Then once more those that the
 # kernels for GPUs serve, which the CPU runs.
-parity: venv build
+PARITY := parity-pytest parity-self-test parity-kernels
+.PHONY: $(PARITY)
+parity: $(PARITY)
+$(PARITY): venv build
+
+parity-pytest:
 	.venv/bin/python -m pytest -q parity
+parity-self-test:
 	.venv/bin/python parity/run.py --self-test
+parity-kernels:
 	.venv/bin/python parity/run.py --only '[pr][ra]*_float32' --cuda-on-cpu 1 --self-test
 
 # How fast this machine runs the rasterizer, how its time grows with Gaussians and pixels, and how fast training data load.

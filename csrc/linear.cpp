@@ -1,13 +1,19 @@
 #include "linear.h"
 
 #include <ATen/Context.h>
+#include <ATen/Parallel.h>
+#include <ATen/TensorIterator.h>
+#include <ATen/core/LegacyTypeDispatch.h>
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/custom_function.h>
 
 #include <algorithm>
+#include <atomic>
+#include <functional>
 #include <optional>
 
 #include "globalsplat-csrc/src/linear.rs.h"
+#include "processor.h"
 #include "room.h"
 
 namespace globalsplat {
@@ -19,6 +25,9 @@ using torch::autograd::tensor_list;
 
 // Of the gradient of weights, summed up part by part: both matrices are read along their columns, and more rows fall out of the caches.
 constexpr int64_t kRows = 2048;
+
+// A product is computed in blocks of so many rows; of few rows, also in blocks of so many columns at least, until there are kBlocks.
+constexpr int64_t kBlockRows = 256, kBlockColumns = 256, kBlocks = 16;
 
 using Product = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
                        c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
@@ -35,31 +44,92 @@ const std::optional<c10::TypedOperatorHandle<Product>>& product() {
   return known;
 }
 
-// xs [m, k] · weightsᵀ [n, k] + bias, if there is one. Beside the result there may be the weights in oneDNN's order.
+// Whether oneDNN computes products of float32 faster than MKL, to which libtorch gives them: MKL leaves half of the vector units idle on
+// processors that aren't Intel's.
+bool is_for_one_dnn() {
+#if defined(__x86_64__)
+  static const bool is = [] {
+    __builtin_cpu_init();
+    return at::hasMKL() && product() && __builtin_cpu_supports("avx2") && simd_limit() != SimdLimit::Portable && !__builtin_cpu_is("intel");
+  }();
+  return is;
+#else
+  return false;
+#endif
+}
+
+// xs [m, k] · weightsᵀ [n, k] + bias, if there is one, in float32 or bfloat16.
 Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
-  expect_room_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
-  if (xs.scalar_type() == at::kBFloat16) return at::linear(xs, weights, bias);
+  if (xs.scalar_type() == at::kBFloat16 || !is_for_one_dnn()) return at::linear(xs, weights, bias);
   return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
+}
+
+// Throws std::bad_alloc unless there is memory for a product. Beside the result there may be the weights in oneDNN's order.
+void expect_room_for(const Tensor& xs, const Tensor& weights) {
+  expect_room_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
+}
+
+// Calls task(0) to task(count - 1), each on one of libtorch's threads. Called there, oneDNN and MKL compute on that thread alone.
+void run_on_libtorch_threads(int64_t count, const std::function<void(int64_t)>& task) {
+  std::atomic<int64_t> next{0};
+  const auto take_tasks = [&](char**, const int64_t*, int64_t, int64_t) {
+    const at::AutoDispatchBelowAutograd no_gradients;  // each thread has its own mode
+    for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
+  };
+  // at::parallel_for shares work only where OpenMP compiles it, so it is libtorch's own that is called here. For one element it would
+  // start no threads.
+  const Tensor an_element_each = at::empty({std::max(2, at::get_num_threads())}, at::kByte);
+  at::TensorIterator::borrowing_nullary_op(an_element_each).for_each(take_tasks, 1);
+}
+
+// The same as multiply(), with the same bits for any number of threads: by how many a library shares a product out decides how it adds
+// up. Here each block is computed by one thread, and which blocks there are depends on the shape alone.
+Tensor multiply_in_blocks(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
+  const int64_t m = xs.size(0), n = weights.size(0);
+  const auto blocks_of = [](int64_t length, int64_t each) { return (length + each - 1) / each; };
+  const int64_t row_blocks = blocks_of(m, kBlockRows);
+  const int64_t wanted = std::clamp(n / kBlockColumns, int64_t(1), blocks_of(kBlocks, row_blocks));
+  const int64_t columns = blocks_of(n, wanted), column_blocks = blocks_of(n, columns);
+  Tensor out;
+  if (row_blocks * column_blocks > 1) out = at::empty({m, n}, xs.options());
+  run_on_libtorch_threads(row_blocks * column_blocks, [&](int64_t block) {
+    const int64_t row = block / column_blocks * kBlockRows, height = std::min(kBlockRows, m - row);
+    const int64_t column = block % column_blocks * columns, width = std::min(columns, n - column);
+    std::optional<Tensor> bias_part;
+    if (bias) bias_part = bias->narrow(0, column, width);
+    Tensor part = multiply(xs.narrow(0, row, height), weights.narrow(0, column, width), bias_part);
+    if (out.defined())
+      out.narrow(0, row, height).narrow(1, column, width).copy_(part);
+    else
+      out = std::move(part);
+  });
+  return out;
 }
 
 struct LinearFunction : torch::autograd::Function<LinearFunction> {
   static Tensor forward(AutogradContext* ctx, Tensor xs, Tensor weights, std::optional<Tensor> bias) {
     ctx->save_for_backward({xs, weights});
     ctx->saved_data["has_bias"] = bias.has_value();
-    return multiply(xs, weights, bias);
+    expect_room_for(xs, weights);
+    return multiply_in_blocks(xs, weights, bias);
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list gradients) {
     const tensor_list kept = ctx->get_saved_variables();
     const Tensor &xs = kept[0], &weights = kept[1], g = gradients[0].contiguous();
     Tensor d_xs, d_weights, d_bias;
-    if (ctx->needs_input_grad(0)) d_xs = multiply(g, weights.t(), {});
+    if (ctx->needs_input_grad(0)) {
+      expect_room_for(g, weights.t());
+      d_xs = multiply(g, weights.t(), {});
+    }
     if (ctx->needs_input_grad(1)) {
       // Sums of bfloat16 parts would be rounded once more each.
       const int64_t at_once = g.scalar_type() == at::kBFloat16 ? g.size(0) : kRows;
       for (int64_t first = 0; first < g.size(0); first += at_once) {
         const int64_t rows = std::min(at_once, g.size(0) - first);
-        const Tensor part = multiply(g.narrow(0, first, rows).t(), xs.narrow(0, first, rows).t(), {});
+        const Tensor g_part = g.narrow(0, first, rows).t(), xs_part = xs.narrow(0, first, rows).t();
+        expect_room_for(g_part, xs_part);
+        const Tensor part = multiply(g_part, xs_part, {});
         d_weights = d_weights.defined() ? d_weights.add_(part) : part;
       }
     }
@@ -72,18 +142,6 @@ bool is_on_cpu(const Tensor& t, at::ScalarType kind) { return t.device().is_cpu(
 
 }  // namespace
 
-bool linear_is_faster() {
-#if defined(__x86_64__)
-  static const bool is = [] {
-    __builtin_cpu_init();
-    return at::hasMKL() && product() && __builtin_cpu_supports("avx2") && !__builtin_cpu_is("intel");
-  }();
-  return is;
-#else
-  return false;
-#endif
-}
-
 size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
   const auto borrowed = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
   const Tensor &xs = borrowed(xs_address), &weights = borrowed(weights_address);
@@ -91,7 +149,6 @@ size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
   if (bias_address != 0) bias = borrowed(bias_address);
   const at::ScalarType kind = xs.scalar_type();
   TORCH_CHECK(kind == at::kFloat || kind == at::kBFloat16, "linear layers are of float32 or bfloat16, not of ", kind);
-  TORCH_CHECK(kind != at::kFloat || linear_is_faster(), "products of float32 are libtorch's on this processor");
   TORCH_CHECK(is_on_cpu(xs, kind) && is_on_cpu(weights, kind) && (!bias || is_on_cpu(*bias, kind)),
               "linear layers must be on the CPU, and of one kind of numbers");
   TORCH_CHECK(weights.dim() == 2 && xs.dim() > 0 && xs.size(-1) == weights.size(1) && xs.numel() > 0 && weights.numel() > 0 &&

@@ -5,14 +5,10 @@
 
 namespace globalsplat {
 
-// Whether linear() of float32 is faster here than libtorch's own, which gives these products to MKL: that leaves half of the vector units
-// idle on processors that aren't Intel's, oneDNN doesn't.
-bool linear_is_faster();
-
-// xs weightsᵀ + bias, by oneDNN, to which libtorch gives bfloat16 itself: xs [.., k], weights [n, k] and bias [n], float32 or bfloat16 on
-// the CPU; addresses of live tensors, that of the bias 0 where there is none. Returns the address of a new tensor [.., n] that the caller
-// owns. Differentiable, once. Throws on what doesn't fit, where the system has no memory for the products' code, and with float32 where
-// linear_is_faster() says no.
+// xs weightsᵀ + bias: xs [.., k], weights [n, k] and bias [n], float32 or bfloat16 on the CPU; addresses of live tensors, that of the bias
+// 0 where there is none. Returns the address of a new tensor [.., n] that the caller owns, with the same bits for any number of threads.
+// Differentiable, once. Throws on what doesn't fit, and where the system has no memory for the products' code. Float32 is multiplied by
+// oneDNN where that is faster than what libtorch takes, which is MKL; bfloat16 by libtorch's choice, which is oneDNN.
 size_t linear(size_t xs, size_t weights, size_t bias);
 
 }  // namespace globalsplat

@@ -2,7 +2,11 @@
 
 #include <ATen/Context.h>
 #include <ATen/cpu/Utils.h>
+#include <ATen/Version.h>
 #include <ATen/detail/CUDAHooksInterface.h>
+
+#include <cstdlib>
+#include <string>
 
 #include "globalsplat-csrc/src/processor.rs.h"
 
@@ -10,7 +14,30 @@ namespace globalsplat {
 
 namespace {
 
+// Each of the libraries reads a variable of its own when it first chooses a kernel; one that the user has set stays.
+SimdLimit limit_libraries() {
+  struct Level {
+    SimdLimit limit;
+    const char *ours, *libtorch, *one_dnn, *mkl;
+  };
+  constexpr Level levels[] = {{SimdLimit::Avx2, "avx2", "avx2", "AVX2", "AVX2"},
+                              {SimdLimit::Portable, "portable", "default", "SSE41", "SSE4_2"}};
+  const char* const wanted = std::getenv("GLOBALSPLAT_SIMD");
+  for (const Level& level : levels) {
+    if (wanted == nullptr || std::string(wanted) != level.ours) continue;
+    setenv("ATEN_CPU_CAPABILITY", level.libtorch, 0);
+    setenv("ONEDNN_MAX_CPU_ISA", level.one_dnn, 0);
+    setenv("MKL_ENABLE_INSTRUCTIONS", level.mkl, 0);
+    return level.limit;
+  }
+  return SimdLimit::None;
+}
+
+// Set before main(), when nothing has chosen a kernel yet and there are no other threads.
+const SimdLimit limit = limit_libraries();
+
 Bf16 found() {
+  if (limit != SimdLimit::None) return Bf16::None;
   const auto capabilities = at::cpu::get_cpu_capabilities();
   const auto has = [&](const char* name) {
     const auto found = capabilities.find(name);
@@ -22,6 +49,10 @@ Bf16 found() {
 }
 
 }  // namespace
+
+SimdLimit simd_limit() { return limit; }
+
+rust::String libtorch_simd_level() { return at::get_cpu_capability(); }
 
 Bf16 bf16_of_cpu() {
   static const Bf16 known = found();

@@ -3,7 +3,7 @@
 //!     cargo run --release --example reconstruct -- model.safetensors captures/room room.ply
 
 use globalsplat::data::{Holdout, open_capture};
-use globalsplat::io::{Splat, write_splat};
+use globalsplat::io::write_splat;
 use globalsplat::reconstruct::{load_context, load_model, reconstruct};
 use globalsplat::{Error, Result};
 use std::path::Path;
@@ -22,7 +22,7 @@ fn main() -> Result<()> {
 
     let reconstruction = reconstruct(&model, &views, &[])?;
     // The model works in a world in which all scenes are alike; this is the way back to the capture's own.
-    let splat = Splat::of(&reconstruction.in_world())?;
+    let splat = reconstruction.to_splat()?;
     write_splat(Path::new(out), &splat)?;
     println!("{out}: {} Gaussians from {} photos", splat.gaussians.count(), views.len());
     Ok(())

@@ -1,10 +1,16 @@
 #!/usr/bin/env bash
-# Runs a command, and says every half minute that it still runs, where standard error is no terminal:
-#   heartbeat.sh building cargo build …
+# Runs a command, and says every half minute that it still runs:
+#   heartbeat.sh building cargo build …              where standard error is no terminal: there cargo shows progress itself
+#   heartbeat.sh --always installing pip install …   in a terminal, too
 set -uo pipefail
+always=false
+if [ "$1" = --always ]; then
+    always=true
+    shift
+fi
 what=$1
 shift
-[ ! -t 2 ] || exec "$@"
+[ ! -t 2 ] || $always || exec "$@"
 
 # Crates and C++ files that this command's compilers work on now.
 compiled() {

@@ -9,7 +9,6 @@ Prints a Markdown table for each capture. What is done stays done.
 
 import argparse
 from pathlib import Path
-from zlib import crc32
 
 from core_runs import row, told_once
 
@@ -23,9 +22,7 @@ def scored(arguments, capture, setting, phase, pictures):
     command += ["--views", str(arguments.views), "--pictures-at", str(pictures)]
     if setting != "small":
         command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
-    # Other weights in the same place aren't these.
-    weights = f"{crc32(Path(arguments.weights).read_bytes()):08x}"
-    return told_once(arguments.out / f"{Path(folder).name}.{weights}.{setting}.{phase}.{pictures}.json", *command)
+    return told_once(arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json", *command)
 
 
 def main():

@@ -20,8 +20,10 @@ weights() {
         [ "${1:-}" = --if-possible ] || missing "no Python found, which fetches the weights of LPIPS"
         return 0
     fi
-    "$python" scripts/lpips_weights.py "$@"
+    scripts/heartbeat.sh --always weights "$python" scripts/lpips_weights.py "$@"
 }
+
+npm_ci=(npm ci --ignore-scripts --no-audit --no-fund --loglevel=error --no-update-notifier)
 
 # The viewer that `globalsplat view` has in its pages, bundled from what web/ pins. Without npm, or a registry, the program is
 # built without it, and says so when a page is asked for.
@@ -32,7 +34,8 @@ page() {
         return
     fi
     echo "setup: bundling the viewer that web/ pins" >&2
-    if ! (cd web && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error >/dev/null && npm run --silent build); then
+    if ! { scripts/heartbeat.sh --always "setup: bundling" "${npm_ci[@]}" --prefix web >/dev/null \
+        && npm run --prefix web --silent build; }; then
         echo "setup: npm can't do it; the program is built without pages to walk in" >&2
     fi
 }
@@ -70,7 +73,7 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
         trap 'kill "$early" 2>/dev/null || true' EXIT
     fi
     # Python compiles what it imports when it first does.
-    scripts/heartbeat.sh "setup: installing" \
+    scripts/heartbeat.sh --always "setup: installing" \
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.txt \
         || missing "requirements.txt can't be installed; pip's message above tells why"
     cp requirements.txt .venv/requirements.txt
@@ -82,7 +85,7 @@ ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname
 if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true ] && command -v npm >/dev/null \
     && ! cmp -s parity/npm/package-lock.json parity/npm/node_modules/.installed; then
     echo "setup: installing what parity/npm pins" >&2
-    if (cd parity/npm && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error >/dev/null); then
+    if scripts/heartbeat.sh --always "setup: installing" "${npm_ci[@]}" --prefix parity/npm >/dev/null; then
         cp parity/npm/package-lock.json parity/npm/node_modules/.installed
     else
         rm -rf parity/npm/node_modules
@@ -92,6 +95,9 @@ fi
 
 weights --if-possible
 if [ -n "${early:-}" ]; then
+    echo "setup: compiling what needs no libtorch" >&2
+    # shellcheck disable=SC2016
+    scripts/heartbeat.sh --always "setup: compiling" bash -c 'while kill -0 "$0" 2>/dev/null; do sleep 0.2; done' "$early"
     wait "$early" || true
     trap - EXIT
 fi

@@ -2,7 +2,7 @@
 //!
 //! ```no_run
 //! use globalsplat::data::{Holdout, open_capture};
-//! use globalsplat::io::{Splat, write_splat};
+//! use globalsplat::io::write_splat;
 //! use globalsplat::reconstruct::{load_context, reconstruct, shipped_model};
 //!
 //! # fn main() -> globalsplat::Result<()> {
@@ -11,7 +11,7 @@
 //! // Twelve photos, spread over the path of the camera and fitted to the model.
 //! let views = load_context(&capture, Holdout::None, Some(12), model.config.data.image_size)?;
 //! let reconstruction = reconstruct(&model, &views, &[])?;
-//! write_splat("room.ply".as_ref(), &Splat::of(&reconstruction.in_world())?)?;
+//! write_splat("room.ply".as_ref(), &reconstruction.to_splat()?)?;
 //! # Ok(())
 //! # }
 //! ```

@@ -33,10 +33,12 @@ fn assert_says(error: &str, parts: &[&str]) {
 }
 
 #[test]
-fn a_missing_image() {
+fn all_images_but_one_missing() {
     let (_folder, room) = room();
-    std::fs::remove_file(room.join("images/003.png")).unwrap();
-    assert_says(&refuse_room(&room), &["image of view 3", "images/003.png", "not there"]);
+    (1..9).for_each(|i| std::fs::remove_file(room.join(format!("images/00{i}.png"))).unwrap());
+    let expected =
+        ["the number of frames with an image is 1 of 9", "images/001.png", "not there", "two or more"];
+    assert_says(&refuse_room(&room), &expected);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use common::program::room;
 use common::{again, captures, has_lpips, skip};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Capture, find_captures, open_capture};
-use globalsplat::eval::{EvalScene, Method, Perceptual, Synthesis, judge, score};
+use globalsplat::eval::{CaptureScores, EvalScene, Method, Perceptual, judge};
 use globalsplat::io::{Splat, read_splat, write_splat};
 use globalsplat::render::transform;
 use globalsplat::scene::Similarity;
@@ -33,18 +33,18 @@ fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
     known
 }
 
-/// The splat that was published for the capture in `folder`, at all of its cameras.
-fn published_splat(folder: &Path, capture: &Capture) -> (EvalScene, Synthesis) {
-    let scene = EvalScene::all_views(capture, None).expect("photos");
-    let made = Method::Splat(folder.join("reference.ply")).synthesize(&scene).expect("pictures");
-    (scene, made)
+/// Scores the splat that was published for the capture in `folder` at all of its cameras.
+fn published_scores(folder: &Path, capture: &Capture, perceptual: &Perceptual) -> CaptureScores {
+    let scene = EvalScene::all_views(capture, None);
+    let mut made = Method::Splat(folder.join("reference.ply")).synthesize(scene).expect("a picture");
+    judge(&mut made, perceptual, |_, _, _| Ok(())).expect("scores")
 }
 
 #[test]
 fn published_splats_reach_their_scores() {
+    let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
     for (path, capture, [psnr, ssim]) in known(&PUBLISHED) {
-        let (scene, made) = published_splat(&path, &capture);
-        let scores = score(&scene.name, &made.pictures, &scene.target, made.gaussians).expect("scores");
+        let scores = published_scores(&path, &capture, &perceptual);
         assert!((scores.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.psnr);
         assert!((scores.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.ssim);
     }
@@ -61,8 +61,7 @@ fn published_splats_look_as_they_are_known_to() {
     }
     let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
     for (path, capture, [vgg, alex]) in known(&PUBLISHED_LPIPS) {
-        let (scene, made) = published_splat(&path, &capture);
-        let scores = judge(&scene, &made, &perceptual).expect("scores");
+        let scores = published_scores(&path, &capture, &perceptual);
         assert!(perceptual.why_absent(&scores).is_none());
         let (found_vgg, found_alex) =
             (scores.lpips_vgg.expect("LPIPS-VGG"), scores.lpips_alex.expect("LPIPS-Alex"));
@@ -123,12 +122,12 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
 #[test]
 fn folders_of_captures_are_found() {
     let Some(paths) = captures() else { return };
-    let found = find_captures(paths[0].parent().expect("a parent")).expect("captures");
+    let found = find_captures(paths[0].parent().expect("a parent")).expect("captures").captures;
     assert_eq!(found.len(), paths.len());
     let above = tempfile::tempdir().expect("a folder");
     std::os::unix::fs::symlink(paths[0].parent().expect("a parent"), above.path().join("re10k"))
         .expect("a link");
-    assert_eq!(find_captures(above.path()).expect("captures").len(), paths.len());
+    assert_eq!(find_captures(above.path()).expect("captures").captures.len(), paths.len());
     let mut names: Vec<_> = found.iter().map(|capture| capture.name.as_str()).collect();
     names.sort_unstable();
     assert!(paths.iter().map(|path| path.file_name().expect("a name")).eq(names));

@@ -480,3 +480,63 @@ fn what_is_wrong_with_a_scene_is_named() {
         assert!(error.contains("index.json") && error.contains(found), "{error}");
     }
 }
+
+/// A chunk of a scene with two views of one photo, whose dict has `entries` besides `images`.
+fn chunk_of(entries: &[(&str, Vec<u8>)], cameras: &[f32]) -> Chunk {
+    let mut png = Cursor::new(vec![]);
+    image::RgbImage::new(16, 16).write_to(&mut png, image::ImageFormat::Png).unwrap();
+    let (png, numbers) = (png.into_inner(), cameras.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>());
+    let image = tensor("ByteStorage", numbers.len() as u32, &[png.len() as u32], &[1]);
+    let images = [b"](".to_vec(), image.repeat(2), b"e".to_vec()].concat();
+    let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+    let program = [
+        b"\x80\x02](}(".to_vec(),
+        entries.iter().flat_map(|(key, value)| entry(key, value)).collect(),
+        entry("images", &images),
+        b"ue.".to_vec(),
+    ];
+    let bytes = archive(&program.concat(), &[numbers, png].concat(), CompressionMethod::Stored);
+    Chunk::parse(Path::new("c.torch"), bytes).unwrap()
+}
+
+#[test]
+fn cameras_images_and_a_key_are_all_that_a_scene_needs() {
+    let camera = |x: f32| [0.5, 0.6, 0.5, 0.5, 0., 0., 1., 0., 0., x, 0., 1., 0., 0., 0., 0., 1., 0.];
+    let cameras = [camera(0.), camera(2.)].concat();
+    let dense = tensor("FloatStorage", 0, &[2, 18], &[18, 1]);
+    let expected = chunk_of(&[("key", text("a#b")), ("cameras", dense)], &cameras).capture("a#b").unwrap();
+    assert_eq!(expected.len(), 2);
+    let poses = expected.cameras();
+    assert!((poses[1].c2w.w_axis.x + 2.).abs() < 1e-9 && (poses[1].intrinsics.fy - 9.6).abs() < 1e-6);
+    // Stored column by column, and every other row of more.
+    let transposed: Vec<f32> = (0..18).flat_map(|i| [cameras[i], cameras[18 + i]]).collect();
+    let spread = [camera(0.), camera(9.), camera(2.)].concat();
+    for (numbers, stride) in [(transposed, [1, 2]), (spread, [36, 1])] {
+        let strided = tensor("FloatStorage", 0, &[2, 18], &stride);
+        let found = chunk_of(&[("cameras", strided), ("key", text("a#b"))], &numbers).capture("a#b").unwrap();
+        assert_same_cameras(&found, &poses);
+    }
+}
+
+#[test]
+fn a_scene_is_opened_whatever_signs_its_key_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path().join("a#b.torch#c");
+    let names = ["#", "x#y", "x.torch#y", "x#y.png"];
+    for name in names {
+        write_room(&place.join(name), 1, 3, [24, 24].into()).unwrap();
+    }
+    let chunks = place.join("chunks");
+    std::fs::create_dir(&chunks).unwrap();
+    let mut writer = ChunkWriter::new(&chunks, 1 << 30).unwrap();
+    for name in names {
+        writer.add(&open_capture(&place.join(name)).unwrap()).unwrap();
+    }
+    writer.finish().unwrap();
+    for name in names {
+        let named = format!("{}#{name}", chunks.join("000000.torch").display());
+        assert_eq!(open_capture(Path::new(&named)).unwrap().name, name);
+        let told: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
+        assert_eq!((told["kind"].as_str(), told["name"].as_str()), (Some("capture"), Some(name)));
+    }
+}

@@ -87,6 +87,45 @@ fn every_simd_level_renders_alike() {
     }
 }
 
+/// What GLOBALSPLAT_SIMD hides is hidden from libtorch and from the choice of a precision, too, as on a processor without it.
+#[cfg(target_arch = "x86_64")]
+#[test]
+fn a_simd_level_limits_libtorch_and_precision() {
+    for (level, libtorch) in [("avx2", "AVX2"), ("portable", "DEFAULT")] {
+        let mut doctor = command(&["doctor", "--json"]);
+        // A level may limit these tests themselves.
+        for limit in ["ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS"] {
+            doctor.env_remove(limit);
+        }
+        let output = doctor.env("GLOBALSPLAT_SIMD", level).output().unwrap();
+        if String::from_utf8_lossy(&output.stderr).contains("GLOBALSPLAT_SIMD is") {
+            skip("AVX2", "the processor has none");
+            continue;
+        }
+        let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        assert_eq!(
+            (&report["simd"], &report["libtorch_simd"], &report["precision"]),
+            (&level.into(), &libtorch.into(), &"f32".into())
+        );
+    }
+}
+
+#[test]
+fn threads_do_not_change_a_splat() {
+    let (folder, room) = room();
+    for precision in ["f32", "bf16"] {
+        let splat = |threads: &str| {
+            let out = folder.path().join(format!("{precision}_{threads}.ply"));
+            let arguments =
+                ["reconstruct", "--scene", arg(&room), "--precision", precision, "--out", arg(&out)];
+            let output = command(&arguments).env("OMP_NUM_THREADS", threads).output().unwrap();
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            std::fs::read(out).unwrap()
+        };
+        assert!(splat("1") == splat("3"), "{precision}: threads change the bytes");
+    }
+}
+
 #[test]
 fn a_million_gaussians_fit_into_a_gigabyte() {
     let report = json(&[

@@ -3,8 +3,10 @@
 mod common;
 
 use common::has_lpips;
-use common::program::{arg, command, fail, refuse, rooms, succeed, text, tiny_weights};
+use common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
+use globalsplat::data::{Dataset, Split};
 use globalsplat::eval::read_evaluation;
+use globalsplat::io::{Weights, read_image, read_weights, write_png, write_sharded};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -111,7 +113,13 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
     assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
     // Nor do those of the same weights in another precision.
     let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
-    assert!(refuse(&text(&half)).contains("evaluation.json: the evaluation is of tiny.safetensors"));
+    let (code, _, err) = run(&half, set.folder.path());
+    // Before it, where bf16 is slower, a line says so.
+    let refusal = err.lines().last().unwrap_or_default();
+    assert!(
+        code == Some(2) && refusal.contains("evaluation.json: the evaluation is of tiny.safetensors"),
+        "{err}"
+    );
     let elsewhere = set.path("half");
     let half: Vec<String> = half
         .into_iter()
@@ -151,6 +159,155 @@ fn what_changed_since_is_scored_again() {
     succeed(&text(&arguments));
     let third = read_evaluation(&set.path("out")).unwrap();
     assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
+}
+
+/// Replaces what the file at `path` holds. Its size and its time stay as they were.
+fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
+    let metadata = std::fs::metadata(path).unwrap();
+    let (length, modified) = (metadata.len() as usize, metadata.modified().unwrap());
+    assert!(bytes.len() <= length, "{} bytes for {length}", bytes.len());
+    // Decoders don't look behind an image's end.
+    bytes.resize(length, 0);
+    std::fs::write(path, bytes).unwrap();
+    let file = std::fs::File::options().write(true).open(path).unwrap();
+    file.set_times(std::fs::FileTimes::new().set_modified(modified)).unwrap();
+}
+
+#[test]
+fn what_changed_unnoticed_is_scored_again() {
+    let set = Set::new();
+    let photo = set.path("captures/room_000/images/001.png");
+    std::fs::write(&photo, [std::fs::read(&photo).unwrap(), vec![0; 1 << 20]].concat()).unwrap();
+    let arguments = set.arguments(&["--splat", arg(&set.path("splats"))], "captures");
+    let psnr = || {
+        let (code, _, err) = run(&arguments, set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        let evaluation = read_evaluation(&set.path("out")).unwrap();
+        evaluation.scenes.iter().map(|scene| scene.scores.psnr).collect::<Vec<_>>()
+    };
+    let first = psnr();
+    // Scores that are believed as long as nothing changes.
+    let kept = set.path("out/scenes/room_002.json");
+    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
+    scores["psnr"] = json!(99.5);
+    std::fs::write(&kept, scores.to_string()).unwrap();
+
+    let read = |name: &str| std::fs::read(set.path(name)).unwrap();
+    replace_unnoticed(&set.path("splats/room_000.ply"), read("splats/room_001.ply"));
+    let second = psnr();
+    assert!(second[0] < first[0] - 10. && second[1] == 99.5, "another splat: {first:?} and {second:?}");
+    replace_unnoticed(&photo, read("captures/room_002/images/000.png"));
+    let third = psnr();
+    assert!(third[0] != second[0] && third[1] == 99.5, "another photo: {second:?} and {third:?}");
+    let cameras = "captures/room_000/cameras.json";
+    let mut moved: Value = serde_json::from_slice(&read(cameras)).unwrap();
+    moved["views"][1]["c2w"][0][3] = json!(0.123);
+    std::fs::write(set.path(cameras), moved.to_string()).unwrap();
+    let fourth = psnr();
+    assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
+}
+
+#[test]
+fn sharded_weights_are_told_apart_by_their_shards() {
+    let set = Set::new();
+    let weights = read_weights(&tiny_weights(set.folder.path(), &set.path("captures"))).unwrap();
+    let plain = set.path("sharded.safetensors");
+    let index = write_sharded(&plain, &weights, 20_000).unwrap();
+    let index_text = std::fs::read(&index).unwrap();
+    let arguments =
+        |weights: &Path| set.arguments(&["--precision", "f32", "--weights", arg(weights)], "chunks");
+    // By the name that they would have as one file, and by their index's, they are the same.
+    for name in [&plain, &index] {
+        let (code, _, err) = run(&arguments(name), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+    }
+    let first = read_evaluation(&set.path("out")).unwrap();
+    let scale = |tensor: tch::Tensor| tensor * 1.5;
+    let tensors = weights.tensors.into_iter().map(|(name, tensor)| (name, scale(tensor))).collect();
+    write_sharded(&plain, &Weights { tensors, ..weights }, 20_000).unwrap();
+    assert_eq!(std::fs::read(&index).unwrap(), index_text, "the index alone doesn't tell");
+    for name in [&plain, &index] {
+        let error = refuse(&text(&arguments(name)));
+        let expected = "evaluation.json: the evaluation is of sharded.safetensors.index.json";
+        assert!(error.contains(expected) && error.contains("choose another --out"), "{error}");
+    }
+    std::fs::remove_dir_all(set.path("out")).unwrap();
+    assert_eq!(run(&arguments(&plain), set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert_ne!(first.summary.psnr, second.summary.psnr);
+}
+
+#[test]
+fn made_up_videos_are_told_apart_by_what_they_depend_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let made_by = |pictures: &str| {
+        let name = format!("synth:seed=1,scenes=1{pictures}");
+        Dataset::open(Path::new(&name), Split::Test).unwrap().made_by().map(String::from)
+    };
+    let with_pictures = |grey: f64| {
+        let picture = tch::Tensor::full([3, 16, 16], grey, (tch::Kind::Float, tch::Device::Cpu));
+        write_png(&folder.path().join("a.png"), &picture).unwrap();
+        made_by(&format!(",pictures={}", folder.path().display()))
+    };
+    let (black, grey) = (with_pictures(0.), with_pictures(0.5));
+    assert!(black != grey && with_pictures(0.5) == grey, "{black:?} and {grey:?}");
+    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != grey));
+}
+
+/// Largest resident size of this process' children that have ended, in bytes.
+fn peak_of_children() -> u64 {
+    // SAFETY: rusage is plain numbers, for which zero is valid, and getrusage only writes into it.
+    let usage = unsafe {
+        let mut usage: libc::rusage = std::mem::zeroed();
+        libc::getrusage(libc::RUSAGE_CHILDREN, &mut usage);
+        usage
+    };
+    usage.ru_maxrss as u64 * if cfg!(target_os = "macos") { 1 } else { 1024 }
+}
+
+#[test]
+fn photos_are_scored_one_at_a_time() {
+    // As tensors they take 24 MB each, and as much again when they are rendered.
+    const PHOTOS: u64 = 40;
+    let (width, height) = (1632, 1224);
+    let folder = tempfile::tempdir().unwrap();
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images).unwrap();
+    let rows = tch::Tensor::linspace(0., 1., height, (tch::Kind::Float, tch::Device::Cpu));
+    let photo = rows.view([1, height, 1]).expand([3, height, width], false);
+    write_png(&images.join("000.png"), &photo).unwrap();
+    let frame = |i: u64| {
+        let file = format!("images/{i:03}.png");
+        if i > 0 {
+            std::fs::hard_link(images.join("000.png"), folder.path().join(&file)).unwrap();
+        }
+        let at = i as f64 * 0.05;
+        let pose = json!([[1., 0., 0., at], [0., 1., 0., 0.], [0., 0., 1., 2.], [0., 0., 0., 1.]]);
+        json!({"file_path": file, "transform_matrix": pose})
+    };
+    let frames: Vec<Value> = (0..PHOTOS).map(frame).collect();
+    let capture = json!({
+        "w": width, "h": height, "fl_x": 1300., "fl_y": 1300., "cx": 816., "cy": 612., "frames": frames,
+    });
+    std::fs::write(folder.path().join("transforms.json"), capture.to_string()).unwrap();
+    let (_rooms, room) = room();
+    let (splat, sheet) = (room.join("truth.ply"), folder.path().join("sheet.png"));
+    let scene = ["--scene", arg(folder.path()), "--json"];
+    for subject in [&["--splat", arg(&splat), "--sheet", arg(&sheet)][..], &["--renders", arg(&images)]] {
+        let arguments: Vec<String> =
+            ["eval"].iter().chain(subject).chain(&scene).map(|argument| argument.to_string()).collect();
+        let (code, out, err) = run(&arguments, folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        let scores: Value = serde_json::from_str(&out).unwrap();
+        assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
+        let is_shrunk = err.contains("sheet.png: pictures are shrunk to 1/2");
+        assert_eq!(is_shrunk, subject.contains(&"--sheet"), "{err}");
+        let peak = peak_of_children();
+        assert!(peak < PHOTOS * 24_000_000, "{subject:?}: {peak} bytes");
+    }
+    // 40 rows of three pictures of 816×612, and the gaps.
+    let size = read_image(&sheet).unwrap().dimensions();
+    assert_eq!(size, (3 * 816 + 2 * 4, PHOTOS as u32 * 612 + (PHOTOS as u32 - 1) * 4));
 }
 
 #[test]

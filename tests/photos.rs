@@ -8,16 +8,17 @@ use common::formats::{
 use common::largest_error;
 use glam::{DMat4, DVec3};
 use globalsplat::data::open_capture;
-use globalsplat::io::tensor_from_rgb;
+use globalsplat::io::{decode_photo, tensor_from_rgb};
 use globalsplat::scene::{Camera, Intrinsics};
 use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage};
 use serde_json::json;
 use std::io::Cursor;
 
 /// Where the ray (x, y, 1) is seen, in the words of OpenCV's documentation.
-fn distort([k1, k2, p1, p2]: [f64; 4], x: f64, y: f64) -> (f64, f64) {
+fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, f64) {
     let r2 = x.powi(2) + y.powi(2);
-    let radial = 1. + k1 * r2 + k2 * r2.powi(2);
+    let radial = (1. + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
+        / (1. + k4 * r2 + k5 * r2.powi(2) + k6 * r2.powi(3));
     (
         x * radial + 2. * p1 * x * y + p2 * (r2 + 2. * x.powi(2)),
         y * radial + p1 * (r2 + 2. * y.powi(2)) + 2. * p2 * x * y,
@@ -25,7 +26,7 @@ fn distort([k1, k2, p1, p2]: [f64; 4], x: f64, y: f64) -> (f64, f64) {
 }
 
 /// The ray that is seen at (u, v), by going back what it was moved.
-fn undistort(lens: [f64; 4], u: f64, v: f64) -> (f64, f64) {
+fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
     let (mut x, mut y) = (u, v);
     for _ in 0..200 {
         let (du, dv) = distort(lens, x, y);
@@ -44,9 +45,13 @@ fn scene(x: f64, y: f64) -> [f64; 3] {
 
 #[test]
 fn distortion_is_removed_from_the_photos() {
+    check_lens([-0.15, 0.04, 0.01, -0.02, 0., 0., 0., 0.]);
+    check_lens([0.1, -0.05, 0.01, -0.02, 0.02, 0.3, -0.08, 0.04]);
+}
+
+fn check_lens(lens: [f64; 8]) {
     let (width, height) = (160, 120);
     let k = Intrinsics { fx: 110., fy: 115., cx: 83., cy: 58. };
-    let lens @ [k1, k2, p1, p2] = [-0.15, 0.04, 0.01, -0.02];
     let camera = Camera { intrinsics: k, c2w: DMat4::IDENTITY, width, height };
     let cameras = [camera, Camera { c2w: DMat4::from_translation(DVec3::X), ..camera }];
     let ray = |x: u32, y: u32| ((f64::from(x) + 0.5 - k.cx) / k.fx, (f64::from(y) + 0.5 - k.cy) / k.fy);
@@ -63,9 +68,12 @@ fn distortion_is_removed_from_the_photos() {
     std::fs::create_dir(path.join("images")).unwrap();
     let names = ["a.png".to_string(), "b.png".to_string()];
     names.iter().for_each(|name| seen.save(path.join("images").join(name)).unwrap());
-    let opencv = format!("OPENCV {} {} {} {} {k1} {k2} {p1} {p2}", k.fx, k.fy, k.cx, k.cy);
+    let (model, count) = if lens[4..] == [0.; 4] { ("OPENCV", 4) } else { ("FULL_OPENCV", 8) };
+    let coefficients = lens[..count].iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+    let opencv = format!("{model} {} {} {} {} {coefficients}", k.fx, k.fy, k.cx, k.cy);
     let mut contents = transforms(&in_images(&names), &cameras);
-    for (key, value) in ["k1", "k2", "p1", "p2"].iter().zip(lens) {
+    contents["camera_model"] = json!(model);
+    for (key, value) in ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"].iter().zip(lens) {
         contents[*key] = json!(value);
     }
     write_colmap_text(&path.join("colmap/sparse/0"), &names, &cameras, &opencv);
@@ -191,4 +199,124 @@ fn photos_of_every_kind_load() {
     grey.write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
     let found = load_photo(jpeg.get_ref(), "jpeg", WIDTH, HEIGHT).unwrap();
     assert!(largest_error(&found, &repeated) < 0.05 && found.select(0, 0).equal(&found.select(0, 2)));
+}
+
+/// Levels that compress badly, so that the data of every block are of many bytes.
+fn noise(width: u32, height: u32) -> RgbImage {
+    RgbImage::from_fn(width, height, |x, y| {
+        Rgb([1, 2, 3]
+            .map(|k: u32| ((x * 7919 + y * 104_729 + k * 31).wrapping_mul(2_654_435_761) >> 24) as u8))
+    })
+}
+
+/// JPEGs of every kind that is known: sequential and progressive, of one, three and four components, of smaller planes of colour,
+/// with restart markers and without.
+fn jpegs() -> Vec<(String, Vec<u8>)> {
+    use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+    let pixels = noise(45, 37).into_raw();
+    let mut made = vec![];
+    for (progressive, colours) in
+        [false, true].into_iter().flat_map(|p| [1, 3, 4].map(|colours| (p, colours)))
+    {
+        for sampling in
+            [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2, SamplingFactor::F_4_1]
+        {
+            // The decoder knows no smaller planes of four, and refuses them.
+            if colours == 4 && !matches!(sampling, SamplingFactor::F_1_1) {
+                continue;
+            }
+            for restart in [0, 3] {
+                let (kind, bytes): (ColorType, Vec<u8>) = match colours {
+                    1 => (ColorType::Luma, pixels.iter().step_by(3).copied().collect()),
+                    3 => (ColorType::Rgb, pixels.clone()),
+                    _ => (ColorType::Cmyk, pixels.chunks(3).flat_map(|p| [p[0], p[1], p[2], 40]).collect()),
+                };
+                let mut jpeg = vec![];
+                let mut encoder = Encoder::new(&mut jpeg, 90);
+                encoder.set_progressive(progressive);
+                encoder.set_sampling_factor(sampling);
+                if restart > 0 {
+                    encoder.set_restart_interval(restart);
+                }
+                encoder.set_optimized_huffman_tables(restart == 0);
+                encoder.encode(&bytes, 45, 37, kind).unwrap();
+                made.push((format!("{colours} {sampling:?} {restart} progressive {progressive}"), jpeg));
+            }
+        }
+    }
+    made
+}
+
+#[test]
+fn jpegs_cut_short_are_refused_by_name() {
+    let decode = |bytes: &[u8]| decode_photo(bytes, "cut.jpg".as_ref(), (45, 37)).map(|photo| photo.pixels);
+    for (kind, jpeg) in jpegs() {
+        let whole = decode(&jpeg).unwrap_or_else(|e| panic!("{kind}: {e}"));
+        let (data, end) = jpeg.split_at(jpeg.len() - 2);
+        assert_eq!(end, [0xff, 0xd9]);
+        // The end marker tells nothing that isn't known.
+        for end in [&[][..], &[0xff], &[0xff, 0xd9, 1, 2, 3]] {
+            assert_eq!(
+                decode(&[data, end].concat()).unwrap_or_else(|e| panic!("{kind}: {e}")),
+                whole,
+                "{kind}"
+            );
+        }
+        for cut in (jpeg.len() / 16..data.len() - 1).step_by(41).chain([data.len() - 2]) {
+            // A progressive file may end after any of its scans if it says so.
+            if (cut - 1..=cut).any(|at| matches!(data[at..], [0xff, 0xc4 | 0xda, ..])) {
+                continue;
+            }
+            for end in [&[][..], end, &[0; 4096]] {
+                let error = decode(&[&data[..cut], end].concat());
+                let error = match error {
+                    Err(error) => error.to_string(),
+                    Ok(_) => panic!("{kind} of {} bytes was taken with {cut} and {end:?}", jpeg.len()),
+                };
+                assert!(error.starts_with("cut.jpg: the image is "), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn pngs_cut_short_are_refused_by_name() {
+    let mut png = Cursor::new(vec![]);
+    noise(45, 37).write_to(&mut png, ImageFormat::Png).unwrap();
+    let png = png.into_inner();
+    let decode = |bytes: &[u8]| decode_photo(bytes, "cut.png".as_ref(), (45, 37));
+    decode(&png).unwrap();
+    // The last chunk, of 12 bytes, and two checksums of 4 tell nothing that isn't known.
+    for cut in (0..png.len() - 20).step_by(37) {
+        let error = decode(&png[..cut]).expect_err("a part of it").to_string();
+        assert!(error.starts_with("cut.png: the image is "), "{error}");
+    }
+}
+
+/// 24×16 pixels of 16 colours in a palette.
+const PALETTE_PNG: &str = "89504e470d0a1a0a0000000d4948445200000018000000100403000000fe0aa2a600000030504c5445b4d20078d2003cd200\
+    b48c00788c003c8c0000d200008c00b446007846003c4600004600b400007800003c0000000000c5d2909e0000002349444154789c63fccfc0f01e8698\
+    1890006e0ecb1ef2f4dc2355cf7b0686b324ea010020e70e8d4441c80f0000000049454e44ae426082";
+
+#[test]
+fn only_photos_of_plain_colours_are_as_stored() {
+    let palette: Vec<u8> = (0..PALETTE_PNG.len())
+        .step_by(2)
+        .map(|i| u8::from_str_radix(&PALETTE_PNG[i..i + 2], 16).unwrap())
+        .collect();
+    let as_stored = |bytes: &[u8], size| decode_photo(bytes, "photo".as_ref(), size).unwrap().as_stored;
+    assert!(!as_stored(&palette, (WIDTH, HEIGHT)));
+    for (kind, jpeg) in jpegs() {
+        assert_eq!(as_stored(&jpeg, (45, 37)), kind.starts_with('3'), "{kind}");
+    }
+    for (image, expected) in [
+        (DynamicImage::from(noise(9, 9)), true),
+        (DynamicImage::from(noise(9, 9)).to_luma8().into(), false),
+        (DynamicImage::from(noise(9, 9)).to_rgba8().into(), false),
+        (DynamicImage::from(noise(9, 9)).to_rgb16().into(), false),
+    ] {
+        let mut png = Cursor::new(vec![]);
+        image.write_to(&mut png, ImageFormat::Png).unwrap();
+        assert_eq!(as_stored(png.get_ref(), (9, 9)), expected, "{:?}", image.color());
+    }
 }

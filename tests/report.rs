@@ -40,6 +40,7 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         target: vec![4, 12, 17],
         enlarged: false,
         splat_bytes: None,
+        warnings: vec![],
         warm_up: false,
         forward_seconds,
         peak_memory_bytes: None,

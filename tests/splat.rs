@@ -80,6 +80,76 @@ fn fields(g: &Gaussians) -> [(&'static str, &Tensor); 5] {
     ]
 }
 
+/// `g` with quaternions of lengths from 1e-30 to 1e30, by powers of two: the rotations are the same to the bit.
+fn of_any_length(g: &Gaussians) -> Gaussians {
+    let count = g.count();
+    let exponents =
+        Tensor::from_slice(&[0f64, -66., 66., -100., 100.]).repeat([count / 5 + 1]).narrow(0, 0, count);
+    let powers = exponents.exp2().view([1, count, 1]).to_kind(g.quaternions.kind());
+    Gaussians { quaternions: &g.quaternions * powers, ..g.map(Tensor::shallow_clone) }
+}
+
+/// Pictures and gradients of what [`objective`] tells of them.
+fn differentiated(g: &Gaussians, c: &Cameras) -> (Pictures, [(&'static str, Tensor); 5]) {
+    let g = leaves(g);
+    let p = draw(&g, c);
+    objective(&p).backward();
+    (p, fields(&g).map(|(name, leaf)| (name, leaf.grad())))
+}
+
+#[test]
+fn quaternions_of_any_length_turn_the_same() {
+    for (kind, exponents) in
+        [(Kind::Float, [-100., -66., 66., 126.]), (Kind::Double, [-1000., -66., 66., 1022.])]
+    {
+        let (g, c) = (gaussians(1, 300, 2, kind, 14), cameras(1, 2, 61, 43, kind));
+        let (expected, gradients) = differentiated(&g, &c);
+        assert!(expected.alpha.max().double_value(&[]) > 0.3, "an empty picture proves nothing");
+        for exponent in exponents {
+            let length = f64::exp2(exponent);
+            let scaled = Gaussians { quaternions: &g.quaternions * length, ..g.map(Tensor::shallow_clone) };
+            let (p, found) = differentiated(&scaled, &c);
+            let pictures =
+                [(&p.rgb, &expected.rgb), (&p.alpha, &expected.alpha), (&p.depth, &expected.depth)];
+            assert!(pictures.iter().all(|(a, b)| a.equal(b)), "{kind:?}, length {length:e}");
+            for ((name, found), (_, expected)) in found.iter().zip(&gradients) {
+                // ∂L/∂(s q) = ∂L/∂q / s.
+                let found = if *name == "quaternions" { found * length } else { found.shallow_clone() };
+                let error = common::relative_error(&found, expected);
+                assert!(error < 1e-6, "{kind:?}, length {length:e}: {name} is off by {error:.1e}");
+            }
+        }
+    }
+}
+
+#[test]
+fn gaussians_without_a_rotation_are_dropped() {
+    for kind in [Kind::Float, Kind::Double] {
+        let (subnormal, infinite) = (if kind == Kind::Float { 1e-40 } else { 1e-310 }, f64::INFINITY);
+        let parts = [
+            [0.; 4],
+            [f64::NAN, 1., 0., 0.],
+            [1., 0., 0., -infinite],
+            [infinite; 4],
+            [subnormal, 0., 0., 0.],
+        ];
+        let (g, c) = (gaussians(1, 60, 1, kind, 15), cameras(1, 2, 61, 43, kind));
+        let strange = Tensor::from_slice2(&parts).to_kind(kind);
+        g.quaternions.select(0, 0).narrow(0, 0, parts.len() as i64).copy_(&strange);
+        let (p, gradients) = differentiated(&g, &c);
+        let without = g.map(|t| t.narrow(1, parts.len() as i64, 60 - parts.len() as i64));
+        let (expected, _) = differentiated(&without, &c);
+        assert!(
+            p.rgb.equal(&expected.rgb) && p.alpha.equal(&expected.alpha) && p.depth.equal(&expected.depth)
+        );
+        for (name, gradient) in &gradients {
+            assert_eq!(gradient.isfinite().all().int64_value(&[]), 1, "{name}");
+            let of_dropped = gradient.narrow(1, 0, parts.len() as i64).abs().max().double_value(&[]);
+            assert_eq!(of_dropped, 0., "{kind:?}: {name}");
+        }
+    }
+}
+
 #[test]
 fn gradients_are_those_of_finite_differences() {
     // Central differences in float64 along random directions, one input at a time and all of its entries at once. The
@@ -314,7 +384,7 @@ fn instruction_sets_agree() {
             std::process::exit(UNSUPPORTED);
         }
         let (g, c) = globalsplat::bench::made_up_scene(16384, 12, ImageSize { width: 256, height: 256 });
-        let g = leaves(&g);
+        let g = leaves(&of_any_length(&g));
         let p = draw(&g, &c);
         objective(&p).backward();
         let mut tensors = vec![("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
@@ -360,7 +430,8 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
     // A variable of the process decides: this test runs itself again, to draw and save.
     const OUT: &str = "GLOBALSPLAT_TEST_OUT";
     let answer = || {
-        let (g, c) = (leaves(&gaussians(2, 700, 3, Kind::Float, 21)), cameras(2, 2, 75, 50, Kind::Float));
+        let g = of_any_length(&gaussians(2, 700, 3, Kind::Float, 21));
+        let (g, c) = (leaves(&g), cameras(2, 2, 75, 50, Kind::Float));
         let c = Cameras { w2c: c.w2c.set_requires_grad(true), ..c };
         let p = draw(&g, &c);
         objective(&p).backward();

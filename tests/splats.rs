@@ -4,7 +4,7 @@ mod common;
 
 use common::program::{arg, refuse, room, succeed};
 use common::{Random, largest_error};
-use globalsplat::io::{Splat, find_splat, fit_splat, read_splat, write_splat};
+use globalsplat::io::{Splat, find_splat, fit_splat, read_splat, read_splat_without_invalid, write_splat};
 use globalsplat::render::{HarmonicLimits, render_views};
 use globalsplat::scene::{Camera, Gaussians, Intrinsics};
 use serde_json::Value;
@@ -641,7 +641,7 @@ fn convert_keeps_what_a_capture_sees() {
                     "{ending}: {beyond:?} beyond what viewers hold"
                 );
             }
-            globalsplat::eval::psnr_between(&splat.gaussians, &copy.gaussians, &cameras).unwrap().unwrap()
+            globalsplat::eval::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
         };
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
         assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
@@ -659,11 +659,316 @@ fn convert_keeps_what_a_capture_sees() {
         let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
         succeed(&[&refine[..], &[arg(to)]].concat());
     }
-    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap().gaussians);
+    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap());
     let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
-    let cut = fit_splat(&out, &Splat { gaussians: large.map(Tensor::copy) }, &HarmonicLimits::up_to(3), &[])
-        .unwrap()
-        .gaussians;
+    let cut = fit_splat(&out, &large, &HarmonicLimits::up_to(3), &[]).unwrap();
     let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
     assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
+}
+
+/// The properties of three Gaussians in a PLY, by name.
+type Columns = Vec<(&'static str, [f64; 3])>;
+
+/// Properties of a PLY that is one Gaussian's, with the values of three Gaussians in a row.
+fn small_gaussians() -> Columns {
+    vec![
+        ("x", [-0.5, 0., 0.5]),
+        ("y", [0.1, -0.1, 0.2]),
+        ("z", [4., 4.2, 4.4]),
+        ("f_dc_0", [1., 0.5, -0.5]),
+        ("f_dc_1", [-1., 1.2, 0.1]),
+        ("f_dc_2", [0.3, -0.4, 0.8]),
+        ("opacity", [2.; 3]),
+        ("scale_0", [-1.5; 3]),
+        ("scale_1", [-2.; 3]),
+        ("scale_2", [-2.5; 3]),
+        ("rot_0", [1., 0.5, 0.8]),
+        ("rot_1", [0., 0.5, 0.1]),
+        ("rot_2", [0.2, 0.5, 0.3]),
+        ("rot_3", [0.4, -0.5, 0.]),
+    ]
+}
+
+/// Writes a binary PLY of `columns`, whose numbers are float but where `types` says otherwise.
+fn write_ply(path: &Path, columns: &[(&str, [f64; 3])], types: &[(&str, &str)]) {
+    let type_of = |name: &str| types.iter().find(|(own, _)| *own == name).map_or("float", |(_, of)| of);
+    let mut bytes = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n".to_vec();
+    for (name, _) in columns {
+        bytes.extend(format!("property {} {name}\n", type_of(name)).bytes());
+    }
+    bytes.extend(b"end_header\n");
+    for row in 0..3 {
+        for (name, values) in columns {
+            match type_of(name) {
+                "uchar" => bytes.push(values[row] as u8),
+                "ushort" => bytes.extend((values[row] as u16).to_le_bytes()),
+                "double" => bytes.extend(values[row].to_le_bytes()),
+                _ => bytes.extend((values[row] as f32).to_le_bytes()),
+            }
+        }
+    }
+    std::fs::write(path, bytes).unwrap();
+}
+
+/// What a command that succeeds says on standard error, and on standard output.
+fn said(arguments: &[&str]) -> (String, String) {
+    let done = common::program::globalsplat(arguments);
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    let (stdout, stderr) = (text(done.stdout), text(done.stderr));
+    assert!(done.status.success(), "{arguments:?}: {stderr}");
+    (stderr, stdout)
+}
+
+/// Rotations of length 0 are dropped by what reads and what writes, and counted, as the rasterizer doesn't draw them.
+#[test]
+fn gaussians_without_a_rotation_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = random_splat(300, 1, 11);
+    let _ = splat.gaussians.quaternions.narrow(1, 100, 50).zero_();
+    let made = Splat::of(&splat.gaussians).unwrap();
+    assert_eq!(made.gaussians.count(), 250);
+    assert_says(&made.warnings[0], &["50 of 300 Gaussians are left out", "length 0"]);
+    for ending in ENDINGS {
+        let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
+        assert_eq!((copy.gaussians.count(), copy.warnings.len()), (250, 0), "{ending}");
+    }
+    // Files of other programs: zeros, and numbers that are as good as zero, in a PLY; the middle of a byte in a .splat.
+    let mut columns = small_gaussians();
+    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
+    let ply = folder.path().join("zero.ply");
+    write_ply(&ply, &columns, &[]);
+    let antimatter = written(folder.path(), "zero.splat", &random_splat(3, 0, 1));
+    let mut bytes = std::fs::read(&antimatter).unwrap();
+    bytes[32 + 28..64].fill(128);
+    std::fs::write(&antimatter, bytes).unwrap();
+    for path in [&ply, &antimatter] {
+        let splat = read_splat(path).unwrap();
+        assert_eq!(splat.gaussians.count(), 2);
+        let line = "1 of 3 Gaussians are left out, whose rotations have length 0\n";
+        let expected = format!("{}: {line}", path.display());
+        let to = folder.path().join("b.spz");
+        assert!(said(&["convert", arg(path), arg(&to)]).0.starts_with(&expected));
+        assert_eq!(said(&["inspect", arg(path)]).0, expected);
+        let views = folder.path().join("views.png");
+        let render = ["render", "--splat", arg(path), "--orbit", "--frames", "1", "--size", "16x16", "--out"];
+        assert_eq!(said(&[&render[..], &[arg(&views)]].concat()).0, expected);
+    }
+}
+
+/// `convert` leaves out Gaussians with numbers that no Gaussian has, and counts them; other commands refuse them and name it.
+#[test]
+fn convert_repairs_what_others_refuse() {
+    let (folder, room) = room();
+    let write = |name: &str, change: &dyn Fn(&mut Columns)| {
+        let path = folder.path().join(name);
+        let mut columns = small_gaussians();
+        columns.push(("f_rest_0", [0.1; 3]));
+        columns.extend((1..9).map(|k| {
+            (
+                [
+                    "", "f_rest_1", "f_rest_2", "f_rest_3", "f_rest_4", "f_rest_5", "f_rest_6", "f_rest_7",
+                    "f_rest_8",
+                ][k],
+                [0.; 3],
+            )
+        }));
+        change(&mut columns);
+        write_ply(&path, &columns, &[]);
+        path
+    };
+    let set = |columns: &mut Columns, name: &str, row: usize, value: f64| {
+        columns.iter_mut().find(|(own, _)| *own == name).unwrap().1[row] = value;
+    };
+    let mut cases: Vec<(PathBuf, &str, &str)> = [
+        ("x", f64::NAN),
+        ("z", f64::INFINITY),
+        ("y", 1e39),
+        ("f_dc_1", f64::NEG_INFINITY),
+        ("f_rest_7", f64::NAN),
+        ("opacity", f64::NAN),
+        ("scale_2", f64::NAN),
+        ("scale_0", f64::INFINITY),
+        ("scale_1", 89.),
+        ("rot_0", f64::NAN),
+        ("rot_3", f64::INFINITY),
+    ]
+    .into_iter()
+    .map(|(name, value)| (write(&format!("{name}.ply"), &|columns| set(columns, name, 1, value)), name, name))
+    .collect();
+    // .splat files have no names for what they hold, and SPZ's oldest version has halves.
+    let antimatter = |name: &str, at: usize, value: f32| {
+        let path = written(folder.path(), name, &random_splat(3, 0, 1));
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes[32 + at..][..4].copy_from_slice(&value.to_le_bytes());
+        std::fs::write(&path, bytes).unwrap();
+        path
+    };
+    cases.push((antimatter("position.splat", 4, f32::NAN), "the position", "position"));
+    cases.push((antimatter("infinite.splat", 12, f32::INFINITY), "the scale", "scale"));
+    cases.push((antimatter("negative.splat", 20, -0.1), "the scale", "scale"));
+    let head = [b"NGSP", &[1, 0, 0, 0, 3, 0, 0, 0, 0, 12, 0, 0][..]].concat();
+    let halves = [0x3c00u16, 0x3c00, 0x4400, 0x3c00, 0x7e00, 0x4400, 0xbc00, 0x3c00, 0x4400];
+    let rest = [vec![200; 3], vec![128; 9], vec![130; 9], vec![128; 9]].concat();
+    let spz = folder.path().join("half.spz");
+    std::fs::write(&spz, gzip(&[head, halves.map(u16::to_le_bytes).concat(), rest].concat())).unwrap();
+    cases.push((spz, "the position", "position"));
+    for (index, (path, field, property)) in cases.iter().enumerate() {
+        let (picture, out) = (folder.path().join("orbit.png"), folder.path().join("refined.ply"));
+        let render = ["render", "--splat", arg(path), "--orbit", "--out", arg(&picture)];
+        let refine = ["refine", "--splat", arg(path), "--scene", arg(&room), "--out", arg(&out)];
+        let eval = ["eval", "--splat", arg(path), "--scene", arg(&room)];
+        let commands = [&["inspect", arg(path)][..], &render, &refine, &eval];
+        for arguments in &commands[..if index == 0 { 4 } else { 1 }] {
+            assert_says(&refuse(arguments), &[field, "`globalsplat convert` leaves out"]);
+        }
+        for ending in &ENDINGS[if index == 0 { 0..4 } else { index % 4..index % 4 + 1 }] {
+            let to = folder.path().join(format!("repaired.{ending}"));
+            let (warnings, _) = said(&["convert", arg(path), arg(&to)]);
+            let expected = format!(
+                "{}: 1 of 3 Gaussians are left out, whose numbers aren't finite or are out of range: {property}",
+                path.display()
+            );
+            assert_eq!(warnings.lines().next(), Some(&*expected), "{ending}");
+            assert_eq!(read_splat(&to).unwrap().gaussians.count(), 2, "{ending}");
+        }
+    }
+    // Several properties are named once each, and no more than a few; a Gaussian counts once.
+    let many = write("many.ply", &|columns| {
+        columns.iter_mut().for_each(|(_, values)| values[0] = f64::NAN);
+        set(columns, "y", 2, f64::NAN);
+    });
+    let repaired = read_splat_without_invalid(&many).unwrap();
+    assert_says(
+        &repaired.warnings[0],
+        &["2 of 3 Gaussians", ": x, y, z, f_dc_0, f_dc_1, f_dc_2 and 17 more"],
+    );
+    let none =
+        write("none.ply", &|columns| columns.iter_mut().for_each(|(_, values)| *values = [f64::NAN; 3]));
+    let to = folder.path().join("none.spz");
+    assert_says(
+        &refuse(&["convert", arg(&none), arg(&to)]),
+        &["the number of Gaussians is 3, none of which"],
+    );
+}
+
+/// What bounds a compressed PLY's Gaussians makes all of them invalid.
+#[test]
+fn compressed_gaussians_without_bounds_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = written(folder.path(), "a.compressed.ply", &random_splat(300, 0, 4));
+    let mut bytes = std::fs::read(&path).unwrap();
+    let body = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    bytes[body + 4..][..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(&path, bytes).unwrap();
+    let repaired = read_splat_without_invalid(&path).unwrap();
+    assert_eq!(repaired.gaussians.count(), 44);
+    assert_says(&repaired.warnings[0], &["256 of 300 Gaussians are left out", ": min_y"]);
+}
+
+/// 2DGS has no third scale: its Gaussians are flat, in every format, to each format's smallest scale.
+#[test]
+fn surfels_are_flat() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| *name != "scale_2");
+    let surfels = folder.path().join("surfels.ply");
+    write_ply(&surfels, &columns, &[]);
+    let splat = read_splat(&surfels).unwrap();
+    assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
+    let third = |splat: &Splat| splat.gaussians.scales.select(2, 2).max().double_value(&[]);
+    assert!(third(&splat) > 0. && third(&splat) <= 1.1e-30, "{}", third(&splat));
+    // From the side there is only what the rasterizer's blur leaves: nothing is thinner.
+    let mut thinnest = Splat::of(&splat.gaussians).unwrap();
+    thinnest.gaussians.scales = splat.gaussians.scales.copy();
+    let _ = thinnest.gaussians.scales.select(2, 2).zero_();
+    assert!(psnr_of_pictures(&splat, &thinnest, camera()) > 90.);
+    for (ending, flat) in [("ply", 1.1e-30), ("compressed.ply", 2.1e-9), ("spz", 4.6e-5), ("splat", 1.1e-30)]
+    {
+        let to = folder.path().join(format!("a.{ending}"));
+        let (warnings, _) = said(&["convert", arg(&surfels), arg(&to)]);
+        assert_eq!(warnings.lines().count(), 1, "{warnings}");
+        let copy = read_splat(&to).unwrap();
+        assert!(third(&copy) <= flat, "{ending}: {}", third(&copy));
+        let psnr = psnr_of_pictures(&splat, &copy, camera());
+        assert!(psnr > 35., "{ending}: {psnr} dB");
+    }
+}
+
+/// Colours in place of spherical harmonics, in whatever type and by whatever name.
+#[test]
+fn colours_are_harmonics_of_degree_0() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("colours.ply");
+    let bytes = [[0., 255., 10.], [128., 3., 20.], [255., 77., 30.]];
+    let largest = |of: &str| match of {
+        "uchar" => 255.,
+        "ushort" => 65535.,
+        _ => 1.,
+    };
+    for names in [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]]
+    {
+        for (of, whole) in
+            [("uchar", 255.), ("ushort", 65535.), ("float", 1.), ("float", 255.), ("double", 1.)]
+        {
+            let mut columns = small_gaussians();
+            columns.retain(|(name, _)| !name.starts_with("f_dc"));
+            columns
+                .extend(names.into_iter().zip(bytes.map(|of_rows| of_rows.map(|byte| byte / 255. * whole))));
+            write_ply(&path, &columns, &names.map(|name| (name, of)));
+            let splat = read_splat(&path).unwrap();
+            assert_says(&splat.warnings[0], &[&names.join(", "), "f_dc_*"]);
+            let expected: Vec<f64> = (0..3)
+                .flat_map(|row| bytes.map(|of_rows| (of_rows[row] / 255. - 0.5) / 0.28209479177387814))
+                .collect();
+            let expected = Tensor::from_slice(&expected).view([1, 3, 1, 3]);
+            let step = if largest(of) == 65535. { 1e-4 } else { 1e-6 };
+            let error = largest_error(&splat.gaussians.sh, &expected);
+            assert!(error < step, "{of} {names:?} of {whole}: {error}");
+            // Beside coefficients, colours are another program's picture of them.
+            columns.extend(small_gaussians().into_iter().filter(|(name, _)| name.starts_with("f_dc")));
+            write_ply(&path, &columns, &names.map(|name| (name, of)));
+            let splat = read_splat(&path).unwrap();
+            assert!(splat.warnings.is_empty() && splat.gaussians.sh.double_value(&[0, 0, 0, 0]) == 1.);
+        }
+    }
+}
+
+/// What lacks all that makes Gaussians of points is called what it is.
+#[test]
+fn point_clouds_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("points.ply");
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| name.len() == 1);
+    columns.extend(["red", "green", "blue"].map(|name| (name, [200.; 3])));
+    write_ply(&path, &columns, &["red", "green", "blue"].map(|name| (name, "uchar")));
+    let told = ["points.ply: the element vertex is a point cloud, without opacity, scale_* and rot_*"];
+    assert_says(&refuse(&["inspect", arg(&path)]), &told);
+    for absent in ["opacity", "scale_0", "rot_2", "f_dc_1"] {
+        let mut columns = small_gaussians();
+        columns.retain(|(name, _)| *name != absent);
+        write_ply(&path, &columns, &[]);
+        assert_says(&refuse(&["inspect", arg(&path)]), &[&format!("property {absent} is absent")]);
+    }
+}
+
+/// Lengths of quaternions say nothing, in any format: rotations come back as of length 1.
+#[test]
+fn quaternions_of_any_length_are_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = random_splat(257, 0, 12);
+    for length in [1e-36, 1e-20, 1e-4, 1e4, 1e20, 2e38] {
+        let mut other = random_splat(257, 0, 12);
+        let _ = other.gaussians.quaternions.g_mul_scalar_(length);
+        for ending in ENDINGS {
+            let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &other)).unwrap();
+            assert_eq!(
+                (copy.gaussians.count(), copy.warnings.len()),
+                (257, 0),
+                "{ending}, length {length:e}"
+            );
+            let what = format!("{ending} with quaternions of length {length:e}");
+            assert_within(&what, &splat, &copy, &steps(ending, 257));
+        }
+    }
 }

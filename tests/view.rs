@@ -335,6 +335,37 @@ fn without_a_browser_view_says_where_the_page_is() {
     assert!(err.starts_with("no browser could be started (") && err.lines().count() == 1, "{err}");
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn pages_are_for_their_owner_and_go_with_the_next() {
+    if !has_viewer() {
+        return;
+    }
+    let (folder, room) = room();
+    let (empty, temporary) = (folder.path().join("empty"), folder.path().join("temporary"));
+    std::fs::create_dir(&empty).unwrap();
+    std::fs::create_dir(&temporary).unwrap();
+    let other = temporary.join("page.html");
+    std::fs::write(&other, "somebody's").unwrap();
+    let splat = room.join("truth.ply");
+    let mut before: Option<PathBuf> = None;
+    for _ in 0..2 {
+        let done = command(&["view", arg(&splat), "--scene", arg(&room), "--json"])
+            .env("PATH", &empty)
+            .env("TMPDIR", &temporary)
+            .output()
+            .unwrap();
+        assert!(done.status.success());
+        let told: Value = serde_json::from_slice(&done.stdout).unwrap();
+        let page = PathBuf::from(told["page"].as_str().unwrap());
+        assert_eq!(std::fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
+        assert_eq!(std::fs::read_dir(&temporary).unwrap().count(), 2, "the page, and what isn't ours");
+        assert!(before.is_none_or(|before| !before.exists()));
+        before = Some(page);
+    }
+    assert!(other.exists());
+}
+
 #[test]
 fn bad_requests_are_refused() {
     if !has_viewer() {

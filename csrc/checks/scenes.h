@@ -179,6 +179,10 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   add("all behind", around(random, repeated({-2}, 5)), repeated({0.3}, 15), repeated({0.9}, 5));
   add("no Gaussian", {}, {}, {});
 
+  add_scattered("quaternions of any length", 48, 33, 1, 2, 45);
+  std::vector<double>& quaternions = scenes.back().gaussians[0].quaternions;
+  for (size_t k = 0; k < quaternions.size(); ++k) quaternions[k] *= std::exp2(25. * double(k / 4 % 9) - 100);
+
   // Every strange number in every place, each in a Gaussian of its own.
   const double infinity = std::numeric_limits<double>::infinity();
   const std::vector<double> strange = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,

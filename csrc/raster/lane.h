@@ -61,7 +61,18 @@ GS_INLINE int lane_bits(bool m) { return m; }
 // The second operand where either is NaN.
 GS_INLINE float smaller(float a, float b) { return a < b ? a : b; }
 GS_INLINE float larger(float a, float b) { return a > b ? a : b; }
+GS_INLINE float magnitude(float v) { return larger(v, -v); }
 GS_INLINE float clamp(float v, float low, float high) { return smaller(larger(v, low), high); }
+
+template <class T>
+GS_INLINE T inverse_power_of_two(T v) {
+  union {
+    float number;
+    uint32_t bits;
+  } inverse{v};
+  inverse.bits = 0x7F800000u - (inverse.bits & 0x7F800000u);
+  return inverse.number;
+}
 
 GS_INLINE float exp2_where(bool m, float x) {
   const float shifted = x + kToEighths, f = x - (shifted - kToEighths);

@@ -6,7 +6,8 @@
 //     Σ2D = (J W R S)(J W R S)ᵀ + eps2d·I;    det ≤ 0 is dropped
 //     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p.
 //
-// R is the rotation of the normalized quaternion, S = diag(scales). Only J sees the clamp: 15 % of the image's width
+// R is the rotation of the normalized quaternion, S = diag(scales). A quaternion whose largest part is 0, subnormal or not
+// finite has none: R is NaN, and the Gaussian is dropped. Only J sees the clamp: 15 % of the image's width
 // (height) beyond its borders. Writing Σ2D as a product of one factor keeps it positive semi-definite in float.
 //
 // All cameras of a scene are served while a vector of its Gaussians is at hand: what doesn't depend on the camera, above
@@ -24,7 +25,7 @@ template <class T>
 struct Group {
   int count;             // lanes in use; the others repeat the last Gaussian
   Vector<T> mean[3], scale[3];
-  Vector<T> inverse_norm, unit[4];       // 1/‖q‖, q/‖q‖
+  Vector<T> power, inverse_norm, unit[4];  // a power of two near 1/‖q‖, 1/‖power q‖, q/‖q‖
   Vector<T> rotation[9], axes[9];        // R, R S
   Vector<T> opacity, log2_opacity;
   Vector<T> sh[kMaxBases * 3];
@@ -99,7 +100,10 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, 3 * g.bases, group.count, group.sh);
   group.log2_opacity = log2_of<T>(group.opacity);
 
+  // Times a power of two, which rounds nothing, squares neither overflow nor underflow.
   V* q = group.unit;
+  group.power = inverse_power_of_two<T>(larger(larger(magnitude(q[0]), magnitude(q[1])), larger(magnitude(q[2]), magnitude(q[3]))));
+  for (int k = 0; k < 4; ++k) q[k] *= group.power;
   group.inverse_norm = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   for (int k = 0; k < 4; ++k) q[k] *= group.inverse_norm;
   const V w = q[0], x = q[1], y = q[2], z = q[3];
@@ -174,7 +178,7 @@ GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projectio
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The room on top covers the rounding of s, whose terms may be larger than s itself: on
   // the rim of a splat by 1 + |b|/c.
-  const V exact = g.log2_opacity + T(kLog2Of255), skew = larger(b, -b) / c;
+  const V exact = g.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
   constexpr T rounding = sizeof(T) == 4 ? T(1e-6) : T(1e-15);
   const V reach = exact + T(1e-3) * (T(1) + exact) + rounding * exact * (T(1) + skew);
   const V radius = sqrt(reach), bb_cc = b * b + c * c;
@@ -348,7 +352,7 @@ GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vecto
                        T(2) * (w * (r[2] - r[6]) + x * (r[1] + r[3]) + z * (r[5] + r[7]) - T(2) * y * (r[0] + r[8])),
                        T(2) * (w * (r[3] - r[1]) + x * (r[2] + r[6]) + y * (r[5] + r[7]) - T(2) * z * (r[0] + r[4]))};
   const V inward = d_unit[0] * w + d_unit[1] * x + d_unit[2] * y + d_unit[3] * z;
-  for (int k = 0; k < 4; ++k) d_quaternion[k] = (d_unit[k] - inward * g.unit[k]) * g.inverse_norm;
+  for (int k = 0; k < 4; ++k) d_quaternion[k] = (d_unit[k] - inward * g.unit[k]) * g.inverse_norm * g.power;
 }
 
 // The records of Gaussian `first` and those after it, added up in their order, one Gaussian per lane. Tells which

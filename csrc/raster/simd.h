@@ -272,6 +272,20 @@ GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm_ma
 #endif
 #endif
 
+// |v|
+template <class V>
+GS_INLINE V magnitude(V v) {
+  return larger(v, -v);
+}
+
+// 2^(1−k) for v in [2^k, 2^(k+1)), so that their product is in [2, 4). Infinite where v is 0 or subnormal, 0 where v isn't finite.
+template <class T>
+GS_INLINE Vector<T> inverse_power_of_two(Vector<T> v) {
+  typedef typename Simd<T>::bits Integers;
+  const Integers exponents = (Integers)broadcast<T>(T(__builtin_inf()));
+  return (Vector<T>)(exponents - ((Integers)v & exponents));
+}
+
 template <class V>
 GS_INLINE V clamp(V v, V low, V high) {
   return smaller(larger(v, low), high);

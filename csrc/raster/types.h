@@ -31,7 +31,7 @@ template <class T>
 struct Gaussians {
   const T* means;        // [N, 3] world
   const T* scales;       // [N, 3] linear
-  const T* quaternions;  // [N, 4] (w, x, y, z), any length but zero
+  const T* quaternions;  // [N, 4] (w, x, y, z), any length; of length 0 they are dropped
   const T* opacities;    // [N]
   const T* sh;           // [N, bases, 3]
   int64_t count;

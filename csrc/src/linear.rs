@@ -10,9 +10,6 @@ mod ffi {
         include!("linear.h");
 
         /// See `csrc/linear.h`.
-        fn linear_is_faster() -> bool;
-
-        /// See `csrc/linear.h`.
         ///
         /// # Safety
         /// Addresses of live tensors; 0 for a bias that isn't there.

@@ -18,8 +18,11 @@ mod ffi {
     unsafe extern "C++" {
         include!("processor.h");
 
-        /// Of the CPU, as libtorch sees it.
+        /// Of the CPU, as libtorch sees it; none where `GLOBALSPLAT_SIMD` hides them.
         fn bf16_of_cpu() -> Bf16;
+
+        /// The instruction set of libtorch's own kernels, such as "AVX2".
+        fn libtorch_simd_level() -> String;
 
         /// Of the current GPU.
         fn gpu_has_bf16() -> bool;

@@ -118,6 +118,18 @@ def huge(rng, size):
     return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 8)), scales, 0.3)
 
 
+def quaternions_of_length(length):
+    @scene(f"quaternions of length {length:g}")
+    def make(rng, size):
+        inputs = before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), rng.uniform(0.02, 0.3, (24, 3)), 0.5)
+        return inputs | {"quaternions": length * inputs["quaternions"]}
+
+
+# A draw each: beside the gradients of the shortest, those of others are nothing.
+for length in (1e-30, 1e-20, 1e20, 1e30):
+    quaternions_of_length(length)
+
+
 @scene("opacity 0 to 1")
 def opacities(rng, size):
     opacity = np.tile([0.0, 1e-12, 0.0039, 0.0040, 0.5, 1.0], 4)  # 1/255 is 0.00392

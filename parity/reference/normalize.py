@@ -2,7 +2,7 @@
 
 import torch
 
-SMALLEST_SCALE = 1e-12  # a camera constellation no wider than this keeps its scale
+ROUNDING = 1e-14  # a camera constellation no wider than this share of its largest coordinate keeps its scale
 SMALLEST_DIRECTION = 1e-6  # a mean of directions no longer than this points nowhere
 METRIC_FAR = 4.0 * 10.0  # far bound of the frustum loss before division by the scene scale
 
@@ -42,10 +42,14 @@ def normalize_scene(c2w):
     Returns the normalized c2w [C, 4, 4], its inverse w2c [C, 4, 4] and the scale s:
         T'_i = T_avg^-1 T_i,   s = max_ab |o'_a - o'_b|,   o'_i <- o'_i / s.
     """
-    aligned = invert_rigid(average_pose(c2w)) @ c2w
+    average = average_pose(c2w)
+    centred = c2w.clone()
+    centred[:, :3, 3] -= average[:3, 3]
+    average[:3, 3] = 0.0
+    aligned = invert_rigid(average) @ centred
     centres = aligned[:, :3, 3]
     scale = (centres[:, None] - centres[None, :]).norm(dim=-1).max()
-    if not torch.isfinite(scale) or scale <= SMALLEST_SCALE:
+    if not torch.isfinite(scale) or scale <= ROUNDING * c2w[:, :3, 3].abs().max():
         scale = torch.ones_like(scale)
 
     normalized = aligned.clone()

@@ -48,6 +48,7 @@ def quaternion_from_matrix(m):
 
 def matrix_from_quaternion(q):
     """[..., 4] (w, x, y, z), of any length but zero -> [..., 3, 3]."""
+    q = q / q.detach().abs().amax(-1, keepdim=True)  # squares of what is left neither overflow nor vanish
     w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),

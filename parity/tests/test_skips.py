@@ -76,4 +76,5 @@ def test_the_last_line_counts(tmp_path, lines, said):
     script = REPOSITORY / "scripts" / "count_skips.sh"
     told = run(tmp_path, str(script), sys.executable, "-c", tell, LINES=lines)
     assert told.stdout.splitlines() == ["done", said]
-    assert run(tmp_path, str(script), "sh", "-c", "exit 7").returncode == 7
+    failed = run(tmp_path, str(script), sys.executable, "-c", f"{tell}; exit(7)", LINES=lines)
+    assert failed.returncode == 7 and failed.stdout == told.stdout

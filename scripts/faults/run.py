@@ -56,7 +56,7 @@ NOTICE = re.compile(
     "|.*the best checkpoint is looked for anew$|left out: lpips_|.* pixels that the model sees$"
 )
 # Names of what is on its way.
-TEMPORARY = re.compile(r"(^|/)(\.[^/]+\.globalsplat-(partial|old)|\.globalsplat-probe)(/|$)")
+TEMPORARY = re.compile(r"(^|/)\.[^/]+\.globalsplat-(partial(-\d+)?|old)(/|$)")
 VOLATILE = {
     "seconds",
     "seconds_of",
@@ -70,8 +70,8 @@ VOLATILE = {
 
 def plain(text):
     """With the names that files and folders get in the end."""
-    text = re.sub(r"/\.([^/ ]+?)\.globalsplat-(partial|old)(?=[/ :]|$)", r"/\1", text)
-    return re.sub(r"/\.globalsplat-probe", "", text)
+    text = re.sub(r"/\.([^/ ]+?)\.globalsplat-(partial(-\d+)?|old)(?=[/ :]|$)", r"/\1", text)
+    return re.sub(r"/globalsplat-probe", "", text)
 
 
 def steady(value):
@@ -169,9 +169,10 @@ class Tree:
         wrong = self.broken + [f"{name} isn't the new one" for name in sorted(names)]
         return wrong + [f"{name} is left" for name in sorted(self.temporary)]
 
-    def mixes(self, trees, unit_of, crashed=False):
+    def mixes(self, trees, unit_of, crashed=False, completed_by=None):
         """What is neither old nor new. `trees`: the old one, those between, the new one. After a crash, a folder may lie
-        where it was moved to make room for its successor."""
+        where it was moved to make room for its successor. The file `completed_by` may be gone: without it, the others are
+        taken for nothing."""
         of = [tree.units(unit_of) for tree in trees]
         wrong = list(self.broken)
         units = self.units(unit_of)
@@ -184,7 +185,7 @@ class Tree:
         moved = {plain("/" + name)[1:]: value for name, value in self.temporary.items() if ".globalsplat-old/" in name and value}
         for unit, files in of[0].items():
             lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
-            if unit in of[-1] and unit not in units and not lies_beside:
+            if unit in of[-1] and unit not in units and not lies_beside and unit != completed_by:
                 wrong.append(f"{unit} is gone")
         checkpoints = [any("checkpoints/" in unit for unit in tree) for tree in (of[0], units)]
         return wrong + ["all checkpoints are gone"] * (checkpoints == [True, False])
@@ -204,8 +205,9 @@ def whole_checkpoint(name):
 class Operation:
     """A command, the state it starts from, and the states it may leave."""
 
-    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None):
+    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None, once=False, completed_by=None):
         self.bench, self.name, self.unit_of, self.waits, self.into = bench, name, unit_of, waits, into
+        self.once, self.completed_by = once, completed_by
         self.arguments = [str(argument) for argument in arguments]
         self.old = bench.folder / "old" / name.replace(" ", "_").replace(",", "").replace("/", "_")
         self.old.mkdir(parents=True)
@@ -364,6 +366,10 @@ def operations(bench, only):
     train = ["train", "--config", tiny, "--out", out, "--json"]
     export = ["export", "--config", tiny, "--out", out / "model.safetensors", "--json"]
     reconstruct = ["reconstruct", "--weights", weights, "--scene", room, "--out", out / "room.ply", "--json"]
+    far = inputs / "far.ply"
+    shutil.copy(splat, far)
+    (inputs / "far.ply.origin.json").write_text(json.dumps({"origin": [5e6, 4e5, 100.0]}))
+    convert = ["convert", far, out / "far.spz", "--local-origin", "--json"]
     score = ["eval", "--splat", splat, "--scene", room, "--json", "--sheet", out / "sheet.png"]
     report = ["report", inputs / "evaluation", "--out", out / "report.html", "--json"]
     orbit = ["render", "--splat", splat, "--size", "24x24", "--orbit", "--frames", 3, "--json", "--out"]
@@ -393,12 +399,23 @@ def operations(bench, only):
         bench.make(*command)
         (out / "000001.torch").unlink()
         (out / "index.json").unlink()
-        return Operation(bench, "pack", command).take()
+        return Operation(bench, "pack", command, once=True).take()
 
     def synthesized():
         bench.make("synth", "--gaussians", "--out", out, "--frames", 4, "--size", 16, "--seed", 7)
         command = ["synth", "--gaussians", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--json"]
         return Operation(bench, "synth", command, whole_room).take()
+
+    def filmed():
+        more = ["--depth", "--sheet", out / "sheet.png"]
+        command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, *more, "--json"]
+        # As if from long ago, and without what says that it is finished.
+        return Operation(bench, "synth, videos", command, once=True).age(drop=["000000.torch", "index.json"])
+
+    def converted():
+        shutil.copy(splat, out / "room.ply")
+        command = ["convert", out / "room.ply", out / "room.ply", "--sh-degree", 1]
+        return Operation(bench, "convert, in place", command).take()
 
     def aged(name, command, keep=(), **more):
         return lambda: Operation(bench, name, command, **more).age(keep)
@@ -408,7 +425,15 @@ def operations(bench, only):
         "train": lambda: training("train", False),
         "train, resumed": lambda: training("train, resumed", True),
         "export": aged("export", export),
+        "export, shards": aged(
+            "export, shards",
+            [*export, "--max-shard-size", "80KB"],
+            completed_by="model.safetensors.index.json",
+        ),
         "reconstruct": aged("reconstruct", reconstruct),
+        "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
+        "convert, in place": converted,
+        "convert --local-origin": aged("convert --local-origin", convert),
         "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
         "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
         "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),
@@ -418,6 +443,7 @@ def operations(bench, only):
         "report": aged("report", report),
         "pack": packed,
         "synth": synthesized,
+        "synth, videos": filmed,
     }
     for name, make in made.items():
         if not only or name in only:
@@ -460,11 +486,12 @@ def check(op, fault):
         if kind == "short" or kind == "EINTR" and group in INTERRUPTIBLE:
             wrong.append("it doesn't go on")
         # A full disk is waited for, but not by what looks whether the run's folder can be written and is nobody's.
-        looks = re.search(r"/out(/\.globalsplat-probe|/\.lock)?$", done.hit[0])
+        looks = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
         if op.waits and not sticky and kind in ("ENOSPC", "torn") and not looks:
             wrong.append("it doesn't wait for room")
         # Where renames fail for good, of anything or onto this one, nobody can take one back: the next run does.
-        wrong += tree.mixes(op.trees, op.unit_of, crashed=sticky and group in ("rename", "any"))
+        crashed = sticky and group in ("rename", "any")
+        wrong += tree.mixes(op.trees, op.unit_of, crashed, op.completed_by)
     return "right" if done.code == 0 else "refused", wrong, done
 
 
@@ -496,7 +523,7 @@ def inject(operations, most, short, one):
             count["injected"] += 1
             count[became] += not wrong
             # Chunks are never written over: a folder that has them all is refused.
-            again = [] if op.name == "pack" and done.code == 0 else op.again()
+            again = [] if op.once and done.code == 0 else op.again()
             count["again"] += not again
             if wrong or again:
                 count["failures"] += 1

@@ -2,19 +2,17 @@ use super::bench_attention::Attention;
 use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
-use super::{device, memory, parse_size, print_json, progress};
+use super::{device, memory, open_capture, parse_size, print_json, progress, warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    self, RasterReport, Section, Spread, bench_loader, bench_raster, bench_synth, made_up_scene,
-    made_up_videos,
+    RasterReport, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
 };
-use globalsplat::config::Config;
-use globalsplat::data::{DataConfig, TrainingScenes, open_capture, view_batch};
+use globalsplat::data::{DataConfig, TrainingScenes, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
 use globalsplat::scene::ImageSize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use tch::Device;
 
@@ -53,47 +51,6 @@ impl Bench {
     pub fn is_shared(&self) -> bool {
         matches!(self.part, Part::Train(_))
     }
-}
-
-/// The configuration that a measurement is of; without a file, the defaults, which are the paper's main model.
-pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
-    Ok(match file {
-        Some(file) => Config::read(file, set)?,
-        None => Config::parse("", set, "the defaults".as_ref())?,
-    })
-}
-
-/// A line for each section, with its share, and one for the whole.
-pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
-    println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "least", "3 of 4", "share");
-    let row = |name: &str, s: &Spread| {
-        let share = 1e2 * s.median / whole.median;
-        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
-    };
-    sections.iter().for_each(|section| row(section.name, &section.milliseconds));
-    row(name, whole);
-}
-
-/// The parts of a forward pass, beside `whole`.
-pub fn print_parts(title: &str, parts: &[bench::Part], whole: &Spread) {
-    println!(
-        "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
-        "median", "least", "share", "GFLOP", "GB", "of the peak"
-    );
-    for part in parts {
-        let of_peak = match part.gflop > 0. {
-            true => format!("{:>11.1} %", 1e2 * part.share_of_peak),
-            false => String::new(),
-        };
-        let rest = format!("{:>9.2} {:>7.3} {of_peak}", part.gflop, part.gigabytes);
-        print_part(part.name, &part.milliseconds, whole, &rest);
-    }
-}
-
-/// One of them.
-pub fn print_part(name: &str, s: &Spread, whole: &Spread, rest: &str) {
-    let share = 1e2 * s.median / whole.median;
-    println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
 }
 
 /// The splat op, forward and backward, stage by stage.
@@ -154,9 +111,12 @@ impl Raster {
         }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
-                let gaussians = read_splat(splat)?.gaussians;
+                let splat = read_splat(splat)?;
+                warn(&splat.warnings);
+                let frame = splat.frame();
                 let views = open_capture(scene)?.load_all(None)?;
-                let poses: Vec<_> = views.iter().map(|view| view.camera.c2w).collect();
+                let poses: Vec<_> = views.iter().map(|view| frame.pose_to_local(&view.camera.c2w)).collect();
+                let gaussians = frame.gaussians_to_local(&splat.gaussians, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),

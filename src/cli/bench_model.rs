@@ -1,4 +1,4 @@
-use super::bench::{print_part, print_parts, read_config};
+use super::bench_common::{print_part, print_parts, read_config};
 use super::{device, model, print_json};
 use anyhow::Result;
 use clap::Args;

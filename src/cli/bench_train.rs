@@ -1,4 +1,4 @@
-use super::bench::{print_parts, print_sections, read_config};
+use super::bench_common::{print_parts, print_sections, read_config};
 use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;

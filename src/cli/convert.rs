@@ -1,11 +1,13 @@
-use super::{print_json, render::orbit_around_splat};
+use super::{cameras::orbit_around_splat, open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
+use glam::DVec3;
 use globalsplat::eval::psnr_between;
-use globalsplat::io::{Splat, check_writable_splat, fit_splat, read_splat, write_splat};
+use globalsplat::io::{
+    Inputs, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
+};
 use globalsplat::render::HarmonicLimits;
-use globalsplat::scene::{Camera, ImageSize};
+use globalsplat::scene::{Camera, ImageSize, LocalFrame};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -23,6 +25,9 @@ const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
 /// SPZ's coefficients are within ±1 and a .splat has one for each colour; viewers for browsers hold no more of a PLY's, either
 /// (--for-viewers). Where the capture is named, those that are left show its cameras what all did before; else what can't be held is
 /// cut off, which may cost much.
+///
+/// Gaussians that can't be drawn are left out and counted: those with numbers that aren't finite, which other commands refuse, and
+/// those whose rotation has length 0.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
@@ -44,6 +49,10 @@ pub struct Convert {
     /// Lose least for the cameras of this capture, and tell the loss by them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
+    /// Write coordinates relative to the centre of the scene, which goes to a file beside the splat: far from the world's origin, as in
+    /// UTM coordinates, float32 and the formats' own numbers lose detail
+    #[arg(long)]
+    local_origin: bool,
     /// Print what was done as one JSON object
     #[arg(long)]
     json: bool,
@@ -52,8 +61,13 @@ pub struct Convert {
 impl Convert {
     pub fn run(self) -> Result<()> {
         check_writable_splat(&self.to)?;
+        splat_out::check_origin(&self.to, self.local_origin)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
-        let original = read_splat(&self.from)?;
+        let mut inputs = Inputs::default();
+        capture.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        inputs.check_file(&self.to)?;
+        let original = read_splat_without_invalid(&self.from)?;
+        warn(&original.warnings);
         // Before the file is replaced, if it is the same.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.unwrap_or(original.sh_degree());
@@ -68,7 +82,14 @@ impl Convert {
             None if !self.for_viewers => None,
             None => Some(fit(&[])?),
         };
-        write_splat(&self.to, &fitted.as_ref().unwrap_or(&original).with_sh_degree(degree))?;
+        let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
+        let origin = self.local_origin.then(|| match &capture {
+            Some(capture) => LocalFrame::from_cameras(&capture.cameras()).origin,
+            // A splat that has an origin keeps it.
+            None if original.origin != DVec3::ZERO => original.origin,
+            None => original.frame().origin,
+        });
+        splat_out::write(&self.to, &written, origin)?;
         let copy = read_splat(&self.to)?;
         let to = description(&self.to, &copy)?;
 
@@ -79,7 +100,7 @@ impl Convert {
         if capture.is_none() {
             self.tell_cut(&original, &fit(&[])?.gaussians.sh);
         }
-        let psnr = psnr_between(&original.gaussians, &copy.gaussians, &cameras)?;
+        let psnr = psnr_between(&original, &copy, &cameras)?;
         let views = cameras.len();
         if self.json {
             let told = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
@@ -111,7 +132,7 @@ impl Convert {
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {
     Ok(json!({
-        "splat": path,
+        "splat": path.to_string_lossy(),
         "gaussians": splat.gaussians.count(),
         "sh_degree": splat.sh_degree(),
         "bytes": std::fs::metadata(path)?.len(),

@@ -4,13 +4,14 @@ use clap::Args;
 use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
-use globalsplat::model::are_denormals_flushed;
+use globalsplat::model::{Precision, are_denormals_flushed};
 use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::SHIPPED_MODEL;
-use globalsplat::render::cpu::simd_level;
+use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
 use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
 use serde_json::{Value, json};
 use std::fmt::Display;
+use tch::Device;
 
 /// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights and the ffmpeg found.
 #[derive(Args)]
@@ -41,6 +42,7 @@ impl Doctor {
         let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
         let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
+        let precision = Precision::fastest_on(Device::Cpu);
         let denormals = if are_denormals_flushed() { "taken for 0" } else { "kept" };
         if self.json {
             let found: serde_json::Map<_, _> = weights
@@ -52,6 +54,8 @@ impl Doctor {
                 "libtorch": libtorch,
                 "devices": devices,
                 "simd": simd,
+                "libtorch_simd": libtorch_simd_level(),
+                "precision": precision,
                 "threads": threads,
                 "cores": cores,
                 "denormals": denormals,
@@ -74,7 +78,14 @@ impl Doctor {
         line("globalsplat", &env!("CARGO_PKG_VERSION"));
         line("libtorch", &libtorch);
         line("devices", &devices.join(", "));
-        line("rasterizer", &format!("{simd} (GLOBALSPLAT_SIMD forces another)"));
+        line(
+            "rasterizer",
+            &format!("{simd} (GLOBALSPLAT_SIMD=avx2 or portable hides what is newer, from libtorch as well)"),
+        );
+        line(
+            "precision",
+            &format!("{precision} (the fastest for wide models on this CPU, which --precision auto takes)"),
+        );
         line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
         line("denormals", &format!("{denormals} (many processors are slow with numbers below 1.2e-38)"));
         let of = |built: bool, without: &'static str| if built { "built in" } else { without };

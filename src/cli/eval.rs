@@ -1,15 +1,19 @@
-use super::{check_views, device, model, print_json, progress, ranks, stop_flag};
+use super::{
+    check_views, device, model, open_capture, print_json, progress, ranks, say_shrunk, stop_flag, warn,
+    warn_of_many,
+};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Dataset, Holdout, Split, open_capture};
+use globalsplat::data::{Capture, Dataset, Holdout, Split, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    Baselines, CaptureScores, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual, Sweep,
-    contact_sheet, judge, machine, peak_memory_bytes, write_csv, write_evaluation, write_report,
+    Baselines, CaptureScores, ContactSheet, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual,
+    PhotoSource, REPORT, Sweep, TABLE, evaluation_files, judge, machine, peak_memory_bytes, write_csv,
+    write_evaluation, write_report,
 };
-use globalsplat::io::{check_writable_dir, check_writable_png, write_png};
+use globalsplat::io::{Inputs, WeightsFile, check_writable_dir, check_writable_png, checksum, weights_files};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, load_context};
+use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, context_views};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::ops::RangeInclusive;
@@ -24,7 +28,7 @@ use tch::Device;
 ///
 /// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
 /// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
-/// it was stopped. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
+/// it was stopped, and scores again what was changed since. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
 /// anybody's pictures DIR/SCENE/000012.png, named by the frame. Started by torchrun, many processes share the scenes out:
 /// docs/distributed.md.
 #[derive(Args)]
@@ -63,7 +67,7 @@ pub struct Eval {
     /// a whole word, else as its folder
     #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
     dataset: Option<String>,
-    /// Target views: every:N or every:N+K; by default as the model was trained
+    /// Target views: every:N, every:N+K, or none for the capture's own test part; by default as the model was trained
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
     /// Photos the model is shown, spread over the path of the camera; by default all that are not held out
@@ -80,7 +84,8 @@ pub struct Eval {
     /// others' pictures of a data set 256, and of one capture as its photos
     #[arg(long, value_name = "PIXELS")]
     pictures_at: Option<u32>,
-    /// Also write a picture: photo, render and depth side by side, a row per view
+    /// Also write a picture: photo, render and depth side by side, a row per view; shrunk where it would have more than 64 million
+    /// pixels
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
     /// f32, bf16 for the model's matrix products, or auto: bf16 for wide models where the device has instructions for it
@@ -113,20 +118,31 @@ impl Eval {
             check_writable_png(sheet)?;
         }
         let capture = open_capture(scene)?;
+        if let Some(sheet) = &self.sheet {
+            let mut inputs = self.inputs(std::iter::once(self.method(None)));
+            capture.add_inputs(&mut inputs);
+            inputs.check_file(sheet)?;
+        }
         let loaded = self.load_model(device)?;
         let model = self.model(loaded.as_ref())?;
         let scene = self.one_scene(&capture, model)?;
         if self.chooses_size() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let made = self.method(model).synthesize(&scene)?;
+        let mut made = self.method(model).synthesize(scene)?;
+        warn(&made.warnings);
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
-        let scores = judge(&scene, &made, &perceptual)?;
+        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(made.scene.target.len()));
+        let scores = judge(&mut made, &perceptual, |truth, picture, _| {
+            let row = sheet.as_mut().zip(picture.rendered.as_ref());
+            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&truth.image, rendered))
+        })?;
+        let scene = &made.scene;
         // Beside a model, what answering without one would score.
-        let baselines = model.map(|model| self.baselines(&capture, model, &scene)).transpose()?;
-        if let Some(sheet) = &self.sheet {
-            write_png(sheet, &contact_sheet(&scene.target, &made.rendered))?;
+        let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
+        if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
+            say_shrunk(path, sheet.write(path)?);
         }
         if let Some(line) = perceptual.why_absent(&scores) {
             eprintln!("{line}");
@@ -166,7 +182,7 @@ impl Eval {
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let picture_size = self.picture_size(model)?;
         let Some(model) = model else {
-            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size))?);
+            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size)));
         };
         let photo_size = model.input.photo_size(model.config.data.image_size);
         Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, picture_size)?)
@@ -175,10 +191,13 @@ impl Eval {
     /// What the photos that `model` is shown of `scene` would score, as large as the pictures are.
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
         let size = self.picture_size(Some(model))?;
-        if size == model.input.photo_size(model.config.data.image_size) {
-            return Ok(Baselines::of(&scene.name, &scene.context, &scene.target)?);
-        }
-        let photos = load_context(capture, self.holdout(model)?, self.views, size)?;
+        let photos = match size == model.input.photo_size(model.config.data.image_size) {
+            true => PhotoSource::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
+            false => {
+                let shown = context_views(capture, self.holdout(model)?, self.views);
+                PhotoSource::of(capture, &shown, Some(size))
+            }
+        };
         Ok(Baselines::of(&scene.name, &photos, &scene.target)?)
     }
 
@@ -230,10 +249,52 @@ impl Eval {
         Ok(Some(Model { input, ..loaded.into() }))
     }
 
+    /// The files of what is judged, of a data set by `methods`, one for each scene.
+    fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> Inputs {
+        let mut inputs = Inputs::default();
+        match &self.weights {
+            Some(weights) => weights_files(weights).iter().for_each(|file| inputs.add(file)),
+            None => methods.for_each(|method| method.add_inputs(&mut inputs)),
+        }
+        inputs
+    }
+
+    /// Refuses an output that would replace what is read.
+    fn check_outputs<'a>(
+        &self,
+        dataset: &Dataset,
+        out: &Path,
+        evaluations: impl Iterator<Item = (&'a EvaluationIndex, &'a PathBuf)> + Clone,
+    ) -> Result<()> {
+        let method = self.method(None);
+        let scenes = || evaluations.clone().flat_map(|(index, _)| index.scenes.keys());
+        let mut inputs = self.inputs(scenes().map(|key| method.of_scene(key)));
+        dataset.add_inputs(out, &mut inputs);
+        evaluations.clone().for_each(|(index, _)| inputs.add(&index.file));
+        inputs.check_folder(out)?;
+        inputs.check_file(&out.join(REPORT))?;
+        for (index, folder) in evaluations {
+            let files = evaluation_files(folder, index.scenes.keys());
+            files.iter().try_for_each(|file| inputs.check_file(file))?;
+        }
+        Ok(())
+    }
+
     /// The file or folder that is judged.
     fn path(&self) -> &Path {
         let paths = [&self.weights, &self.splat, &self.renders];
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
+    }
+
+    /// Tells what is judged from others: weights by their name and all that their files hold. Every scene's splat or pictures are told
+    /// apart one by one, so of their folder it is the place.
+    fn fingerprint(&self) -> Result<String> {
+        let Some(weights) = &self.weights else {
+            return Ok(self.path().canonicalize()?.display().to_string());
+        };
+        let weights = WeightsFile::open(weights)?;
+        let name = weights.path().file_name().unwrap_or_default();
+        Ok(format!("{} {:08x}", name.display(), checksum(weights.files())?))
     }
 
     fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {
@@ -258,12 +319,15 @@ impl Eval {
             return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
         }
         let dataset = Dataset::open(data, Split::Test)?;
+        warn_of_many(dataset.warnings().iter());
         let dataset_name = |index| Sweep::dataset_name(self.dataset.as_deref(), data, index);
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
+        self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = self.model(loaded.as_ref())?;
         let picture_size = self.picture_size(model)?;
+        let fingerprint = self.fingerprint()?;
         let stop = stop_flag()?;
 
         let mut evaluations = vec![];
@@ -282,7 +346,7 @@ impl Eval {
             let sweep = Sweep {
                 method: self.method(model),
                 name: self.name.clone().unwrap_or(stem + &setting),
-                fingerprint: fingerprint(path)? + &setting,
+                fingerprint: fingerprint.clone() + &setting,
                 dataset: &dataset,
                 root: data,
                 dataset_name,
@@ -314,15 +378,16 @@ impl Eval {
             if self.chooses_size() && enlarged > 0 {
                 eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
             }
+            warn_of_many(evaluation.scenes.iter().flat_map(|scene| &scene.warnings));
             write_evaluation(&folder, &evaluation)?;
-            write_csv(&folder.join("scores.csv"), &evaluation)?;
+            write_csv(&folder.join(TABLE), &evaluation)?;
             evaluations.push((folder, evaluation));
         }
         group.leave()?;
         if !group.is_first() {
             return Ok(());
         }
-        let report = out.join("report.html");
+        let report = out.join(REPORT);
         write_report(&report, &evaluations)?;
         self.tell(&report, &evaluations)
     }
@@ -333,13 +398,13 @@ impl Eval {
                 .iter()
                 .map(|(folder, e)| {
                     json!({
-                        "folder": folder, "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
+                        "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
                         "input": e.input, "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
                         "efficiency": e.efficiency, "failures": e.failures,
                     })
                 })
                 .collect();
-            print_json(&json!({ "report": report, "evaluations": summaries }));
+            print_json(&json!({ "report": report.to_string_lossy(), "evaluations": summaries }));
         } else {
             for (_, e) in evaluations {
                 let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
@@ -390,15 +455,6 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
         .into()),
         None => Ok(folders),
     }
-}
-
-/// Tells this file, or folder, from others.
-fn fingerprint(path: &Path) -> Result<String> {
-    if path.is_dir() {
-        return Ok(path.canonicalize()?.display().to_string());
-    }
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    Ok(format!("{} {:08x}", path.file_name().unwrap_or_default().display(), crc32fast::hash(&bytes)))
 }
 
 fn print_table(scores: &CaptureScores) {

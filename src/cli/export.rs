@@ -2,9 +2,10 @@ use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::config::Config;
+use globalsplat::io::Inputs;
 use globalsplat::model::GlobalSplat;
 use globalsplat::reconstruct::load_model;
-use globalsplat::train::{MODEL_FILE, best_checkpoint, latest_checkpoint};
+use globalsplat::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
 use serde_json::json;
 use std::path::PathBuf;
 use tch::{Device, nn};
@@ -35,7 +36,10 @@ pub struct Export {
 
 impl Export {
     pub fn run(self) -> Result<()> {
-        self.out.check(self.format)?;
+        let mut inputs = Inputs::default();
+        self.run.iter().for_each(|run| add_run_inputs(run, &mut inputs));
+        self.config.iter().for_each(|config| inputs.add(config));
+        self.out.check(self.format, &inputs)?;
         let (vs, config, stage) = match (&self.run, &self.config) {
             (Some(run), _) => {
                 let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };

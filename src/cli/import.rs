@@ -1,6 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::io::{Inputs, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
@@ -30,7 +31,9 @@ pub struct Import {
 
 impl Import {
     pub fn run(self) -> Result<()> {
-        self.out.check(Format::Safetensors)?;
+        let mut inputs = Inputs::default();
+        weights_files(&self.from).iter().for_each(|file| inputs.add(file));
+        self.out.check(Format::Safetensors, &inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
         let loaded = file.load(Device::Cpu, Precision::F32)?;

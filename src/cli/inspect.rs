@@ -1,7 +1,8 @@
-use super::print_json;
+use super::{open_capture, print_json, warn};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split, open_capture};
+use glam::DVec3;
+use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split};
 use globalsplat::error::Error;
 use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
@@ -24,14 +25,20 @@ pub struct Inspect {
 
 impl Inspect {
     pub fn run(self) -> Result<()> {
+        let is_scene_of_chunk = !self.path.exists() && self.path.to_string_lossy().contains(".torch#");
         let object = match self.path.extension().and_then(|e| e.to_str()) {
+            _ if is_scene_of_chunk => capture(&self.path)?,
             _ if is_splat_name(&self.path) => splat(&self.path)?,
             _ if is_weights_name(&self.path) => weights(&self.path)?,
+            _ if !self.path.exists() => {
+                return Err(Error::Request(format!("{}: no such file or folder", self.path.display())).into());
+            }
             Some("torch") => chunk(&self.path)?,
-            Some(extension) if extension == "json" || extension.starts_with("torch#") => capture(&self.path)?,
+            Some("json") => capture(&self.path)?,
             _ if self.path.join(INDEX_FILE).is_file() => dataset(&self.path)?,
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
+                std::fs::metadata(&self.path).map_err(Error::read(&self.path))?;
                 let expected = "a splat (.ply, .compressed.ply, .spz or .splat), a .safetensors, a .ckpt, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
             }
@@ -64,8 +71,10 @@ fn range(t: &Tensor) -> Value {
 
 fn splat(path: &Path) -> Result<Value> {
     let splat = read_splat(path)?;
+    warn(&splat.warnings);
     let g = &splat.gaussians;
-    let axis = |i: i64| range(&g.means.select(-1, i));
+    let axis = |i: usize| range(&(g.means.select(-1, i as i64).to_kind(Kind::Double) + splat.origin[i]));
+    let origin = (splat.origin != DVec3::ZERO).then(|| splat.origin.to_array());
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
@@ -74,6 +83,7 @@ fn splat(path: &Path) -> Result<Value> {
         "x": axis(0),
         "y": axis(1),
         "z": axis(2),
+        "local_origin": origin,
         "scales": range(&g.scales),
         "opacities": range(&g.opacities),
     }))
@@ -120,7 +130,8 @@ fn chunk(path: &Path) -> Result<Value> {
 fn dataset(path: &Path) -> Result<Value> {
     let dataset = Dataset::open(path, Split::Test)?;
     let groups = dataset.groups().iter();
-    let absent: Vec<_> = groups.filter(|group| !group.path().is_file()).map(|group| group.path()).collect();
+    let absent: Vec<_> =
+        groups.filter(|group| !group.path().is_file()).map(|group| group.path().to_string_lossy()).collect();
     Ok(json!({
         "kind": "data set",
         "scenes": dataset.scenes(),
@@ -138,6 +149,7 @@ fn capture(path: &Path) -> Result<Value> {
         "kind": "capture",
         "name": capture.name,
         "views": capture.len(),
+        "test_views": capture.has_test_part().then(|| capture.scored_views().len()),
         "image_size": [first.height, first.width],
         "focal_lengths": [first.intrinsics.fx, first.intrinsics.fy],
         "extent": globalsplat::scene::normalize(&poses)?.world_from_normalized.scale,

@@ -5,9 +5,11 @@
 
 mod bench;
 mod bench_attention;
+mod bench_common;
 mod bench_model;
 mod bench_refine;
 mod bench_train;
+mod cameras;
 mod convert;
 mod device;
 mod doctor;
@@ -27,6 +29,7 @@ mod reconstruct;
 mod refine;
 mod render;
 mod report;
+mod splat_out;
 mod synth;
 mod train;
 mod view;
@@ -35,9 +38,11 @@ mod weights_out;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
+use globalsplat::data::Capture;
 use globalsplat::error::panic_message;
 use globalsplat::scene::ImageSize;
 use std::panic;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -192,7 +197,45 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
     }
 }
 
+/// Opens a capture and says what is left out or changed of it.
+fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
+    let capture = globalsplat::data::open_capture(path)?;
+    warn(capture.warnings());
+    Ok(capture)
+}
+
+/// Says what is left out or changed of an input, a line each.
+fn warn(lines: &[String]) {
+    if ranks::is_first() {
+        lines.iter().for_each(|line| eprintln!("{line}"));
+    }
+}
+
+/// Says the first few of what is left out or changed of many inputs, and how many more lines there are.
+fn warn_of_many<'a>(lines: impl Iterator<Item = &'a String>) {
+    const SHOWN: usize = 5;
+    let lines: Vec<String> = lines.cloned().collect();
+    let (shown, others) = lines.split_at(lines.len().min(SHOWN));
+    warn(shown);
+    if !others.is_empty() {
+        warn(&[format!(
+            "and {} more lines of this kind: `globalsplat inspect` says those of a capture",
+            others.len()
+        )]);
+    }
+}
+
 /// Prints a result as one JSON object.
 fn print_json(value: &serde_json::Value) {
     println!("{value}");
+}
+
+/// Says that the pictures in the picture at `path` are shrunk, if the sides of the largest are divided by more than 1.
+fn say_shrunk(path: &Path, by: i64) {
+    if by > 1 {
+        eprintln!(
+            "{}: pictures are shrunk to 1/{by} of their sides, to 64 million pixels at most in all",
+            path.display()
+        );
+    }
 }

@@ -1,16 +1,16 @@
-use super::{print_json, progress};
+use super::{print_json, progress, warn_of_many};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{ChunkWriter, find_captures};
+use globalsplat::data::{ChunkWriter, FoundCaptures, Holdout, find_captures};
 use globalsplat::error::Error;
-use globalsplat::io::check_writable_dir;
+use globalsplat::io::{Inputs, check_writable_dir};
 use serde_json::json;
 use std::path::PathBuf;
 
 /// Pack captures into the chunks that RealEstate10K, ACID and DL3DV come in.
 ///
-/// The folder gets an index.json and files that Python's torch.load reads. JPEG and PNG photos are taken bit for bit, unless
-/// lens distortion has to be removed.
+/// The folder gets an index.json and files that Python's torch.load reads. JPEG and PNG photos of 8-bit RGB are taken bit for bit,
+/// unless lens distortion has to be removed; all others are encoded anew.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat pack captures/room captures/garden --out chunks/train")]
 pub struct Pack {
@@ -30,27 +30,43 @@ pub struct Pack {
 
 impl Pack {
     pub fn run(self) -> Result<()> {
-        let mut captures = vec![];
+        let (mut captures, mut lines) = (vec![], vec![]);
         for scene in &self.scenes {
             if !scene.exists() && !scene.to_string_lossy().contains('#') {
                 return Err(Error::Request(format!("{}: no such capture", scene.display())).into());
             }
-            captures.extend(find_captures(scene)?);
+            let found: FoundCaptures = find_captures(scene)?;
+            lines.extend(found.warnings);
+            captures.extend(found.captures);
         }
+        for capture in &captures {
+            lines.extend_from_slice(capture.warnings());
+            if capture.has_test_part() {
+                let test = capture.scored_views().len();
+                lines.push(format!(
+                    "{}: the {test} views of its test part are left out",
+                    capture.file().display()
+                ));
+            }
+        }
+        warn_of_many(lines.iter());
         check_writable_dir(&self.out)?;
+        let mut inputs = Inputs::default();
+        captures.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        inputs.check_folder(&self.out)?;
         let mut writer = ChunkWriter::new(&self.out, self.chunk_size as usize * 1_000_000)?;
         let bar = progress::bar(captures.len() as u64, "scenes");
         let mut views = 0;
         for capture in &captures {
             writer.add(capture)?;
-            views += capture.len();
+            views += capture.split(Holdout::None).0.len();
             bar.inc(1);
         }
         let chunks = writer.finish()?;
         bar.finish_and_clear();
         if self.json {
             print_json(
-                &json!({ "out": self.out, "scenes": captures.len(), "views": views, "chunks": chunks }),
+                &json!({ "out": self.out.to_string_lossy(), "scenes": captures.len(), "views": views, "chunks": chunks }),
             );
         } else {
             println!("{}: {} scenes, {views} views in {chunks} chunks", self.out.display(), captures.len());

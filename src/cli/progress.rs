@@ -16,11 +16,29 @@ pub struct Progress {
     _lines: Option<Sender<()>>,
 }
 
+/// What a bar counts.
+#[derive(Clone, Copy)]
+enum Unit {
+    /// Items by this name, as fast as they come.
+    Items(&'static str),
+    /// Seconds of a time that is given: what is left of it is no guess.
+    Seconds,
+}
+
 /// Progress over `length` items with rate and time left.
 pub fn bar(length: u64, unit: &'static str) -> Progress {
     let template = format!("{{bar:30}} {{pos}}/{{len}} {unit} {{per_sec}} {{elapsed}} <{{eta}} {{msg}}");
+    progress(length, &template, Unit::Items(unit))
+}
+
+/// Progress over a time: its position is how many seconds are gone.
+pub fn seconds_of(time: Duration) -> Progress {
+    progress(time.as_secs_f64().ceil() as u64, "{bar:30} {pos}/{len} s {msg}", Unit::Seconds)
+}
+
+fn progress(length: u64, template: &str, unit: Unit) -> Progress {
     let style =
-        ProgressStyle::with_template(&template).expect("a template that is right").progress_chars("━╸─");
+        ProgressStyle::with_template(template).expect("a template that is right").progress_chars("━╸─");
     let bar = ProgressBar::new(length).with_style(style);
     let lines = (!stderr().is_terminal()).then(|| write_lines(bar.clone(), unit));
     Progress { bar, _lines: lines }
@@ -42,7 +60,7 @@ impl Deref for Progress {
     }
 }
 
-fn write_lines(bar: ProgressBar, unit: &'static str) -> Sender<()> {
+fn write_lines(bar: ProgressBar, unit: Unit) -> Sender<()> {
     let (sender, receiver) = channel();
     std::thread::spawn(move || {
         while receiver.recv_timeout(PAUSE) == Err(RecvTimeoutError::Timeout) && !bar.is_finished() {
@@ -52,13 +70,17 @@ fn write_lines(bar: ProgressBar, unit: &'static str) -> Sender<()> {
     sender
 }
 
-/// Where the work stands, as `600 of 3000 steps, 8.1 a second, 5 minutes left, loss 0.02`.
-fn line(bar: &ProgressBar, unit: &str) -> String {
+/// Where the work stands, as `600 of 3000 steps, 8.1 a second, 5 minutes left, loss 0.02` or `20 of 60 seconds, 40 seconds left`.
+fn line(bar: &ProgressBar, unit: Unit) -> String {
     let (done, of) = (bar.position(), bar.length().unwrap_or(0));
-    let mut line = format!("{done} of {of} {unit}");
-    if done > 0 {
-        line += &rate(bar.per_sec(), bar.eta());
-    }
+    let mut line = match unit {
+        Unit::Items(unit) if done > 0 => format!("{done} of {of} {unit}{}", rate(bar.per_sec(), bar.eta())),
+        Unit::Items(unit) => format!("{done} of {of} {unit}"),
+        Unit::Seconds => {
+            let left = duration(Duration::from_secs(of.saturating_sub(done)));
+            format!("{done} of {of} seconds, {left} left")
+        }
+    };
     if !bar.message().is_empty() {
         line += &format!(", {}", bar.message());
     }
@@ -92,11 +114,24 @@ mod tests {
     fn lines_tell_where_the_work_stands() {
         let bar = ProgressBar::hidden();
         bar.set_length(10);
-        assert_eq!(line(&bar, "scenes"), "0 of 10 scenes");
+        assert_eq!(line(&bar, Unit::Items("scenes")), "0 of 10 scenes");
         bar.set_position(4);
         bar.set_message("loss 0.5");
-        let line = line(&bar, "scenes");
+        let line = line(&bar, Unit::Items("scenes"));
         assert!(line.starts_with("4 of 10 scenes, ") && line.ends_with(" left, loss 0.5"), "{line}");
+    }
+
+    /// However fast the work goes, and whatever it is.
+    #[test]
+    fn time_that_is_given_is_what_is_left() {
+        let bar = ProgressBar::hidden();
+        bar.set_length(60);
+        assert_eq!(line(&bar, Unit::Seconds), "0 of 60 seconds, 60 seconds left");
+        bar.set_position(52);
+        bar.set_message("900 steps");
+        assert_eq!(line(&bar, Unit::Seconds), "52 of 60 seconds, 8 seconds left, 900 steps");
+        bar.set_position(61);
+        assert_eq!(line(&bar, Unit::Seconds), "61 of 60 seconds, 0 seconds left, 900 steps");
     }
 
     #[test]

@@ -1,15 +1,15 @@
 use super::memory::keep_during;
 use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
-use super::{check_views, device, model, print_json};
+use super::{check_views, device, model, open_capture, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Capture, Holdout, open_capture};
+use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{Splat, check_writable_splat, write_splat_for};
+use globalsplat::io::{Inputs, check_writable_splat, weights_files};
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
-use globalsplat::scene::ImageSize;
+use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -39,12 +39,16 @@ pub struct Reconstruct {
     /// share its pixels out; time and memory grow with views, N²-fold at most
     #[arg(long, value_name = "PIXELS")]
     views_at: Option<u32>,
-    /// Views not to use: every:N, every:N+K or none
+    /// Views not to use: every:N, every:N+K, or none but the capture's own test part
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
     refine: Option<f64>,
+    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
+    /// in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    local_origin: bool,
     /// f32, bf16 for matrix products, or auto: bf16 for wide models where the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
@@ -66,6 +70,7 @@ impl Reconstruct {
             space: SpaceName::Gaussians,
             scene: self.scene,
             out: self.out,
+            local_origin: self.local_origin,
             gaussians: DEFAULT_GAUSSIANS,
             seconds,
             steps: None,
@@ -76,6 +81,7 @@ impl Reconstruct {
             correct_poses: false,
             correct_exposures: false,
             sheet: None,
+            lpips: false,
             set: vec![],
             json: self.json,
         }
@@ -89,11 +95,17 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
         check_writable_splat(&self.out)?;
+        splat_out::check_origin(&self.out, self.local_origin)?;
         let asked = model::asked_precision(&self.precision)?;
         let started = process_age();
         let mut watch = Stopwatch::default();
         let loaded = watch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = watch.time("photos", || open_capture(&self.scene))?;
+        let mut inputs = Inputs::default();
+        capture.add_inputs(&mut inputs);
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.for_each(|file| inputs.add(&file));
+        inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {
             Some(height) => Input::at(height, ViewsAs::Polyphase, data.image_size)?,
@@ -109,7 +121,9 @@ impl Reconstruct {
         let model = Model { input, ..Model::from(&loaded) };
         let reconstruction = watch.time("network", || reconstruct(model, &photos, &[]))?;
         watch.time("splat", || {
-            write_splat_for(&self.out, &Splat::of(&reconstruction.in_world())?, &capture.cameras())
+            let (splat, cameras) = (reconstruction.to_splat()?, capture.cameras());
+            let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+            splat_out::write_for(&self.out, &splat, &cameras, origin)
         })?;
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))
@@ -124,8 +138,8 @@ impl Reconstruct {
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());
         if self.json {
             print_json(&json!({
-                "splat": self.out,
-                "weights": model::name(self.weights.as_deref()),
+                "splat": self.out.to_string_lossy(),
+                "weights": model::name(self.weights.as_deref()).to_string_lossy(),
                 "photos": photos.len(),
                 "image_size": input.photo_size(data.image_size),
                 "views": views,

@@ -1,38 +1,43 @@
 use super::progress::{self, Progress};
-use super::{check_views, memory, model, parse_size, print_json, stop_flag};
+use super::{
+    FAILED, check_views, memory, model, open_capture, parse_size, print_json, say_shrunk, splat_out, warn,
+};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
-use glam::DMat4;
-use globalsplat::data::{Capture, Holdout, View, open_capture, points_of};
+use globalsplat::data::{Capture, Holdout, View};
 use globalsplat::error::Error;
-use globalsplat::eval::{CaptureScores, Perceptual, contact_sheet, judge_pictures};
-use globalsplat::io::{
-    Splat, check_writable_png, check_writable_splat, read_splat, write_png, write_splat_for,
-};
+use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, process_age, score_views};
+use globalsplat::io::{Inputs, Splat, check_writable_png, check_writable_splat, read_splat, weights_files};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
+use globalsplat::reconstruct::spread_over_path;
 use globalsplat::refine::{
-    Budget, Correction, Corrections, GaussianSpace, Photos, RefineConfig, Space, Task, TokenSpace,
-    gaussians_from_photos, load_photos, refine, scene_depth,
+    Budget, Correction, Initial, MIN_SIDE, PatchScores, RefineConfig, RefineEvent, RefineOptions,
+    RefineResult, RefineSession, SpaceKind,
 };
-use globalsplat::render::{Rendered, render_views, transform};
-use globalsplat::scene::{Camera, Gaussians, RawGaussians, Similarity};
-use serde::Serialize;
+use globalsplat::render::render_views;
+use globalsplat::scene::{Camera, Gaussians, LocalFrame};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use tch::{Device, Tensor};
+use tch::Device;
 
-/// Of the time or the steps, what goes to tokens where Gaussians follow.
-const TOKENS_SHARE: f64 = 0.2;
 /// As many as the models of the paper's main size make.
 pub const DEFAULT_GAUSSIANS: u32 = 16_384;
-/// For the optimization, however long the beginning took.
-const LEAST_SECONDS: f64 = 1.;
-/// Parts of a phase at which views held out are scored.
-const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+/// Said where the work is ended before there is a splat.
+const NOTHING_YET: &str = "stopped before there was a splat: nothing is written";
+/// The longest time that can be asked for: a year.
+const MAX_SECONDS: f64 = 365. * 24. * 3600.;
+/// Of the time, what scoring the views held out takes at most, before and after.
+const SCORING_SHARE: f64 = 0.05;
+/// What writing a splat and leaving take, and a Gaussian more of it.
+const WRITING: Duration = Duration::from_millis(200);
+const WRITING_GAUSSIAN: Duration = Duration::from_micros(2);
+/// Cameras for which the colours of a splat are fitted to what its file can hold, at most.
+const FITTED_CAMERAS: usize = 64;
+/// Photos that LPIPS compares where no views are held out, at most.
+const LPIPS_PHOTOS: usize = 8;
 
 /// Make a splat sharp on the photos of its scene, or make one of the photos alone.
 ///
@@ -61,10 +66,14 @@ pub struct Refine {
     /// The splat to write, of one of these endings
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
+    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
+    /// in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    pub local_origin: bool,
     /// How many Gaussians, where none were begun with, or a model's that are fewer
     #[arg(long, value_name = "N", default_value_t = DEFAULT_GAUSSIANS, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     pub gaussians: u32,
-    /// How long, all in all
+    /// How long, all in all: from the start of the program to its end
     #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
     pub seconds: f64,
     /// How many steps instead: the same steps and seed give the same bytes
@@ -73,7 +82,7 @@ pub struct Refine {
     /// Other random numbers for another seed
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub seed: u64,
-    /// Views to keep out and to score by: every:N, every:N+K or none
+    /// Views to keep out and to score by: every:N, every:N+K, or none but the capture's own test part
     #[arg(long, value_name = "WHICH", default_value = "none")]
     pub holdout: String,
     /// Use so many of the other views at most, spread over the path of the camera
@@ -91,6 +100,9 @@ pub struct Refine {
     /// Also write a picture: photo, render and depth side by side, a row per view held out, or else per view
     #[arg(long, value_name = "FILE.png")]
     pub sheet: Option<PathBuf>,
+    /// Also score by LPIPS, before and after, where its weights are found; it takes its own time, once the splat is written
+    #[arg(long)]
+    pub lpips: bool,
     /// Change a number of the method, as in views=4; docs/refine.md has them
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -119,327 +131,361 @@ pub enum SpaceName {
     Both,
 }
 
-/// What is begun with.
-enum Start {
-    Gaussians(RawGaussians),
-    Model(Box<LoadedModel>, Reconstruction),
+impl From {
+    fn needs_model(asked: &Refine) -> Result<bool> {
+        let needs_model = asked.weights.is_some() || asked.space != SpaceName::Gaussians;
+        if asked.from == Some(From::Nothing) && needs_model {
+            let why = "--from nothing has neither weights nor tokens; --from weights has";
+            return Err(Error::Request(why.into()).into());
+        }
+        Ok(needs_model || asked.from == Some(From::Weights))
+    }
 }
 
 impl Refine {
     pub fn run(self) -> Result<()> {
+        let clock = Instant::now();
+        let clock = clock.checked_sub(process_age().unwrap_or_default()).unwrap_or(clock);
         memory::keep();
         check_views(self.views)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
-        let size = self.size.as_deref().map(parse_size).transpose()?;
-        let config = RefineConfig::with(&self.set, self.splat.is_some())?;
-        if !(self.seconds > 0. && self.seconds.is_finite()) {
-            return Err(Error::Request(format!("--seconds is {}, expected more than 0", self.seconds)).into());
-        }
+        let options = self.options()?;
+        let needs_model = From::needs_model(&self)?;
         if self.space == SpaceName::Tokens && (self.correct_poses || self.correct_exposures) {
             let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
             return Err(Error::Request(why.into()).into());
         }
         check_writable_splat(&self.out)?;
+        splat_out::check_origin(&self.out, self.local_origin)?;
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
+        let stop = StopRequest::install()?;
         let capture = open_capture(&self.scene)?;
-        let (shown, held_out) = holdout.split(capture.len());
-        let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX).max(1));
-        let photos = load_photos(&capture, &shown, size)?;
-        let held_out = load_photos(&capture, &held_out, size)?;
-        let judge =
-            Judge { name: capture.name.clone(), held_out, perceptual: Perceptual::find(Device::Cpu)? };
+        self.check_outputs(&capture)?;
+        let splat = self.splat.as_deref().map(read_splat).transpose()?;
+        if let Some(splat) = &splat {
+            warn(&splat.warnings);
+        }
+        let loaded = needs_model
+            .then(|| model::load(self.weights.as_deref(), Some(Precision::F32), Device::Cpu))
+            .transpose()?;
+        let (shown, held_out) = capture.split(holdout);
+        let cameras = capture.cameras();
+        let shown = spread_over_path(&cameras, &shown, self.views.unwrap_or(usize::MAX).max(1));
+        let bar = Bar {
+            bar: bar_of(&options.budget),
+            budget: options.budget,
+            clock,
+            count: shown.len() + held_out.len(),
+        };
+        let watch = |event: RefineEvent| {
+            bar.tell(event);
+            !stop.is_requested()
+        };
+        let mut session = RefineSession::load(&capture, &shown, &held_out, &options, clock, watch)?;
+        let initial = match (&splat, &loaded) {
+            (Some(splat), _) => Initial::Splat(&splat.gaussians, splat.origin),
+            (None, Some(loaded)) => Initial::Model { loaded, views: self.views },
+            (None, None) => Initial::Photos,
+        };
+        // Depths of some photos make a splat, too.
+        stop.set_ends_at_once(loaded.is_some());
+        let initial = session.start(initial)?;
+        stop.set_ends_at_once(false);
+        bar.bar.suspend(|| session.warnings().iter().for_each(|warning| eprintln!("{warning}")));
 
-        let clock = Instant::now();
-        let start = self.start(&capture, &photos)?;
-        let begin_seconds = clock.elapsed().as_secs_f64();
-        let first = match &start {
-            Start::Gaussians(raw) => raw.activate(),
-            Start::Model(_, made) => made.in_world(),
-        };
-        let before = judge.scores_of_both(&first, &photos)?;
-        let mut work = Work {
-            asked: &self,
-            capture: &capture,
-            photos: &photos,
-            judge: &judge,
-            config: &config,
-            seconds: (self.seconds - begin_seconds).max(LEAST_SECONDS),
-            stop: stop_flag()?,
-            bar: progress::bar(1000, "‰"),
-            done_steps: 0,
-            done_seconds: begin_seconds,
-            curve: vec![],
-        };
-        if let (Start::Model(..), Some(scores)) = (&start, &before.held_out) {
-            work.keep(scores);
+        let scorer = Scorer { name: &capture.name, stop: &stop };
+        let scored = scorer.affordable(&initial, session.held_out(), options.budget)?;
+        let begun = Instant::now();
+        let before = scorer.score(&initial, &scored)?;
+        session.reserve(begun.elapsed() + self.time_after(&session, &initial)?);
+        if let Some(line) = session.is_late() {
+            bar.bar.suspend(|| eprintln!("{line}"));
         }
-        let (mut gaussians, corrections) = work.optimize(&start, &first)?;
-        work.bar.finish_and_clear();
-        let mut after = judge.scores_of_both(&gaussians, &corrections.applied(&photos))?;
-        let mut corrected =
-            if self.correct_poses || self.correct_exposures { corrections.told(&photos) } else { vec![] };
-        if after.shown.psnr < before.shown.psnr {
+        let result = session.run()?;
+        bar.bar.finish_and_clear();
+        if result.is_initial && result.steps > 0 {
             eprintln!("the photos were shown better before: what was begun with is kept");
-            (gaussians, after) = (first, before.clone());
-            corrected.clear();
         }
-        write_splat_for(&self.out, &Splat::of(&gaussians)?, &capture.cameras())?;
+        let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
+        let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
+        // What wasn't changed is written as it was.
+        let refined;
+        let written = match splat.as_ref().filter(|_| result.is_initial) {
+            Some(splat) => splat,
+            None => {
+                let (gaussians, origin) = session.to_world(&result.gaussians);
+                refined = Splat { origin, ..Splat::of(&gaussians)? };
+                &refined
+            }
+        };
+        let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+        splat_out::write_for(&self.out, written, &spread, origin)?;
+        let after =
+            if result.is_initial { before.clone() } else { scorer.score(&result.gaussians, &scored)? };
+        let held_out = before.zip(after);
         if let Some(sheet) = &self.sheet {
-            let views = if judge.held_out.is_empty() { &photos } else { &judge.held_out };
-            write_png(sheet, &contact_sheet(views, &rendered(&gaussians, views)?))?;
+            if stop.is_requested() {
+                eprintln!("{}: stopped before it was written", sheet.display());
+            } else {
+                let rows = sheet_of(&result.gaussians, sheet_views(&session))?;
+                say_shrunk(sheet, rows.write(sheet)?);
+            }
         }
-        let Work { done_steps: steps, done_seconds: seconds, curve, .. } = work;
-        let (out, count) = (self.out.display(), gaussians.count());
+        let lpips = if self.lpips { scorer.lpips(&initial, &result.gaussians, &session)? } else { None };
+        self.print(&session, &result, held_out.as_ref(), lpips);
+        Ok(())
+    }
+
+    fn options(&self) -> Result<RefineOptions> {
+        let size = self.size.as_deref().map(parse_size).transpose()?;
+        if let Some(size) = size
+            && size.width.min(size.height) < MIN_SIDE
+        {
+            let (width, height) = (size.width, size.height);
+            let why = format!("--size {width}x{height}: expected {MIN_SIDE} pixels or more along each side");
+            return Err(Error::Request(why).into());
+        }
+        if !(self.seconds > 0. && self.seconds <= MAX_SECONDS) {
+            let why = format!("--seconds is {}, expected more than 0, up to a year", self.seconds);
+            return Err(Error::Request(why).into());
+        }
+        Ok(RefineOptions {
+            config: RefineConfig::with(&self.set, self.splat.is_some())?,
+            space: match self.space {
+                SpaceName::Gaussians => SpaceKind::Gaussians,
+                SpaceName::Tokens => SpaceKind::Tokens,
+                SpaceName::Both => SpaceKind::Both,
+            },
+            budget: match self.steps {
+                Some(steps) => Budget::Steps(steps),
+                None => Budget::Time(Duration::from_secs_f64(self.seconds)),
+            },
+            gaussians: self.gaussians as usize,
+            seed: self.seed,
+            correct_poses: self.correct_poses,
+            correct_exposures: self.correct_exposures,
+            size,
+        })
+    }
+
+    /// What writing takes, after the optimization.
+    fn time_after(&self, session: &RefineSession, gaussians: &Gaussians) -> Result<Duration> {
+        let count = gaussians.count().max(i64::from(self.gaussians)) as u32;
+        let mut time = WRITING + WRITING_GAUSSIAN * count;
+        if self.sheet.is_some() {
+            let views = sheet_views(session);
+            let begun = Instant::now();
+            let _ = sheet_of(gaussians, &views[..1])?;
+            time += begun.elapsed() * views.len() as u32;
+        }
+        Ok(time)
+    }
+
+    fn print(
+        &self,
+        session: &RefineSession,
+        result: &RefineResult,
+        held_out: Option<&(CaptureScores, CaptureScores)>,
+        lpips: Option<[CaptureScores; 2]>,
+    ) {
+        let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
+        let (count, photos) = (result.gaussians.count(), session.photos().len());
+        // Of the views held out, or else of photos.
+        let distances = lpips.map(|scores| scores.map(|scores| scores.lpips_vgg)).unwrap_or_default();
+        let (of_photos, of_held_out) =
+            if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
+        let scores = |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
         if self.json {
+            let of = |scores_of: &PatchScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
             let mut object = json!({
-                "splat": self.out, "gaussians": count, "photos": photos.len(), "steps": steps, "seconds": seconds,
-                "begin_seconds": begin_seconds, "corrections": corrected,
-                "shown": { "before": means(&before.shown), "after": means(&after.shown) },
+                "splat": self.out.to_string_lossy(), "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
+                "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
+                "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
             });
-            if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
+            if let Some((before, after)) = held_out {
+                let of = |scores_of: &CaptureScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
+                let last =
+                    json!({ "seconds": ended, "steps": steps, "psnr": after.psnr, "ssim": after.ssim });
+                let mut curve: Vec<Value> = result.curve.iter().map(|point| json!(point)).collect();
+                curve.push(last);
                 object["held_out"] = json!({
-                    "views": after.views.len(), "before": means(before), "after": means(after), "curve": curve,
+                    "views": after.views.len(), "before": of(before, of_held_out[0]),
+                    "after": of(after, of_held_out[1]), "curve": curve,
                 });
             }
             print_json(&object);
-            return Ok(());
+            return;
         }
-        println!("{out}: {count} Gaussians, {steps} steps in {seconds:.0} s");
+        println!("{}: {count} Gaussians, {steps} steps, {ended:.0} s", self.out.display());
         println!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM");
-        let row = |name: String, before: &CaptureScores, after: &CaptureScores| {
-            println!("{name:<24} {:>14.2} {:>8.2} {:>8.4}", before.psnr, after.psnr, after.ssim);
+        let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
+            println!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}");
         };
-        row(format!("{} photos", photos.len()), &before.shown, &after.shown);
-        if let (Some(before), Some(after)) = (&before.held_out, &after.held_out) {
-            row(format!("{} views held out", after.views.len()), before, after);
+        row(format!("{photos} photos, patches"), [before.psnr, after.psnr], after.ssim);
+        if let Some((before, after)) = held_out {
+            let (scored, all) = (after.views.len(), session.held_out().len());
+            let of_all = if scored < all { format!(" of {all}") } else { String::new() };
+            row(format!("{scored}{of_all} views held out"), [before.psnr, after.psnr], after.ssim);
         }
-        if let Some(line) = told_of(&corrected) {
+        if let [Some(before), Some(after)] = distances {
+            println!("LPIPS (VGG) {before:.4} before, {after:.4} after");
+        }
+        if let Some(line) = told_of(corrections) {
             println!("{line}");
         }
-        Ok(())
     }
 
-    /// Gaussians where the photos agree, those of a file, or what a model makes of the photos.
-    fn start(&self, capture: &Capture, photos: &[View]) -> Result<Start> {
-        if let Some(path) = &self.splat {
-            return Ok(Start::Gaussians(RawGaussians::of(&read_splat(path)?.gaussians)));
-        }
-        let needs_model = self.weights.is_some() || self.space != SpaceName::Gaussians;
-        if self.from == Some(From::Nothing) && needs_model {
-            let why = "--from nothing has neither weights nor tokens; --from weights has";
-            return Err(Error::Request(why.into()).into());
-        }
-        if self.from == Some(From::Weights) || needs_model {
-            let loaded = model::load(self.weights.as_deref(), Some(Precision::F32), Device::Cpu)?;
-            let data = &loaded.config.data;
-            let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-            let all: Vec<usize> = (0..photos.len()).collect();
-            let context = spread_over_path(&cameras, &all, self.views.unwrap_or(data.context_views))
-                .into_iter()
-                .map(|index| photos[index].fitted(data.image_size))
-                .collect::<globalsplat::Result<Vec<_>>>()?;
-            let made = reconstruct(&loaded, &context, &[])?;
-            return Ok(Start::Model(Box::new(loaded), made));
-        }
-        if photos.len() < 2 {
-            let why = "one photo tells no depth: two or more are expected, or a --splat";
-            return Err(Error::Request(why.into()).into());
-        }
-        Ok(Start::Gaussians(self.gaussians_of(capture, photos, None)?))
-    }
-
-    /// As many Gaussians as were asked for; of `known` ones, those that can be where they are.
-    fn gaussians_of(
-        &self,
-        capture: &Capture,
-        photos: &[View],
-        known: Option<&RawGaussians>,
-    ) -> Result<RawGaussians> {
-        let points = points_of(capture)?;
-        Ok(gaussians_from_photos(photos, &points, known, self.gaussians as usize, self.seed))
+    /// Refuses outputs that would replace what is read, but for the splat that is begun with.
+    fn check_outputs(&self, capture: &Capture) -> Result<()> {
+        let mut inputs = Inputs::default();
+        capture.add_inputs(&mut inputs);
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.for_each(|file| inputs.add(&file));
+        inputs.check_file(&self.out)?;
+        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add(splat));
+        Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 }
 
-/// The optimization, and how far it is.
-struct Work<'a> {
-    asked: &'a Refine,
-    capture: &'a Capture,
-    photos: &'a [View],
-    judge: &'a Judge,
-    config: &'a RefineConfig,
-    /// All in all, once it has begun.
-    seconds: f64,
-    stop: Arc<AtomicBool>,
-    bar: Progress,
-    done_steps: u64,
-    /// Without the time that scoring takes.
-    done_seconds: f64,
-    curve: Vec<Mark>,
+/// What the user or the system asks for by Ctrl-C or SIGTERM.
+#[derive(Clone, Default)]
+struct StopRequest {
+    is_requested: Arc<AtomicBool>,
+    ends_at_once: Arc<AtomicBool>,
 }
 
-/// What views held out scored on the way.
-#[derive(Serialize)]
-struct Mark {
-    seconds: f64,
-    steps: u64,
-    psnr: f64,
-    ssim: f64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    lpips_vgg: Option<f64>,
-}
-
-impl Work<'_> {
-    /// In one space, or in one after the other; photos are corrected with Gaussians alone. `first` are those of `start` in the
-    /// capture's world.
-    fn optimize(&mut self, start: &Start, first: &Gaussians) -> Result<(Gaussians, Corrections)> {
-        let asked = self.asked;
-        let end = match asked.space {
-            SpaceName::Gaussians => 0.,
-            SpaceName::Tokens => 1.,
-            SpaceName::Both => TOKENS_SHARE,
-        };
-        let (raw, done) = match start {
-            Start::Gaussians(raw) => (raw.shallow_clone(), 0.),
-            Start::Model(loaded, made) => {
-                let gaussians = if end > 0. {
-                    self.through_tokens(loaded, made, first, end)?
-                } else {
-                    first.map(Tensor::shallow_clone)
-                };
-                if end == 1. || self.stop.load(Ordering::Relaxed) {
-                    return Ok((gaussians, Corrections::none()));
-                }
-                (self.filled(&gaussians)?, end)
+impl StopRequest {
+    /// Listens from now on. The first request ends the process at once as long as nothing is there that could be kept, a second one at
+    /// any time: files appear whole or not at all.
+    fn install() -> Result<Self> {
+        let request = StopRequest::default();
+        request.set_ends_at_once(true);
+        let handler = request.clone();
+        ctrlc::set_handler(move || {
+            let is_second = handler.is_requested.swap(true, Ordering::Relaxed);
+            if is_second || handler.ends_at_once.load(Ordering::Relaxed) {
+                eprintln!("globalsplat: {}", if is_second { "stopped at once" } else { NOTHING_YET });
+                // SAFETY: ends the process. Destructors of libraries would wait for the threads that work.
+                unsafe { libc::_exit(FAILED.into()) }
             }
-        };
-        let depth = scene_depth(&raw.activate(), self.photos)?;
-        let mut space = GaussianSpace::new(&raw, depth, self.config);
-        let (count, config) = (self.photos.len(), self.config);
-        let mut corrections =
-            Corrections::new(count, asked.correct_poses, asked.correct_exposures, depth, config);
-        let poses: Vec<DMat4> = self.photos.iter().map(|view| view.camera.c2w).collect();
-        Ok((self.phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
-    }
-
-    /// What tokens become until `end` of the way. They know the normalized world alone.
-    fn through_tokens(
-        &mut self,
-        loaded: &LoadedModel,
-        made: &Reconstruction,
-        first: &Gaussians,
-        end: f64,
-    ) -> Result<Gaussians> {
-        let world = &made.world_from_normalized;
-        let poses: Vec<DMat4> = self.photos.iter().map(|view| world.pose_before(&view.camera.c2w)).collect();
-        let mut space = TokenSpace::new(&loaded.model, loaded.stage, &made.tokens, self.config);
-        let depth = scene_depth(first, self.photos)? / world.scale;
-        self.phase(&mut space, &mut Corrections::none(), &poses, depth, [0., end], Some(world))
-    }
-
-    /// As many Gaussians as are to be, at the least: those that are missing lie where the photos agree, and in place of those that
-    /// can't be where they are.
-    fn filled(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
-        let mut raw = RawGaussians::of(gaussians);
-        if self.photos.len() < 2 || gaussians.count() >= i64::from(self.asked.gaussians) {
-            return Ok(raw);
-        }
-        let clock = Instant::now();
-        // Spherical harmonics follow when they do for the others.
-        raw.sh = raw.sh.narrow(2, 0, 1);
-        let filled = self.asked.gaussians_of(self.capture, self.photos, Some(&raw))?;
-        let seconds = clock.elapsed().as_secs_f64();
-        self.done_seconds += seconds;
-        self.seconds = (self.seconds - seconds).max(LEAST_SECONDS);
-        Ok(filled)
-    }
-
-    /// The part of the way from `from` to `to`. `poses` are those of the photos in the world of `space`, `world` the way from there to
-    /// the capture's. The Gaussians are in the capture's world.
-    fn phase(
-        &mut self,
-        space: &mut dyn Space,
-        corrections: &mut Corrections,
-        poses: &[DMat4],
-        depth: f64,
-        [from, to]: [f64; 2],
-        world: Option<&Similarity>,
-    ) -> Result<Gaussians> {
-        let in_world = |gaussians: Gaussians| match world {
-            Some(world) => transform(&gaussians, world),
-            None => gaussians,
-        };
-        let budget = match self.asked.steps {
-            Some(steps) => Budget::Steps(((to - from) * steps as f64).round() as u64),
-            None => Budget::Time(Duration::from_secs_f64((to - from) * self.seconds)),
-        };
-        let photos = Photos::new(self.photos, poses, self.config.levels());
-        let task = Task { photos: &photos, depth, config: self.config, budget, seed: self.asked.seed };
-        let (steps, seconds) = (self.done_steps, self.done_seconds);
-        let mut marks = MARKS.iter().peekable();
-        let mut failure = None;
-        let gaussians = refine(space, corrections, &task, |at| {
-            self.done_steps = steps + at.step;
-            self.done_seconds = seconds + at.elapsed.as_secs_f64();
-            self.bar.set_position(((from + (to - from) * at.progress) * 1000.) as u64);
-            if marks.next_if(|&&mark| at.progress >= mark).is_some() {
-                failure = self.mark(&in_world(at.gaussians())).err();
-            }
-            failure.is_none() && !self.stop.load(Ordering::Relaxed)
         })?;
-        if let Some(error) = failure {
-            return Err(error.into());
+        Ok(request)
+    }
+
+    fn set_ends_at_once(&self, ends: bool) {
+        self.ends_at_once.store(ends, Ordering::Relaxed);
+    }
+
+    fn is_requested(&self) -> bool {
+        self.is_requested.load(Ordering::Relaxed)
+    }
+}
+
+/// The progress of a session.
+struct Bar {
+    bar: Progress,
+    budget: Budget,
+    clock: Instant,
+    /// Photos to be read.
+    count: usize,
+}
+
+fn bar_of(budget: &Budget) -> Progress {
+    match *budget {
+        Budget::Steps(steps) => progress::bar(steps, "steps"),
+        Budget::Time(time) => progress::seconds_of(time),
+    }
+}
+
+impl Bar {
+    fn tell(&self, event: RefineEvent) {
+        let message = match event {
+            RefineEvent::Loading(done) => format!("{done} of {} photos read", self.count),
+            RefineEvent::Starting(done) => format!("depths found in {done} photos"),
+            RefineEvent::Optimizing { steps, psnr } => match psnr {
+                Some(psnr) => format!("{steps} steps, held out {psnr:.2} dB"),
+                None => format!("{steps} steps"),
+            },
+        };
+        self.bar.set_message(message);
+        match (event, self.budget) {
+            (RefineEvent::Optimizing { steps, .. }, Budget::Steps(_)) => {
+                // The start says nothing of how fast steps are.
+                if self.bar.position() == 0 {
+                    self.bar.reset_eta();
+                }
+                self.bar.set_position(steps);
+            }
+            (_, Budget::Time(_)) => self.bar.set_position(self.clock.elapsed().as_secs()),
+            _ => {}
         }
-        let gaussians = in_world(gaussians);
-        self.mark(&gaussians)?;
-        Ok(gaussians)
+    }
+}
+
+/// Scores splats of a capture, until the user asks for an end.
+struct Scorer<'a> {
+    name: &'a str,
+    stop: &'a StopRequest,
+}
+
+impl Scorer<'_> {
+    /// Those of `views`, spread over all, that are scored in a share of the time.
+    fn affordable(&self, gaussians: &Gaussians, views: &[View], budget: Budget) -> Result<Vec<View>> {
+        let every = match budget {
+            Budget::Time(time) if !views.is_empty() => {
+                let begun = Instant::now();
+                self.score(gaussians, &views[..1])?;
+                let all = begun.elapsed() * views.len() as u32;
+                all.div_duration_f64(time.mul_f64(SCORING_SHARE)).ceil().max(1.) as usize
+            }
+            _ => 1,
+        };
+        Ok(views.iter().step_by(every).map(View::shallow_clone).collect())
     }
 
-    /// Scores the views held out.
-    fn mark(&mut self, gaussians: &Gaussians) -> globalsplat::Result<()> {
-        if let Some(scores) = self.judge.held_out_scores(gaussians)? {
-            self.keep(&scores);
+    fn score(&self, gaussians: &Gaussians, views: &[View]) -> Result<Option<CaptureScores>> {
+        let go_on = |_| !self.stop.is_requested();
+        let scores = score_views(self.name, gaussians, views, None, go_on)?;
+        Ok(scores.filter(|scores| scores.views.len() == views.len()))
+    }
+
+    /// LPIPS before and after: of the views held out, or else of a few photos. None where the user asks for an end.
+    fn lpips(
+        &self,
+        before: &Gaussians,
+        after: &Gaussians,
+        session: &RefineSession,
+    ) -> Result<Option<[CaptureScores; 2]>> {
+        let perceptual = Perceptual::find(Device::Cpu)?;
+        let views = match session.held_out() {
+            [] => &session.photos()[..session.photos().len().min(LPIPS_PHOTOS)],
+            views => views,
+        };
+        let score = |gaussians| {
+            let go_on = |_| !self.stop.is_requested();
+            score_views(self.name, gaussians, views, Some(&perceptual), go_on)
+        };
+        let (Some(before), Some(after)) = (score(before)?, score(after)?) else { return Ok(None) };
+        if let Some(line) = perceptual.why_absent(&after) {
+            eprintln!("{line}");
         }
-        Ok(())
-    }
-
-    /// What views held out score now.
-    fn keep(&mut self, scores: &CaptureScores) {
-        self.bar.set_message(format!("{} steps, held out {:.2} dB", self.done_steps, scores.psnr));
-        let (steps, seconds) = (self.done_steps, self.done_seconds);
-        let &CaptureScores { psnr, ssim, lpips_vgg, .. } = scores;
-        self.curve.push(Mark { seconds, steps, psnr, ssim, lpips_vgg });
+        Ok((before.views.len() == after.views.len()).then_some([before, after]))
     }
 }
 
-/// Scores splats of a capture.
-struct Judge {
-    name: String,
-    held_out: Vec<View>,
-    perceptual: Perceptual,
+/// Those of which the sheet has a row: held out, or else all.
+fn sheet_views<'a>(session: &'a RefineSession) -> &'a [View] {
+    if session.held_out().is_empty() { session.photos() } else { session.held_out() }
 }
 
-/// Of the photos shown, and of those held out, if any.
-#[derive(Clone)]
-struct Scores {
-    shown: CaptureScores,
-    held_out: Option<CaptureScores>,
-}
-
-impl Judge {
-    fn scores_of_both(&self, gaussians: &Gaussians, shown: &[View]) -> globalsplat::Result<Scores> {
-        Ok(Scores { shown: self.scores(gaussians, shown)?, held_out: self.held_out_scores(gaussians)? })
+fn sheet_of(gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<ContactSheet> {
+    let mut rows = ContactSheet::new(views.len());
+    for view in views {
+        rows.add(&view.image, &render_views(gaussians, &[view.camera])?[0])?;
     }
-
-    fn scores(&self, gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<CaptureScores> {
-        let pictures: Vec<_> = rendered(gaussians, views)?.into_iter().map(|rendered| rendered.rgb).collect();
-        judge_pictures(&self.name, &pictures, views, Some(gaussians.count()), &self.perceptual)
-    }
-
-    fn held_out_scores(&self, gaussians: &Gaussians) -> globalsplat::Result<Option<CaptureScores>> {
-        (!self.held_out.is_empty()).then(|| self.scores(gaussians, &self.held_out)).transpose()
-    }
+    Ok(rows)
 }
 
 /// What was learned of the photos, in one line, if anything was.
@@ -452,13 +498,4 @@ fn told_of(corrected: &[Correction]) -> Option<String> {
         largest(|of| of.depths)?,
         largest(factor)?,
     ))
-}
-
-fn means(scores: &CaptureScores) -> Value {
-    json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": scores.lpips_vgg })
-}
-
-fn rendered(gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<Vec<Rendered>> {
-    let cameras: Vec<_> = views.iter().map(|view| view.camera).collect();
-    render_views(gaussians, &cameras)
 }

@@ -1,8 +1,8 @@
 use super::print_json;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::eval::{read_evaluation, write_report};
-use globalsplat::io::check_writable_file;
+use globalsplat::eval::{evaluation_files, read_evaluation, write_report};
+use globalsplat::io::{Inputs, check_writable_file};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -26,11 +26,14 @@ pub struct Report {
 impl Report {
     pub fn run(self) -> Result<()> {
         check_writable_file(&self.out)?;
-        let mut evaluations = vec![];
+        let (mut evaluations, mut inputs) = (vec![], Inputs::default());
         for folder in self.folders {
             let evaluation = read_evaluation(&folder)?;
+            let scenes = evaluation.scenes.iter().map(|scene| &scene.scores.scene);
+            evaluation_files(&folder, scenes).iter().for_each(|file| inputs.add(file));
             evaluations.push((folder, evaluation));
         }
+        inputs.check_file(&self.out)?;
         write_report(&self.out, &evaluations)?;
         let bytes = std::fs::metadata(&self.out)?.len();
         if self.json {

@@ -5,7 +5,7 @@ use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
+    Inputs, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
@@ -82,6 +82,11 @@ impl Synth {
     fn write_videos(&self) -> Result<()> {
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
         check_writable_dir(&self.out)?;
+        let mut inputs = Inputs::default();
+        let on_walls = self.pictures.iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
+        on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
+        inputs.check_folder(&self.out)?;
+        self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
         let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
         let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
@@ -108,7 +113,11 @@ impl Synth {
                 if self.depth && !file.exists() {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
-                note(capture)
+                // A sheet shows pictures as they were made, not the JPEGs of a chunk.
+                match self.sheet.is_some() && number < SHEET.0 {
+                    true => note(&videos.capture(number)?),
+                    false => note(capture),
+                }
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
@@ -129,18 +138,21 @@ impl Synth {
                 note(&capture)?;
             }
         }
-        let chunks = writer.finish()?;
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
         index.write()?;
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &tile_vertically(&rows))?;
         }
+        // Last: a folder with the index of its chunks is finished, and nothing more is written there.
+        let chunks = writer.finish()?;
         bar.finish_and_clear();
         let (out, scenes) = (self.out.display(), self.scenes);
         if self.json {
-            print_json(
-                &json!({ "out": self.out, "scenes": scenes, "chunks": chunks, "index": index.file, "depth": self.depth.then_some(depths), "sheet": self.sheet }),
-            );
+            print_json(&json!({
+                "out": self.out.to_string_lossy(), "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
+                "depth": self.depth.then_some(depths.to_string_lossy()),
+                "sheet": self.sheet.as_deref().map(Path::to_string_lossy),
+            }));
         } else {
             println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
             if let Some(sheet) = &self.sheet {
@@ -163,7 +175,7 @@ impl Synth {
             let path = self.out.join(format!("room_{scene:03}"));
             let seed = self.seed.wrapping_mul(1_000_003).wrapping_add(scene);
             write_room(&path, seed, self.frames as usize, self.image_size())?;
-            captures.push(path);
+            captures.push(path.to_string_lossy().into_owned());
             bar.inc(1);
         }
         bar.finish_and_clear();

@@ -1,14 +1,15 @@
-use super::{memory, print_json, progress, ranks, stop_flag};
+use super::{memory, print_json, progress, ranks, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
-use globalsplat::data::{BadData, SceneGroups, TrainingScenes};
+use globalsplat::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::check_writable_dir;
+use globalsplat::io::{Inputs, check_writable_dir, weights_files};
 use globalsplat::loss::{Term, psnr_of_mse};
-use globalsplat::train::{Event, Outcome, Resume, Trainer, Validator, run};
+use globalsplat::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -40,7 +41,7 @@ pub struct Train {
     out: PathBuf,
     /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
-    resume: String,
+    resume: OsString,
     /// Weights to begin with, where RUN has no checkpoint, instead of fresh ones, of a model of the same shape, or of one with patches two, three
     /// or more times as wide, or with a half, a third or less of the scene tokens; all Gaussians are shown from the
     /// first step on
@@ -57,16 +58,19 @@ pub struct Train {
     json: bool,
 }
 
+/// Shows how the run went.
+const CURVES_FILE: &str = "curves.svg";
+
 impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
         let (is_first, count) = (group.is_first(), group.ranks());
         let config = Config::read(&self.config, &self.set)?;
         memory::keep_for(&config.train);
-        let resume = match self.resume.as_str() {
-            "auto" => Resume::Auto,
-            "never" => Resume::Never,
-            path => Resume::From(path.into()),
+        let resume = match self.resume.to_str() {
+            Some("auto") => Resume::Auto,
+            Some("never") => Resume::Never,
+            _ => Resume::From(self.resume.clone().into()),
         };
         let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths()?)?);
         if scenes.sizes().is_empty() {
@@ -80,6 +84,7 @@ impl Train {
         }
         if is_first {
             check_writable_dir(&self.out)?;
+            self.check_outputs(&config, &scenes)?;
         }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
         if let ([first, others @ ..], true) = (held_out.trained_on(), is_first) {
@@ -88,6 +93,8 @@ impl Train {
                 "{first}{more} of data.validation is trained on, too: its score tells nothing of unseen scenes"
             );
         }
+        let captures = scenes.captures().iter().flat_map(Capture::warnings);
+        warn_of_many(scenes.warnings().iter().chain(captures).chain(held_out.warnings()));
         let mut trainer = Trainer::new(&config, scenes, device)?;
         if let Some(weights) = &self.from {
             trainer = trainer.with_weights(weights);
@@ -124,6 +131,19 @@ impl Train {
             anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
         }
         self.report(&outcome, seconds, held_out.scores(), &bad_data)
+    }
+
+    /// Refuses a folder whose files would replace what is read. The configuration may be the run's own, of which the same is left.
+    fn check_outputs(&self, config: &Config, scenes: &TrainingScenes) -> Result<()> {
+        let mut inputs = Inputs::default();
+        scenes.add_inputs(&self.out, &mut inputs);
+        for path in config.data.validation_paths()? {
+            Dataset::open(&path, Split::Test)?.add_inputs(&self.out, &mut inputs);
+        }
+        self.from.iter().flat_map(|path| weights_files(path)).for_each(|file| inputs.add(&file));
+        inputs.check_folder(&self.out)?;
+        let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
+        Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)
     }
 
     fn train(
@@ -190,12 +210,12 @@ impl Train {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
-        let curves = self.out.join("curves.svg");
+        let curves = self.out.join(CURVES_FILE);
         write_curves(&curves, &self.out, (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr)))?;
         if self.json {
             let mut object = json!({
-                "checkpoint": outcome.checkpoint,
-                "curves": curves,
+                "checkpoint": outcome.checkpoint.to_string_lossy(),
+                "curves": curves.to_string_lossy(),
                 "seconds": seconds,
                 "skipped_steps": outcome.skipped,
                 "skipped_scenes": bad_data,

@@ -5,7 +5,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::Error;
 use globalsplat::config::Config;
-use globalsplat::io::{check_writable_file, write_sharded};
+use globalsplat::io::{Inputs, check_writable_file, shard_index, write_sharded};
 use globalsplat::model::Stage;
 use globalsplat::reconstruct::{ModelDtype, model_weights, save_checkpoint};
 use serde_json::{Value, json};
@@ -46,12 +46,22 @@ pub enum Format {
 }
 
 impl WeightsOut {
-    pub fn check(&self, format: Format) -> Result<()> {
+    /// Refuses, before the work, what could not be written after it, and what would replace one of `inputs`.
+    pub fn check(&self, format: Format, inputs: &Inputs) -> Result<()> {
         if format == Format::Torch && self.max_shard_size.is_some() {
             let why = "--max-shard-size: a checkpoint for torch is one file, expected --format safetensors";
             return Err(Error::Request(why.into()).into());
         }
-        Ok(check_writable_file(&self.out)?)
+        check_writable_file(&self.out)?;
+        inputs.check_file(&self.out)?;
+        // Shards have numbers in their names.
+        let Some(index) = shard_index(&self.out) else { return Ok(()) };
+        let stem = format!("{}-", self.out.file_stem().unwrap_or_default().to_string_lossy());
+        let beside = index.parent().and_then(|folder| folder.read_dir().ok());
+        let beside = beside.into_iter().flatten().flatten();
+        let shards = beside.filter(|file| file.file_name().to_string_lossy().starts_with(&stem));
+        let mut shards = shards.map(|file| file.path()).chain([index.clone()]);
+        Ok(shards.try_for_each(|file| inputs.check_file(&file))?)
     }
 
     /// Writes the variables of `vs` and tells it; JSON gets the entries of `more`, too, and people `note`.
@@ -82,8 +92,7 @@ impl WeightsOut {
         let bytes = if written == self.out { std::fs::metadata(&written)?.len() } else { bytes as u64 };
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
         if self.json {
-            let mut told =
-                json!({ "weights": written, "parameters": parameters, "bytes": bytes, "stage": stage });
+            let mut told = json!({ "weights": written.to_string_lossy(), "parameters": parameters, "bytes": bytes, "stage": stage });
             for (key, value) in more.as_object().into_iter().flatten() {
                 told[key] = value.clone();
             }

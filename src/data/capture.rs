@@ -1,10 +1,12 @@
 //! A capture: what every format on disk is read into.
 
+use super::holdout::Holdout;
 use super::pixels::{Distortion, Lens, Planes, fit, looked_at, undistort};
 use crate::error::{Error, Result};
-use crate::io;
-use crate::scene::{Camera, ImageSize, check_pose};
+use crate::io::{self, Inputs};
+use crate::scene::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::synth::Video;
+use glam::DMat4;
 use image::RgbImage;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -60,13 +62,92 @@ impl Photo {
     }
 }
 
+/// Memory for photos that are decoded at the same time, which are small once they are fitted to a model.
+const DECODED_BYTES: u64 = 1 << 30;
+/// What decoding takes: the decoder's pixels and those without distortion, in 8 bits.
+const DECODED_BYTES_PER_PIXEL: u64 = 8;
+
 /// Posed photos of one scene. The images are read when they are loaded.
 #[derive(Debug, Clone)]
 pub struct Capture {
     /// The folder's name, or the key in a chunk.
     pub name: String,
     file: PathBuf,
+    /// Those of its own test part last.
     frames: Vec<Frame>,
+    /// Of `frames`, those to learn from.
+    train: usize,
+    is_complete: bool,
+    warnings: Vec<String>,
+}
+
+/// What a format's reader leaves out or changes.
+#[derive(Debug, Default)]
+pub(super) struct Changes {
+    /// Names of photos that aren't there.
+    pub absent: Vec<String>,
+    /// Names of photos whose pose was a rotation times a factor, and the factor, which was taken out.
+    pub scaled: Vec<(String, f64)>,
+    /// Other changes, a line each.
+    pub lines: Vec<String>,
+}
+
+impl Changes {
+    /// Refuses a capture of `present` photos that lacks so many that nothing can be made of the others.
+    ///
+    /// # Errors
+    /// Fewer than two, where `purpose` needs photos.
+    pub fn check(&self, file: &Path, present: usize, purpose: Purpose) -> Result<()> {
+        match (self.absent.first(), purpose) {
+            (Some(name), Purpose::Photos) if present < FEWEST_VIEWS => {
+                let found = format!("{present} of {}, {name:?} is not there", present + self.absent.len());
+                Err(Error::input(file, "the number of frames with an image", found, "two or more"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Takes the scale out of `c2w`, the pose of photo `name`, if it is a rotation times a factor, and else leaves it as it is.
+    pub fn unscaled(&mut self, name: &str, c2w: DMat4) -> DMat4 {
+        match nearest_rigid_of_scaled(&c2w) {
+            Ok((rigid, scale)) if check_pose(&c2w).is_err() => {
+                self.scaled.push((name.to_string(), scale));
+                rigid
+            }
+            _ => c2w,
+        }
+    }
+
+    /// A line for each kind of change to what `file` describes, of which `present` photos are left.
+    fn into_lines(self, file: &Path, present: usize) -> Vec<String> {
+        let file = file.display();
+        let mut lines = vec![];
+        if !self.absent.is_empty() {
+            let (count, all) = (self.absent.len(), present + self.absent.len());
+            let names = listed(self.absent.iter().map(String::as_str));
+            lines.push(format!("{file}: {count} of {all} photos are not there and left out: {names}"));
+        }
+        if let Some((_, factor)) = self.scaled.first() {
+            let names = listed(self.scaled.iter().map(|(name, _)| name.as_str()));
+            lines.push(format!(
+                "{file}: {} of {present} rotations are scaled, the first by {factor:.6}, which is taken out: {names}",
+                self.scaled.len()
+            ));
+        }
+        lines.extend(self.lines.into_iter().map(|line| format!("{file}: {line}")));
+        lines
+    }
+}
+
+/// Views that a scene can be made of.
+const FEWEST_VIEWS: usize = 2;
+
+/// The first few of `names`, and how many more there are.
+pub(super) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+    const SHOWN: usize = 3;
+    let more = names.len().saturating_sub(SHOWN);
+    let shown = names.take(SHOWN).collect::<Vec<_>>().join(", ");
+    if more == 0 { shown } else { format!("{shown} and {more} more") }
 }
 
 /// A photo and where it was taken from.
@@ -122,17 +203,78 @@ impl Purpose {
 }
 
 impl Capture {
-    /// Checks what every format has to hold: two views, or one camera of a path, rigid poses, sensible intrinsics.
-    pub(super) fn new(name: String, file: PathBuf, frames: Vec<Frame>, purpose: Purpose) -> Result<Self> {
+    /// Checks what every format has to hold: two views, or one camera of a path, rigid poses, sensible intrinsics. Where a photo is
+    /// smaller or larger than `frames` say, and of the same aspect, its intrinsics are scaled. `changes` are what the format's
+    /// reader left out or changed.
+    pub(super) fn new(
+        name: String,
+        file: PathBuf,
+        mut frames: Vec<Frame>,
+        changes: Changes,
+        purpose: Purpose,
+    ) -> Result<Self> {
         let (least, expected) = match purpose {
-            Purpose::Photos => (2, "two or more"),
+            Purpose::Photos => (FEWEST_VIEWS, "two or more"),
             Purpose::Cameras(_) => (1, "one or more"),
         };
+        changes.check(&file, frames.len(), purpose)?;
         if frames.len() < least {
             return Err(Error::input(&file, "the number of views", frames.len(), expected));
         }
-        check_cameras(&file, frames.iter().map(|frame| &frame.camera))?;
-        Ok(Capture { name, file, frames })
+        let is_complete = changes.absent.is_empty();
+        let warnings = check_frames(&file, &mut frames, changes, purpose)?;
+        let train = frames.len();
+        Ok(Capture { name, file, frames, train, is_complete, warnings })
+    }
+
+    /// Adds `frames`, which `file` describes, as those that are held out unless another split is asked for.
+    pub(super) fn with_test(
+        mut self,
+        file: &Path,
+        mut frames: Vec<Frame>,
+        changes: Changes,
+        purpose: Purpose,
+    ) -> Result<Self> {
+        self.is_complete &= changes.absent.is_empty();
+        self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
+        self.frames.append(&mut frames);
+        Ok(self)
+    }
+
+    /// Adds `lines` before the other warnings.
+    pub(super) fn with_warnings(mut self, mut lines: Vec<String>) -> Self {
+        lines.append(&mut self.warnings);
+        self.warnings = lines;
+        self
+    }
+
+    /// Returns what was left out or changed when the capture was opened, a line for each kind, with counts and names.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// Returns whether every photo that the capture names is there, so that the positions of its views are its author's.
+    pub fn is_complete(&self) -> bool {
+        self.is_complete
+    }
+
+    /// Returns the positions of the views to show and of those to hold out. [`Holdout::None`] holds out the capture's own test part,
+    /// if it has one; any other split is made of the remaining views alone, and leaves that part aside.
+    pub fn split(&self, holdout: Holdout) -> (Vec<usize>, Vec<usize>) {
+        match holdout {
+            Holdout::None => (0..self.len()).partition(|&view| view < self.train),
+            Holdout::Every { .. } => holdout.split(self.train),
+        }
+    }
+
+    /// Returns whether the capture itself says which views are to be held out.
+    pub fn has_test_part(&self) -> bool {
+        self.train < self.len()
+    }
+
+    /// Returns the positions of the views that pictures from elsewhere are scored at: the capture's own test part, else all.
+    pub fn scored_views(&self) -> Vec<usize> {
+        if self.has_test_part() { (self.train..self.len()).collect() } else { (0..self.len()).collect() }
     }
 
     /// Number of views.
@@ -170,18 +312,32 @@ impl Capture {
     /// that all of them share. Each is another one: where endings alone tell photos apart they are part of the name, and where
     /// nothing does, numbers stand for the names.
     pub fn picture_names(&self) -> Vec<String> {
-        picture_names(&self.names().collect::<Vec<_>>())
+        self.picture_names_with(&[""])
     }
 
-    /// Whether `path` is a photo of the capture.
-    pub fn has_photo(&self, path: &Path) -> bool {
-        let is_same = |photo: &Path| photo.canonicalize().ok() == path.canonicalize().ok();
-        let name = path.file_name();
-        path.is_file()
-            && self.frames.iter().any(|frame| match &frame.photo {
-                Photo::File(photo) => photo.file_name() == name && is_same(photo),
-                Photo::Part { .. } | Photo::Made { .. } => false,
-            })
+    /// Returns [`Capture::picture_names`] for several pictures of each view, whose names end in `suffixes`: no two of all these are
+    /// the same, either.
+    pub fn picture_names_with(&self, suffixes: &[&str]) -> Vec<String> {
+        picture_names(&self.names().collect::<Vec<_>>(), suffixes)
+    }
+
+    /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
+    pub fn add_inputs(&self, inputs: &mut Inputs) {
+        let described = described_in(&self.file);
+        inputs.add(&described);
+        // A COLMAP model is in several files.
+        let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
+        let siblings = form.and_then(|_| std::fs::read_dir(described.parent()?).ok());
+        for sibling in siblings.into_iter().flatten().flatten() {
+            if Path::new(&sibling.file_name()).extension() == form {
+                inputs.add(&sibling.path());
+            }
+        }
+        for frame in &self.frames {
+            if let Photo::File(photo) = &frame.photo {
+                inputs.add_photo(photo);
+            }
+        }
     }
 
     /// Reads the views of `indices`, fitted to `size`, or as they are.
@@ -190,12 +346,22 @@ impl Capture {
     /// An image that is missing, can't be decoded, or has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
         let lens = self.shared_lens(indices, size);
-        let views: Vec<_> = indices
-            .par_iter()
-            .map(|&index| self.load_view(&self.frames[index], size, lens.as_ref()))
-            .collect();
-        // Of several that can't be read the first one is told.
-        views.into_iter().collect()
+        let pixels = |&index: &usize| {
+            let Camera { width, height, .. } = self.frames[index].camera;
+            u64::from(width) * u64::from(height)
+        };
+        let largest = indices.iter().map(pixels).max().unwrap_or(0).max(1);
+        let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
+        let mut views = vec![];
+        for indices in indices.chunks(at_once) {
+            let load = |&index: &usize| self.load_view(&self.frames[index], size, lens.as_ref());
+            let loaded: Vec<_> = indices.par_iter().map(load).collect();
+            // Of several that can't be read the first one is told.
+            for view in loaded {
+                views.push(view?);
+            }
+        }
+        Ok(views)
     }
 
     /// [`Capture::load`] of every view.
@@ -215,6 +381,23 @@ impl Capture {
             && *distortion != Distortion::default()
             && u64::from(camera.width) * u64::from(camera.height) <= MOST_PIXELS;
         is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
+    }
+
+    /// Computes the CRC-32 of what views `indices` are: their photos' files, as they are, and their cameras. Made-up photos are told
+    /// apart by their cameras alone.
+    ///
+    /// # Errors
+    /// A photo that can't be read.
+    pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
+        let mut hasher = crc32fast::Hasher::new();
+        for index in indices {
+            let Frame { photo, camera, distortion, .. } = &self.frames[index];
+            hasher.update(format!("{camera:?}{distortion:?}").as_bytes());
+            if !matches!(photo, Photo::Made { .. }) {
+                hasher.update(&photo.read()?);
+            }
+        }
+        Ok(hasher.finalize())
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<View> {
@@ -281,7 +464,80 @@ impl Capture {
     }
 }
 
-fn picture_names(names: &[&str]) -> Vec<String> {
+/// The file in `path`, which may have the key of one of its scenes after a `#`.
+fn described_in(path: &Path) -> PathBuf {
+    let text = path.to_string_lossy();
+    let prefixes = text.match_indices('#').rev().map(|(at, _)| PathBuf::from(&text[..at]));
+    std::iter::once(path.to_owned()).chain(prefixes).find(|file| file.is_file()).unwrap_or_default()
+}
+
+/// Checks the cameras of `frames`, which `file` describes, fits them to their photos, and returns a line for each kind of change.
+fn check_frames(
+    file: &Path,
+    frames: &mut [Frame],
+    changes: Changes,
+    purpose: Purpose,
+) -> Result<Vec<String>> {
+    check_cameras(file, frames.iter().map(|frame| &frame.camera))?;
+    let mut lines = changes.into_lines(file, frames.len());
+    if matches!(purpose, Purpose::Photos) {
+        lines.extend(fit_cameras_to_photos(file, frames));
+    }
+    Ok(lines)
+}
+
+/// Scales the intrinsics of `frames` to photos that are of another size than `file` says and agree with its aspect, and says so in
+/// a line. What a photo says of itself is found when it is loaded.
+fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
+    let scaled = |frame: &Frame| match &frame.photo {
+        Photo::File(path) => scaled_to(&frame.camera, io::read_image_size(path).ok()?),
+        Photo::Part { .. } | Photo::Made { .. } => None,
+    };
+    let scaled: Vec<_> = frames.par_iter().map(scaled).collect();
+    let count = frames.len();
+    let mut names = vec![];
+    let mut first = None;
+    for (frame, camera) in frames.iter_mut().zip(scaled) {
+        let Some(camera) = camera else { continue };
+        first.get_or_insert((frame.camera, camera));
+        frame.camera = camera;
+        names.push(frame.name.as_str());
+    }
+    let (said, found) = first?;
+    Some(format!(
+        "{}: {} of {count} photos have another size than it says, the first {}×{} pixels in place of {}×{}: their intrinsics \
+         are scaled: {}",
+        file.display(),
+        names.len(),
+        found.width,
+        found.height,
+        said.width,
+        said.height,
+        listed(names.into_iter())
+    ))
+}
+
+/// Returns `camera` at the size of a photo, (width, height), if that is another one and of the same aspect up to a pixel of the
+/// smaller. A photo that lies on its side may be turned when it is loaded.
+fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
+    let said = (camera.width, camera.height);
+    let choices = [(width, height), (height, width)];
+    if choices.contains(&said) {
+        return None;
+    }
+    let shares = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
+    let agrees = |&(width, height): &(u32, u32)| {
+        let (x, y) = (shares(width, said.0), shares(height, said.1));
+        let is_one_way = (width <= said.0) == (height <= said.1) || x == 1. || y == 1.;
+        let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
+        is_one_way && (x - y).abs() <= pixel(width, said.0) + pixel(height, said.1)
+    };
+    let (width, height) = choices.into_iter().find(agrees)?;
+    let (x, y) = (f64::from(width) / f64::from(said.0), f64::from(height) / f64::from(said.1));
+    Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
+}
+
+fn picture_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
     let plain = |part: Component| match part {
         Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
         Component::ParentDir => Some("up".to_string()),
@@ -299,7 +555,11 @@ fn picture_names(names: &[&str]) -> Vec<String> {
     let stem = |path: &Vec<String>| Path::new(&below(path)).with_extension("").to_string_lossy().into_owned();
     let numbered = |index: usize| format!("{index:06}");
     let choices: [Vec<String>; 2] = [paths.iter().map(stem).collect(), paths.iter().map(below).collect()];
-    let is_unique = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
+    let is_unique = |names: &Vec<String>| {
+        let files =
+            names.iter().flat_map(|name| suffixes.iter().map(move |suffix| format!("{name}{suffix}")));
+        files.collect::<BTreeSet<_>>().len() == names.len() * suffixes.len()
+    };
     choices.into_iter().find(is_unique).unwrap_or_else(|| (0..names.len()).map(numbered).collect())
 }
 
@@ -319,7 +579,38 @@ pub(super) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a C
 
 #[cfg(test)]
 mod tests {
-    use super::picture_names;
+    use super::{picture_names as names_with, scaled_to};
+    use crate::scene::{Camera, Intrinsics};
+    use glam::DMat4;
+
+    fn picture_names(names: &[&str]) -> Vec<String> {
+        names_with(names, &[""])
+    }
+
+    #[test]
+    fn pictures_of_several_kinds_have_names_of_their_own() {
+        let suffixes = ["", "_depth"];
+        assert_eq!(names_with(&["x.png", "y.png"], &suffixes), ["x", "y"]);
+        assert_eq!(names_with(&["x.png", "x_depth.png"], &suffixes), ["x.png", "x_depth.png"]);
+        assert_eq!(names_with(&["x", "x_depth"], &suffixes), ["000000", "000001"]);
+    }
+
+    #[test]
+    fn cameras_are_scaled_where_the_aspect_agrees_to_a_pixel() {
+        let intrinsics = Intrinsics { fx: 500., fy: 510., cx: 250., cy: 180. };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 519, height: 339 };
+        let size = |photo| scaled_to(&camera, photo).map(|camera| (camera.width, camera.height));
+        for photo in [(519, 339), (339, 519), (519, 300), (260, 180), (600, 339), (64, 64), (1038, 600)] {
+            assert_eq!(size(photo), None, "{photo:?}");
+        }
+        // Halves and eighths, cut or rounded; twice as large; one row more; on its side.
+        for photo in [(259, 169), (260, 170), (64, 42), (65, 42), (1038, 678), (1037, 678), (519, 340)] {
+            assert_eq!(size(photo), Some(photo), "{photo:?}");
+        }
+        assert_eq!(size((170, 260)), Some((260, 170)));
+        let half = scaled_to(&Camera { width: 512, height: 340, ..camera }, (256, 170)).unwrap();
+        assert_eq!(half.intrinsics, Intrinsics { fx: 250., fy: 255., cx: 125., cy: 90. });
+    }
 
     #[test]
     fn pictures_are_named_as_photos_and_none_twice() {

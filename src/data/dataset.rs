@@ -1,9 +1,12 @@
 //! Data sets: many captures under one name (spec 10.8).
 
 use super::capture::Capture;
-use super::formats::{Chunk, INDEX_FILE, capture_folders, folder_name, open_capture};
+use super::formats::{
+    CaptureFolders, Chunk, INDEX_FILE, capture_folders, folder_name, is_capture, open_capture,
+};
 use super::made_up::MadeUp;
 use crate::error::{Error, Result};
+use crate::io::{Inputs, read_text};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -60,6 +63,8 @@ pub struct Dataset {
     /// The folder's name.
     pub name: String,
     groups: Vec<SceneGroup>,
+    warnings: Vec<String>,
+    made_by: Option<String>,
 }
 
 /// A group in memory, images still encoded.
@@ -81,24 +86,45 @@ impl Dataset {
     /// are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = MadeUp::named(root)? {
-            return Ok(Dataset { name: root.to_string_lossy().into_owned(), groups: made_up_groups(videos) });
+            let made_by = Some(videos.made_by());
+            let name = root.to_string_lossy().into_owned();
+            return Ok(Dataset { name, groups: made_up_groups(videos), warnings: vec![], made_by });
         }
         let name = folder_name(root);
         let indexed =
             [root.to_owned(), root.join(split.folder())].into_iter().find(|f| f.join(INDEX_FILE).is_file());
-        let groups = match indexed {
-            Some(folder) => chunk_groups(&folder)?,
+        let (groups, warnings) = match indexed {
+            Some(folder) => (chunk_groups(&folder)?, vec![]),
             None => {
-                let part = Some(root.join(split.folder())).filter(|folder| folder.is_dir());
+                // A capture may have its photos in a folder of that name.
+                let part =
+                    Some(root.join(split.folder())).filter(|folder| folder.is_dir() && !is_capture(root));
                 capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
             }
         };
-        Ok(Dataset { name, groups })
+        Ok(Dataset { name, groups, warnings, made_by: None })
+    }
+
+    /// Returns a line for each folder that couldn't be looked into.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// Every group, in the order of their paths.
     pub fn groups(&self) -> &[SceneGroup] {
         &self.groups
+    }
+
+    /// Returns what made-up videos depend on beside their name: the program's version, and pictures that are seen in them. Of other
+    /// data sets it is nothing.
+    pub fn made_by(&self) -> Option<&str> {
+        self.made_by.as_deref()
+    }
+
+    /// Adds the files that the data set is read from to `inputs`, as far as what is written below the folder `output` could be one
+    /// of them.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        self.groups.iter().for_each(|group| group.add_inputs(output, inputs));
     }
 
     /// The number of scenes.
@@ -117,6 +143,27 @@ impl SceneGroup {
             Source::Chunk => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
             Source::Folder => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
             Source::MadeUp(videos, index) => Ok(OpenGroup::Capture(Box::new(videos.capture(*index)?))),
+        }
+    }
+
+    /// Adds the files that the group is read from to `inputs`, as far as what is written below the folder `output` could be one of
+    /// them. A capture that can't be opened has none: whoever opens it says so.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        let resolved = |path: &Path| path.canonicalize().unwrap_or(path.to_owned());
+        match &self.source {
+            Source::Chunk => {
+                inputs.add(&self.path);
+                inputs.add(&self.path.with_file_name(INDEX_FILE));
+            }
+            Source::Folder => {
+                let (folder, output) = (resolved(&self.path), resolved(output));
+                if (folder.starts_with(&output) || output.starts_with(&folder))
+                    && let Ok(capture) = open_capture(&self.path)
+                {
+                    capture.add_inputs(inputs);
+                }
+            }
+            Source::MadeUp(..) => {}
         }
     }
 
@@ -146,8 +193,7 @@ impl OpenGroup {
 
 fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
     let file = folder.join(INDEX_FILE);
-    let text = std::fs::read(&file).map_err(Error::read(&file))?;
-    let index: BTreeMap<String, String> = serde_json::from_slice(&text).map_err(|e| {
+    let index: BTreeMap<String, String> = serde_json::from_str(&read_text(&file)?).map_err(|e| {
         Error::input(&file, "the index", format!("unusable ({e})"), "{scene: chunk's file name}")
     })?;
     let mut chunks: BTreeMap<String, Vec<String>> = BTreeMap::new();
@@ -177,9 +223,9 @@ fn made_up_groups(videos: MadeUp) -> Vec<SceneGroup> {
     videos.keys().into_iter().enumerate().map(group).collect()
 }
 
-/// Of the captures in `root` those that aren't in `except`.
-fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
-    let mut folders = capture_folders(root)?;
+/// Of the captures in `root` those that aren't in `except`, and what couldn't be looked into.
+fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<String>)> {
+    let CaptureFolders { mut folders, warnings } = capture_folders(root)?;
     folders.retain(|folder| !folder.starts_with(except));
     if folders.is_empty() {
         let found = format!("without captures but those in {}", except.display());
@@ -195,5 +241,5 @@ fn capture_groups(root: &Path, except: &Path) -> Result<Vec<SceneGroup>> {
     };
     let keys: Vec<String> = folders.iter().zip(&names).map(|(folder, name)| key(folder, name)).collect();
     let group = |(path, key)| SceneGroup { path, source: Source::Folder, keys: vec![key] };
-    Ok(folders.into_iter().zip(keys).map(group).collect())
+    Ok((folders.into_iter().zip(keys).map(group).collect(), warnings))
 }

@@ -1,9 +1,9 @@
 //! Made-up videos, named where a data set is named: `synth:seed=1,scenes=10000`.
 
-use super::capture::{Capture, Frame, Photo, Purpose};
+use super::capture::{Capture, Changes, Frame, Photo, Purpose};
 use super::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, read_image};
+use crate::io::{PHOTO_EXTENSIONS, checksum, read_image};
 use crate::scene::ImageSize;
 use crate::synth::{Texture, Video, VideoSettings};
 use std::collections::BTreeSet;
@@ -25,6 +25,8 @@ pub struct MadeUp {
     first: u64,
     scenes: u64,
     settings: VideoSettings,
+    /// Of the files of pictures that are seen on things, if there are some.
+    pictures_checksum: Option<u32>,
 }
 
 impl MadeUp {
@@ -43,7 +45,7 @@ impl MadeUp {
     /// `scenes` videos of `seed`, from number `first` on.
     pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> MadeUp {
         let name = format!("{}seed={seed},first={first},scenes={scenes}", Self::PREFIX);
-        MadeUp { name, seed, first, scenes, settings }
+        MadeUp { name, seed, first, scenes, settings, pictures_checksum: None }
     }
 
     /// What `path` names, if it is no path but made-up videos.
@@ -56,7 +58,7 @@ impl MadeUp {
         };
         let refuse = |field: &str, found: &str| Error::input(path, field, found, EXPECTED);
         let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, None, 0, 24, 128);
-        let mut pictures = vec![];
+        let (mut pictures, mut pictures_checksum) = (vec![], None);
         let mut said = BTreeSet::new();
         for field in fields.split(',') {
             let (name, value) = field.split_once('=').unwrap_or((field, ""));
@@ -71,7 +73,10 @@ impl MadeUp {
                 "frames" => frames = number()?,
                 "size" => size = number()?,
                 "pictures" if value.is_empty() => return Err(refuse(name, "nothing")),
-                "pictures" => pictures = read_pictures(Path::new(value))?,
+                "pictures" => {
+                    pictures = read_pictures(Path::new(value))?;
+                    pictures_checksum = Some(checksum(picture_files(Path::new(value))?)?);
+                }
                 _ => return Err(refuse("a field", &format!("{name:?}"))),
             }
         }
@@ -89,7 +94,14 @@ impl MadeUp {
         }
         let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
         let settings = VideoSettings { frames, size, pictures };
-        Ok(Some(MadeUp { name: path.to_string_lossy().into_owned(), seed, first, scenes, settings }))
+        let name = path.to_string_lossy().into_owned();
+        Ok(Some(MadeUp { name, seed, first, scenes, settings, pictures_checksum }))
+    }
+
+    /// Returns what the videos depend on beside their name.
+    pub(super) fn made_by(&self) -> String {
+        let pictures = self.pictures_checksum.map(|checksum| format!(", pictures {checksum:08x}"));
+        format!("globalsplat {}{}", env!("CARGO_PKG_VERSION"), pictures.unwrap_or_default())
     }
 
     /// Names of the scenes.
@@ -116,7 +128,8 @@ impl MadeUp {
             distortion: Distortion::default(),
         };
         let frames = video.cameras().iter().enumerate().map(frame).collect();
-        Capture::new(self.key(number), PathBuf::from(&self.name), frames, Purpose::Photos)
+        let file = PathBuf::from(&self.name);
+        Capture::new(self.key(number), file, frames, Changes::default(), Purpose::Photos)
     }
 }
 
@@ -125,6 +138,12 @@ impl MadeUp {
 /// # Errors
 /// No folder, none in it, or one that can't be read.
 pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
+    let files = picture_files(folder)?;
+    files.iter().map(|file| Ok(Arc::new(Texture::of_picture(&read_image(file)?)))).collect()
+}
+
+/// Lists the pictures in `folder`, one at least, by their names.
+fn picture_files(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(Error::read(folder))?;
     let mut files = vec![];
     for entry in entries {
@@ -138,5 +157,5 @@ pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
         return Err(Error::input(folder, "the pictures", "none", "PNG or JPEG files"));
     }
     files.sort();
-    files.iter().map(|file| Ok(Arc::new(Texture::of_picture(&read_image(file)?)))).collect()
+    Ok(files)
 }

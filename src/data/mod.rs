@@ -18,7 +18,7 @@ pub use capture::{Capture, View};
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use formats::{
-    CameraPath, Chunk, ChunkWriter, INDEX_FILE, Point, find_captures, open_capture, points_of,
+    CameraPath, Chunk, ChunkWriter, FoundCaptures, INDEX_FILE, Point, find_captures, open_capture, points_of,
     read_camera_path, write_cameras_json,
 };
 pub use holdout::Holdout;

@@ -2,7 +2,7 @@
 
 use super::formats::write_cameras_json;
 use crate::error::{Error, Result};
-use crate::io::{Splat, replace_dir, write_png, write_splat};
+use crate::io::{Splat, lock_parent, replace_dir, write_png, write_splat};
 use crate::render::render_views;
 use crate::scene::ImageSize;
 use crate::synth::Room;
@@ -40,6 +40,7 @@ fn photo_name(index: usize) -> String {
 
 /// That nothing is at `path`, or a room and nothing else.
 fn check_free(path: &Path) -> Result<()> {
+    let _swapping = lock_parent(path);
     if !path.exists() {
         return Ok(());
     }

@@ -86,6 +86,9 @@ pub struct SceneScores {
     /// Size of the splat as a PLY, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub splat_bytes: Option<u64>,
+    /// What was left out of the splat's file, a sentence each.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
     /// Of the forward pass, or passes, where a model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_seconds: Option<f64>,

@@ -1,26 +1,29 @@
 //! What a splat loses on its way into another file: both drawn from the same cameras.
 
+use super::metrics::squared_error;
 use crate::error::Result;
+use crate::io::Splat;
 use crate::loss::psnr_of_mse;
-use crate::render::render_views;
-use crate::scene::{Camera, Gaussians};
-use tch::Kind;
+use crate::render::SplatRenderer;
+use crate::scene::Camera;
 
 /// PSNR in dB of what `cameras` see of `copy` against what they see of `original`, of the mean squared error over all pixels;
 /// none where these are the same.
 ///
 /// # Errors
 /// Those of rendering.
-pub fn psnr_between(original: &Gaussians, copy: &Gaussians, cameras: &[Camera]) -> Result<Option<f64>> {
+pub fn psnr_between(original: &Splat, copy: &Splat, cameras: &[Camera]) -> Result<Option<f64>> {
+    let frame = original.frame();
+    let [original, copy] =
+        [original, copy].map(|splat| SplatRenderer::new(&splat.gaussians, splat.origin, frame));
     let (mut sum, mut numbers) = (0., 0);
     for camera in cameras {
-        let seen = |gaussians| -> Result<_> {
-            let rgb = render_views(gaussians, std::slice::from_ref(camera))?.remove(0).rgb;
-            Ok(rgb.to_kind(Kind::Double).clamp(0., 1.))
+        let seen = |splat: &SplatRenderer| -> Result<_> {
+            Ok(splat.render(std::slice::from_ref(camera))?.remove(0).rgb)
         };
-        let error = (seen(original)? - seen(copy)?).square();
-        sum += error.sum(Kind::Double).double_value(&[]);
-        numbers += error.numel();
+        let original = seen(&original)?;
+        sum += squared_error(&original, &seen(&copy)?);
+        numbers += original.numel();
     }
     Ok((sum != 0.).then(|| psnr_of_mse(sum / numbers as f64)))
 }

@@ -1,15 +1,19 @@
 //! Validation: what training never shows is rendered and scored while it goes on (spec 8.8).
 
-use super::method::{colours, synthesize_views};
+use super::photo_source::PhotoSource;
 use super::scene::split_views;
 use super::scores::{CaptureScores, nearest_context_baseline, score};
-use crate::data::{Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View};
+use crate::data::{
+    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at,
+};
 use crate::error::{Error, Result};
-use crate::reconstruct::spread_over_path;
+use crate::reconstruct::{reconstruct, spread_over_path};
+use crate::render::render_views;
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use tch::Tensor;
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
@@ -17,6 +21,7 @@ pub struct HeldOut {
     config: DataConfig,
     scenes: Vec<HeldOutScene>,
     trained_on: Vec<String>,
+    warnings: Vec<String>,
     scores: Vec<HeldOutScores>,
 }
 
@@ -50,22 +55,26 @@ impl HeldOut {
     /// broken or has too few.
     pub fn find(config: &DataConfig, training: &TrainingScenes) -> Result<Self> {
         let mut scenes = vec![];
+        let holds_out = |capture: &&Capture| config.holdout != Holdout::None || capture.has_test_part();
+        for capture in training.captures().iter().filter(holds_out) {
+            split_views(capture, config.holdout)?;
+            scenes.push(HeldOutScene::Views(capture.clone()));
+        }
         if config.holdout != Holdout::None {
-            for capture in training.captures() {
-                split_views(capture, config.holdout)?;
-                scenes.push(HeldOutScene::Views(capture.clone()));
-            }
             let others = spread(training.others(), config.validation_scenes);
             scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInGroup(group, key)));
         }
-        let mut groups = vec![];
+        let (mut groups, mut warnings) = (vec![], vec![]);
         for path in config.validation_paths()? {
-            groups.extend_from_slice(Dataset::open(&path, Split::Test)?.groups());
+            let dataset = Dataset::open(&path, Split::Test)?;
+            groups.extend_from_slice(dataset.groups());
+            warnings.extend_from_slice(dataset.warnings());
         }
         let (trained, mut trained_on) = (places(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
             let capture = group.open()?.capture(&key)?;
             split_scene(&capture, config)?;
+            warnings.extend_from_slice(capture.warnings());
             let place = match group.is_folder() {
                 true => place(capture.file(), None),
                 false => place(group.path(), Some(&key)),
@@ -75,7 +84,7 @@ impl HeldOut {
             }
             scenes.push(HeldOutScene::Whole(group, key));
         }
-        Ok(HeldOut { config: config.clone(), scenes, trained_on, scores: vec![] })
+        Ok(HeldOut { config: config.clone(), scenes, trained_on, warnings, scores: vec![] })
     }
 
     /// Whether nothing is held out.
@@ -86,6 +95,11 @@ impl HeldOut {
     /// Scenes held out as a whole that are learned all the same: their scores tell nothing of scenes never seen.
     pub fn trained_on(&self) -> &[String] {
         &self.trained_on
+    }
+
+    /// Returns what is left out or changed of the scenes held out as a whole, a line each.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// What the last validation found.
@@ -151,7 +165,7 @@ impl HeldOut {
                     continue;
                 }
             };
-            match judge_views(trainer, &name, &context, &target) {
+            match judge_views(trainer, &name, context, target) {
                 Ok(scores) => found.scores.push((i, scores)),
                 Err(e) => {
                     found.failed = Some(e.to_string());
@@ -164,13 +178,20 @@ impl HeldOut {
 }
 
 /// What the model makes of the views `context` of scene `name`, held against `target`.
-fn judge_views(trainer: &Trainer, name: &str, context: &[View], target: &[View]) -> Result<HeldOutScores> {
-    let (reconstruction, rendered) = synthesize_views(trainer.as_model(), context, target)?;
-    let count = reconstruction.gaussians.count();
-    Ok(HeldOutScores {
-        ours: score(name, &colours(&rendered), target, Some(count))?,
-        nearest: nearest_context_baseline(name, context, target)?,
-    })
+fn judge_views(
+    trainer: &Trainer,
+    name: &str,
+    context: Vec<View>,
+    target: Vec<View>,
+) -> Result<HeldOutScores> {
+    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
+    let reconstruction = reconstruct(trainer.as_model(), &context, &poses)?;
+    let rendered =
+        render_views(&reconstruction.gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
+    let pictures: Vec<Tensor> = rendered.into_iter().map(|rendered| rendered.rgb).collect();
+    let ours = score(name, &pictures, &target, Some(reconstruction.gaussians.count()))?;
+    let [context, target] = [context, target].map(PhotoSource::Loaded);
+    Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
 
 impl Validator for HeldOut {
@@ -239,6 +260,11 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
 /// camera's path, from the middle of a video that is longer than training's.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
+    if capture.has_test_part() {
+        let (shown, held_out) = split_views(capture, Holdout::None)?;
+        let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
+        return Ok((context, spread_over_path(&cameras, &held_out, config.target_views)));
+    }
     if cameras.len() < 3 {
         return Err(Error::input(capture.file(), "the number of views", cameras.len(), "three or more"));
     }

@@ -1,7 +1,8 @@
 //! Evaluation indices: which frames of which scenes are context, and which are targets.
 
+use crate::data::Capture;
 use crate::error::{Error, Result};
-use crate::io::write_json;
+use crate::io::{read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,6 +20,19 @@ impl SceneFrames {
     /// Of a video of `count` frames, three at least: every other one is shown, and every other one of the rest has to be matched.
     pub fn alternating(count: usize) -> Self {
         SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
+    }
+
+    /// Returns a checksum of these frames' photos, as their files are, and of their cameras.
+    ///
+    /// # Errors
+    /// A photo that can't be read.
+    pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
+        capture.checksum(self.context.iter().chain(&self.target).copied())
+    }
+
+    /// What pictures of the targets are called, without their ending: by their numbers, as chunks name frames.
+    pub(super) fn picture_names(&self) -> Vec<String> {
+        self.target.iter().map(|frame| format!("{frame:06}")).collect()
     }
 }
 
@@ -38,9 +52,8 @@ impl EvaluationIndex {
     /// # Errors
     /// A file that can't be read, is no index, or has a scene with fewer than two context frames or no target.
     pub fn read(file: &Path) -> Result<Self> {
-        let text = std::fs::read(file).map_err(Error::read(file))?;
         let expected = "{scene: {\"context\": [frames], \"target\": [frames]} or null}";
-        let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_slice(&text)
+        let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_str(&read_text(file)?)
             .map_err(|e| Error::input(file, "the index", format!("unusable ({e})"), expected))?;
         let scenes: BTreeMap<_, _> =
             scenes.into_iter().filter_map(|(key, frames)| Some((key, frames?))).collect();

@@ -1,10 +1,14 @@
 //! What a sweep keeps on disk to go on from: whose scores they are, and every scene's as they come.
 
 use super::evaluation::{SceneScores, scene_file_name};
+use super::scores_file::{REPORT, SCORES, TABLE, comparison_path};
 use crate::error::{Error, Result};
 use crate::io::write_json;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+
+/// The file that an evaluation begins with.
+const IDENTITY: &str = "evaluation.json";
 
 /// By which a sweep that goes on is recognized.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -18,11 +22,19 @@ pub(super) struct Identity {
 
 /// A scene's scores on disk.
 #[derive(Serialize, Deserialize)]
-struct Kept {
+pub(super) struct Kept {
     #[serde(flatten)]
-    scores: SceneScores,
+    pub scores: SceneScores,
     /// What tells the files that were scored from others in their place.
-    files: Option<String>,
+    pub files: Option<String>,
+}
+
+/// The files that an evaluation of the scenes `keys` writes into the folder `out`.
+pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a String>) -> Vec<PathBuf> {
+    let journal = Journal::of(out);
+    let of_scene = |key: &'a String| [journal.file(key), comparison_path(out, key)];
+    let of_all = [IDENTITY, SCORES, TABLE].map(|name| out.join(name));
+    keys.into_iter().flat_map(of_scene).chain(of_all).collect()
 }
 
 /// The folder `scenes` of an evaluation.
@@ -36,9 +48,9 @@ impl Journal {
     /// # Errors
     /// Scores of something else in it, or the system's refusal to write.
     pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
-        let file = out.join("evaluation.json");
+        let file = out.join(IDENTITY);
         // An evaluation begins with that file, so these would be somebody else's.
-        let others = ["scores.json", "scores.csv", "report.html"];
+        let others = [SCORES, TABLE, REPORT];
         if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
         {
             let found = format!("a folder with a {name} that no evaluation wrote");
@@ -78,18 +90,18 @@ impl Journal {
         Journal { scenes: out.join("scenes") }
     }
 
-    /// Scores of scene `key` from before, of the same `files`. What can't be read is none.
-    pub fn kept(&self, key: &str, files: Option<String>) -> Option<SceneScores> {
+    /// Returns the scores of scene `key` from before. What can't be read is none.
+    pub fn kept(&self, key: &str) -> Option<Kept> {
         let kept: Kept = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
-        (kept.scores.scores.scene == key && kept.files == files).then_some(kept.scores)
+        (kept.scores.scores.scene == key).then_some(kept)
     }
 
     /// Keeps the scores of scene `key`, which are of `files`.
     ///
     /// # Errors
     /// The system's refusal to write.
-    pub fn keep(&self, key: &str, scores: &SceneScores, files: Option<String>) -> Result<()> {
-        write_json(&self.file(key), &Kept { scores: scores.clone(), files })
+    pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
+        write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })
     }
 
     fn file(&self, key: &str) -> PathBuf {

@@ -3,15 +3,18 @@
 use super::memory::{device_memory_bytes, peak_memory_bytes};
 use super::perceptual::Perceptual;
 use super::scene::EvalScene;
-use super::scores::{CaptureScores, score};
-use crate::data::{View, cameras_at};
+use super::scores::{CaptureScores, ViewScore, score_view};
+use crate::data::View;
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, Splat, find_splat, read_image, read_splat, tensor_from_rgb};
-use crate::reconstruct::{Input, Model, Reconstruction, reconstruct};
-use crate::render::{Rendered, render_views};
-use crate::scene::ImageSize;
+use crate::io::{
+    Inputs, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
+    tensor_from_rgb,
+};
+use crate::reconstruct::{Input, Model, reconstruct};
+use crate::render::{Rendered, SplatRenderer};
+use crate::scene::{Camera, ImageSize, LocalFrame};
+use glam::{DMat4, DVec3};
 use std::path::{Path, PathBuf};
-use std::time::UNIX_EPOCH;
 use tch::Tensor;
 
 /// Makes pictures of a scene's target views.
@@ -25,19 +28,41 @@ pub enum Method<'a> {
     Renders(PathBuf),
 }
 
-/// What a method makes of a scene.
+/// What a method makes of a scene. Its pictures of the target views come one by one: the first is made at once, and the others when
+/// [`judge`] asks for them.
 #[derive(Debug)]
 pub struct Synthesis {
-    /// Of the target views, [3, H, W].
-    pub pictures: Vec<Tensor>,
-    /// The same with depth, where a splat was rendered here.
-    pub rendered: Vec<Rendered>,
+    /// The scene.
+    pub scene: EvalScene,
+    source: PictureSource,
+    /// Until it is judged.
+    first: Option<(View, Picture)>,
     /// Of the splat, where there is one.
     pub gaussians: Option<i64>,
     /// Of the PLY that the splat is, or would be.
     pub splat_bytes: Option<u64>,
     /// Of a model's forward pass, or passes.
     pub forward_seconds: Option<f64>,
+    /// What was left out of the splat's file, a sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// Where pictures of the target views come from.
+#[derive(Debug)]
+enum PictureSource {
+    /// A splat, rendered from these poses (camera-to-world, in the splat's world).
+    Splat(SplatRenderer, Vec<DMat4>),
+    /// A folder of pictures.
+    Folder(PathBuf),
+}
+
+/// A picture of a target view.
+#[derive(Debug)]
+pub struct Picture {
+    /// [3, H, W].
+    pub rgb: Tensor,
+    /// The same with depth, where a splat was rendered here.
+    pub rendered: Option<Rendered>,
 }
 
 /// What a model took, in bytes.
@@ -61,37 +86,46 @@ impl Method<'_> {
         }
     }
 
-    /// Pictures of the scene's target views.
+    /// Makes pictures of the scene's target views, the first of them at once.
     ///
     /// # Errors
-    /// Whatever the reconstruction fails with, a splat that can't be read, a picture that is missing.
-    pub fn synthesize(&self, scene: &EvalScene) -> Result<Synthesis> {
-        match self {
+    /// Whatever the reconstruction fails with, a splat that can't be read, a first photo or picture that can't.
+    pub fn synthesize(&self, scene: EvalScene) -> Result<Synthesis> {
+        let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
-                let (reconstruction, rendered) = synthesize_views(*model, &scene.context, &scene.target)?;
-                let splat = Splat::of(&reconstruction.gaussians)?;
-                let seconds = reconstruction.forward_time.as_secs_f64();
-                Ok(Synthesis { forward_seconds: Some(seconds), ..of_splat(&splat, rendered) })
+                let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
+                let splat = Splat::of(&made.gaussians)?;
+                // The normalized world is a local frame already.
+                let frame = LocalFrame { origin: DVec3::ZERO, scale: 1. };
+                let renderer = SplatRenderer::new(&made.gaussians, DVec3::ZERO, frame);
+                let source = PictureSource::Splat(renderer, made.target_poses);
+                (source, Some(splat), Some(made.forward_time.as_secs_f64()))
             }
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
-                let cameras: Vec<_> = scene.target.iter().map(|view| view.camera).collect();
-                let rendered = render_views(&splat.gaussians, &cameras)?;
-                Ok(of_splat(&splat, rendered))
+                (PictureSource::Splat(splat.renderer(), scene.target.poses()), Some(splat), None)
             }
+            Method::Renders(folder) => (PictureSource::Folder(folder.clone()), None, None),
+        };
+        Ok(Synthesis {
+            first: Some(source.picture(&scene, 0)?),
+            scene,
+            source,
+            gaussians: splat.as_ref().map(|splat| splat.gaussians.count()),
+            splat_bytes: splat.as_ref().map(Splat::ply_bytes),
+            forward_seconds,
+            warnings: splat.map(|splat| splat.warnings).unwrap_or_default(),
+        })
+    }
+
+    /// Adds the files of a splat or pictures to `inputs`.
+    pub fn add_inputs(&self, inputs: &mut Inputs) {
+        match self {
+            Method::Model(_) => {}
+            Method::Splat(file) => inputs.add(file),
             Method::Renders(folder) => {
-                let pictures = scene
-                    .picture_names
-                    .iter()
-                    .map(|name| read_picture(folder, name))
-                    .collect::<Result<_>>()?;
-                Ok(Synthesis {
-                    pictures,
-                    rendered: vec![],
-                    gaussians: None,
-                    splat_bytes: None,
-                    forward_seconds: None,
-                })
+                let pictures = std::fs::read_dir(folder).into_iter().flatten().flatten();
+                pictures.for_each(|picture| inputs.add_photo(&picture.path()));
             }
         }
     }
@@ -123,43 +157,63 @@ impl Method<'_> {
         }
     }
 
-    /// What tells a scene's splat or pictures from others in their place: names, sizes, times. Of a model it is nothing.
-    pub(super) fn files(&self) -> Option<String> {
-        let files: Vec<PathBuf> = match self {
-            Method::Model(_) => return None,
-            Method::Splat(file) => vec![file.clone()],
+    /// Returns a checksum of what a scene's splat or pictures called `names` hold, by which they are told from others in their place.
+    /// Of a model it is nothing.
+    ///
+    /// # Errors
+    /// A file that can't be read.
+    pub(super) fn checksum(&self, names: &[String]) -> Result<Option<u32>> {
+        match self {
+            Method::Model(_) => Ok(None),
+            Method::Splat(file) => {
+                let origin = Some(origin_file(file)).filter(|origin| origin.exists());
+                checksum([file].into_iter().chain(&origin)).map(Some)
+            }
             Method::Renders(folder) => {
-                let pictures = std::fs::read_dir(folder).ok()?;
-                pictures.filter_map(|entry| Some(entry.ok()?.path())).collect()
+                let files = names.iter().map(|name| find_picture(folder, name));
+                checksum(files.collect::<Result<Vec<_>>>()?).map(Some)
+            }
+        }
+    }
+}
+
+impl PictureSource {
+    /// Makes the picture of target view `i` of `scene`, and loads its photo.
+    fn picture(&self, scene: &EvalScene, i: usize) -> Result<(View, Picture)> {
+        let truth = scene.target.load(i)?;
+        let picture = match self {
+            PictureSource::Splat(renderer, poses) => {
+                let camera = Camera { c2w: poses[i], ..truth.camera };
+                let rendered = renderer.render(&[camera])?.remove(0);
+                Picture { rgb: rendered.rgb.shallow_clone(), rendered: Some(rendered) }
+            }
+            PictureSource::Folder(folder) => {
+                let file = find_picture(folder, &scene.picture_names[i])?;
+                Picture { rgb: tensor_from_rgb(&read_image(&file)?), rendered: None }
             }
         };
-        let describe = |file: &PathBuf| {
-            let metadata = file.metadata().ok()?;
-            let since = metadata.modified().ok()?.duration_since(UNIX_EPOCH).ok()?;
-            Some(format!("{} {} {}", file.file_name()?.display(), metadata.len(), since.as_nanos()))
-        };
-        let mut described: Vec<_> = files.iter().filter_map(describe).collect();
-        described.sort();
-        Some(format!("{:08x}", crc32fast::hash(described.join("\n").as_bytes())))
+        Ok((truth, picture))
     }
 }
 
-fn of_splat(splat: &Splat, rendered: Vec<Rendered>) -> Synthesis {
-    Synthesis {
-        pictures: colours(&rendered),
-        rendered,
-        gaussians: Some(splat.gaussians.count()),
-        splat_bytes: Some(splat.ply_bytes()),
-        forward_seconds: None,
-    }
-}
-
-/// What a method's pictures are worth, LPIPS included.
+/// Scores a method's pictures one by one, LPIPS included. `see` is shown every photo with its picture and score.
 ///
 /// # Errors
-/// A picture of another size than its view.
-pub fn judge(scene: &EvalScene, made: &Synthesis, perceptual: &Perceptual) -> Result<CaptureScores> {
-    judge_pictures(&scene.name, &made.pictures, &scene.target, made.gaussians, perceptual)
+/// A photo or picture that can't be read, a picture of another size than its view, and those of `see`.
+pub fn judge(
+    made: &mut Synthesis,
+    perceptual: &Perceptual,
+    mut see: impl FnMut(&View, &Picture, &ViewScore) -> Result<()>,
+) -> Result<CaptureScores> {
+    let Synthesis { scene, source, first, gaussians, .. } = made;
+    let mut scores = vec![];
+    for i in 0..scene.target.len() {
+        let (truth, picture) = first.take().map_or_else(|| source.picture(scene, i), Ok)?;
+        let score = perceptual.add_to(score_view(&picture.rgb, &truth)?, &picture.rgb, &truth);
+        see(&truth, &picture, &score)?;
+        scores.push(score);
+    }
+    Ok(CaptureScores::of(&scene.name, scores, *gaussians))
 }
 
 /// What pictures of the views `truth` are worth, LPIPS included.
@@ -173,37 +227,18 @@ pub fn judge_pictures(
     gaussians: Option<i64>,
     perceptual: &Perceptual,
 ) -> Result<CaptureScores> {
-    let mut scores = score(scene, pictures, truth, gaussians)?;
-    perceptual.add_to(&mut scores, pictures, truth);
-    Ok(scores)
+    let score =
+        |(picture, view): (&Tensor, &View)| Ok(perceptual.add_to(score_view(picture, view)?, picture, view));
+    let scores = pictures.iter().zip(truth).map(score).collect::<Result<_>>()?;
+    Ok(CaptureScores::of(scene, scores, gaussians))
 }
 
-/// What a model that sees `context` makes of the cameras of `target`.
-pub(super) fn synthesize_views(
-    model: Model,
-    context: &[View],
-    target: &[View],
-) -> Result<(Reconstruction, Vec<Rendered>)> {
-    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
-    let reconstruction = reconstruct(model, context, &poses)?;
-    let cameras = cameras_at(target, &reconstruction.target_poses);
-    let rendered = render_views(&reconstruction.gaussians, &cameras)?;
-    Ok((reconstruction, rendered))
-}
-
-/// [3, H, W] each.
-pub(super) fn colours(rendered: &[Rendered]) -> Vec<Tensor> {
-    rendered.iter().map(|rendered| rendered.rgb.shallow_clone()).collect()
-}
-
-/// The picture `name` in `folder`, whatever its ending, [3, H, W].
-fn read_picture(folder: &Path, name: &str) -> Result<Tensor> {
+/// Finds the picture `name` in `folder`, whatever its ending.
+fn find_picture(folder: &Path, name: &str) -> Result<PathBuf> {
     let candidates = PHOTO_EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
-    match candidates.iter().find(|path| path.is_file()) {
-        Some(path) => Ok(tensor_from_rgb(&read_image(path)?)),
-        None => {
-            let expected = candidates[0].display().to_string();
-            Err(Error::input(folder, format!("the picture for {name}"), "absent", expected))
-        }
-    }
+    let found = candidates.iter().find(|path| path.is_file()).cloned();
+    found.ok_or_else(|| {
+        let expected = candidates[0].display().to_string();
+        Error::input(folder, format!("the picture for {name}"), "absent", expected)
+    })
 }

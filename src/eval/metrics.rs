@@ -3,19 +3,49 @@
 use crate::loss::{self, psnr_of_mse};
 use tch::{Kind, Tensor};
 
-fn prepare(picture: &Tensor) -> Tensor {
-    picture.detach().to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
+/// A picture is compared in bands of rows of about this many pixels, so that the float64 copies of a large one don't exist at once.
+const BAND_PIXELS: i64 = 1 << 20;
+/// Side of the windows that SSIM looks through, in pixels.
+pub(super) const SSIM_WINDOW: i64 = 11;
+/// Rows that a band shares with the next one, so that every window is inside of a band.
+const SSIM_OVERLAP: i64 = SSIM_WINDOW - 1;
+
+/// Returns rows `first` to `first + count` of a picture [3, H, W] in float64, clamped to [0, 1], on the CPU.
+fn band(picture: &Tensor, first: i64, count: i64) -> Tensor {
+    let rows = picture.detach().narrow(-2, first, count);
+    rows.to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
 }
 
-/// Peak signal-to-noise ratio in dB of two pictures of one shape.
+/// Returns (first row, number of rows) of every band of `rows` rows of `width` pixels.
+fn bands(rows: i64, width: i64) -> impl Iterator<Item = (i64, i64)> {
+    let height = (BAND_PIXELS / width.max(1)).max(1);
+    (0..rows).step_by(height as usize).map(move |first| (first, height.min(rows - first)))
+}
+
+/// Sums up the squared differences of two pictures [3, H, W], values clamped to [0, 1].
+pub(super) fn squared_error(picture: &Tensor, truth: &Tensor) -> f64 {
+    let size = picture.size();
+    let error = |(first, count)| {
+        (band(picture, first, count) - band(truth, first, count)).square().sum(Kind::Double).double_value(&[])
+    };
+    bands(size[1], size[2]).map(error).sum()
+}
+
+/// Peak signal-to-noise ratio in dB of two pictures of one shape, [3, H, W].
 pub fn psnr(picture: &Tensor, truth: &Tensor) -> f64 {
-    let mse = (prepare(picture) - prepare(truth)).square().mean(Kind::Double).double_value(&[]);
-    psnr_of_mse(mse)
+    psnr_of_mse(squared_error(picture, truth) / picture.numel() as f64)
 }
 
 /// Structural similarity of two pictures [3, H, W], H and W at least 11.
 pub fn ssim(picture: &Tensor, truth: &Tensor) -> f64 {
-    loss::ssim(&prepare(picture), &prepare(truth)).double_value(&[])
+    let size = picture.size();
+    // Rows whose windows are inside.
+    let rows = size[1] - SSIM_OVERLAP;
+    let weighted = |(first, count)| {
+        let band = |picture| band(picture, first, count + SSIM_OVERLAP);
+        loss::ssim(&band(picture), &band(truth)).double_value(&[]) * count as f64
+    };
+    bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64
 }
 
 #[cfg(test)]
@@ -38,5 +68,18 @@ mod tests {
         let a = Tensor::linspace(0., 1., 3 * 32 * 32, options).view([3, 32, 32]);
         assert!((ssim(&a, &a) - 1.).abs() < 1e-9);
         assert!(ssim(&(1. - &a), &a) < 0.5);
+    }
+
+    #[test]
+    fn bands_are_the_whole() {
+        tch::manual_seed(1);
+        // Three bands, the last of them a single row.
+        let height = 2 * BAND_PIXELS / 40_000 + 1;
+        let picture = |rows: i64| Tensor::rand([3, rows, 40_000], (Kind::Double, Device::Cpu));
+        let (a, b) = (picture(height + SSIM_OVERLAP), picture(height + SSIM_OVERLAP));
+        assert_eq!(bands(height, 40_000).count(), 3);
+        let mse = (&a - &b).square().mean(Kind::Double).double_value(&[]);
+        assert!((psnr(&a, &b) - psnr_of_mse(mse)).abs() < 1e-10);
+        assert!((ssim(&a, &b) - loss::ssim(&a, &b).double_value(&[])).abs() < 1e-12);
     }
 }

@@ -13,31 +13,36 @@ mod memory;
 mod method;
 mod metrics;
 mod perceptual;
+mod photo_source;
 mod published;
 mod report;
 mod scene;
+mod score_views;
 mod scores;
 mod scores_file;
 mod sweep;
 
 pub use age::process_age;
-pub use contact_sheet::contact_sheet;
+pub use contact_sheet::ContactSheet;
 pub use evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 pub use fidelity::psnr_between;
 pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
+pub use journal::evaluation_files;
 pub use machine::machine;
 pub use memory::peak_memory_bytes;
 pub(crate) use memory::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
-pub use method::{Method, Synthesis, judge, judge_pictures};
+pub use method::{Method, Picture, Synthesis, judge, judge_pictures};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
+pub use photo_source::PhotoSource;
 pub use published::{
     Published, PublishedAblation, PublishedCompactness, PublishedEfficiency, PublishedMethod,
     PublishedScores, published,
 };
 pub use report::{write_curves, write_report};
 pub use scene::EvalScene;
+pub use score_views::score_views;
 pub use scores::{Baselines, CaptureScores, ViewScore, score};
-pub use scores_file::{comparison_path, read_evaluation, write_csv, write_evaluation};
+pub use scores_file::{REPORT, TABLE, comparison_path, read_evaluation, write_csv, write_evaluation};
 pub use sweep::Sweep;

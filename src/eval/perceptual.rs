@@ -27,18 +27,14 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Scores pictures [3, H, W], clamped to [0, 1], against the views that `scores` is of, in the same order. A network
-    /// that is absent, or too large for some view, leaves no mean.
-    pub fn add_to(&self, scores: &mut CaptureScores, pictures: &[Tensor], truth: &[View]) {
-        for ((score, picture), view) in scores.views.iter_mut().zip(pictures).zip(truth) {
-            score.lpips_vgg = distance(self.vgg.as_ref(), picture, &view.image);
-            score.lpips_alex = distance(self.alex.as_ref(), picture, &view.image);
+    /// Adds to `score` how far a picture [3, H, W], clamped to [0, 1], is from `truth`. What a network tells stays out where it is absent
+    /// or the view is too small for it.
+    pub(super) fn add_to(&self, score: ViewScore, picture: &Tensor, truth: &View) -> ViewScore {
+        ViewScore {
+            lpips_vgg: distance(self.vgg.as_ref(), picture, &truth.image),
+            lpips_alex: distance(self.alex.as_ref(), picture, &truth.image),
+            ..score
         }
-        let mean = |value: fn(&ViewScore) -> Option<f64>| {
-            let values: Option<Vec<f64>> = scores.views.iter().map(value).collect();
-            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
-        };
-        (scores.lpips_vgg, scores.lpips_alex) = (mean(|view| view.lpips_vgg), mean(|view| view.lpips_alex));
     }
 
     /// Whether `scores` of views of one size lack a distance that the weights that are there could tell.

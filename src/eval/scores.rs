@@ -1,8 +1,10 @@
 //! Pictures against photos, view by view.
 
-use super::metrics::{psnr, ssim};
+use super::metrics::{SSIM_WINDOW, psnr, ssim};
+use super::photo_source::PhotoSource;
 use crate::data::View;
 use crate::error::{Error, Result};
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
@@ -48,35 +50,55 @@ pub struct CaptureScores {
 /// Scores pictures [3, H, W] against views of the same sizes, without LPIPS, which [`super::Perceptual`] adds.
 ///
 /// # Errors
-/// A picture of another size than its view.
+/// A picture of another size than its view, or one that is too small for SSIM.
 pub fn score(
     scene: &str,
     pictures: &[Tensor],
     truth: &[View],
     gaussians: Option<i64>,
 ) -> Result<CaptureScores> {
-    let mut views = vec![];
-    for (picture, view) in pictures.iter().zip(truth) {
-        if picture.size() != view.image.size() {
-            let (found, expected) = (picture.size(), view.image.size());
-            return Err(Error::Request(format!(
-                "the picture for {} has shape {found:?}, expected {expected:?}",
-                view.name
-            )));
-        }
-        let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
-        views.push(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None });
+    let scores = pictures.iter().zip(truth).map(|(picture, view)| score_view(picture, view));
+    Ok(CaptureScores::of(scene, scores.collect::<Result<_>>()?, gaussians))
+}
+
+/// Scores a picture [3, H, W] against a view of the same size, without LPIPS.
+///
+/// # Errors
+/// A picture of another size than its view, or one that is too small for SSIM.
+pub(super) fn score_view(picture: &Tensor, view: &View) -> Result<ViewScore> {
+    let (found, expected) = (picture.size(), view.image.size());
+    if found != expected {
+        let why = format!("the picture for {} has shape {found:?}, expected {expected:?}", view.name);
+        return Err(Error::Request(why));
     }
-    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len() as f64;
-    Ok(CaptureScores {
-        scene: scene.to_string(),
-        psnr: mean(|v| v.psnr),
-        ssim: mean(|v| v.ssim),
-        lpips_vgg: None,
-        lpips_alex: None,
-        gaussians,
-        views,
-    })
+    if found[1].min(found[2]) < SSIM_WINDOW {
+        let (height, width) = (found[1], found[2]);
+        return Err(Error::Request(format!(
+            "the picture for {} is {width}×{height} pixels, expected sides of {SSIM_WINDOW} or more, as SSIM needs",
+            view.name
+        )));
+    }
+    let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
+    Ok(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None })
+}
+
+impl CaptureScores {
+    /// Takes the means over `views`, one at least.
+    pub(super) fn of(scene: &str, views: Vec<ViewScore>, gaussians: Option<i64>) -> Self {
+        let mean = |value: fn(&ViewScore) -> Option<f64>| {
+            let values: Option<Vec<f64>> = views.iter().map(value).collect();
+            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        CaptureScores {
+            scene: scene.to_string(),
+            psnr: mean(|view| Some(view.psnr)).unwrap_or(f64::NAN),
+            ssim: mean(|view| Some(view.ssim)).unwrap_or(f64::NAN),
+            lpips_vgg: mean(|view| view.lpips_vgg),
+            lpips_alex: mean(|view| view.lpips_alex),
+            gaussians,
+            views,
+        }
+    }
 }
 
 /// What answering without looking would score for the target views of a scene.
@@ -89,34 +111,45 @@ pub struct Baselines {
 }
 
 impl Baselines {
-    /// Of a scene's views, all of one size, a context view at least.
+    /// Scores the targets of a scene. All photos are of one size, and one context photo is there at least.
     ///
     /// # Errors
-    /// Views of different sizes.
-    pub fn of(scene: &str, context: &[View], target: &[View]) -> Result<Self> {
-        let images: Vec<&Tensor> = context.iter().map(|view| &view.image).collect();
-        let mean = Tensor::stack(&images, 0).mean_dim(0, false, None);
-        let means: Vec<Tensor> = target.iter().map(|_| mean.shallow_clone()).collect();
+    /// Photos of different sizes, or ones that can't be read.
+    pub fn of(scene: &str, context: &PhotoSource, target: &PhotoSource) -> Result<Self> {
+        let mut sum = context.load(0)?.image.copy();
+        for i in 1..context.len() {
+            sum += context.load(i)?.image;
+        }
+        let mean = sum / context.len() as f64;
+        let mut means = vec![];
+        for i in 0..target.len() {
+            means.push(score_view(&mean, &target.load(i)?)?);
+        }
         Ok(Baselines {
             nearest_photo: nearest_context_baseline(scene, context, target)?,
-            mean_photo: score(scene, &means, target, None)?,
+            mean_photo: CaptureScores::of(scene, means, None),
         })
     }
 }
 
-/// What answering with the context photo taken nearest (by camera centre) would score for the target views.
+/// Scores, for every target view, the context photo that was taken nearest, by camera centres.
 pub(super) fn nearest_context_baseline(
     scene: &str,
-    context: &[View],
-    target: &[View],
+    context: &PhotoSource,
+    target: &PhotoSource,
 ) -> Result<CaptureScores> {
-    let centre = |view: &View| view.camera.c2w.w_axis.truncate();
-    let nearest = |target: &View| {
-        let distance = |view: &&View| centre(view).distance(centre(target));
-        let view = context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a context view");
-        view.image.shallow_clone()
+    let centres = |photos: &PhotoSource| -> Vec<DVec3> {
+        photos.poses().iter().map(|pose| pose.w_axis.truncate()).collect()
     };
-    score(scene, &target.iter().map(nearest).collect::<Vec<_>>(), target, None)
+    let shown = centres(context);
+    let mut scores = vec![];
+    for (i, centre) in centres(target).into_iter().enumerate() {
+        let distance = |&photo: &usize| shown[photo].distance(centre);
+        let nearest = (0..shown.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        let nearest = context.load(nearest.expect("a context view"))?;
+        scores.push(score_view(&nearest.image, &target.load(i)?)?);
+    }
+    Ok(CaptureScores::of(scene, scores, None))
 }
 
 #[cfg(test)]
@@ -134,7 +167,9 @@ mod tests {
             image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)),
             camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
         };
-        let baselines = Baselines::of("", &[view(0., 0.2), view(1., 0.6)], &[view(0.7, 0.7)]).unwrap();
+        let photos = PhotoSource::Loaded;
+        let (context, target) = (photos(vec![view(0., 0.2), view(1., 0.6)]), photos(vec![view(0.7, 0.7)]));
+        let baselines = Baselines::of("", &context, &target).unwrap();
         assert!((baselines.nearest_photo.psnr - 20.).abs() < 1e-4, "0.1 apart");
         assert!((baselines.mean_photo.psnr - 20. * (1f64 / 0.3).log10()).abs() < 1e-4, "0.3 apart");
     }

@@ -7,7 +7,11 @@ use crate::io::{write_atomically, write_json};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-const SCORES: &str = "scores.json";
+pub(super) const SCORES: &str = "scores.json";
+/// The scores for spreadsheets.
+pub const TABLE: &str = "scores.csv";
+/// The page that shows them.
+pub const REPORT: &str = "report.html";
 
 /// The picture of a scene's worst view in the folder of its evaluation: truth, render, error and depth side by side.
 pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {

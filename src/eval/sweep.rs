@@ -8,17 +8,19 @@ use super::journal::{Identity, Journal};
 use super::method::{Method, Synthesis, judge};
 use super::perceptual::Perceptual;
 use super::published::known_dataset;
-use super::scene::{EvalScene, SceneLoader};
+use super::scene::SceneLoader;
 use super::scores_file::comparison_path;
-use crate::data::{Dataset, SceneGroup};
+use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::error::{Error, Result};
 use crate::io::write_jpeg;
 use crate::ranks::Group;
 use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
+use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::mpsc::sync_channel;
+use tch::Tensor;
 
 /// What to evaluate, and where to.
 #[derive(Debug)]
@@ -150,10 +152,14 @@ impl Sweep<'_> {
     fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
         let journal = Journal::open(self.out, &self.identity()?)?;
         let (mut kept, mut missing) = (vec![], vec![]);
-        for key in self.wanted()?.into_iter().flat_map(|(_, keys)| keys) {
-            match self.kept(&journal, &key) {
-                Some(scores) => kept.push(scores),
-                None => missing.push(key),
+        for (group, keys) in self.wanted()? {
+            let open = OnceCell::new();
+            let open = || open.get_or_init(|| group.open().ok()).as_ref();
+            for key in keys {
+                match self.kept(&journal, &key, open) {
+                    Some(scores) => kept.push(scores),
+                    None => missing.push(key),
+                }
             }
         }
         Ok((kept, missing))
@@ -190,20 +196,21 @@ impl Sweep<'_> {
             scope.spawn(move || loader.send(own, &sender));
             while go_on && let Ok((key, loaded)) = receiver.recv() {
                 let method = self.method.of_scene(&key);
-                let made = loaded.and_then(|scene| Ok((method.synthesize(&scene)?, scene)));
+                let made = loaded.and_then(|scene| method.synthesize(scene));
                 let first = made.is_ok().then(|| judges.take()).flatten();
                 let warm_up = first.is_some();
                 if let Some(judges) = first {
                     memory = method.memory();
                     perceptual = Some(judges()?);
                 }
-                let judged = made.and_then(|(made, scene)| {
+                let judged = made.and_then(|made| {
                     let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    let mut scores = self.judge(&scene, &made, perceptual)?;
-                    scores.warm_up = warm_up && made.forward_seconds.is_some();
+                    let content = self.content(&key, made.scene.checksum)?;
+                    let mut scores = self.judge(made, perceptual)?;
+                    scores.warm_up = warm_up && scores.forward_seconds.is_some();
                     scores.peak_memory_bytes = memory.map(|memory| memory.host);
                     scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
-                    journal.keep(&key, &scores, method.files())?;
+                    journal.keep(&key, &scores, content)?;
                     Ok(scores)
                 });
                 match judged {
@@ -228,18 +235,39 @@ impl Sweep<'_> {
         let index = std::fs::read(&self.index.file).map_err(Error::read(&self.index.file))?;
         // Its name alone doesn't tell, many a folder is called `test`: but that of made-up videos, which lie nowhere.
         let root = self.root.canonicalize().unwrap_or(self.root.to_owned());
+        let made_by = self.dataset.made_by().map_or(String::new(), |made_by| format!(" of {made_by}"));
         Ok(Identity {
             method: self.fingerprint.clone(),
-            dataset: root.display().to_string(),
+            dataset: root.display().to_string() + &made_by,
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
             image_size: self.picture_size.into(),
         })
     }
 
-    /// Scores from before. What is of other files, or lacks a score that could be had now, is scored again.
-    fn kept(&self, journal: &Journal, key: &str) -> Option<SceneScores> {
-        let scores = journal.kept(key, self.method.of_scene(key).files())?;
-        (!Perceptual::could_add_to(&scores.scores, self.picture_size)).then_some(scores)
+    /// Returns scores from before of scene `key`, which is one of those that `open` opens. What is of other files, or lacks a score
+    /// that could be had now, is scored again.
+    fn kept<'a>(
+        &self,
+        journal: &Journal,
+        key: &str,
+        open: impl FnOnce() -> Option<&'a OpenGroup>,
+    ) -> Option<SceneScores> {
+        let kept = journal.kept(key)?;
+        if Perceptual::could_add_to(&kept.scores.scores, self.picture_size) {
+            return None;
+        }
+        let capture = open()?.capture(key).ok()?;
+        let frames = self.index.frames(key, capture.len()).ok()?;
+        let content = self.content(key, frames.checksum(&capture).ok()?).ok()?;
+        (kept.files.as_ref() == Some(&content)).then_some(kept.scores)
+    }
+
+    /// Returns what tells the files of which scene `key` was scored from others in their place: checksums of the splat or pictures, if
+    /// these are judged, and of the photos and cameras, which is `photos`.
+    fn content(&self, key: &str, photos: u32) -> Result<String> {
+        let names = self.index.scenes[key].picture_names();
+        let made = self.method.of_scene(key).checksum(&names)?.map(|made| format!("{made:08x} "));
+        Ok(format!("{}{photos:08x}", made.unwrap_or_default()))
     }
 
     /// The groups that hold indexed scenes, with these.
@@ -259,22 +287,27 @@ impl Sweep<'_> {
     }
 
     /// The scene's scores; its worst view is drawn.
-    fn judge(&self, scene: &EvalScene, made: &Synthesis, perceptual: &Perceptual) -> Result<SceneScores> {
-        let scores = judge(scene, made, perceptual)?;
-        let psnr = |&view: &usize| scores.views[view].psnr;
-        let views = 0..made.pictures.len();
-        let worst = views.min_by(|a, b| psnr(a).total_cmp(&psnr(b))).expect("a target view");
-        let image =
-            comparison_image(&scene.target[worst].image, &made.pictures[worst], made.rendered.get(worst));
+    fn judge(&self, mut made: Synthesis, perceptual: &Perceptual) -> Result<SceneScores> {
+        let mut worst: Option<(f64, Tensor)> = None;
+        let scores = judge(&mut made, perceptual, |truth, picture, score| {
+            if worst.as_ref().is_none_or(|(psnr, _)| score.psnr.total_cmp(psnr).is_lt()) {
+                let image = comparison_image(&truth.image, &picture.rgb, picture.rendered.as_ref());
+                worst = Some((score.psnr, image));
+            }
+            Ok(())
+        })?;
+        let Synthesis { scene, splat_bytes, forward_seconds, warnings, .. } = made;
+        let (_, image) = worst.expect("a target view");
         write_jpeg(&comparison_path(self.out, &scene.name), &image)?;
-        let frames = scene.frames.as_ref().expect("an indexed scene");
+        let frames = scene.frames.expect("an indexed scene");
         Ok(SceneScores {
             scores,
-            context: frames.context.clone(),
-            target: frames.target.clone(),
+            context: frames.context,
+            target: frames.target,
             enlarged: scene.enlarged,
-            splat_bytes: made.splat_bytes,
-            forward_seconds: made.forward_seconds,
+            splat_bytes,
+            warnings,
+            forward_seconds,
             warm_up: false,
             peak_memory_bytes: None,
             peak_device_memory_bytes: None,

@@ -1,5 +1,6 @@
 //! Files that grow by whole records.
 
+use super::atomic::check_regular;
 use crate::error::{Error, Result};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -18,8 +19,9 @@ impl AppendFile {
     /// Opens the file at `path` to go on at its end, or makes it.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Anything but a regular file there, or the system's refusal.
     pub fn open(path: &Path) -> Result<Self> {
+        check_regular(path)?;
         let file = OpenOptions::new().create(true).append(true).open(path).map_err(Error::write(path))?;
         let length = file.metadata().map_err(Error::read(path))?.len();
         Ok(AppendFile { path: path.to_owned(), file, length })

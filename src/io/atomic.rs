@@ -1,39 +1,42 @@
 //! Files and folders that appear whole or not at all. Nothing is removed but what the program made: its temporary files and
 //! folders bear its name, and of a folder that is replaced only the files go that it is known to make.
+//!
+//! A temporary file or folder lies beside what it becomes, as `.NAME.globalsplat-partial`, or `-1`, `-2`, … after that where
+//! another process writes the same. Its process holds a lock on it, so that one without a lock was left by a process that was
+//! ended: the next one that writes the same removes it.
 
 use crate::error::{Error, Result};
 use serde::Serialize;
-use std::fs::{self, File};
-use std::io::{BufWriter, Write};
+use std::fs::{self, File, FileType, Metadata, OpenOptions};
+use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 /// What is being written.
 const PARTIAL: &str = "globalsplat-partial";
 /// What has been moved away to make room.
 const OLD: &str = "globalsplat-old";
+/// What temporary names have of the final one, in bytes: it may be as long as the file system allows by itself.
+const NAME_BYTES: usize = 48;
 
 /// Writes `path` by way of a temporary file beside it: a reader sees the older file or the new one, never a part, and a
-/// full disk leaves the older one as it was.
+/// full disk leaves the older one as it was. Links are followed, and the new file has the permissions of the older one.
 ///
 /// # Errors
-/// What `fill` returns, or the system's refusal to write.
+/// What `fill` returns, anything but a regular file at `path`, or the system's refusal to write.
 pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let temporary = sibling(path, PARTIAL);
-    let attempt = || {
-        let file = File::create(&temporary).map_err(Error::write(path))?;
-        let mut writer = BufWriter::new(file);
-        fill(&mut writer)?;
-        let file = writer.into_inner().map_err(|e| Error::write(path)(e.into_error()))?;
-        file.sync_all().map_err(Error::write(path))?;
-        fs::rename(&temporary, path).map_err(Error::write(path))
-    };
-    let result = attempt();
-    if result.is_err() {
-        let _ = fs::remove_file(&temporary);
-        return result;
-    }
-    sync_parent(path);
-    Ok(())
+    write_partially(path, fill)?.keep()
+}
+
+/// As [`write_atomically`], but for the name, which the file gets when it is kept.
+///
+/// # Errors
+/// As there.
+pub fn write_partially(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<PartialFile> {
+    let partial = PartialFile::create(path)?;
+    let mut writer = BufWriter::new(&partial.file);
+    fill(&mut writer)?;
+    writer.into_inner().map_err(|e| Error::write(path)(e.into_error()))?;
+    Ok(partial)
 }
 
 /// Writes `value`, which is made of numbers, texts, lists and maps by names, as JSON that a person can read, whole or not at all.
@@ -49,34 +52,49 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
 /// that such a folder has; whatever else is in one that was there before is there afterwards.
 ///
 /// # Errors
-/// What `fill` returns, or the system's refusal to write.
+/// What `fill` returns, anything but a folder at `path`, or the system's refusal to write.
 pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let (temporary, retired) = (sibling(path, PARTIAL), sibling(path, OLD));
-    let attempt = || {
-        remove_dir_if_there(&temporary)?;
-        fs::create_dir_all(&temporary).map_err(Error::write(&temporary))?;
-        fill(&temporary)?;
-        sync_dir(&temporary);
-        if retired.is_dir() && !path.exists() {
-            fs::rename(&retired, path).map_err(Error::write(path))?;
-        }
-        retire(&retired, path, made)?;
-        if path.exists() {
-            fs::rename(path, &retired).map_err(Error::write(path))?;
-        }
-        fs::rename(&temporary, path).map_err(Error::write(path))?;
-        retire(&retired, path, made)
+    let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
+    fs::create_dir_all(parent_of(&target)).map_err(Error::write(path))?;
+    let make = |place: &Path| {
+        fs::create_dir(place)?;
+        // Another process may have removed it before it was locked, and made its own.
+        File::open(place)
+            .map_err(|e| if e.kind() == ErrorKind::NotFound { ErrorKind::AlreadyExists.into() } else { e })
     };
-    let result = attempt();
+    let (temporary, _lock) = claim(&target, make).map_err(Error::write(path))?;
+    let retired = old_name(&target);
+    let swap = || {
+        if retired.is_dir() && !target.exists() {
+            fs::rename(&retired, &target).map_err(Error::write(path))?;
+        }
+        retire(&retired, &target, made)?;
+        if target.exists() {
+            fs::rename(&target, &retired).map_err(Error::write(path))?;
+        }
+        fs::rename(&temporary, &target).map_err(Error::write(path))?;
+        retire(&retired, &target, made)
+    };
+    let filled = fill(&temporary);
+    sync_dir(&temporary);
+    let _swapping = lock_parent(&target);
+    let result = filled.and_then(|()| swap());
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
-        if !path.exists() {
-            let _ = fs::rename(&retired, path);
+        if !target.exists() {
+            let _ = fs::rename(&retired, &target);
         }
         return result;
     }
-    sync_parent(path);
+    sync_dir(parent_of(&target));
     Ok(())
+}
+
+/// Has processes that replace folders beside `path` do it one after the other, until what is returned is dropped. Without it, a
+/// folder is gone for a moment. Where the file system has no locks, there is none.
+pub fn lock_parent(path: &Path) -> Option<File> {
+    let parent = File::open(parent_of(path)).ok()?;
+    parent.lock().ok().map(|()| parent)
 }
 
 /// Removes the folder `retired`, of whose files `made` are the program's, once the others are in the folder `heir`.
@@ -108,10 +126,9 @@ pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
             return remove_made(path, made);
         }
     }
-    let temporary = sibling(path, PARTIAL);
-    remove_dir_if_there(&temporary)?;
+    let temporary = free_names(path).next().expect("names without end");
     fs::rename(path, &temporary).map_err(Error::write(path))?;
-    remove_dir_if_there(&temporary)
+    unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
 }
 
 /// Removes `made` from `folder`, and the folder itself, if nothing else is in it.
@@ -122,13 +139,14 @@ fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
         unless_missing(removed).map_err(Error::write(&path))?;
     }
     match fs::remove_dir(folder) {
-        Err(e) if e.kind() == std::io::ErrorKind::DirectoryNotEmpty => Ok(()),
+        Err(e) if e.kind() == ErrorKind::DirectoryNotEmpty => Ok(()),
         removed => unless_missing(removed).map_err(Error::write(folder)),
     }
 }
 
-/// Puts right what [`replace_dir`] left in `folder` when its process was ended: folders that it had moved away come back where
-/// nothing has taken their place, and those half filled go. Nothing is done where there is no such folder.
+/// Puts right what [`replace_dir`] and [`remove_dir`] left in `folder` when their process was ended: folders that were moved away
+/// come back where nothing has taken their place, and those half filled or half removed go. Nothing is done where there is no
+/// such folder.
 ///
 /// # Errors
 /// The system's refusal to read, rename or remove.
@@ -139,36 +157,50 @@ pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
     for entry in fs::read_dir(folder).map_err(Error::read(folder))? {
         let left = entry.map_err(Error::read(folder))?.path();
         let name = left.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        if !left.is_dir() {
-            continue;
-        }
-        let of = |suffix: &str| {
-            let name = name.strip_prefix('.')?.strip_suffix(suffix)?.strip_suffix('.')?;
-            Some(folder.join(name))
-        };
-        match of(OLD) {
-            Some(path) if !path.exists() => fs::rename(&left, &path).map_err(Error::write(&path))?,
-            Some(path) => retire(&left, &path, made)?,
-            None if of(PARTIAL).is_some() => remove_dir_if_there(&left)?,
-            None => {}
+        let Some(name) = name.strip_prefix('.').filter(|_| left.is_dir()) else { continue };
+        if let Some(name) = name.strip_suffix(&format!(".{OLD}")) {
+            let path = folder.join(name);
+            match path.exists() {
+                false => fs::rename(&left, &path).map_err(Error::write(&path))?,
+                true => retire(&left, &path, made)?,
+            }
+        } else if name.contains(&format!(".{PARTIAL}")) {
+            remove_abandoned(&left).map_err(Error::write(&left))?;
         }
     }
     Ok(())
 }
 
-/// A file that another hand fills, or by and by: at `place` until it is kept, and gone unless it is.
+/// A file that is being filled beside its place, and gone unless it is kept.
 #[derive(Debug)]
 pub struct PartialFile {
+    /// As errors call it.
     path: PathBuf,
-    /// Where it is filled.
+    /// Where it goes: `path` with links followed.
+    target: PathBuf,
+    /// Where it is filled, by this process alone.
     pub place: PathBuf,
-    kept: bool,
+    /// The file there, empty at first.
+    pub file: File,
+    /// Whether nothing is at `place` any more.
+    is_gone: bool,
 }
 
 impl PartialFile {
-    /// What is to become the file at `path`. Nothing is there yet.
-    pub fn of(path: &Path) -> Self {
-        PartialFile { path: path.to_owned(), place: sibling(path, PARTIAL), kept: false }
+    /// Makes the file that is to become the one at `path`. One that replaces another can be read by the same people, and by its
+    /// owner be written.
+    ///
+    /// # Errors
+    /// Anything but a regular file at `path`, or the system's refusal to write.
+    pub fn create(path: &Path) -> Result<Self> {
+        let target = target_of(path, Metadata::is_file, "the name of a file")?;
+        let make = |place: &Path| OpenOptions::new().write(true).create_new(true).open(place);
+        let (place, file) = claim(&target, make).map_err(Error::write(path))?;
+        if let Ok(replaced) = fs::metadata(&target) {
+            // Best effort: some file systems have no permissions.
+            let _ = file.set_permissions(writable_by_owner(replaced.permissions()));
+        }
+        Ok(PartialFile { path: path.to_owned(), target, place, file, is_gone: false })
     }
 
     /// Gives it its name.
@@ -176,81 +208,227 @@ impl PartialFile {
     /// # Errors
     /// The system's refusal to write.
     pub fn keep(mut self) -> Result<()> {
-        let whole = File::open(&self.place).and_then(|file| file.sync_all());
-        whole.and_then(|()| fs::rename(&self.place, &self.path)).map_err(Error::write(&self.path))?;
-        self.kept = true;
-        sync_parent(&self.path);
+        let whole = self.file.sync_all().and_then(|()| fs::rename(&self.place, &self.target));
+        whole.map_err(Error::write(&self.path))?;
+        self.is_gone = true;
+        sync_dir(parent_of(&self.target));
         Ok(())
+    }
+
+    /// Removes it.
+    fn remove(mut self) -> io::Result<()> {
+        self.is_gone = true;
+        unless_missing(fs::remove_file(&self.place))
     }
 }
 
 impl Drop for PartialFile {
     fn drop(&mut self) {
-        if !self.kept {
+        if !self.is_gone {
             let _ = fs::remove_file(&self.place);
         }
     }
 }
 
-/// Whether a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
+/// Checks that a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
 ///
 /// # Errors
-/// A request error that names the path.
+/// A request error that names the path: anything but a regular file there, or what the system refuses.
 pub fn check_writable_file(path: &Path) -> Result<()> {
-    if path.is_dir() {
-        return Err(Error::input(path, "the output", "a folder", "the name of a file"));
-    }
-    let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    probe(parent, path)
-}
-
-/// Whether files could be written under the folder `path`, which is made if need be.
-///
-/// # Errors
-/// A request error that names the path.
-pub fn check_writable_dir(path: &Path) -> Result<()> {
-    if path.is_file() {
-        return Err(Error::input(path, "the output", "a file", "the name of a folder"));
-    }
+    let parent = match target_of(path, Metadata::is_file, "the name of a file") {
+        Ok(target) => parent_of(&target).to_owned(),
+        Err(e) => return Err(refused(e)),
+    };
+    fs::create_dir_all(parent).map_err(Error::write(path)).map_err(refused)?;
     probe(path, path)
 }
 
-fn probe(dir: &Path, named: &Path) -> Result<()> {
-    let refused = |e: std::io::Error| match Error::write(named)(e) {
-        // There may be room later: that is no wrong request.
-        full if full.is_disk_full() => full,
-        other => Error::Request(other.to_string()),
+/// Checks that files could be written under the folder `path`, which is made if need be.
+///
+/// # Errors
+/// A request error that names the path: anything but a folder there, or what the system refuses.
+pub fn check_writable_dir(path: &Path) -> Result<()> {
+    let folder = target_of(path, Metadata::is_dir, "the name of a folder").map_err(refused)?;
+    fs::create_dir_all(&folder).map_err(Error::write(path)).map_err(refused)?;
+    probe(&folder.join("globalsplat-probe"), path)
+}
+
+/// Makes a file beside `file` and removes it again; errors call it `named`.
+fn probe(file: &Path, named: &Path) -> Result<()> {
+    let named_so = |e: Error| match e {
+        Error::Write { source, .. } => Error::write(named)(source),
+        other => other,
     };
-    fs::create_dir_all(dir).map_err(refused)?;
-    // What a process that was ended left of it, the next one removes.
-    let file = dir.join(".globalsplat-probe");
-    File::create(&file).map_err(refused)?;
-    unless_missing(fs::remove_file(&file)).map_err(refused)
+    let removed = PartialFile::create(file).map_err(named_so).map(PartialFile::remove);
+    removed.and_then(|removed| removed.map_err(Error::write(named))).map_err(refused)
 }
 
-/// `.name.suffix` beside `path`.
-fn sibling(path: &Path, suffix: &str) -> PathBuf {
-    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    path.with_file_name(format!(".{name}.{suffix}"))
+/// What the system refuses is a wrong request.
+fn refused(e: Error) -> Error {
+    match e {
+        // There may be room later.
+        full if full.is_disk_full() => full,
+        Error::Write { .. } => Error::Request(e.to_string()),
+        other => other,
+    }
 }
 
-fn remove_dir_if_there(path: &Path) -> Result<()> {
-    unless_missing(fs::remove_dir_all(path)).map_err(Error::write(path))
+/// Checks that a regular file is at `path`, or nothing.
+///
+/// # Errors
+/// A request error that names the path.
+pub fn check_regular(path: &Path) -> Result<()> {
+    target_of(path, Metadata::is_file, "the name of a file").map(drop).map_err(refused)
+}
+
+/// Where what is written to `path` goes: links are followed, also one whose target isn't there yet.
+///
+/// # Errors
+/// Anything at `path` that `is_expected` says no of, such as a device.
+fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) -> Result<PathBuf> {
+    let refuse = |found: &str| Err(Error::input(path, "the output", found, expected));
+    match fs::metadata(path) {
+        Ok(there) if is_expected(&there) => {}
+        Ok(there) => return refuse(kind_name(there.file_type())),
+        Err(e) if e.kind() == ErrorKind::NotFound => {}
+        Err(e) => return Err(Error::write(path)(e)),
+    }
+    let mut target = path.to_owned();
+    while let Ok(link) = fs::read_link(&target) {
+        // As /dev/stdout and /dev/fd/1 are.
+        if parent_of(&target).canonicalize().is_ok_and(|folder| folder.starts_with("/proc")) {
+            return refuse("an open file of a process");
+        }
+        target = parent_of(&target).join(link);
+    }
+    Ok(target)
+}
+
+fn kind_name(kind: FileType) -> &'static str {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        if kind.is_fifo() {
+            return "a FIFO";
+        }
+        if kind.is_socket() {
+            return "a socket";
+        }
+        if kind.is_block_device() || kind.is_char_device() {
+            return "a device";
+        }
+    }
+    if kind.is_dir() { "a folder" } else { "a file" }
+}
+
+#[cfg(unix)]
+fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
+    use std::os::unix::fs::PermissionsExt;
+    permissions.set_mode(permissions.mode() & 0o777 | 0o200);
+    permissions
+}
+
+#[cfg(not(unix))]
+fn writable_by_owner(permissions: fs::Permissions) -> fs::Permissions {
+    permissions
+}
+
+/// Takes a temporary name beside `target` for this process alone. `make` makes what is to be there, new, and opens it: the lock on
+/// it lasts until that is closed.
+fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<(PathBuf, File)> {
+    for place in free_names(target) {
+        let file = match make(&place) {
+            Ok(file) => file,
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => continue,
+            Err(e) => return Err(e),
+        };
+        // Without locks nobody takes it for abandoned, and nobody removes what was.
+        let _ = file.lock();
+        // Another process may have found it before it was locked, and removed it.
+        if is_at(&file, &place) {
+            let later = temporary_names(target).skip_while(|name| *name != place).skip(1);
+            for left in later.take_while(|name| name.symlink_metadata().is_ok()) {
+                let _ = remove_abandoned(&left);
+            }
+            return Ok((place, file));
+        }
+    }
+    unreachable!("names without end")
+}
+
+/// The temporary names for `target` that nothing has, once what was abandoned there is removed.
+fn free_names(target: &Path) -> impl Iterator<Item = PathBuf> {
+    // A removal that fails leaves the name taken.
+    let is_free =
+        |name: &PathBuf| name.symlink_metadata().is_err() || remove_abandoned(name).unwrap_or(false);
+    temporary_names(target).filter(is_free)
+}
+
+/// All temporary names for `target`, without end.
+fn temporary_names(target: &Path) -> impl Iterator<Item = PathBuf> {
+    let name = target.file_name().unwrap_or_default().to_string_lossy();
+    let ends = name.char_indices().map(|(at, letter)| at + letter.len_utf8());
+    let end = ends.take_while(|end| *end <= NAME_BYTES).last().unwrap_or(0);
+    let stem = format!(".{}.{PARTIAL}", &name[..end]);
+    let target = target.to_owned();
+    (0..).map(move |number| match number {
+        0 => target.with_file_name(&stem),
+        later => target.with_file_name(format!("{stem}-{later}")),
+    })
+}
+
+/// Removes the temporary file or folder at `place` unless a process works on it, and returns whether it did.
+fn remove_abandoned(place: &Path) -> io::Result<bool> {
+    let kind = place.symlink_metadata()?.file_type();
+    if !kind.is_file() && !kind.is_dir() {
+        return Ok(false);
+    }
+    let file = File::open(place)?;
+    if file.try_lock().is_err() || !is_at(&file, place) {
+        return Ok(false);
+    }
+    unless_missing(if kind.is_dir() { fs::remove_dir_all(place) } else { fs::remove_file(place) })?;
+    Ok(true)
+}
+
+/// Whether `file` is what lies at `place`.
+fn is_at(file: &File, place: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let id = |metadata: Metadata| (metadata.dev(), metadata.ino());
+        let there = place.symlink_metadata().map(id);
+        file.metadata().map(id).is_ok_and(|own| there.is_ok_and(|there| there == own))
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = file;
+        place.exists()
+    }
+}
+
+/// Where the folder at `path` is moved to make room for its successor.
+fn old_name(path: &Path) -> PathBuf {
+    let mut name = std::ffi::OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(format!(".{OLD}"));
+    path.with_file_name(name)
 }
 
 /// What isn't there needs no removing.
-fn unless_missing(removed: std::io::Result<()>) -> std::io::Result<()> {
+fn unless_missing(removed: io::Result<()>) -> io::Result<()> {
     match removed {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e),
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(e),
         _ => Ok(()),
     }
 }
 
-/// A rename is only safe from a power cut once its folder is on the disk. Not every file system can; then it is best effort.
-fn sync_parent(path: &Path) {
-    sync_dir(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")));
+fn parent_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
+/// Puts the names in a folder on the disk: a rename is only safe from a power cut then. Not every file system can; then it is best
+/// effort.
 fn sync_dir(path: &Path) {
     if let Ok(dir) = File::open(path) {
         let _ = dir.sync_all();
@@ -260,6 +438,18 @@ fn sync_dir(path: &Path) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(folder).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    fn write(path: &Path, text: &str) -> Result<()> {
+        write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))
+    }
 
     #[test]
     fn a_folder_goes_as_one_and_foreign_files_stay() {
@@ -271,7 +461,7 @@ mod tests {
         };
         make(&["model", "state"]);
         // Of one that was removed by half before, nothing hinders.
-        fs::create_dir_all(sibling(&folder, PARTIAL).join("model")).unwrap();
+        fs::create_dir_all(root.path().join(".step.globalsplat-partial/model")).unwrap();
         remove_dir(&folder, &["model", "state"]).unwrap();
         assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
 
@@ -279,5 +469,122 @@ mod tests {
         remove_dir(&folder, &["model", "state"]).unwrap();
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
         assert_eq!(fs::read(folder.join("notes")).unwrap(), b"notes");
+    }
+
+    #[test]
+    fn writers_of_one_file_have_names_of_their_own() {
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("room.ply");
+        // Left by processes that were ended.
+        for left in [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"] {
+            fs::write(root.path().join(left), "left").unwrap();
+        }
+        let first = PartialFile::create(&file).unwrap();
+        assert_eq!(names(root.path()), [".room.ply.globalsplat-partial"]);
+        let second = PartialFile::create(&file).unwrap();
+        assert_eq!(names(root.path()), [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"]);
+        (&first.file).write_all(b"first").unwrap();
+        (&second.file).write_all(b"second").unwrap();
+        second.keep().unwrap();
+        assert_eq!(fs::read(&file).unwrap(), b"second");
+        first.keep().unwrap();
+        assert_eq!(fs::read(&file).unwrap(), b"first");
+        drop(PartialFile::create(&file).unwrap());
+        assert_eq!(names(root.path()), ["room.ply"]);
+    }
+
+    #[test]
+    fn folders_are_replaced_by_many_at_once() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("room");
+        std::thread::scope(|scope| {
+            for writer in 0..8 {
+                let folder = &folder;
+                scope.spawn(move || {
+                    for _ in 0..20 {
+                        let fill = |place: &Path| {
+                            let put = |name| fs::write(place.join(name), format!("{writer}"));
+                            ["a", "b"].into_iter().try_for_each(put).map_err(Error::write(place))
+                        };
+                        replace_dir(folder, &["a", "b"], fill).unwrap();
+                    }
+                });
+            }
+        });
+        assert_eq!(names(root.path()), ["room"]);
+        assert_eq!(fs::read(folder.join("a")).unwrap(), fs::read(folder.join("b")).unwrap());
+    }
+
+    #[test]
+    fn names_may_be_as_long_as_the_file_system_allows() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["x".repeat(255), "é".repeat(127)] {
+            let file = root.path().join(&name);
+            check_writable_file(&file).unwrap();
+            write(&file, "text").unwrap();
+            assert_eq!(names(root.path()), [name]);
+            fs::remove_file(file).unwrap();
+        }
+        assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_request());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_are_followed_and_anything_else_is_refused() {
+        use std::os::unix::fs::symlink;
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        fs::create_dir(at("below")).unwrap();
+        fs::write(at("below/file"), "old").unwrap();
+        symlink("file", at("below/link")).unwrap();
+        symlink("below/link", at("twice")).unwrap();
+        symlink("below/new", at("dangling")).unwrap();
+        for (link, target) in [("twice", "below/file"), ("dangling", "below/new")] {
+            check_writable_file(&at(link)).unwrap();
+            write(&at(link), "new").unwrap();
+            assert!(at(link).is_symlink(), "{link}");
+            assert_eq!(fs::read(at(target)).unwrap(), b"new");
+        }
+        assert!(at("below/link").is_symlink());
+        assert_eq!(names(&at("below")), ["file", "link", "new"]);
+
+        let fifo = std::ffi::CString::new(at("fifo").to_str().unwrap()).unwrap();
+        assert_eq!(unsafe { libc::mkfifo(fifo.as_ptr(), 0o600) }, 0);
+        let _listener = std::os::unix::net::UnixListener::bind(at("socket")).unwrap();
+        symlink("fifo", at("to_fifo")).unwrap();
+        symlink("loop", at("loop")).unwrap();
+        for (path, found) in [
+            (at("fifo"), "a FIFO"),
+            (at("to_fifo"), "a FIFO"),
+            (at("socket"), "a socket"),
+            (at("below"), "a folder"),
+            ("/dev/null".into(), "a device"),
+            ("/proc/self/exe".into(), "an open file of a process"),
+            (at("loop"), "can't be written"),
+        ] {
+            for error in [check_writable_file(&path).unwrap_err(), write(&path, "new").unwrap_err()] {
+                assert!(error.to_string().contains(found), "{error}");
+            }
+            assert!(check_writable_file(&path).unwrap_err().is_request());
+        }
+        for file in ["fifo", "below/file"] {
+            assert!(check_writable_dir(&at(file)).unwrap_err().to_string().contains("the name of a folder"));
+        }
+        assert_eq!(names(root.path()), ["below", "dangling", "fifo", "loop", "socket", "to_fifo", "twice"]);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_few_may_read_stays_so() {
+        use std::os::unix::fs::PermissionsExt;
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("private");
+        for (before, after) in [(0o600, 0o600), (0o400, 0o600), (0o664, 0o664)] {
+            fs::write(&file, "old").unwrap();
+            fs::set_permissions(&file, fs::Permissions::from_mode(before)).unwrap();
+            write(&file, "new").unwrap();
+            assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, after);
+            fs::remove_file(&file).unwrap();
+        }
     }
 }

@@ -5,6 +5,9 @@ use tch::{Kind, Tensor};
 /// Depth behind less opacity than this is no depth.
 const MIN_ALPHA: f64 = 0.05;
 
+/// Depths and their ranges that are 0 are divided by as this, so that colours are the same whatever the unit is.
+const SMALLEST: f64 = f32::MIN_POSITIVE as f64;
+
 /// matplotlib's viridis, from far to near: dark violet, blue, green, yellow. Of the well-known ones its lightness grows in the most
 /// even steps, so it reads the same in grey and for the colour-blind; and what is far isn't black, which is where nothing is.
 const COLOURS: colorous::Gradient = colorous::VIRIDIS;
@@ -39,7 +42,7 @@ impl DepthScale {
     /// Depth [H, W] as colours [3, H, W]: near is bright, far dark, evenly by inverse depth; where little is seen (`alpha`) it
     /// fades to black.
     pub fn colourize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
-        let share = (inverse(depth) - self.far) / (self.near - self.far).max(1e-9);
+        let share = (inverse(depth) - self.far) / (self.near - self.far).max(SMALLEST);
         let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
         let colours = Tensor::from_slice2(&depth_colours()).to_device(depth.device());
         let (height, width) = (depth.size()[0], depth.size()[1]);
@@ -55,7 +58,7 @@ pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
 }
 
 fn inverse(depth: &Tensor) -> Tensor {
-    depth.clamp_min(1e-6).reciprocal()
+    depth.clamp_min(SMALLEST).reciprocal()
 }
 
 fn seen(depth: &Tensor, alpha: &Tensor) -> Tensor {

@@ -1,6 +1,7 @@
 //! Environment variables in what a configuration names.
 
 use crate::error::{Error, Result};
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 /// The path that `text` names, with `${NAME}` and `${NAME:-default}` filled in. An empty variable counts as none.
@@ -11,18 +12,18 @@ pub fn expand_path(text: &str) -> Result<PathBuf> {
     expand(text).map(PathBuf::from)
 }
 
-fn expand(text: &str) -> Result<String> {
-    let Some((before, rest)) = text.split_once("${") else { return Ok(text.to_string()) };
-    let Some((inside, after)) = rest.split_once('}') else { return Ok(text.to_string()) };
+fn expand(text: &str) -> Result<OsString> {
+    let Some((before, rest)) = text.split_once("${") else { return Ok(text.into()) };
+    let Some((inside, after)) = rest.split_once('}') else { return Ok(text.into()) };
     let (name, default) = match inside.split_once(":-") {
-        Some((name, default)) => (name, Some(default.to_string())),
+        Some((name, default)) => (name, Some(OsString::from(default))),
         None => (inside, None),
     };
-    let value = std::env::var(name).ok().filter(|v| !v.is_empty()).or(default);
+    let value = std::env::var_os(name).filter(|v| !v.is_empty()).or(default);
     let value = value.ok_or_else(|| {
         Error::Request(format!(
             "{text}: the environment variable {name} is not set, expected it or a path in its place"
         ))
     })?;
-    Ok(format!("{before}{value}{}", expand(after)?))
+    Ok([before.into(), value, expand(after)?].into_iter().collect())
 }

@@ -12,7 +12,7 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 use tch::Tensor;
 
-/// A film under way. It appears at its path when it is finished; one that is dropped before leaves nothing.
+/// A film that is being written. It appears at its path when it is finished; one that is dropped before leaves nothing.
 pub struct Film {
     path: PathBuf,
     size: ImageSize,
@@ -20,6 +20,22 @@ pub struct Film {
     encoder: Encoder,
     // After the encoder, which writes to it until it is dropped.
     partial: PartialFile,
+}
+
+/// Told by the ending.
+enum Format {
+    Gif,
+    Mp4,
+}
+
+impl Format {
+    fn of(path: &Path) -> Option<Self> {
+        match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+            "gif" => Some(Format::Gif),
+            "mp4" => Some(Format::Mp4),
+            _ => None,
+        }
+    }
 }
 
 enum Encoder {
@@ -33,11 +49,16 @@ impl Film {
     /// # Errors
     /// Another ending, more frames per second than the format has, or no ffmpeg with libx264 for `.mp4`.
     pub fn check(path: &Path, frames_per_second: u32) -> Result<()> {
-        match path.extension().and_then(|e| e.to_str()) {
-            Some("gif") => Gif::check(path, frames_per_second),
-            Some("mp4") => Mp4::check(path),
-            _ => Err(Error::input(path, "the film's ending", path.display(), ".gif or .mp4")),
+        match Format::of(path) {
+            Some(Format::Gif) => Gif::check(path, frames_per_second),
+            Some(Format::Mp4) => Mp4::check(path),
+            None => Err(Error::input(path, "the film's ending", path.display(), ".gif or .mp4")),
         }
+    }
+
+    /// Whether the ending of `path` is that of a film.
+    pub fn is_name(path: &Path) -> bool {
+        Format::of(path).is_some()
     }
 
     /// Begins a film of `size`; an MP4 has even sides, and loses a row or a column that is too many.
@@ -46,10 +67,10 @@ impl Film {
     /// As [`Film::check`], a size that the format doesn't know, or the system's refusal to write.
     pub fn begin(path: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         Self::check(path, frames_per_second)?;
-        let partial = PartialFile::of(path);
-        let encoder = match path.extension().is_some_and(|ending| ending == "gif") {
-            true => Encoder::Gif(Gif::begin(path, &partial.place, size, frames_per_second)?),
-            false => Encoder::Mp4(Mp4::begin(path, &partial.place, size, frames_per_second)?),
+        let partial = PartialFile::create(path)?;
+        let encoder = match Format::of(path) {
+            Some(Format::Gif) => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
+            _ => Encoder::Mp4(Mp4::begin(path, &partial.place, size, frames_per_second)?),
         };
         Ok(Film { path: path.to_owned(), size, frames: 0, encoder, partial })
     }
@@ -102,13 +123,13 @@ impl Gif {
         }
     }
 
-    fn begin(path: &Path, place: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
+    fn begin(path: &Path, file: &File, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         let ImageSize { height, width } = size;
         let (Ok(sixteen_wide), Ok(sixteen_high)) = (u16::try_from(width), u16::try_from(height)) else {
             let found = format!("{width}×{height} pixels");
             return Err(Error::input(path, "the film's size", found, "65535 or less a side in a .gif"));
         };
-        let writer = BufWriter::new(File::create(place).map_err(Error::write(path))?);
+        let writer = BufWriter::new(file.try_clone().map_err(Error::write(path))?);
         let encoder = gif::Encoder::new(writer, sixteen_wide, sixteen_high, &[]);
         let mut encoder = encoder.map_err(not_encoded(path))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(not_encoded(path))?;

@@ -1,12 +1,15 @@
 //! Images between files and tensors, and pictures for people.
 
+use super::jpeg::{END_MARKER, check_jpeg, jpeg_size};
 use super::{check_writable_file, write_atomically};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, panic_message};
 use crate::scene::ImageSize;
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Rgb, RgbImage};
-use std::io::{BufReader, Cursor};
+use std::any::Any;
+use std::io::{BufReader, Cursor, Seek};
+use std::panic::{self, AssertUnwindSafe};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
@@ -17,7 +20,7 @@ pub const PHOTO_EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// are rounded to 8.
 ///
 /// # Errors
-/// A file that is missing or can't be decoded.
+/// A file that is missing, can't be decoded, or is cut short.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     Ok(rgb_over_black(decode(&bytes, path)?.image))
@@ -28,7 +31,7 @@ pub fn read_image(path: &Path) -> Result<RgbImage> {
 pub struct Photo {
     /// 8-bit RGB.
     pub pixels: RgbImage,
-    /// Whether they are just what its file holds, not turned and not converted.
+    /// Whether its file holds 8-bit RGB, and these pixels: no palette, grey, CMYK or opacity, not turned and not converted.
     pub as_stored: bool,
     /// Whether its file is a JPEG.
     pub is_jpeg: bool,
@@ -45,7 +48,7 @@ pub struct Photo {
 /// # Errors
 /// As [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Photo> {
-    let Decoded { mut image, orientation, format } = decode(encoded, file)?;
+    let Decoded { mut image, orientation, format, is_rgb } = decode(encoded, file)?;
     let stored = (image.width(), image.height());
     let turned = match orientation {
         Orientation::Rotate90
@@ -58,7 +61,7 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Pho
     if turn {
         image.apply_orientation(orientation);
     }
-    let as_stored = !turn && matches!(image, DynamicImage::ImageRgb8(_));
+    let as_stored = !turn && is_rgb && matches!(image, DynamicImage::ImageRgb8(_));
     Ok(Photo { pixels: rgb_over_black(image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
 }
 
@@ -79,7 +82,9 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
 
 /// As [`read_image_size`], of an image in memory; `None` for what is no image.
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
-    ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok()
+    let dimensions =
+        || ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok();
+    jpeg_size(Cursor::new(encoded)).or_else(dimensions)
 }
 
 /// (width, height) of the pixels as stored, from the image's header alone.
@@ -88,7 +93,13 @@ pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
 /// A file that is missing or is no image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     let file = std::fs::File::open(path).map_err(Error::read(path))?;
-    let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(Error::read(path))?;
+    let mut reader = BufReader::new(file);
+    // The decoder would read the whole file.
+    if let Some(size) = jpeg_size(&mut reader) {
+        return Ok(size);
+    }
+    reader.rewind().map_err(Error::read(path))?;
+    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
     reader.into_dimensions().map_err(undecodable(path))
 }
 
@@ -96,7 +107,14 @@ struct Decoded {
     image: DynamicImage,
     orientation: Orientation,
     format: Option<ImageFormat>,
+    /// Whether the file holds three channels, whatever they were decoded to, and is marked as whole.
+    is_rgb: bool,
 }
+
+/// Where a PNG's header says what its pixels are made of.
+const PNG_COLOUR_TYPE: usize = 25;
+/// Red, green and blue, without a palette.
+const PNG_RGB: u8 = 2;
 
 fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
@@ -110,10 +128,31 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
         return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
     }
     decoder.set_limits(limits).map_err(undecodable(file))?;
+    let is_rgb = match format {
+        Some(ImageFormat::Jpeg) => {
+            let damaged =
+                |why| Error::input(file, "the image", format!("undecodable ({why})"), "a PNG or JPEG");
+            let checked = check_jpeg(encoded).map_err(damaged)?;
+            if !checked.is_marked {
+                // Without it the decoder leaves the last rows grey, though nothing of them is missing.
+                let decoded = decode(&[encoded, &END_MARKER].concat(), file)?;
+                return Ok(Decoded { is_rgb: false, ..decoded });
+            }
+            checked.components == Some(3)
+        }
+        Some(ImageFormat::Png) => encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB),
+        _ => false,
+    };
     // EXIF that can't be read is no reason to refuse the pixels.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let image = DynamicImage::from_decoder(decoder).map_err(undecodable(file))?;
-    Ok(Decoded { image, orientation, format })
+    // Decoders of some rare kinds panic.
+    let image = panic::catch_unwind(AssertUnwindSafe(|| DynamicImage::from_decoder(decoder)));
+    let panicked = |why: Box<dyn Any + Send>| {
+        let found = format!("undecodable (the decoder failed: {})", panic_message(&*why));
+        Error::input(file, "the image", found, "a PNG or JPEG")
+    };
+    let image = image.map_err(panicked)?.map_err(undecodable(file))?;
+    Ok(Decoded { image, orientation, format, is_rgb })
 }
 
 fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
@@ -156,12 +195,17 @@ pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
         .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
 }
 
+/// Whether the ending of `path` is a PNG's.
+pub fn is_png_name(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png"))
+}
+
 /// Whether a PNG could be written at `path`, as by [`check_writable_file`].
 ///
 /// # Errors
 /// Another ending, and as there.
 pub fn check_writable_png(path: &Path) -> Result<()> {
-    if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
+    if !is_png_name(path) {
         return Err(Error::input(path, "the picture's ending", "another", ".png"));
     }
     check_writable_file(path)
@@ -184,7 +228,15 @@ pub fn write_jpeg(path: &Path, picture: &Tensor) -> Result<()> {
 }
 
 fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
-    let bytes = encode_photo(&rgb_from_tensor(picture)?, as_jpeg)?;
+    write_image(path, &rgb_from_tensor(picture)?, as_jpeg)
+}
+
+/// Writes an image as a JPEG, or as a PNG.
+///
+/// # Errors
+/// The system's refusal to write, or a size that the format doesn't know.
+pub(super) fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Result<()> {
+    let bytes = encode_photo(image, as_jpeg)?;
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
@@ -192,6 +244,23 @@ fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
 pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
     let factor = (height / picture.size()[1]).max(1);
     picture.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
+}
+
+/// Shrinks `picture` [3, H, W] by a whole factor: every pixel is the mean of `factor`² pixels.
+pub fn shrink(picture: &Tensor, factor: i64) -> Tensor {
+    match factor {
+        1 => picture.shallow_clone(),
+        _ => picture.avg_pool2d(factor, factor, 0, false, true, None),
+    }
+}
+
+/// Takes every `factor`-th row and column of numbers [H, W] that have no mean, as many as [`shrink`] leaves.
+pub fn subsample(numbers: &Tensor, factor: i64) -> Tensor {
+    let along = |t: Tensor, dim: i64| {
+        let whole = t.size()[dim as usize] / factor * factor;
+        t.narrow(dim, 0, whole).slice(dim, factor / 2, None, factor)
+    };
+    along(along(numbers.shallow_clone(), 0), 1)
 }
 
 /// Pixels between pictures.
@@ -205,6 +274,27 @@ pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
 /// Pictures [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
 pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 1)
+}
+
+/// Puts images below each other, or else side by side, as [`tile_vertically`] and [`tile_horizontally`] do it.
+pub(super) fn tile_images(images: &[RgbImage], is_column: bool) -> RgbImage {
+    let gap = GAP as u32;
+    let largest = |side: fn(&RgbImage) -> u32| images.iter().map(side).max().unwrap_or(0);
+    let sum = |side: fn(&RgbImage) -> u32| {
+        (images.iter().map(side).sum::<u32>() + gap * images.len() as u32).saturating_sub(gap)
+    };
+    let (width, height) = match is_column {
+        true => (largest(RgbImage::width), sum(RgbImage::height)),
+        false => (sum(RgbImage::width), largest(RgbImage::height)),
+    };
+    let mut whole = RgbImage::from_pixel(width, height, Rgb([u8::MAX; 3]));
+    let mut at = 0;
+    for image in images {
+        let (x, y, side) = if is_column { (0, at, image.height()) } else { (at, 0, image.width()) };
+        image::imageops::replace(&mut whole, image, x.into(), y.into());
+        at += side + gap;
+    }
+    whole
 }
 
 /// How large `count` pictures of `size` are when [`tile_horizontally`] has put them side by side.

@@ -1,13 +1,21 @@
 //! Weights too large for one file: several, and an index that says which tensor is where, as Hugging Face's libraries write and read
 //! them.
 
-use super::weights::{Weights, write_weights};
+use super::atomic::PartialFile;
+use super::weights::{Weights, write_weights, write_weights_partially};
 use super::weights_file::{INDEX_ENDING, ShardIndex};
 use super::write_json;
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
+
+/// The index of the shards that [`write_sharded`] writes for `path`; none where its name isn't one for shards.
+pub fn shard_index(path: &Path) -> Option<PathBuf> {
+    let ending = path.extension()?;
+    let stem = path.file_stem()?.to_string_lossy();
+    ending.eq_ignore_ascii_case("safetensors").then(|| path.with_file_name(format!("{stem}{INDEX_ENDING}")))
+}
 
 /// Writes `weights` to `path`, a `*.safetensors`, or, where they have more bytes than `most`, to files of no more beside it
 /// (`*-00001-of-00003.safetensors`) and their index. A tensor that is larger by itself has a file of its own. What was written is
@@ -24,9 +32,10 @@ pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBu
         return Ok(path.to_owned());
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let Some(stem) = name.strip_suffix(".safetensors") else {
+    let Some(index) = shard_index(path) else {
         return Err(Error::input(path, "the name", name, "one that ends in .safetensors, for shards"));
     };
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     if path.exists() {
         let expected = "none: it would be taken for the shards that are to be written";
         return Err(Error::input(path, "the output", "a file", expected));
@@ -41,17 +50,18 @@ pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBu
         room = room.saturating_sub(bytes(tensor));
         shards.last_mut().expect("one at least").insert(name.clone(), tensor.shallow_clone());
     }
-    let index = path.with_file_name(format!("{stem}{INDEX_ENDING}"));
+    let (mut weight_map, mut written) = (BTreeMap::new(), vec![]);
+    for (number, shard) in shards.iter().enumerate() {
+        let name = format!("{stem}-{:05}-of-{:05}.safetensors", number + 1, shards.len());
+        let metadata = weights.metadata.clone();
+        written.push(write_weights_partially(&path.with_file_name(&name), shard, metadata)?);
+        weight_map.extend(shard.keys().map(|tensor| (tensor.clone(), name.clone())));
+    }
     // One of before would describe other files.
     if index.exists() {
         std::fs::remove_file(&index).map_err(Error::write(&index))?;
     }
-    let mut weight_map = BTreeMap::new();
-    for (number, shard) in shards.iter().enumerate() {
-        let name = format!("{stem}-{:05}-of-{:05}.safetensors", number + 1, shards.len());
-        write_weights(&path.with_file_name(&name), shard, weights.metadata.clone())?;
-        weight_map.extend(shard.keys().map(|tensor| (tensor.clone(), name.clone())));
-    }
+    written.into_iter().try_for_each(PartialFile::keep)?;
     let metadata = [("total_size".to_string(), total.into())].into_iter().collect();
     write_json(&index, &ShardIndex { metadata, weight_map })?;
     Ok(index)

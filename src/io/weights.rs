@@ -1,6 +1,6 @@
 //! Weights as safetensors, with the configuration that rebuilds their model in the file's metadata.
 
-use super::write_atomically;
+use super::atomic::{PartialFile, write_partially};
 use crate::error::{Error, Result};
 use safetensors::{Dtype, tensor::TensorView};
 use std::collections::{BTreeMap, HashMap};
@@ -25,6 +25,18 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
+    write_weights_partially(path, tensors, metadata)?.keep()
+}
+
+/// As [`write_weights`], but for the name, which the file gets when it is kept.
+///
+/// # Errors
+/// As there.
+pub(super) fn write_weights_partially(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor>,
+    metadata: HashMap<String, String>,
+) -> Result<PartialFile> {
     let stored = Stored::all(tensors)?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
     let failed = |e: &dyn std::fmt::Display| {
@@ -32,7 +44,7 @@ pub fn write_weights(
     };
     let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
     sort_header(&mut bytes).map_err(|e| failed(&e))?;
-    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+    write_partially(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
 /// The metadata come in the order of a hash map, another one in each process: sorted, the same weights are the same bytes.

@@ -2,13 +2,14 @@
 //! files are mapped, so a tensor is read when it is asked for, once, and straight to where it belongs.
 
 use super::state_dict::{Contents, state_dict};
+use super::text::read_text;
 use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
 use memmap2::{Mmap, MmapMut, MmapOptions, UncheckedAdvice};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs::File;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -35,15 +36,41 @@ pub fn read_weights(path: &Path) -> Result<Weights> {
 
 /// Whether files of this name hold weights, as a rule.
 pub fn is_weights_name(path: &Path) -> bool {
-    let ending = path.extension().and_then(|ending| ending.to_str());
-    path.to_string_lossy().ends_with(INDEX_ENDING)
-        || matches!(ending, Some("safetensors" | "ckpt" | "pt" | "pth"))
+    let name = path.to_string_lossy().to_ascii_lowercase();
+    let endings = [INDEX_ENDING, ".safetensors", ".ckpt", ".pt", ".pth"];
+    endings.iter().any(|ending| name.ends_with(ending))
+}
+
+/// The files that [`WeightsFile::open`] reads at `path`: one, or an index and what it names.
+pub fn weights_files(path: &Path) -> Vec<PathBuf> {
+    let Some(index) = index_at(path) else { return vec![path.to_owned()] };
+    let shards = read_index(&index).map(|index| index.weight_map.into_values().collect::<BTreeSet<_>>());
+    let shards = shards.unwrap_or_default().into_iter().map(|name| index.with_file_name(name));
+    std::iter::once(index.clone()).chain(shards).collect()
+}
+
+/// The index of shards that `path` is, or that stands for it.
+fn index_at(path: &Path) -> Option<PathBuf> {
+    let ends_in = |ending: &str| path.to_string_lossy().to_ascii_lowercase().ends_with(ending);
+    if ends_in(INDEX_ENDING) {
+        return Some(path.to_owned());
+    }
+    // The name that shards were written under.
+    let index = path.with_extension(INDEX_ENDING.trim_start_matches('.'));
+    (!path.exists() && ends_in(".safetensors") && index.exists()).then_some(index)
+}
+
+fn read_index(path: &Path) -> Result<ShardIndex> {
+    serde_json::from_str(&read_text(path)?)
+        .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))
 }
 
 /// Weights in one file or several, none of them read yet.
 #[derive(Debug)]
 pub struct WeightsFile {
     path: PathBuf,
+    /// The index, if there is one, and the files with tensors.
+    files: Vec<PathBuf>,
     parts: Vec<Bytes>,
     tensors: BTreeMap<String, Place>,
     metadata: HashMap<String, String>,
@@ -117,16 +144,10 @@ impl WeightsFile {
     /// # Errors
     /// A file that can't be read, is damaged or is none of these, or has tensors of a type that no weights have.
     pub fn open(path: &Path) -> Result<Self> {
-        if path.to_string_lossy().ends_with(INDEX_ENDING) {
-            return Self::open_shards(path);
+        match index_at(path) {
+            Some(index) => Self::open_shards(&index),
+            None => Self::of(Bytes::map(path)?, path),
         }
-        // The name that shards were written under.
-        let index = path.with_extension(INDEX_ENDING.trim_start_matches('.'));
-        if !path.exists() && path.extension().is_some_and(|ending| ending == "safetensors") && index.exists()
-        {
-            return Self::open_shards(&index);
-        }
-        Self::of(Bytes::map(path)?, path)
     }
 
     /// What the program carries; `path` is what errors call it.
@@ -140,17 +161,17 @@ impl WeightsFile {
             false => safetensors(bytes.get(), path)?,
         };
         let tensors = arrays.into_iter().map(|(name, array)| (name, Place { part: 0, array })).collect();
-        Ok(WeightsFile { path: path.to_owned(), parts: vec![bytes], tensors, metadata })
+        let path = path.to_owned();
+        Ok(WeightsFile { files: vec![path.clone()], path, parts: vec![bytes], tensors, metadata })
     }
 
     fn open_shards(path: &Path) -> Result<Self> {
-        let text = std::fs::read(path).map_err(Error::read(path))?;
-        let index: ShardIndex = serde_json::from_slice(&text)
-            .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))?;
+        let index = read_index(path)?;
         let mut names: Vec<&String> = index.weight_map.values().collect();
         names.sort();
         names.dedup();
         let (mut parts, mut tensors, mut metadata) = (vec![], BTreeMap::new(), HashMap::new());
+        let mut files = vec![path.to_owned()];
         for name in names {
             if Path::new(name).components().count() != 1 || name.starts_with('.') {
                 return Err(Error::input(path, "weight_map", name, "the name of a file beside the index"));
@@ -163,19 +184,25 @@ impl WeightsFile {
             }
             metadata.extend(described);
             parts.push(bytes);
+            files.push(file);
         }
         match index.weight_map.iter().find(|(tensor, _)| !tensors.contains_key(*tensor)) {
             Some((tensor, name)) => {
                 let file = path.with_file_name(name);
                 Err(Error::input(&file, format!("tensor {tensor}"), "absent", "what the index says"))
             }
-            None => Ok(WeightsFile { path: path.to_owned(), parts, tensors, metadata }),
+            None => Ok(WeightsFile { path: path.to_owned(), files, parts, tensors, metadata }),
         }
     }
 
     /// The file, or the index of files.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Returns the files that the weights are in: one, or an index and the shards that it names.
+    pub fn files(&self) -> &[PathBuf] {
+        &self.files
     }
 
     /// The file's `__metadata__`; of a checkpoint the strings beside its state dict, and settings that shapes don't tell.

@@ -6,7 +6,7 @@ use super::layers::linear;
 use super::merge::{Candidates, Stage};
 use super::precision::Precision;
 use super::rotation::{normalize, quaternion_from_6d};
-use crate::scene::Gaussians;
+use crate::scene::{Gaussians, sigmoid};
 use std::f64::consts::LN_2;
 use tch::{Tensor, nn};
 
@@ -172,7 +172,7 @@ impl Decoder {
             means: shown.positions.view([b, n, 3]) + &self.mean_offset,
             scales: shown.log_scales.view([b, n, 3]).exp(),
             quaternions: quaternion_from_6d(&rotations_6d),
-            opacities: logits.sigmoid().clamp(0., MAX_OPACITY),
+            opacities: sigmoid(&logits).clamp(0., MAX_OPACITY),
             sh: shown.sh.view([b, n, self.sh_bases, 3]),
         };
         let raw = RawOutputs { log_scales, rotations, sh, opacity_logits: logits };

@@ -57,7 +57,8 @@ impl Candidates {
     fn merge(&self, gate: &Tensor, groups: i64) -> Candidates {
         let (b, m, k) = gate.size3().expect("[B, M, K]");
         let members = k / groups;
-        let weights = gate.view([b, m, groups, members, 1]).softmax(3, None::<Kind>);
+        // Along the last dimension: along others, bits depend on the number of threads.
+        let weights = gate.view([b, m, groups, members]).softmax(-1, None::<Kind>).unsqueeze(-1);
         let weighted = |t: &Tensor| {
             let grouped = t.view([b, m, groups, members, -1]);
             (&weights * grouped).sum_dim_intlist([3i64].as_slice(), false, None::<Kind>)

@@ -1,7 +1,7 @@
 //! What matrix products are computed in (spec 1.3).
 
 use super::parts::does;
-use globalsplat_csrc::linear::{linear, linear_is_faster};
+use globalsplat_csrc::linear::linear;
 use globalsplat_csrc::processor::{Bf16, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -68,27 +68,16 @@ impl Precision {
 
 /// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
-    let is_on_cpu = xs.device() == Device::Cpu && xs.numel() > 0;
-    let out = if is_on_cpu && is_for_one_dnn(xs.kind()) {
-        by_one_dnn(xs, weights, bias)
-    } else {
-        xs.linear(weights, bias)
-    };
+    let is_ours =
+        xs.device() == Device::Cpu && xs.numel() > 0 && matches!(xs.kind(), Kind::Float | Kind::BFloat16);
+    let out = if is_ours { product_on_cpu(xs, weights, bias) } else { xs.linear(weights, bias) };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
     does(flops, owed(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
 }
 
-/// On a CPU. Libtorch gives it bf16, too, but doesn't see to it that there is memory for its code.
-fn is_for_one_dnn(kind: Kind) -> bool {
-    match kind {
-        Kind::BFloat16 => true,
-        Kind::Float => linear_is_faster(),
-        _ => false,
-    }
-}
-
-fn by_one_dnn(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
+/// The same on the CPU, with the same bits for any number of threads.
+fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let address = |t: &Tensor| t.as_ptr() as usize;
     // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
     let out = unsafe { linear(address(xs), address(weights), bias.map_or(0, address)) };
@@ -152,6 +141,51 @@ impl FromStr for Precision {
             "f32" => Ok(Precision::F32),
             "bf16" => Ok(Precision::Bf16),
             _ => Err(format!("{text} is no precision, expected f32 or bf16")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::no_grad;
+
+    /// Shapes of few and many rows and columns, whole blocks and parts of them; by which sums are split in libraries depends on each.
+    #[test]
+    fn products_have_the_same_bits_for_any_number_of_threads() {
+        let numbers = |count: i64, phase: f64| {
+            (Tensor::arange(count, (Kind::Double, Device::Cpu)).square() + phase).sin().to_kind(Kind::Float)
+        };
+        let threads = tch::get_num_threads();
+        for [m, k, n] in [
+            [1, 128, 128],
+            [6, 12, 128],
+            [256, 64, 64],
+            [260, 1024, 256],
+            [384, 128, 59],
+            [100, 768, 1100],
+            [2056, 512, 130],
+            [4100, 192, 128],
+        ] {
+            for (kind, tolerance) in [(Kind::Float, 1e-6), (Kind::BFloat16, 1e-2)] {
+                let xs = numbers(m * k, 0.).view([m, k]).to_kind(kind);
+                let [weights, bias] =
+                    [numbers(n * k, 1.).view([n, k]), numbers(n, 2.)].map(|t| t.to_kind(kind));
+                let multiply = || no_grad(|| product(&xs, &weights, Some(&bias)));
+                let expected = multiply();
+                for count in [1, 2, 3, 7, 16] {
+                    tch::set_num_threads(count);
+                    assert!(
+                        multiply().equal(&expected),
+                        "[{m}, {k}] × [{k}, {n}], {kind:?}, {count} threads"
+                    );
+                }
+                tch::set_num_threads(threads);
+                let [xs, weights, bias] = [&xs, &weights, &bias].map(|t| t.to_kind(Kind::Double));
+                let exact = xs.linear(&weights, Some(&bias));
+                let error = ((expected - &exact).norm() / exact.norm()).double_value(&[]);
+                assert!(error < tolerance, "[{m}, {k}] × [{k}, {n}], {kind:?}: {error}");
+            }
         }
     }
 }

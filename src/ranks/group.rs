@@ -10,8 +10,10 @@ use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// How long a rank may let the others wait, as it does with a disk that is full.
-pub(super) const PATIENCE_SECONDS: i64 = 30 * 60;
+/// How long a collective waits for the other ranks: 20 days, practically as long as they live. One that is gone is noticed by
+/// [`super::Watch`]; one that has more to do, writes to a slow disk or waits for room on a full one is waited for. In milliseconds it
+/// fits 32 bits.
+pub(super) const PATIENCE_SECONDS: i64 = 20 * 24 * 60 * 60;
 
 /// All ranks, as one of them knows them.
 pub struct Group {
@@ -62,6 +64,16 @@ impl Group {
     /// # Errors
     /// A build without that, or others that don't come.
     pub fn join(place: &Place, store: &ffi::Store, device: Device) -> Result<Self> {
+        Group::join_with_timeout(place, store, device, PATIENCE_SECONDS)
+    }
+
+    /// As [`Group::join`]; collectives wait `seconds` for the others.
+    pub(super) fn join_with_timeout(
+        place: &Place,
+        store: &ffi::Store,
+        device: Device,
+        seconds: i64,
+    ) -> Result<Self> {
         let without = |what: &str, install: &str| {
             Error::Request(format!(
                 "this program was built without {what}, which {} processes need: {install}, then `touch csrc/build.rs` and build \
@@ -76,14 +88,14 @@ impl Group {
                 let install = "install what requirements.txt pins beside libtorch's wheel";
                 return Err(without("NCCL", install));
             }
-            Device::Cuda(_) => ffi::nccl(store, rank, ranks, PATIENCE_SECONDS),
+            Device::Cuda(_) => ffi::nccl(store, rank, ranks, seconds),
             _ if !gloo => {
                 return Err(without(
                     "Gloo",
                     "install its headers (Debian and Ubuntu: apt install libgloo-dev)",
                 ));
             }
-            _ => ffi::gloo(store, rank, ranks, PATIENCE_SECONDS),
+            _ => ffi::gloo(store, rank, ranks, seconds),
         };
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();

@@ -19,6 +19,14 @@ pub(crate) mod tests {
 
     /// What every one of `ranks` ranks makes of its group, each in a thread of its own.
     pub(crate) fn together<T: Send>(ranks: usize, work: impl Fn(Group) -> T + Sync) -> Vec<T> {
+        together_with_timeout(ranks, group::PATIENCE_SECONDS, work)
+    }
+
+    fn together_with_timeout<T: Send>(
+        ranks: usize,
+        seconds: i64,
+        work: impl Fn(Group) -> T + Sync,
+    ) -> Vec<T> {
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
         std::thread::scope(|scope| {
             let rank = |rank| {
@@ -34,7 +42,8 @@ pub(crate) mod tests {
                         port: 0,
                         store_is_kept: true,
                     };
-                    work(Group::join(&place, &store, Device::Cpu).expect("a group"))
+                    let group = Group::join_with_timeout(&place, &store, Device::Cpu, seconds);
+                    work(group.expect("a group"))
                 })
             };
             let threads: Vec<_> = (0..ranks).map(rank).collect();
@@ -78,6 +87,25 @@ pub(crate) mod tests {
                     assert!(*list == vec![rank; rank] && number.is_nan(), "{heard:?}");
                 }
             }
+        }
+    }
+
+    /// As in `eval --data`, where ranks gather what they found when each is done with its scenes.
+    #[test]
+    fn a_rank_that_works_longer_is_waited_for() {
+        if !can_meet() {
+            return;
+        }
+        const { assert!(group::PATIENCE_SECONDS > 7 * 24 * 60 * 60) };
+        // c10d itself gives up after its timeout.
+        for (seconds, is_heard) in [(1, false), (group::PATIENCE_SECONDS, true)] {
+            let found = together_with_timeout(2, seconds, |group| {
+                if group.rank() == 1 {
+                    std::thread::sleep(std::time::Duration::from_secs(3));
+                }
+                group.gather(group.rank())
+            });
+            assert_eq!(found[0].is_ok(), is_heard, "a timeout of {seconds} s: {:?}", found[0]);
         }
     }
 

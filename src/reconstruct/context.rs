@@ -15,10 +15,14 @@ pub fn load_context(
     views: Option<usize>,
     size: ImageSize,
 ) -> Result<Vec<View>> {
-    let (shown, _) = holdout.split(capture.len());
-    let chosen = match views {
+    capture.load(&context_views(capture, holdout, views), Some(size))
+}
+
+/// Returns the positions of the views that [`load_context`] loads.
+pub fn context_views(capture: &Capture, holdout: Holdout, views: Option<usize>) -> Vec<usize> {
+    let (shown, _) = capture.split(holdout);
+    match views {
         Some(views) => spread_over_path(&capture.cameras(), &shown, views),
         None => shown,
-    };
-    capture.load(&chosen, Some(size))
+    }
 }

@@ -8,7 +8,7 @@ mod placing;
 mod published;
 mod spread;
 
-pub use context::load_context;
+pub use context::{context_views, load_context};
 pub use input::{Input, ViewsAs};
 pub use model_file::{
     CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, SHIPPED_MODEL, STAGE_KEY, load_model, model_weights,
@@ -20,11 +20,11 @@ pub use spread::spread_over_path;
 use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
-use crate::io::LentWeights;
+use crate::io::{LentWeights, Splat};
 use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
-use glam::DMat4;
+use glam::{DMat4, DVec3};
 use placing::best_placed;
 use std::time::Duration;
 use tch::Device;
@@ -71,9 +71,20 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
-    /// The splat in the capture's own world.
+    /// Returns the Gaussians in the capture's own world, in float32; [`Reconstruction::to_splat`] keeps their detail far from the
+    /// world's origin.
     pub fn in_world(&self) -> Gaussians {
         transform(&self.gaussians, &self.world_from_normalized)
+    }
+
+    /// Returns the splat in the capture's own world, with the mean camera as the origin of its coordinates.
+    ///
+    /// # Errors
+    /// More scenes than one.
+    pub fn to_splat(&self) -> Result<Splat> {
+        let about_origin = Similarity { translation: DVec3::ZERO, ..self.world_from_normalized };
+        let splat = Splat::of(&transform(&self.gaussians, &about_origin))?;
+        Ok(Splat { origin: self.world_from_normalized.translation, ..splat })
     }
 }
 

@@ -1,6 +1,7 @@
 //! Gaussians to begin with where nothing is known but photos, or photos and points.
 
-use super::sweep::{Swept, sight_of, sweep};
+use super::sweep::{Swept, sweep};
+use super::view_selection::projection;
 use crate::data::{Point, View};
 use crate::scene::{RawGaussians, SH_C0};
 use glam::DVec3;
@@ -27,19 +28,24 @@ struct Ball {
 
 /// `count` Gaussians where the photos agree on what they show, and at `points` of the scene, where some are known. Each is as large
 /// as the part of the pictures that it stands for. Of `known` Gaussians, up to `count`, those stay that the photos don't speak
-/// against. Two views at least.
+/// against. Two views at least. `go_on` is asked before each photo, with how many are done; when it says no, Gaussians lie where the
+/// photos that are done show them, and where none is, nothing is returned.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
     known: Option<&RawGaussians>,
     count: usize,
     seed: u64,
-) -> RawGaussians {
-    let swept = sweep(views, points);
-    let Some(known) = known else { return anew(&swept, points, count, seed) };
+    go_on: impl FnMut(usize) -> bool,
+) -> Option<RawGaussians> {
+    let swept = sweep(views, points, go_on);
+    if swept.is_empty() {
+        return None;
+    }
+    let Some(known) = known else { return Some(anew(&swept, points, count, seed)) };
     let kept = known.select(&supported(known, &swept));
     let left = count.saturating_sub(kept.means.size()[1] as usize);
-    kept.and(&anew(&swept, points, left, seed))
+    Some(kept.and(&anew(&swept, points, left, seed)))
 }
 
 /// Those that are in front of nothing that a photo is sure of, and that at least one photo doesn't hide behind it.
@@ -49,7 +55,7 @@ fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
     let map = |of: &Swept| {
         let depth = Vec::<f32>::try_from(of.depth.contiguous().view([-1])).expect("numbers");
         let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
-        (sight_of(&of.camera), of.camera.width as usize, depth, sure)
+        (projection(&of.camera), of.camera.width as usize, depth, sure)
     };
     let maps: Vec<_> = swept.iter().map(map).collect();
     let holds = |mean: DVec3| {
@@ -181,11 +187,15 @@ mod tests {
             }
         };
         let views = [view(0.), view(0.2)];
-        let known = gaussians_from_photos(&views, &[], None, 50, 1);
-        let filled = gaussians_from_photos(&views, &[], Some(&known), 80, 2);
+        let begun = |known: Option<&RawGaussians>, count: usize, seed: u64| {
+            gaussians_from_photos(&views, &[], known, count, seed, |_| true).expect("depths")
+        };
+        let known = begun(None, 50, 1);
+        let filled = begun(Some(&known), 80, 2);
         assert_eq!(filled.means.size(), [1, 80, 3]);
         // Nobody is sure of black photos.
         assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
-        assert_eq!(gaussians_from_photos(&views, &[], Some(&known), 50, 2).means.size(), [1, 50, 3]);
+        assert_eq!(begun(Some(&known), 50, 2).means.size(), [1, 50, 3]);
+        assert!(gaussians_from_photos(&views, &[], None, 50, 1, |_| false).is_none());
     }
 }

@@ -83,23 +83,65 @@ impl Default for RefineConfig {
     }
 }
 
+/// Sizes of the photos, beside the whole.
+const MAX_SIZES: usize = 8;
+
 impl RefineConfig {
     /// The defaults, from a splat or from nothing, with `overrides`, each `key=value` with a TOML value.
     ///
     /// # Errors
-    /// A key that isn't known, or a value of another type.
+    /// A key that isn't known, a value of another type, or one that makes no sense.
     pub fn with(overrides: &[String], from_splat: bool) -> Result<Self> {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
         let mut table = toml::Table::try_from(&defaults).expect("plain numbers");
         for assignment in overrides {
             let refused = |why: &str| Error::Request(format!("--set {assignment}: {why}"));
             let set: toml::Table = assignment.parse().map_err(|_| refused("expected KEY=VALUE"))?;
-            table.extend(set);
-            if let Err(e) = table.clone().try_into::<RefineConfig>() {
-                return Err(refused(&e.message().replace('\n', " ")));
+            if set.len() != 1 {
+                return Err(refused("expected KEY=VALUE"));
             }
+            table.extend(set);
+            let config: RefineConfig =
+                table.clone().try_into().map_err(|e| refused(&e.message().replace('\n', " ")))?;
+            config.check().map_err(|expected| refused(&format!("expected {expected}")))?;
         }
         Ok(table.try_into().expect("what was just tried"))
+    }
+
+    /// Checks that every number is one that the method can work with.
+    ///
+    /// # Errors
+    /// What is expected in place of the first that isn't.
+    pub fn check(&self) -> std::result::Result<(), &'static str> {
+        let rates = [
+            self.means,
+            self.log_scales,
+            self.quaternions,
+            self.opacity_logits,
+            self.colours,
+            self.harmonics,
+            self.tokens,
+            self.poses,
+            self.exposures,
+        ];
+        let weights = [self.opacity, self.scale, self.smooth];
+        let is_size = |&part: &f64| 0. < part && part < 1.;
+        // NaN is in no range.
+        let rules = [
+            (self.views >= 1, "1 or more"),
+            (self.sizes.len() <= MAX_SIZES, "8 sizes or fewer"),
+            (self.sizes.iter().all(is_size), "numbers above 0 and below 1"),
+            (self.sizes.is_sorted_by(|a, b| a < b), "numbers that increase"),
+            ((0..=3).contains(&self.sh_degree), "0 to 3"),
+            (0. < self.sh_every && self.sh_every.is_finite(), "a finite number above 0"),
+            (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
+            ([self.means_end, self.others_end].iter().all(|&end| 0. < end && end <= 1.), "above 0, up to 1"),
+            ((0. ..=1.).contains(&self.similar), "0 to 1"),
+            (weights.iter().all(|weight| (0. ..=1000.).contains(weight)), "0 to 1000"),
+            ((0. ..1.).contains(&self.dead), "0 or more, below 1"),
+            ((0. ..=1.).contains(&self.relocate_until), "0 to 1"),
+        ];
+        rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
     }
 
     /// For a splat that is good already.
@@ -110,5 +152,51 @@ impl RefineConfig {
     /// Sizes of the photos.
     pub fn levels(&self) -> usize {
         self.sizes.len() + 1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_make_no_sense_are_refused() {
+        let with = |assignment: &str| RefineConfig::with(&[assignment.to_string()], false);
+        for (assignment, expected) in [
+            ("views=0", "expected 1 or more"),
+            ("views=-1", "invalid"),
+            ("sizes=[0.1, 0.1]", "expected numbers that increase"),
+            ("sizes=[0.3, 0.1]", "expected numbers that increase"),
+            ("sizes=[0.1, nan]", "expected numbers above 0 and below 1"),
+            ("sizes=[1.0]", "expected numbers above 0 and below 1"),
+            ("sizes=[.01, .02, .03, .04, .05, .06, .07, .08, .09]", "expected"),
+            ("sh_degree=4", "expected 0 to 3"),
+            ("sh_degree=-1", "expected 0 to 3"),
+            ("sh_every=0", "expected a finite number above 0"),
+            ("sh_every=nan", "expected a finite number above 0"),
+            ("sh_every=inf", "expected a finite number above 0"),
+            ("means=-1e-3", "expected 0 to 10"),
+            ("means=1e30", "expected 0 to 10"),
+            ("tokens=nan", "expected 0 to 10"),
+            ("means_end=0", "expected above 0, up to 1"),
+            ("others_end=inf", "expected above 0, up to 1"),
+            ("similar=1.5", "expected 0 to 1"),
+            ("smooth=-1", "expected 0 to 1000"),
+            ("dead=1", "expected 0 or more, below 1"),
+            ("relocate_until=nan", "expected 0 to 1"),
+            ("relocate_every=-1", "invalid"),
+            ("views=", "expected KEY=VALUE"),
+            ("", "expected KEY=VALUE"),
+            ("views=1\nmeans=0.1", "expected KEY=VALUE"),
+            ("view=3", "unknown field"),
+        ] {
+            let message = with(assignment).expect_err(assignment).to_string();
+            assert!(message.starts_with(&format!("--set {assignment}: ")), "{message}");
+            assert!(message.contains(expected), "{message}");
+        }
+        assert_eq!(with("sizes=[]").unwrap().levels(), 1);
+        assert_eq!(with("relocate_every=0").unwrap().relocate_every, 0);
+        assert_eq!(RefineConfig::default().check(), Ok(()));
+        assert_eq!(RefineConfig::from_splat().check(), Ok(()));
     }
 }

@@ -95,18 +95,16 @@ impl Corrections {
         self.optimizer.step();
     }
 
-    /// The photos as the splat would have been photographed: from where they were taken, with its own exposure.
-    pub fn applied(&self, photos: &[View]) -> Vec<View> {
-        let applied = |(index, view): (usize, &View)| {
-            let numbers = self.numbers(index);
-            let mut camera = view.camera;
-            let centre = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
-            camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
-            camera.c2w.w_axis = centre.extend(1.);
-            let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
-            View { name: view.name.clone(), image: &view.image / gain, camera }
-        };
-        photos.iter().enumerate().map(applied).collect()
+    /// Returns photo number `index`, or a part of it, as the splat would have been photographed: from where it was taken, with the
+    /// splat's own exposure.
+    pub fn apply(&self, index: usize, view: &View) -> View {
+        let numbers = self.numbers(index);
+        let mut camera = view.camera;
+        let centre = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
+        camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
+        camera.c2w.w_axis = centre.extend(1.);
+        let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
+        View { name: view.name.clone(), image: &view.image / gain, camera }
     }
 
     /// What was learned of each of `photos`.
@@ -196,7 +194,8 @@ mod tests {
             &[0.1, -0.2, 0.05, 0.3, 0., -0.1, 0., 0., 0.4, 0., 0.2, 0., 0.1, 0., 0., 0., 0., 0.],
         );
         put(&learned.exposures, &[0.3, 0., 0., 0., 0.6, 0., 0., 0., -0.3]);
-        let applied = learned.applied(&views);
+        let applied: Vec<View> =
+            views.iter().enumerate().map(|(index, view)| learned.apply(index, view)).collect();
         let w2c = learned.w2c(&batch, &[0, 1, 2]);
         let images = learned.exposed(batch.images.ones_like() * 0.5, &[0, 1, 2]);
         for (index, view) in applied.iter().enumerate() {

@@ -5,15 +5,20 @@ mod begin;
 mod config;
 mod corrections;
 mod leaves;
+mod patches;
 mod photos;
 mod relocate;
+mod session;
 mod space;
 mod sweep;
+mod view_selection;
 
 pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
-pub use photos::{Photos, load_photos};
+pub use patches::{PatchScores, Patches};
+pub use photos::{MIN_SIDE, Photos, load_photos};
+pub use session::{EvalPoint, Initial, RefineEvent, RefineOptions, RefineResult, RefineSession, SpaceKind};
 pub use space::{GaussianSpace, Space, TokenSpace};
 
 use crate::data::View;
@@ -33,7 +38,7 @@ use tch::{Kind, Tensor};
 pub enum Budget {
     /// The same steps give the same bits.
     Steps(u64),
-    /// So long, about.
+    /// So long, whatever it is spent on.
     Time(Duration),
 }
 
@@ -95,14 +100,18 @@ pub(crate) fn refine_timed(
     let Task { photos, depth, config, budget, seed } = *task;
     let _threads = KernelThreads::take();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut elapsed = Duration::ZERO;
+    let (begun, mut elapsed, mut last) = (Instant::now(), Duration::ZERO, Duration::ZERO);
     for step in 0.. {
         let start = Instant::now();
-        let progress = match budget {
-            Budget::Steps(steps) => step as f64 / steps as f64,
-            Budget::Time(time) => elapsed.as_secs_f64() / time.as_secs_f64(),
+        let (progress, is_over) = match budget {
+            Budget::Steps(steps) => (step as f64 / steps as f64, step >= steps),
+            Budget::Time(time) => {
+                let gone = begun.elapsed();
+                // No step is begun that wouldn't end in time.
+                (gone.as_secs_f64() / time.as_secs_f64(), step > 0 && gone + last > time)
+            }
         };
-        if progress >= 1. {
+        if is_over {
             break;
         }
         let level = config.sizes.iter().filter(|&&part| progress >= part).count();
@@ -121,7 +130,8 @@ pub(crate) fn refine_timed(
             space.step(progress, step, &mut random);
             corrections.step(progress);
         });
-        elapsed += start.elapsed();
+        last = start.elapsed();
+        elapsed += last;
         if !watch(&RefineStep { step: step + 1, progress, elapsed, space }) {
             break;
         }
@@ -150,12 +160,16 @@ fn loss(
     loss
 }
 
-/// The median depth of what the views show of a splat: what lengths are measured by.
+/// Views that are rendered for the median depth, at most: time is better spent on steps.
+const DEPTH_VIEWS: usize = 32;
+
+/// Returns the median depth of what the views, or some spread over all, show of a splat: what lengths are measured by.
 ///
 /// # Errors
 /// Views that see nothing of it.
 pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
-    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+    let every = views.len().div_ceil(DEPTH_VIEWS).max(1);
+    let cameras: Vec<Camera> = views.iter().step_by(every).map(|view| view.camera).collect();
     let mut seen = vec![];
     for rendered in render_views(gaussians, &cameras)? {
         let depth = rendered.depth.masked_select(&rendered.alpha.gt(0.5));

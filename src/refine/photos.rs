@@ -1,36 +1,94 @@
 //! The photos that a splat is refined on, small and large.
 
+use super::view_selection::are_near_duplicates;
 use crate::data::{Capture, View, ViewBatch, view_batch};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};
 use glam::DMat4;
 use rand::Rng;
 use rand::seq::index::sample;
 use std::collections::BTreeMap;
-use tch::Device;
+use tch::{Device, Kind, Tensor};
 
 /// A photo is resized so that its longer side is at most this, pixels: thousands of Gaussians can't show more, and pixels take time.
 const LONGEST_SIDE: f64 = 512.;
-/// A picture is halved only where its sides keep so many pixels.
-const LEAST_SIDE: i64 = 32;
+/// A picture is made smaller only where its sides keep so many pixels.
+const LEAST_SIDE: u32 = 32;
+/// The smallest side of a photo, pixels: SSIM looks at so many at once (spec 9.4).
+pub const MIN_SIDE: u32 = 11;
+/// Photos that are read between two looks at the watch.
+const READ_AT_ONCE: usize = 8;
+/// Pixels along the longer side of the pictures by which photos are found to be nearly equal, and how far apart these are at most, as
+/// a mean squared difference: 40 dB.
+const COMPARED_SIDE: f64 = 64.;
+const NEARLY_EQUAL: f64 = 1e-4;
 
-/// Reads the photos of `indices`, cut and resized to `size`, or each as it is where that is small enough.
+/// Reads the photos of `indices`, cut and resized to `size`, or each as it is where that is small enough. `go_on` hears how many are
+/// read, and ends the work by false.
 ///
 /// # Errors
-/// Those of [`Capture::load`].
-pub fn load_photos(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
+/// Those of [`Capture::load`], a photo with fewer than [`MIN_SIDE`] pixels along a side, and an end before all are read.
+pub fn load_photos(
+    capture: &Capture,
+    indices: &[usize],
+    size: Option<ImageSize>,
+    mut go_on: impl FnMut(usize) -> bool,
+) -> Result<Vec<View>> {
     let cameras = capture.cameras();
-    let mut views = vec![];
+    let size_of = |index: usize| size.or_else(|| smaller(&cameras[index]));
     for &index in indices {
-        views.extend(capture.load(&[index], size.or_else(|| smaller(&cameras[index])))?);
+        let Camera { width, height, .. } = cameras[index];
+        let ImageSize { width, height } = size_of(index).unwrap_or(ImageSize { width, height });
+        if width.min(height) < MIN_SIDE {
+            let field = format!("the size of {}", capture.names().nth(index).unwrap_or_default());
+            let expected = format!("{MIN_SIDE} pixels or more along each side");
+            return Err(Error::input(capture.file(), field, format!("{width}×{height}"), expected));
+        }
+    }
+    let mut views = vec![];
+    for some in indices.chunks(READ_AT_ONCE) {
+        if !go_on(views.len()) {
+            return Err(Error::Failed("stopped before all photos were read: nothing is written".into()));
+        }
+        // Those of one size share what their lens is undone by.
+        for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {
+            views.extend(capture.load(group, size_of(group[0]))?);
+        }
     }
     Ok(views)
 }
 
 fn smaller(camera: &Camera) -> Option<ImageSize> {
-    let scale = LONGEST_SIDE / f64::from(camera.width.max(camera.height));
+    let (longer, shorter) = (camera.width.max(camera.height), camera.width.min(camera.height));
+    let scale = (LONGEST_SIDE / f64::from(longer)).max(f64::from(LEAST_SIDE) / f64::from(shorter));
     let side = |pixels: u32| ((f64::from(pixels) * scale).round() as u32).max(1);
     (scale < 1.).then(|| ImageSize { height: side(camera.height), width: side(camera.width) })
+}
+
+/// Returns the indices of the photos that aren't nearly equal to one before them. Nearly equal photos of a scene at `depth` show nearly
+/// the same pixels from nearly the same place: copies, or frames of a video that rests.
+pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
+    let small: Vec<Tensor> = photos
+        .iter()
+        .map(|View { image, camera, .. }| {
+            let factor = (COMPARED_SIDE / f64::from(camera.width.max(camera.height))).min(1.);
+            let side = |pixels: u32| ((f64::from(pixels) * factor).round() as i64).max(1);
+            image.unsqueeze(0).adaptive_avg_pool2d([side(camera.height), side(camera.width)])
+        })
+        .collect();
+    let mut kept: Vec<usize> = vec![];
+    for index in 0..photos.len() {
+        let is_nearly = |&other: &usize| {
+            are_near_duplicates(&photos[index].camera, &photos[other].camera, depth)
+                && small[index].size() == small[other].size()
+                && (&small[index] - &small[other]).square().mean(Kind::Float).double_value(&[])
+                    <= NEARLY_EQUAL
+        };
+        if !kept.iter().any(is_nearly) {
+            kept.push(index);
+        }
+    }
+    kept
 }
 
 /// Photos at several sizes, from the smallest to the whole; those of one size together.
@@ -95,7 +153,7 @@ impl Photos {
 /// As wide and high as half of them, or as they are where that is too small.
 fn halved(batch: &ViewBatch) -> ViewBatch {
     let size = batch.images.size();
-    let (images, intrinsics) = if size[3].min(size[4]) < 2 * LEAST_SIDE {
+    let (images, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(LEAST_SIDE) {
         (batch.images.shallow_clone(), batch.intrinsics.shallow_clone())
     } else {
         let intrinsics = batch.intrinsics.copy();

@@ -1,25 +1,35 @@
 //! Where the pixels of posed photos lie: for every pixel the depth at which its surroundings look alike in the photos taken
-//! nearby (a plane sweep; Collins 1996). No weights are needed, and no points.
+//! from other places (a plane sweep; Collins 1996). No weights are needed, and no points.
 
+use super::view_selection::{
+    are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
+};
 use crate::data::{Point, View};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
 use tch::{Device, Kind, Tensor};
 
-/// Photos are looked at with so many pixels along the longer side.
+/// Pixels along the longer side of the pictures that are compared.
 const LONGEST_SIDE: f64 = 128.;
 /// Inverse depths that are tried, evenly from 0 to the nearest plane's.
 const PLANES: i64 = 128;
+/// Pixels along the longer side, and inverse depths, where the depth of the scene is estimated.
+const COARSE_SIDE: f64 = 64.;
+const COARSE_PLANES: i64 = 48;
 /// Of the picture's width: how far a pixel of the nearest plane moves in the photo taken nearest.
 const LARGEST_MOVE: f64 = 0.7;
+/// How much nearer than the scene the nearest plane is, at most, where photos alone tell it.
+const NEAREST: f64 = 24.;
 /// The farthest that pixels are put, in units of the nearest plane's distance.
 const FARTHEST: f64 = 500.;
 /// Photos whose pixels get depths, at the most: together they have seen what there is to see.
 const MOST: usize = 32;
-/// Photos that each one is compared with. In half of them a pixel has to look alike: in the others something may hide it.
-const NEIGHBOURS: usize = 4;
-/// Cosine of the angle between two views beyond which they hardly show the same.
-const LEAST_COSINE: f64 = 0.3;
+/// Distances at which the depth of the scene is looked for: the extent of the cameras, its half, its quarter, and so on.
+const OCTAVES: i32 = 9;
+/// Planes that a pixel has to be away from infinity, in the median, for its depth to count as measured.
+const RESOLVED: f64 = 2.;
+/// Pixels that have to agree on a depth, as a share of all.
+const LEAST_SHARE: f64 = 0.05;
 /// Side of the surroundings that are compared, pixels.
 const PATCH: i64 = 9;
 /// What is added to variances, so that noise is not taken for likeness.
@@ -31,7 +41,7 @@ const SURE: f64 = 0.8;
 /// Times that what is known is spread to wider surroundings, and what it counts there, each time.
 const SPREADS: usize = 6;
 const SPREAD_WEIGHT: f64 = 0.1;
-/// Points that a view has to see, or its nearest plane is guessed from the cameras alone.
+/// Points that a view has to see, or its depths are guessed from the photos alone.
 const LEAST_POINTS: usize = 30;
 /// Of the points, those that may be nearer than the nearest plane, and how much nearer it is than the others.
 const NEARER: f64 = 0.02;
@@ -59,29 +69,113 @@ struct Small {
     grey: Tensor,
 }
 
-/// Finds depths for the pixels of the views, or of some spread over all where these are many. `points` of the scene, where some are
-/// known, tell where it begins.
-pub fn sweep(views: &[View], points: &[Point]) -> Vec<Swept> {
-    let small: Vec<Small> = views.iter().map(Small::of).collect();
-    let swept = |index: usize| {
-        let others = neighbours(index, &small);
-        let nearest = nearest_of_points(&small[index].camera, points)
-            .unwrap_or_else(|| nearest_of_cameras(&small[index], others.first().copied()));
-        let (inverse, likeness) = most_alike(&small[index], &others, nearest);
-        Swept {
-            camera: small[index].camera,
-            image: small[index].image.shallow_clone(),
-            depth: filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal(),
-            sure: likeness.gt(SURE),
+/// Finds depths for the pixels of the views, or where these are many, of some that together show what all of them show: near
+/// duplicates don't count. `points` of the scene, where some are known, tell where it begins. `go_on` is asked before each view, with
+/// how many are done; when it says no, these are all there is.
+pub fn sweep(views: &[View], points: &[Point], mut go_on: impl FnMut(usize) -> bool) -> Vec<Swept> {
+    let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE)).collect();
+    let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
+    let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE)).collect();
+    let (mut depths, mut swept): (Vec<f64>, Vec<(usize, Swept)>) = (vec![], vec![]);
+    for index in farthest_first(&cameras, MOST) {
+        if !go_on(swept.len()) {
+            break;
         }
+        let SceneDepth { median, nearest } = SceneDepth::of(index, &coarse, points);
+        depths.extend(median);
+        let depth = median.unwrap_or_else(|| typical_depth(&depths, extent(&cameras)));
+        let is_new =
+            |(other, _): &(usize, Swept)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
+        if swept.iter().all(is_new) {
+            let others = neighbours(index, &cameras, depth);
+            let others: Vec<&Small> = others.into_iter().map(|other| &small[other]).collect();
+            swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
+        }
+    }
+    swept.sort_by_key(|(index, _)| *index);
+    swept.into_iter().map(|(_, swept)| swept).collect()
+}
+
+fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) -> Swept {
+    let nearest = match (nearest, others.first()) {
+        (Some(nearest), _) => nearest,
+        (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
+        // Nothing tells a depth: all of it lies at one.
+        (None, None) => 2. / depth,
     };
-    (0..small.len()).step_by(small.len().div_ceil(MOST).max(1)).map(swept).collect()
+    let (inverse, likeness) = most_alike(this, others, nearest, PLANES);
+    Swept {
+        camera: this.camera,
+        image: this.image.shallow_clone(),
+        depth: filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal(),
+        sure: likeness.gt(SURE),
+    }
+}
+
+/// How far the scene is from a photo, before its depths are looked for.
+struct SceneDepth {
+    /// Of what the photo shows, where anything tells.
+    median: Option<f64>,
+    /// Inverse depth of the nearest plane, where points tell it.
+    nearest: Option<f64>,
+}
+
+impl SceneDepth {
+    /// By the points that the photo shows, else by comparing it with one photo at each of several distances, which are powers of two
+    /// of the extent of all: too near ones show no parallax, too far ones something else. How many photos there are at a distance
+    /// makes no difference.
+    fn of(index: usize, photos: &[Small], points: &[Point]) -> Self {
+        let this = &photos[index];
+        if let Some(inverse) = inverse_depths_of(points, &this.camera) {
+            let median = Some(1. / inverse[inverse.len() / 2]);
+            let last = ((1. - NEARER) * inverse.len() as f64) as usize;
+            return SceneDepth { median, nearest: Some(ROOM * inverse[last]) };
+        }
+        let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+        let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
+        let agreed: Vec<Measured> = compared.filter(|of| of.share >= LEAST_SHARE).collect();
+        let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
+        // The farthest photo is the first: what shows no parallax there is at least so far.
+        let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
+        SceneDepth { median: best.map(|of| of.depth), nearest: None }
+    }
+}
+
+/// What two photos agree on.
+struct Measured {
+    /// Of the pixels that both are sure of, the median.
+    depth: f64,
+    /// How many planes from infinity it is.
+    planes: f64,
+    /// Those pixels, of all.
+    share: f64,
+}
+
+fn measured(this: &Small, other: &Small) -> Measured {
+    let nearest = nearest_of_cameras(this, other);
+    let (inverse, likeness) = most_alike(this, &[other], nearest, COARSE_PLANES);
+    let sure = inverse.masked_select(&likeness.gt(SURE));
+    let share = sure.numel() as f64 / inverse.numel() as f64;
+    let plane = nearest / (COARSE_PLANES - 1) as f64;
+    let median = if sure.numel() == 0 { 0. } else { sure.median().double_value(&[]) };
+    Measured { depth: 1. / median.max(plane), planes: (median / plane).round(), share }
+}
+
+/// The median of the depths of other photos; where there are none, the extent of the cameras, or 1 where they don't move.
+fn typical_depth(depths: &[f64], extent: f64) -> f64 {
+    let mut sorted = depths.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    match sorted.get(sorted.len() / 2) {
+        Some(&depth) => depth,
+        None if extent > 0. => extent,
+        None => 1.,
+    }
 }
 
 impl Small {
-    fn of(view: &View) -> Self {
+    fn of(view: &View, longest_side: f64) -> Self {
         let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
-        let factor = (LONGEST_SIDE / side(camera.width.max(camera.height))).min(1.);
+        let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
         let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
         let (height, width) = (resized(camera.height), resized(camera.width));
         let image = view.image.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
@@ -104,54 +198,30 @@ impl Small {
     }
 }
 
-/// Those taken nearest in about the same direction, the nearest first, but not from the same place.
-fn neighbours(index: usize, views: &[Small]) -> Vec<&Small> {
-    let this = &views[index];
-    let forward = |view: &Small| view.camera.c2w.z_axis.truncate();
-    let mut others: Vec<(f64, &Small)> = views
-        .iter()
-        .filter(|other| forward(other).dot(forward(this)) > LEAST_COSINE)
-        .map(|other| (other.centre().distance(this.centre()), other))
-        .filter(|(distance, _)| *distance > 0.)
-        .collect();
-    others.sort_by(|a, b| a.0.total_cmp(&b.0));
-    others.into_iter().map(|(_, other)| other).take(NEIGHBOURS).collect()
-}
-
-/// Where the camera sees a point, if it does: u and v in pixels, and the depth along its axis.
-pub(super) fn sight_of(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<> {
-    let (w2c, Camera { intrinsics: k, width, height, .. }) = (camera.c2w.inverse(), *camera);
-    let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
-    move |point| {
-        let p = w2c.transform_point3(point);
-        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
-        (p.z > 0. && inside(u, width) && inside(v, height)).then_some([u, v, p.z])
-    }
-}
-
 /// The inverse depth of the nearest plane, such that nothing moves too far in the photo taken nearest.
-fn nearest_of_cameras(this: &Small, other: Option<&Small>) -> f64 {
-    let baseline = other.map_or(1., |other| other.centre().distance(this.centre()));
+fn nearest_of_cameras(this: &Small, other: &Small) -> f64 {
+    let baseline = other.centre().distance(this.centre());
     LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
 }
 
-/// The same, such that it is nearer than the points that the camera sees; none where it sees too few.
-fn nearest_of_points(camera: &Camera, points: &[Point]) -> Option<f64> {
-    let seen = sight_of(camera);
+/// Those of the points that the camera sees, sorted; none where it sees too few.
+fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
+    let project = projection(camera);
     let mut inverse: Vec<f64> =
-        points.iter().filter_map(|point| seen(point.position)).map(|[_, _, z]| 1. / z).collect();
+        points.iter().filter_map(|point| project(point.position)).map(|[_, _, z]| 1. / z).collect();
     inverse.sort_by(f64::total_cmp);
-    let last = ((1. - NEARER) * inverse.len() as f64) as usize;
-    (inverse.len() >= LEAST_POINTS).then(|| ROOM * inverse[last])
+    (inverse.len() >= LEAST_POINTS).then_some(inverse)
 }
 
-/// The inverse depth of every pixel at which it looks most alike in the others, and the correlation there, both [h, w].
-fn most_alike(this: &Small, others: &[&Small], nearest: f64) -> (Tensor, Tensor) {
+/// The inverse depth of every pixel, of so many evenly from 0 to `nearest`, at which it looks most alike in the others, and the
+/// correlation there, both [h, w].
+fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Tensor, Tensor) {
     let (size, options) = (this.size(), (Kind::Float, Device::Cpu));
     if others.is_empty() {
         return (Tensor::full(size, nearest / 2., options), Tensor::zeros(size, options));
     }
-    let planes = Tensor::linspace(0., nearest, PLANES, options).view([PLANES, 1]);
+    let step = nearest / (planes - 1) as f64;
+    let planes = Tensor::linspace(0., nearest, planes, options).view([planes, 1]);
     let own = this.grey.unsqueeze(0);
     let (own_mean, own_variance) = mean_and_variance(&own);
     let alike = |other: &&Small| {
@@ -164,11 +234,11 @@ fn most_alike(this: &Small, others: &[&Small], nearest: f64) -> (Tensor, Tensor)
     let half = (others.len() as i64 / 2).max(1);
     let (best, _) = correlations.topk(half, 0, true, false);
     let (likeness, plane) = best.mean_dim([0].as_slice(), false, Kind::Float).max_dim(0, false);
-    (plane.to_kind(Kind::Float) * (nearest / (PLANES - 1) as f64), likeness)
+    (plane.to_kind(Kind::Float) * step, likeness)
 }
 
 /// What `other` shows where the pixels of `this` would be if they lay on each of the planes, and whether it shows them at all, both
-/// [PLANES, h, w].
+/// [planes, h, w].
 fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     let [height, width] = this.size();
     let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
@@ -184,9 +254,10 @@ fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     // From −1 to 1 across the picture.
     let u = (x / &z * fx + cx) * (2. / f64::from(other.camera.width)) - 1.;
     let v = (y / &z * fy + cy) * (2. / f64::from(other.camera.height)) - 1.;
-    let volume = [PLANES, height, width];
+    let count = planes.size()[0];
+    let volume = [count, height, width];
     let inside = u.abs().le(1.).logical_and(&v.abs().le(1.)).logical_and(&z.gt(0.)).view(volume);
-    let grid = Tensor::stack(&[u, v], -1).view([1, PLANES * height, width, 2]);
+    let grid = Tensor::stack(&[u, v], -1).view([1, count * height, width, 2]);
     let (bilinear, at_the_border) = (0, 1);
     let seen = other.grey.unsqueeze(0).unsqueeze(0).grid_sampler(&grid, bilinear, at_the_border, false);
     (seen.view(volume), inside)
@@ -255,17 +326,18 @@ mod tests {
             View { name: String::new(), image: wave.expand([3, 64, 64], false).contiguous(), camera }
         };
         let views = [view(-0.5), view(0.), view(0.5)];
-        for swept in sweep(&views, &[]) {
+        for swept in sweep(&views, &[], |_| true) {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
         // Where points tell that the scene begins at 3, planes lie closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
-        assert!((nearest_of_points(&views[1].camera, &points).unwrap() - 1.3 / 3.).abs() < 1e-9);
-        assert!(nearest_of_points(&views[1].camera, &points[..20]).is_none());
+        let photos: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE)).collect();
+        assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
+        assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // One photo by itself tells nothing, and that is no NaN.
-        let alone = sweep(&views[..1], &[]);
+        let alone = sweep(&views[..1], &[], |_| true);
         assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
     }
 }

@@ -29,6 +29,11 @@ pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Resu
     Ok(unsafe { ffi::count_pairs(&arguments(gaussians, cameras, eps2d)) }?)
 }
 
+/// Returns the instruction set of libtorch's own kernels, such as "AVX2".
+pub fn libtorch_simd_level() -> String {
+    globalsplat_csrc::processor::libtorch_simd_level()
+}
+
 /// Floating-point operations per second that multiply-adds alone reach here, measured for so many seconds on every thread.
 pub fn multiply_add_peak(seconds: f64) -> f64 {
     ffi::multiply_add_peak(seconds)

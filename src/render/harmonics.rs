@@ -22,7 +22,7 @@ const MAX_OPACITY: f64 = 0.98;
 /// Standard deviations that a Gaussian reaches, and what a picture counts for that it doesn't reach, beside one that it does.
 const REACH: f64 = 2.;
 const OUTSIDE: f64 = 1e-6;
-/// Nearer than this, nothing is drawn (spec 6.2).
+/// Nearer than this, in local units, nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
 /// Coefficients that a file, or who shows it, can hold.
@@ -75,7 +75,7 @@ impl HarmonicLimits {
     }
 }
 
-/// The same Gaussians, [1, N, ..] in float32 on the host, with coefficients within `limits`: the nearest, or where `cameras` see a
+/// The same Gaussians, [1, N, ..] in float32 on the host and in the cameras' local frame (spec 2.5), with coefficients within `limits`: the nearest, or where `cameras` see a
 /// Gaussian whose coefficients aren't, those that show them its colours best. One that would be too dark becomes more opaque.
 pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &HarmonicLimits) -> Gaussians {
     let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");

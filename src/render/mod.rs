@@ -10,7 +10,7 @@ mod views;
 pub(crate) use handed_over::handed_over;
 pub use harmonics::{HarmonicLimits, fit_harmonics};
 pub use transform::transform;
-pub use views::{Rendered, render_views};
+pub use views::{Rendered, SplatRenderer, render_views};
 
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, pose_to_rows};

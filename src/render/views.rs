@@ -2,7 +2,8 @@
 
 use super::{Cameras, DEFAULT_EPS2D, render};
 use crate::error::Result;
-use crate::scene::{Camera, Gaussians};
+use crate::scene::{Camera, Gaussians, LocalFrame};
+use glam::DVec3;
 use tch::Tensor;
 
 /// What a camera saw of a splat.
@@ -16,7 +17,8 @@ pub struct Rendered {
     pub depth: Tensor,
 }
 
-/// Renders a splat from each camera, which may differ in size.
+/// Renders Gaussians from each camera, which may differ in size; both are in the unit that the near plane of spec 6.2 is for.
+/// [`SplatRenderer`] renders from cameras of any world.
 ///
 /// # Errors
 /// Those of [`render`].
@@ -33,4 +35,33 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
             })
         })
         .collect()
+}
+
+/// A splat in a local frame (spec 2.5), to be rendered from cameras of the world.
+#[derive(Debug)]
+pub struct SplatRenderer {
+    gaussians: Gaussians,
+    frame: LocalFrame,
+}
+
+impl SplatRenderer {
+    /// Renders `gaussians` of one scene, whose means are relative to `origin`, in `frame`.
+    pub fn new(gaussians: &Gaussians, origin: DVec3, frame: LocalFrame) -> Self {
+        SplatRenderer { gaussians: frame.gaussians_to_local(gaussians, origin), frame }
+    }
+
+    /// Returns the frame that the splat is rendered in.
+    pub fn frame(&self) -> LocalFrame {
+        self.frame
+    }
+
+    /// Renders the splat from each camera, which may differ in size. Depth is in world units.
+    ///
+    /// # Errors
+    /// Those of [`render`].
+    pub fn render(&self, cameras: &[Camera]) -> Result<Vec<Rendered>> {
+        let mut rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
+        rendered.iter_mut().for_each(|view| view.depth = &view.depth * self.frame.scale);
+        Ok(rendered)
+    }
 }

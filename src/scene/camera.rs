@@ -147,7 +147,7 @@ pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
 ///
 /// # Errors
 /// As [`check_pose`], and where an entry of A is more than 1e-3 off R's: (what was found, what was expected).
-pub fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
+fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
     check_pose(c2w)?;
     let given = DMat3::from_mat4(*c2w);
     // Newton's iteration X ← (X + X⁻ᵀ)/2 squares the error, which is 5e-3 at most, in every round.
@@ -159,6 +159,24 @@ pub fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
     }
     let column = |i: usize| rotation.col(i).extend(0.);
     Ok(DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis.truncate().extend(1.)))
+}
+
+/// Returns [`nearest_rigid`] of a pose whose 3×3 part may be a rotation times a factor above 0, and the factor: poses that a
+/// similarity was applied to are of that kind. The position stays.
+///
+/// # Errors
+/// As [`nearest_rigid`].
+pub fn nearest_rigid_of_scaled(c2w: &DMat4) -> Result<(DMat4, f64), (String, String)> {
+    nearest_rigid(c2w).map(|rigid| (rigid, 1.)).or_else(|why| {
+        let scale = DMat3::from_mat4(*c2w).determinant().cbrt();
+        if !(scale > 0. && scale.is_finite()) {
+            return Err(why);
+        }
+        let column = |i: usize| c2w.col(i) / scale;
+        let unscaled = DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis);
+        // What isn't that is refused as it stands.
+        nearest_rigid(&unscaled).map(|rigid| (rigid, scale)).map_err(|_| why)
+    })
 }
 
 /// The 4×4 matrix, row by row.

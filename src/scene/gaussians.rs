@@ -8,7 +8,7 @@ const OPACITY_MARGIN: f64 = 1e-6;
 pub(crate) const SH_C0: f64 = 0.28209479177387814;
 
 /// Scales are at least this, whose logarithm is finite.
-const MIN_SCALE: f64 = 1e-30;
+pub(crate) const MIN_SCALE: f64 = 1e-30;
 
 /// 3D Gaussians of B scenes with N each.
 #[derive(Debug)]
@@ -82,7 +82,7 @@ impl RawGaussians {
             means: self.means.shallow_clone(),
             scales: self.log_scales.exp(),
             quaternions: self.quaternions.shallow_clone(),
-            opacities: self.opacity_logits.sigmoid(),
+            opacities: sigmoid(&self.opacity_logits),
             sh: self.sh.shallow_clone(),
         }
     }
@@ -135,6 +135,17 @@ impl RawGaussians {
     }
 }
 
+/// Returns the sigmoid of every number, with the same bits for any number of threads; differentiable. Libtorch computes the last numbers
+/// of each thread's share by another formula than the others, so it is given fewer at a time than it shares out.
+pub(crate) fn sigmoid(logits: &Tensor) -> Tensor {
+    const AT_ONCE: i64 = 1 << 14;
+    if logits.device() != Device::Cpu || logits.numel() <= AT_ONCE as usize {
+        return logits.sigmoid();
+    }
+    let parts: Vec<Tensor> = logits.reshape([-1]).split(AT_ONCE, 0).iter().map(Tensor::sigmoid).collect();
+    Tensor::cat(&parts, 0).view_as(logits)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -178,5 +189,18 @@ mod tests {
         let expected = &active.opacities * (1. - &active.opacities);
         let off: Tensor = raw.opacity_logits.grad() - expected;
         assert!(off.abs().max().double_value(&[]) < 1e-15);
+    }
+
+    #[test]
+    fn sigmoid_has_the_same_bits_for_any_number_of_threads() {
+        let logits = Tensor::arange(3 * 33_331, (Kind::Float, Device::Cpu)).sin().view([3, -1]) * 9.;
+        let expected = sigmoid(&logits);
+        let threads = tch::get_num_threads();
+        for count in [1, 2, 3, 7] {
+            tch::set_num_threads(count);
+            assert!(sigmoid(&logits).equal(&expected), "{count} threads");
+        }
+        tch::set_num_threads(threads);
+        assert!((expected - logits.to_kind(Kind::Double).sigmoid()).abs().max().double_value(&[]) < 1e-6);
     }
 }

@@ -4,15 +4,17 @@
 
 mod camera;
 mod gaussians;
+mod local_frame;
 mod normalize;
 mod rays;
 mod smooth_path;
 mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, pose_to_rows};
-pub(crate) use camera::{check_pose, nearest_rigid};
-pub(crate) use gaussians::SH_C0;
+pub(crate) use camera::{check_pose, nearest_rigid_of_scaled};
 pub use gaussians::{Gaussians, RawGaussians};
+pub(crate) use gaussians::{MIN_SCALE, SH_C0, sigmoid};
+pub use local_frame::LocalFrame;
 pub use normalize::{Normalization, Placement, Similarity, normalize};
 pub(crate) use rays::plucker_rays;
 pub use smooth_path::smooth_path;

@@ -3,8 +3,9 @@
 use crate::error::{Error, Result};
 use glam::{DMat3, DMat4, DVec3};
 
-/// Below it (or when not finite) the spread of the cameras counts as none, and the scene keeps its size.
-const MIN_SCALE: f64 = 1e-12;
+/// Cameras whose spread is no more than this share of the largest coordinate (or not finite) differ by rounding alone, and the
+/// scene keeps its size.
+const ROUNDING: f64 = 1e-14;
 
 /// A sum of unit vectors shorter than it points nowhere.
 const MIN_DIRECTION: f64 = 1e-6;
@@ -91,16 +92,21 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     });
     let axes = axes.unwrap_or_else(|| DMat3::from_mat4(c2w[0]));
 
-    let inverse = DMat4::from_mat3_translation(axes, mean(3)).inverse();
-    let aligned: Vec<DMat4> = c2w.iter().map(|pose| inverse * *pose).collect();
+    let (origin, inverse) = (mean(3), axes.inverse());
     let centre = |pose: &DMat4| pose.w_axis.truncate();
+    // The origin is subtracted before anything is multiplied: far away, products would lose the digits that centres differ in.
+    let align = |pose: &DMat4| {
+        DMat4::from_mat3_translation(inverse * DMat3::from_mat4(*pose), inverse * (centre(pose) - origin))
+    };
+    let aligned: Vec<DMat4> = c2w.iter().map(align).collect();
     let mut scale = 0f64;
     for (i, a) in aligned.iter().enumerate() {
         for b in &aligned[..i] {
             scale = scale.max(centre(a).distance(centre(b)));
         }
     }
-    if !(scale > MIN_SCALE && scale.is_finite()) {
+    let largest = c2w.iter().map(|pose| centre(pose).abs().max_element()).fold(0., f64::max);
+    if !(scale > ROUNDING * largest && scale.is_finite()) {
         scale = 1.;
     }
     let c2w = aligned
@@ -110,7 +116,7 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
             pose
         })
         .collect();
-    let world_from_normalized = Similarity { rotation: axes, translation: mean(3), scale };
+    let world_from_normalized = Similarity { rotation: axes, translation: origin, scale };
     Ok(Normalization { c2w, world_from_normalized })
 }
 
@@ -137,6 +143,36 @@ mod tests {
                 assert!(world_from_normalized.pose_before(before).abs_diff_eq(*pose, 1e-12));
             }
         }
+    }
+
+    /// In millimetres, kilometres or UTM coordinates, the normalized cameras are the same; scaled by a power of two, in every bit.
+    #[test]
+    fn unit_and_origin_do_not_matter() {
+        let pose =
+            |x: f64| DMat4::from_translation(DVec3::new(x, 0.3 * x * x, 0.1)) * DMat4::from_rotation_y(x);
+        let moved = |factor: f64, offset: DVec3| -> Vec<DMat4> {
+            let place =
+                |pose: DMat4| DMat4 { w_axis: (pose.w_axis.truncate() * factor + offset).extend(1.), ..pose };
+            [0., 0.1, 0.5, 0.7].map(|x| place(pose(x))).into()
+        };
+        let plain = normalize(&moved(1., DVec3::ZERO)).unwrap();
+        for exponent in [-60, -20, -3, 5, 20, 60] {
+            let factor = f64::from(exponent).exp2();
+            let other = normalize(&moved(factor, DVec3::ZERO)).unwrap();
+            assert_eq!(other.c2w, plain.c2w, "2^{exponent}");
+            let (a, b) = (other.world_from_normalized, plain.world_from_normalized);
+            assert_eq!((a.translation, a.scale), (b.translation * factor, b.scale * factor));
+        }
+        for (factor, offset) in
+            [(1e-6, DVec3::ZERO), (1e-13, DVec3::ZERO), (1e6, DVec3::ONE), (1., DVec3::splat(1e8))]
+        {
+            let other = normalize(&moved(factor, offset)).unwrap();
+            for (a, b) in other.c2w.iter().zip(&plain.c2w) {
+                assert!(a.abs_diff_eq(*b, 1e-6), "{factor} {offset}: {a} {b}");
+            }
+        }
+        let still = normalize(&[DMat4::from_translation(DVec3::splat(1e8)); 3]).unwrap();
+        assert_eq!(still.world_from_normalized.scale, 1.);
     }
 
     #[test]

@@ -8,7 +8,7 @@
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights,
+    Inputs, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights,
 };
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
@@ -27,6 +27,8 @@ const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
 /// All that a checkpoint's folder has of ours. The state comes first, without which there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
+/// Those whose checksums the state has, in the order of their names.
+const CHECKED_FILES: [&str; 2] = [MODEL_FILE, OPTIMIZER_FILE];
 
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct State {
@@ -105,6 +107,11 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
             Err(Error::input(run, "the run", "without a best checkpoint", expected))
         }
     }
+}
+
+/// Adds the files of the run's checkpoints to `inputs`.
+pub(super) fn add_checkpoints(run: &Path, inputs: &mut Inputs) {
+    [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
 }
 
 /// A checkpoint as it is told to people.
@@ -201,8 +208,7 @@ impl Trainer {
         replace_dir(&path, &FILES, |folder| {
             save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
             write_weights(&folder.join(OPTIMIZER_FILE), optimizer, Default::default())?;
-            let files =
-                [MODEL_FILE, OPTIMIZER_FILE].map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
+            let files = CHECKED_FILES.map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;
             let (step, samples) = (self.step, self.samples);
             write_state(folder, &State { step, samples, files, validation: None })
@@ -272,8 +278,16 @@ fn read_state(checkpoint: &Path) -> Result<State> {
     let file = checkpoint.join(STATE_FILE);
     let state = fs::read(&file).map_err(Error::read(&file))?;
     let expected = "what globalsplat train writes";
-    serde_json::from_slice(&state)
-        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))
+    let state: State = serde_json::from_slice(&state)
+        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))?;
+    let names: Vec<&str> = state.files.keys().map(String::as_str).collect();
+    match names == CHECKED_FILES {
+        true => Ok(state),
+        false => {
+            let expected = format!("{CHECKED_FILES:?}");
+            Err(Error::input(&file, "the names in files", format!("{names:?}"), expected))
+        }
+    }
 }
 
 fn write_state(checkpoint: &Path, state: &State) -> Result<()> {

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 /// A line for every step and every validation.
-pub(super) const METRICS_FILE: &str = "metrics.jsonl";
+pub const METRICS_FILE: &str = "metrics.jsonl";
 
 /// How a step went, by name: not what it minimized.
 pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {

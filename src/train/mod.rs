@@ -22,8 +22,8 @@ mod validator;
 mod watch;
 
 pub use checkpoint::{Kept, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
-pub use metrics::Curves;
-pub use run::{Event, Outcome, Resume, run};
+pub use metrics::{Curves, METRICS_FILE};
+pub use run::{CONFIG_FILE, Event, Outcome, Resume, add_run_inputs, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};

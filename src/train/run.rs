@@ -1,23 +1,24 @@
 //! A whole run: from where it stands to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
-    Validation, best_score, check, drop_surplus, keep_best, latest_checkpoint, list_checkpoints, recover,
+    Validation, add_checkpoints, best_score, check, drop_surplus, keep_best, latest_checkpoint,
+    list_checkpoints, recover,
 };
 use super::is_due;
 use super::lock::RunLock;
 use super::metrics::{METRICS_FILE, Metrics};
 use super::step_report::StepReport;
-use super::tensorboard::TensorBoard;
+use super::tensorboard::{TensorBoard, event_files};
 use super::trainer::Trainer;
 use super::validator::{Score, Validator};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::{Inputs, write_atomically};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// The run's configuration, every key written out.
-pub(super) const CONFIG_FILE: &str = "config.toml";
+pub const CONFIG_FILE: &str = "config.toml";
 
 /// Where a run begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -92,6 +93,13 @@ pub fn run(
     let saved = trainer.group.from_first(saved)?;
     let books = begun.map(|(books, _)| books);
     Run { trainer, out, validator, observe, books, validated, asked_to_stop: false }.train(saved)
+}
+
+/// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and what it wrote beside them.
+pub fn add_run_inputs(run: &Path, inputs: &mut Inputs) {
+    add_checkpoints(run, inputs);
+    event_files(run).iter().for_each(|file| inputs.add(file));
+    [CONFIG_FILE, METRICS_FILE].iter().for_each(|file| inputs.add(&run.join(file)));
 }
 
 /// That a run may keep its books in `out`: it did before, or there are none of somebody else's.

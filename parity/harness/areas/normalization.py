@@ -17,6 +17,9 @@ def scene_normalization(rng):
     together = draw.poses(rng, 3)
     together[:, :3, 3] = together[0, :3, 3]
     yield Draw("3 cameras in one place", {"c2w": together}, tolerance=FLOAT64)
+    tiny = draw.poses(rng, 5)
+    tiny[:, :3, 3] *= 1e-13
+    yield Draw("5 cameras in a large unit", {"c2w": tiny}, tolerance=FLOAT64)
     for tilt in (0.0, 0.6):
         around = draw.ring(8, tilt)
         yield Draw(f"8 cameras around a thing, tilted by {tilt}", {"c2w": around}, tolerance=FLOAT64)

@@ -3,17 +3,15 @@
 mod output;
 mod shots;
 
-pub(super) use shots::{median_depth, orbit_around_splat};
-
-use super::{model, parse_size, print_json, progress, stop_flag, view};
+use super::{model, open_capture, parse_size, print_json, progress, stop_flag, view, warn};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Holdout, open_capture};
+use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, Splat, read_splat, tiled_size};
+use globalsplat::io::{DepthScale, Inputs, Splat, read_splat, tiled_size, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
-use globalsplat::render::{Rendered, render_views};
+use globalsplat::render::{Rendered, SplatRenderer};
 use globalsplat::scene::{Camera, ImageSize};
 use output::Output;
 use serde_json::json;
@@ -21,6 +19,10 @@ use shots::Shots;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::{Device, Tensor};
+
+/// What names of pictures that aren't of colours end in.
+const DEPTH: &str = "_depth";
+const ALPHA: &str = "_alpha";
 
 /// Render a splat, or what a model makes of a capture's photos, from the capture's cameras, along a path, or on an orbit.
 ///
@@ -52,7 +54,8 @@ pub struct Render {
     /// Cameras of this capture, of any format, whose photos need not exist, or of a camera_path.json of nerfstudio's viewer
     #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
     path: Option<PathBuf>,
-    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side
+    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side, shrunk where it would have
+    /// more than 64 million pixels
     #[arg(long, value_name = "DIR|FILE", required_unless_present = "html")]
     out: Option<PathBuf>,
     /// Instead, a page to walk in, with the photos of --scene if there is one: one file that needs no other and no network
@@ -91,12 +94,13 @@ impl Render {
     fn page(&self, page: &Path) -> Result<()> {
         view::check_writable(page)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
+        self.inputs(capture.as_ref()).check_file(page)?;
         let splat = self.splat(capture.as_ref())?;
         let name = capture.as_ref().map_or_else(|| view::name_of(page), |capture| capture.name.clone());
         view::write_page(page, &name, &splat, capture.as_ref())?;
         let (gaussians, bytes) = (splat.gaussians.count(), std::fs::metadata(page)?.len());
         if self.json {
-            print_json(&json!({ "page": page, "gaussians": gaussians, "bytes": bytes }));
+            print_json(&json!({ "page": page.to_string_lossy(), "gaussians": gaussians, "bytes": bytes }));
         } else {
             println!("{}: {gaussians} Gaussians, {:.1} MB", page.display(), bytes as f64 * 1e-6);
         }
@@ -107,15 +111,19 @@ impl Render {
         Output::check(out, self.fps)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = self.splat(capture.as_ref())?;
-        let shots = self.shots(&splat, capture.as_ref())?;
-        let scale = if self.depth { Some(depth_scale(&splat, &shots.cameras)?) } else { None };
+        let renderer = splat.renderer();
+        let shots = self.shots(&splat, &renderer, capture.as_ref())?;
+        let scale = if self.depth { Some(depth_scale(&renderer, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
-        let mut output = Output::begin(out, self.size_of_all(&shots.cameras), shots.frames_per_second)?;
+        let mut inputs = self.inputs(capture.as_ref());
+        inputs.extend(shots.inputs.clone());
+        let film = (self.size_of_all(&shots.cameras), shots.frames_per_second);
+        let mut output = Output::begin(out, (&shots.names, &self.suffixes()), film, &inputs)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
-        for (name, camera) in shots.names.iter().zip(&shots.cameras) {
-            let rendered = render_views(&splat.gaussians, std::slice::from_ref(camera))?.remove(0);
-            output.add(name, self.parts(&rendered, scale), capture.as_ref())?;
+        for camera in &shots.cameras {
+            let rendered = renderer.render(std::slice::from_ref(camera))?.remove(0);
+            output.add(&self.parts(&rendered, scale))?;
             if stop.load(Ordering::Relaxed) {
                 let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
                 return Err(Error::Failed(format!("{out}: stopped after {done} of {of} views")).into());
@@ -125,6 +133,7 @@ impl Render {
         let written = output.finish()?;
         bar.finish_and_clear();
         if self.json {
+            let written: Vec<_> = written.iter().map(|file| file.to_string_lossy()).collect();
             print_json(
                 &json!({ "views": shots.cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
             );
@@ -136,34 +145,51 @@ impl Render {
 
     fn splat(&self, capture: Option<&Capture>) -> Result<Splat> {
         let (Some(weights), Some(capture)) = (&self.weights, capture) else {
-            return Ok(read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?);
+            let splat = read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?;
+            warn(&splat.warnings);
+            return Ok(splat);
         };
         let loaded = model::load(Some(weights), Some(Precision::F32), Device::Cpu)?;
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
-        Ok(Splat::of(&reconstruct(&loaded, &photos, &[])?.in_world())?)
+        Ok(reconstruct(&loaded, &photos, &[])?.to_splat()?)
     }
 
-    fn shots(&self, splat: &Splat, capture: Option<&Capture>) -> Result<Shots> {
+    fn shots(&self, splat: &Splat, renderer: &SplatRenderer, capture: Option<&Capture>) -> Result<Shots> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let frames = self.frames.map(|frames| frames as usize);
         let shots = match (&self.path, capture) {
-            (Some(path), _) => Shots::along(path, size, frames, splat)?,
-            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, splat)?,
-            (None, Some(capture)) => Shots::of(capture, size, frames, splat)?,
+            (Some(path), _) => Shots::along(path, size, frames, renderer)?,
+            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, renderer)?,
+            (None, Some(capture)) => Shots::of(capture, size, frames, renderer, &self.suffixes())?,
             (None, None) => Shots::around(splat, size, frames),
         };
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }
 
-    /// Colour and what else was asked for, [3, H, W], each with its file's suffix.
-    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<(&'static str, Tensor)> {
-        let mut parts = vec![("", rendered.rgb.clamp(0., 1.))];
+    /// The files that are read, which no output may replace.
+    fn inputs(&self, capture: Option<&Capture>) -> Inputs {
+        let mut inputs = Inputs::default();
+        let weights = self.weights.iter().flat_map(|path| weights_files(path));
+        weights.chain(self.splat.clone()).for_each(|file| inputs.add(&file));
+        capture.inspect(|capture| capture.add_inputs(&mut inputs));
+        inputs
+    }
+
+    /// What the names of a camera's pictures end in.
+    fn suffixes(&self) -> Vec<&'static str> {
+        let depth = self.depth.then_some(DEPTH);
+        [""].into_iter().chain(depth).chain(self.alpha.then_some(ALPHA)).collect()
+    }
+
+    /// Colour and what else was asked for, [3, H, W], in the order of the suffixes.
+    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<Tensor> {
+        let mut parts = vec![rendered.rgb.clamp(0., 1.)];
         if let Some(scale) = scale {
-            parts.push(("_depth", scale.colourize(&rendered.depth, &rendered.alpha)));
+            parts.push(scale.colourize(&rendered.depth, &rendered.alpha));
         }
         if self.alpha {
-            parts.push(("_alpha", rendered.alpha.unsqueeze(0).expand([3, -1, -1], false)));
+            parts.push(rendered.alpha.unsqueeze(0).expand([3, -1, -1], false));
         }
         parts
     }
@@ -178,7 +204,7 @@ impl Render {
 }
 
 /// What all pictures together show, told by a few that are small: before the first is rendered, the last counts as well.
-fn depth_scale(splat: &Splat, cameras: &[Camera]) -> Result<DepthScale> {
+fn depth_scale(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<DepthScale> {
     const FEW: usize = 12;
     const SMALL: u32 = 128;
     let small = |camera: &Camera| {
@@ -187,6 +213,6 @@ fn depth_scale(splat: &Splat, cameras: &[Camera]) -> Result<DepthScale> {
     };
     let count = cameras.len().min(FEW);
     let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
-    let rendered = render_views(&splat.gaussians, &spread.collect::<Vec<_>>())?;
+    let rendered = renderer.render(&spread.collect::<Vec<_>>())?;
     Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
 }

@@ -1,18 +1,27 @@
 //! Where pictures go, one by one as they are rendered.
 
-use globalsplat::data::Capture;
+use super::super::say_shrunk;
 use globalsplat::error::{Error, Result};
-use globalsplat::io::{Film, check_writable_dir, check_writable_file, tile_horizontally, write_png};
+use globalsplat::io::{
+    Film, Inputs, Mosaic, check_regular, check_writable_dir, check_writable_file, is_png_name,
+    tile_horizontally, write_png,
+};
 use globalsplat::scene::ImageSize;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
 /// What `--out` asks for.
 pub enum Output<'a> {
-    /// A folder of PNGs, and those that are in it.
-    Folder(&'a Path, Vec<PathBuf>),
+    /// A folder of PNGs.
+    Folder {
+        /// The files of each picture's parts.
+        files: Vec<Vec<PathBuf>>,
+        /// How many pictures are written.
+        written: usize,
+    },
     /// One PNG of all side by side.
-    Row(&'a Path, Vec<Tensor>),
+    Row(&'a Path, Mosaic),
     Film(&'a Path, Film),
 }
 
@@ -34,47 +43,59 @@ impl<'a> Output<'a> {
         check_writable_file(path)
     }
 
-    /// For frames of `size` at most, of all parts side by side.
-    pub fn begin(path: &'a Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
-        Ok(match kind(path) {
-            Kind::Folder => Output::Folder(path, vec![]),
-            Kind::Row => Output::Row(path, vec![]),
+    /// For pictures that are called `names`, of parts with `suffixes`, in frames of `size` at most with all parts side by side.
+    ///
+    /// # Errors
+    /// An output that would replace one of `inputs`, or that can't be written.
+    pub fn begin(
+        path: &'a Path,
+        (names, suffixes): (&[String], &[&str]),
+        (size, frames_per_second): (ImageSize, u32),
+        inputs: &Inputs,
+    ) -> Result<Self> {
+        let kind = kind(path);
+        if kind != Kind::Folder {
+            inputs.check_file(path)?;
+        }
+        Ok(match kind {
+            Kind::Folder => {
+                let files = files_of(path, names, suffixes);
+                for file in files.iter().flatten() {
+                    inputs.check_file(file)?;
+                    check_regular(file)?;
+                }
+                inputs.check_folder(path)?;
+                Output::Folder { files, written: 0 }
+            }
+            Kind::Row => Output::Row(path, Mosaic::row(names.len())),
             Kind::Film => Output::Film(path, Film::begin(path, size, frames_per_second)?),
         })
     }
 
-    /// Adds the picture `name`, of `parts` [3, H, W], each with its file's suffix.
-    pub fn add(&mut self, name: &str, parts: Vec<(&str, Tensor)>, capture: Option<&Capture>) -> Result<()> {
-        let side_by_side = |parts: Vec<(&str, Tensor)>| {
-            tile_horizontally(&parts.into_iter().map(|(_, picture)| picture).collect::<Vec<_>>())
-        };
+    /// Adds the next picture, of parts [3, H, W].
+    pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
         match self {
-            Output::Film(_, film) => film.add(&side_by_side(parts)),
-            Output::Row(_, pictures) => {
-                pictures.push(side_by_side(parts));
-                Ok(())
+            Output::Film(_, film) => film.add(&tile_horizontally(parts)),
+            Output::Row(_, mosaic) => mosaic.add(parts),
+            Output::Folder { files, written } => {
+                let of_picture = &files[*written];
+                *written += 1;
+                of_picture.iter().zip(parts).try_for_each(|(file, picture)| {
+                    let folder = file.parent().expect("it is in the output");
+                    std::fs::create_dir_all(folder).map_err(Error::write(folder))?;
+                    write_png(file, picture)
+                })
             }
-            Output::Folder(path, written) => parts.into_iter().try_for_each(|(suffix, picture)| {
-                let file = path.join(format!("{name}{suffix}.png"));
-                let folder = file.parent().expect("it is in the output");
-                std::fs::create_dir_all(folder).map_err(Error::write(folder))?;
-                if capture.is_some_and(|capture| capture.has_photo(&file)) {
-                    let expected = "a folder without the capture's photos";
-                    return Err(Error::input(&file, "the output", "a photo of the capture", expected));
-                }
-                write_png(&file, &picture)?;
-                written.push(file);
-                Ok(())
-            }),
         }
     }
 
     /// The files that were written.
     pub fn finish(self) -> Result<Vec<PathBuf>> {
         match self {
-            Output::Folder(_, written) => Ok(written),
-            Output::Row(path, pictures) => {
-                write_png(path, &tile_horizontally(&pictures))?;
+            Output::Folder { files, .. } => Ok(files.into_iter().flatten().collect()),
+            Output::Row(path, mosaic) => {
+                say_shrunk(path, mosaic.shrunk_by());
+                mosaic.write(path)?;
                 Ok(vec![path.to_owned()])
             }
             Output::Film(path, film) => {
@@ -85,7 +106,21 @@ impl<'a> Output<'a> {
     }
 }
 
-#[derive(PartialEq)]
+/// The files in `folder` of pictures that are called `names`, each with one for every suffix. Where two would be the same, as of `x`
+/// with a suffix and of a photo that is called so, numbers stand for the names.
+fn files_of(folder: &Path, names: &[String], suffixes: &[&str]) -> Vec<Vec<PathBuf>> {
+    let of_picture = |name: &str| -> Vec<PathBuf> {
+        suffixes.iter().map(|suffix| folder.join(format!("{name}{suffix}.png"))).collect()
+    };
+    let files: Vec<Vec<PathBuf>> = names.iter().map(|name| of_picture(name)).collect();
+    let distinct: BTreeSet<&PathBuf> = files.iter().flatten().collect();
+    match distinct.len() == names.len() * suffixes.len() {
+        true => files,
+        false => (0..names.len()).map(|index| of_picture(&format!("{index:06}"))).collect(),
+    }
+}
+
+#[derive(Clone, Copy, PartialEq)]
 enum Kind {
     Folder,
     Row,
@@ -94,9 +129,11 @@ enum Kind {
 
 /// Told by the ending.
 fn kind(path: &Path) -> Kind {
-    match path.extension().and_then(|ending| ending.to_str()) {
-        Some("gif" | "mp4") => Kind::Film,
-        Some("png") => Kind::Row,
-        _ => Kind::Folder,
+    if Film::is_name(path) {
+        Kind::Film
+    } else if is_png_name(path) {
+        Kind::Row
+    } else {
+        Kind::Folder
     }
 }

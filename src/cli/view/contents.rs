@@ -1,14 +1,14 @@
 //! What a page is told about its scene.
 
-use super::super::render::{median_depth, orbit_around_splat};
+use super::super::cameras::{median_depth, orbit_around_splat};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use globalsplat::data::{Capture, View};
+use globalsplat::data::Capture;
 use globalsplat::io::{Splat, encode_photo, rgb_from_tensor};
 use globalsplat::render::DEFAULT_EPS2D;
-use globalsplat::scene::{Camera, ImageSize, smooth_path};
+use globalsplat::scene::{Camera, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
 /// The longer side of a photo, in pixels.
@@ -24,7 +24,8 @@ const MOST_FRAMES: usize = 1200;
 /// A camera's frustum is as long as this share of the distance to what is seen.
 const FRUSTUM: f64 = 0.06;
 
-/// In the page as JSON; read in web/src.
+/// In the page as JSON; read in web/src. Lengths and places are in the splat's local frame (spec 2.5), which a browser's float32 and
+/// its half-precision centres suit.
 #[derive(Serialize)]
 pub struct Contents {
     pub name: String,
@@ -33,7 +34,7 @@ pub struct Contents {
     path: Vec<[f64; 12]>,
     /// Where the photos' up is, of length 1.
     up: [f64; 3],
-    /// To what the middle camera sees, in the capture's unit.
+    /// To what the middle camera sees.
     distance: f64,
     frustum: f64,
     /// What is added to the covariance of a Gaussian in the picture, in square pixels (spec 6.2).
@@ -62,13 +63,13 @@ struct Lens {
 }
 
 impl Contents {
-    /// Of `splat`, seen from the cameras of `capture` or, without one, from around it.
+    /// Of `splat`, which is in the local frame `frame`, seen from the cameras of `capture` or, without one, from around it.
     ///
     /// # Errors
     /// Photos that can't be read.
-    pub fn of(name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<Self> {
+    pub fn of(name: &str, splat: &Splat, capture: Option<&Capture>, frame: &LocalFrame) -> Result<Self> {
         let (cameras, all) = match capture {
-            Some(capture) => (photographed(capture)?, capture.cameras()),
+            Some(capture) => (photographed(capture, frame)?, frame.cameras_to_local(&capture.cameras())),
             None => {
                 let orbit = orbit_around_splat(splat, SIZE, ORBIT);
                 let named =
@@ -76,7 +77,7 @@ impl Contents {
                 (named.collect(), orbit)
             }
         };
-        let distance = median_depth(splat, &all)?;
+        let distance = median_depth(&splat.renderer(), &all)?;
         let path = match capture {
             Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MOST_FRAMES))?,
             None => [&all[..], &all[..1]].concat(),
@@ -109,24 +110,21 @@ fn rows(camera: &Camera) -> [f64; 12] {
 }
 
 /// Cameras and their photos, spread over the capture where there are many.
-fn photographed(capture: &Capture) -> Result<Vec<PageCamera>> {
-    let count = capture.len().min(MOST_PHOTOS);
+fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>> {
+    let (count, cameras) = (capture.len().min(MOST_PHOTOS), capture.cameras());
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
-        let view = shrunk(capture.load(&[index], None)?.remove(0))?;
+        let view = capture.load(&[index], shrunk(&cameras[index]))?.remove(0);
         let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
         let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
-        Ok(PageCamera::of(view.name, &view.camera, Some(photo)))
+        Ok(PageCamera::of(view.name, &frame.camera_to_local(&view.camera), Some(photo)))
     };
     indices.map(photographed).collect()
 }
 
-fn shrunk(view: View) -> Result<View> {
-    let Camera { width, height, .. } = view.camera;
+/// The size to which a photo is shrunk; none where it is small enough.
+fn shrunk(&Camera { width, height, .. }: &Camera) -> Option<ImageSize> {
     let longest = width.max(height);
-    if longest <= LONGEST {
-        return Ok(view);
-    }
     let side = |side: u32| (side * LONGEST).div_ceil(longest);
-    Ok(view.fitted(ImageSize { width: side(width), height: side(height) })?)
+    (longest > LONGEST).then(|| ImageSize { width: side(width), height: side(height) })
 }

@@ -3,19 +3,20 @@ mod page;
 
 pub use page::{check_writable, has_viewer, write_page};
 
-use super::print_json;
+use super::{open_capture, print_json, warn};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::open_capture;
 use globalsplat::error::Error;
 use globalsplat::io::read_splat;
 use serde_json::json;
+use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 
 /// Walk in a splat: writes a page for a browser, with everything in one file, and opens it.
 ///
-/// With --scene there are the capture's photos, too: to jump to, to see in the places they were taken from, and to compare with. The
-/// page stays where it is told to be; `render --html` writes it elsewhere.
+/// With --scene there are the capture's photos, too: to jump to, to see in the places they were taken from, and to compare with.
+/// The page is in the temporary folder, where you alone can read it, until the next `view` removes it; `render --html` writes one
+/// that stays.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat view room.ply --scene captures/room\n  \
     globalsplat render --splat room.ply --scene captures/room --html room.html")]
@@ -36,15 +37,17 @@ impl View {
         page::check_has_viewer()?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = read_splat(&self.splat)?;
+        warn(&splat.warnings);
         let name = name_of(&self.splat);
-        // The browser reads it when this program is gone.
-        let page = tempfile::Builder::new().prefix(&format!("{name}-")).suffix(".html").tempfile()?;
-        let (_, page) = page.keep().map_err(|e| Error::write(e.file.path())(e.error))?;
-        write_page(&page, &name, &splat, capture.as_ref())?;
+        remove_pages(&std::env::temp_dir());
+        // Its owner alone can read it. The browser does when this program is gone.
+        let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile()?;
+        write_page(page.path(), &name, &splat, capture.as_ref())?;
+        let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
         let opened = open::that_detached(&page);
         if self.json {
             print_json(
-                &json!({ "page": page, "gaussians": splat.gaussians.count(), "opened": opened.is_ok() }),
+                &json!({ "page": page.to_string_lossy(), "gaussians": splat.gaussians.count(), "opened": opened.is_ok() }),
             );
         } else {
             println!("{}", page.display());
@@ -54,6 +57,31 @@ impl View {
         }
         Ok(())
     }
+}
+
+/// Of a page's name, by which the next `view` knows it.
+const PAGE_ENDING: &str = ".globalsplat-view.html";
+
+/// Removes what earlier `view`s left in `folder`: those of this user.
+fn remove_pages(folder: &Path) {
+    for file in folder.read_dir().into_iter().flatten().flatten() {
+        if file.file_name().to_string_lossy().ends_with(PAGE_ENDING) && is_own(&file) {
+            let _ = std::fs::remove_file(file.path());
+        }
+    }
+}
+
+/// Whether a file is this user's.
+#[cfg(unix)]
+fn is_own(file: &DirEntry) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    // SAFETY: it reads nothing and always succeeds.
+    file.metadata().is_ok_and(|file| file.is_file() && file.uid() == unsafe { libc::geteuid() })
+}
+
+#[cfg(not(unix))]
+fn is_own(file: &DirEntry) -> bool {
+    file.metadata().is_ok_and(|file| file.is_file())
 }
 
 /// What a page is called that is about the file at `path`.

@@ -8,6 +8,7 @@ use globalsplat::data::Capture;
 use globalsplat::error::Error;
 use globalsplat::io::{self, Splat, check_writable_file, fit_splat, write_atomically, write_splat};
 use globalsplat::render::HarmonicLimits;
+use globalsplat::scene::Camera;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::Path;
 
@@ -51,17 +52,19 @@ pub fn check_writable(path: &Path) -> Result<()> {
 /// # Errors
 /// Photos that can't be read, or the system's refusal to write.
 pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<()> {
-    let contents = Contents::of(name, splat, capture)?;
-    let text = page(&contents, &spz(splat, capture)?)?.into_string();
+    let frame = splat.frame();
+    let splat = Splat::of(&frame.gaussians_to_local(&splat.gaussians, splat.origin))?;
+    let contents = Contents::of(name, &splat, capture, &frame)?;
+    let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
+    let text = page(&contents, &spz(&splat, &cameras)?)?.into_string();
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
 }
 
 /// The splat in few bytes, by colours that viewers can show.
-fn spz(splat: &Splat, capture: Option<&Capture>) -> Result<Vec<u8>> {
+fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
-    let cameras = capture.map(Capture::cameras).unwrap_or_default();
-    write_splat(&file, &fit_splat(&file, splat, &HarmonicLimits::of_viewers(splat.sh_degree()), &cameras)?)?;
+    write_splat(&file, &fit_splat(&file, splat, &HarmonicLimits::of_viewers(splat.sh_degree()), cameras)?)?;
     Ok(std::fs::read(file)?)
 }
 

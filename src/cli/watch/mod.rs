@@ -39,7 +39,7 @@ impl Watch {
         let stop = stop_flag()?;
         let url = server::serve(run, self.port)?;
         match self.json {
-            true => print_json(&json!({"run": self.run, "url": url})),
+            true => print_json(&json!({"run": self.run.to_string_lossy(), "url": url})),
             false => println!("{url} shows {}; Ctrl-C ends it", self.run.display()),
         }
         while !stop.load(Ordering::Relaxed) {

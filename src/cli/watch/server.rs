@@ -99,8 +99,30 @@ fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Respon
 /// Whether the browser knows that it speaks to its own machine. One that was told that a stranger's name means this address
 /// (DNS rebinding) names the stranger, whose page could read the answer.
 fn is_meant_for_us(request: &Request<Body>, port: u16) -> bool {
-    let own = ["127.0.0.1", "localhost", "[::1]"].map(|name| format!("{name}:{port}"));
-    request.headers().get(HOST).is_some_and(|host| own.iter().any(|own| host == own.as_str()))
+    let mut hosts = request.headers().get_all(HOST).iter();
+    match (hosts.next().and_then(|host| host.to_str().ok()), hosts.next()) {
+        (Some(host), None) => is_this_machine(host, port),
+        _ => false,
+    }
+}
+
+/// Whether the value of a Host header names this machine and `port`: names are the same in capitals and with a dot at their end,
+/// and without a port it is HTTP's own (RFC 9110, section 7.2).
+fn is_this_machine(host: &str, port: u16) -> bool {
+    const HTTP: u16 = 80;
+    // An IPv6 address has colons of its own, in brackets.
+    let (name, said) = match host.rsplit_once(':') {
+        Some((name, said)) if !said.ends_with(']') => (name, Some(said)),
+        _ => (host, None),
+    };
+    let said = match said {
+        None | Some("") => Some(HTTP),
+        Some(digits) => {
+            Some(digits).filter(|d| d.bytes().all(|d| d.is_ascii_digit())).and_then(|d| d.parse().ok())
+        }
+    };
+    let name = name.strip_suffix('.').unwrap_or(name).to_ascii_lowercase();
+    said == Some(port) && ["127.0.0.1", "localhost", "[::1]"].contains(&name.as_str())
 }
 
 /// `/picture/STEP.png`. A number is all that ever gets from an address to a file.
@@ -123,4 +145,45 @@ fn send(status: StatusCode, kind: &str, body: impl Into<Body>) -> Response<Body>
         .header("cross-origin-resource-policy", "same-origin")
         .body(body.into())
         .expect("headers without a line's end")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_this_machine;
+
+    #[test]
+    fn this_machine_is_known_by_its_names_and_the_port() {
+        for host in ["127.0.0.1:8123", "localhost:8123", "LocalHost:8123", "localhost.:8123", "[::1]:8123"] {
+            assert!(is_this_machine(host, 8123), "{host}");
+        }
+        // A browser leaves out HTTP's own port.
+        for host in
+            ["127.0.0.1", "localhost", "LOCALHOST.", "[::1]", "localhost:", "localhost:80", "[::1]:80"]
+        {
+            assert!(is_this_machine(host, 80), "{host}");
+        }
+        for host in
+            ["localhost", "[::1]", "localhost:80", "localhost:+8123", "localhost: 8123", "localhost:74659"]
+        {
+            assert!(!is_this_machine(host, 8123), "{host}");
+        }
+        for host in [
+            "",
+            ":80",
+            ".",
+            "example.org",
+            "example.org:80",
+            "localhost.example.org",
+            "localhost..",
+            "127.0.0.1.example.org",
+            "::1",
+            "[::1",
+            "::1]",
+            "127.0.0.2",
+            "example.org@localhost",
+            "localhost:80:80",
+        ] {
+            assert!(!is_this_machine(host, 80), "{host}");
+        }
+    }
 }

@@ -5,10 +5,11 @@
 
 use super::json::null_for_not_a_number;
 use super::transforms_json::{from_opengl, shown};
-use super::{cameras_json, open_for, recognize, transforms_json};
+use super::{cameras_json, is_capture, open_for, transforms_json};
 use crate::data::capture::{Purpose, check_cameras};
 use crate::error::{Error, Result};
-use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid};
+use crate::io::{Inputs, read_text};
+use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
 use serde_json::Value;
 use std::path::Path;
 
@@ -19,6 +20,10 @@ pub struct CameraPath {
     pub cameras: Vec<Camera>,
     /// How fast they follow each other, where the file tells.
     pub frames_per_second: Option<u32>,
+    /// As [`Capture::warnings`](crate::data::Capture::warnings).
+    pub warnings: Vec<String>,
+    /// What they were read from, and the photos of the capture that are there.
+    pub inputs: Inputs,
 }
 
 /// Reads the cameras of a capture of any format, as [`open_capture`](super::open_capture) finds it, or of a JSON file of any
@@ -29,22 +34,26 @@ pub struct CameraPath {
 /// As [`open_capture`](super::open_capture).
 pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
     let purpose = Purpose::Cameras(size);
-    let json = match path.is_file() && path.extension().is_some_and(|ending| ending == "json") {
-        false => None,
-        true => {
-            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
-            // What is no JSON is refused by whoever reads it.
-            Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
-        }
-    };
+    let json =
+        match path.is_file() && path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json")) {
+            false => None,
+            true => {
+                let text = read_text(path)?;
+                // What is no JSON is refused by whoever reads it.
+                Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
+            }
+        };
     let has = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
-    let capture = match (&json, recognize(path)) {
+    let capture = match (&json, is_capture(path)) {
         (Some(json), _) if has("camera_path") => return of_viewer(path, json),
-        (Some(_), None) if has("frames") => transforms_json::read(path, purpose)?,
-        (Some(_), None) => cameras_json::read(path, purpose)?,
+        (Some(_), false) if has("frames") => transforms_json::read(path, purpose)?,
+        (Some(_), false) => cameras_json::read(path, purpose)?,
         _ => open_for(path, purpose)?,
     };
-    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None })
+    let warnings = capture.warnings().to_vec();
+    let mut inputs = Inputs::default();
+    capture.add_inputs(&mut inputs);
+    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None, warnings, inputs })
 }
 
 fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
@@ -79,9 +88,8 @@ fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
         let numbers: Vec<f64> = numbers.filter_map(Value::as_f64).collect();
         let pose_refused = || refuse(&named("camera_to_world"), pose, "16 numbers");
         let c2w = from_opengl(numbers.as_slice().try_into().map_err(|_| pose_refused())?);
-        let c2w = nearest_rigid(&c2w);
-        let c2w =
-            c2w.map_err(|(found, expected)| Error::input(file, named("camera_to_world"), found, expected))?;
+        let (c2w, _) = nearest_rigid_of_scaled(&c2w)
+            .map_err(|(found, expected)| Error::input(file, named("camera_to_world"), found, expected))?;
         let fov = number(entry, "fov", &named("fov"), "degrees between 0 and 180", 0., 180.)?;
         let (w, h) = (f64::from(width), f64::from(height));
         let focal = h / 2. / (fov.to_radians() / 2.).tan();
@@ -98,5 +106,8 @@ fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
         }
         (None, None) => None,
     };
-    Ok(CameraPath { cameras, frames_per_second: rate.map(|rate| rate.round() as u32) })
+    let mut inputs = Inputs::default();
+    inputs.add(file);
+    let frames_per_second = rate.map(|rate| rate.round() as u32);
+    Ok(CameraPath { cameras, frames_per_second, warnings: vec![], inputs })
 }

@@ -2,11 +2,12 @@
 //! (Spec 10.2.)
 
 use super::json::null_for_not_a_number;
+use super::photos::{find_photos, portable};
 use super::{Found, file_in, folder_name};
-use crate::data::capture::{Capture, Frame, Photo, Purpose};
+use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::write_json;
+use crate::io::{read_text, write_json};
 use crate::scene::{Camera, Intrinsics, pose_to_rows};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
@@ -39,31 +40,29 @@ pub(super) fn find(path: &Path) -> Option<Found> {
     Some(Box::new(move |purpose| read(&file, purpose)))
 }
 
-/// Reads the capture that `file` describes. Views come as its author put them, whatever they are called.
+/// Reads the capture that `file` describes. Views come as its author put them, whatever they are called. Those whose photo isn't
+/// there are left out.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let parsed = parse(file)?;
     let root = file.parent().unwrap_or(Path::new("."));
     let cameras = cameras(file, &parsed)?;
-    let mut frames = vec![];
-    for (i, (view, camera)) in parsed.views.into_iter().zip(cameras).enumerate() {
-        let image = root.join(&view.image);
-        if matches!(purpose, Purpose::Photos) && (view.image.is_empty() || !image.is_file()) {
-            let expected = "the path of an image beside it";
-            return Err(Error::input(
-                file,
-                format!("image of view {i}"),
-                format!("{:?}, which is not there", view.image),
-                expected,
-            ));
-        }
-        frames.push(Frame {
-            photo: Photo::File(image),
-            name: view.image,
-            camera,
-            distortion: Distortion::default(),
-        });
+    let names: Vec<&str> = parsed.views.iter().map(|view| view.image.as_str()).collect();
+    let photos = find_photos(&[root.to_owned()], &names);
+    let (mut frames, mut changes) = (vec![], Changes::default());
+    for ((name, photo), camera) in names.into_iter().zip(photos).zip(cameras) {
+        let photo = match (photo, purpose) {
+            (Some(photo), _) => photo,
+            (None, Purpose::Cameras(_)) => root.join(name),
+            (None, Purpose::Photos) => {
+                changes.absent.push(name.to_string());
+                continue;
+            }
+        };
+        let camera = Camera { c2w: changes.unscaled(name, camera.c2w), ..camera };
+        let name = portable(name);
+        frames.push(Frame { photo: Photo::File(photo), name, camera, distortion: Distortion::default() });
     }
-    Capture::new(folder_name(root), file.to_owned(), frames, purpose)
+    Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)
 }
 
 /// Writes a `cameras.json` at `file`; `images` are paths relative to its folder. All cameras have one size.
@@ -86,7 +85,7 @@ fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {
 }
 
 fn parse(file: &Path) -> Result<File> {
-    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let text = read_text(file)?;
     serde_json::from_str(&null_for_not_a_number(&text)).map_err(|e| {
         let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
         Error::input(file, "the file", format!("not a description of cameras ({e})"), expected)

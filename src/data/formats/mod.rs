@@ -6,6 +6,7 @@ mod chunk;
 mod colmap;
 mod json;
 mod natural;
+mod photos;
 mod transforms_json;
 
 pub use camera_path::{CameraPath, read_camera_path};
@@ -24,15 +25,17 @@ type Format = fn(&Path) -> Option<Found>;
 /// Reads the capture that was found.
 type Found = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
 
-/// Of several in a folder, the first is taken.
+/// Of several in a folder, the first that can be read is taken.
 const FORMATS: [Format; 4] = [chunk::find, cameras_json::find, transforms_json::find, colmap::find];
 
 /// What is expected where nothing known is found.
-const KNOWN: &str =
-    "a cameras.json, a transforms.json or a COLMAP model (sparse/0) in it, or a CHUNK.torch#KEY";
+const KNOWN: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
+                     .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, or a \
+                     CHUNK.torch#KEY";
 
-fn recognize(path: &Path) -> Option<Found> {
-    FORMATS.iter().find_map(|find| find(path))
+/// Whether a capture is at `path`, as far as names tell.
+pub(in crate::data) fn is_capture(path: &Path) -> bool {
+    FORMATS.iter().any(|find| find(path).is_some())
 }
 
 /// The file `name` that describes a capture, where `path` is the capture's folder.
@@ -45,9 +48,13 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
 /// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk; `CHUNK.torch` where it has one alone;
 /// 2. a folder with a `cameras.json`, or that file;
 /// 3. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named
-///    `transforms_train.json` and the like;
-/// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `dense/0/sparse`, `dense/sparse` or the folder
-///    itself, and the photos in `images` beside it.
+///    `transforms_train.json` and the like; or a folder with NeRF's `transforms_train.json`, and `transforms_test.json`, whose views
+///    [`Capture::split`] holds out;
+/// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `colmap/sparse/0`, `dense/0/sparse`, `dense/sparse` or
+///    the folder itself, and the photos in `images` beside it, or in the folder itself. Of several the one with the most photos.
+///
+/// Of several formats the first that can be read is taken. Photos that aren't there are left out, and cameras are scaled to photos
+/// that are smaller or larger than they say: [`Capture::warnings`] names whatever is left out or changed.
 ///
 /// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
 ///
@@ -58,10 +65,26 @@ pub fn open_capture(path: &Path) -> Result<Capture> {
 }
 
 fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
-    match recognize(path) {
-        Some(read) => read(purpose),
-        None if !path.exists() => Err(Error::Request(format!("{}: no such capture", path.display()))),
-        None => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
+    let mut refusals = vec![];
+    for read in FORMATS.iter().filter_map(|find| find(path)) {
+        match read(purpose) {
+            Ok(capture) => {
+                let taken = capture.file().display().to_string();
+                let lines = refusals.iter().map(|why| format!("{why}; {taken} is read instead"));
+                return Ok(capture.with_warnings(lines.collect()));
+            }
+            Err(why) if why.is_request() => refusals.push(why),
+            Err(why) => return Err(why),
+        }
+    }
+    match refusals.len() {
+        0 if !path.exists() => Err(Error::Request(format!("{}: no such capture", path.display()))),
+        0 => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
+        1 => Err(refusals.remove(0)),
+        _ => {
+            let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
+            Err(Error::Request(format!("{}: none of its formats can be read: {reasons}", path.display())))
+        }
     }
 }
 
@@ -75,37 +98,64 @@ pub(in crate::data) fn folder_name(path: &Path) -> String {
 /// How many folders deep captures are looked for.
 const DEPTH: usize = 2;
 
-/// Every capture in `path`: itself, or those in the folders up to two levels below it, in the order of their paths, numbers in
-/// them by value.
+/// Captures below a folder.
+#[derive(Debug)]
+pub struct FoundCaptures {
+    /// In the order of their paths, numbers in them by value.
+    pub captures: Vec<Capture>,
+    /// Folders that couldn't be looked into, a line each.
+    pub warnings: Vec<String>,
+}
+
+/// Opens every capture in `path`: itself, or those in the folders up to two levels below it. Hidden folders aren't looked into, as
+/// those are that interrupted work leaves, nor those that can't be read.
 ///
 /// # Errors
-/// A folder that can't be read or holds no capture.
-pub fn find_captures(path: &Path) -> Result<Vec<Capture>> {
-    capture_folders(path)?.iter().map(|folder| open_capture(folder)).collect()
+/// `path` can't be read or holds no capture, or a capture breaks its format's rules.
+pub fn find_captures(path: &Path) -> Result<FoundCaptures> {
+    let CaptureFolders { folders, warnings } = capture_folders(path)?;
+    let captures = folders.iter().map(|folder| open_capture(folder)).collect::<Result<_>>()?;
+    Ok(FoundCaptures { captures, warnings })
 }
 
 /// Where [`find_captures`] finds them.
-pub(in crate::data) fn capture_folders(path: &Path) -> Result<Vec<PathBuf>> {
-    let mut folders = vec![];
-    collect_folders(path, DEPTH, &mut folders)?;
-    if folders.is_empty() {
-        let expected = format!("{KNOWN} or in folders below it");
-        return Err(Error::input(path, "the folder", "without captures", expected));
-    }
-    folders.sort_by(natural_order);
-    Ok(folders)
+#[derive(Debug, Default)]
+pub(in crate::data) struct CaptureFolders {
+    pub folders: Vec<PathBuf>,
+    /// As [`FoundCaptures::warnings`].
+    pub warnings: Vec<String>,
 }
 
-fn collect_folders(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<()> {
-    if recognize(path).is_some() {
-        found.push(path.to_owned());
-    } else if depth > 0 {
+/// Finds the folders of [`find_captures`].
+pub(in crate::data) fn capture_folders(path: &Path) -> Result<CaptureFolders> {
+    let mut found = CaptureFolders::default();
+    found.collect(path, DEPTH)?;
+    if found.folders.is_empty() {
+        let unread = found.warnings.first().map_or(String::new(), |line| format!(" ({line})"));
+        let expected = format!("{KNOWN}; or folders with such, up to {DEPTH} levels below it");
+        return Err(Error::input(path, "the folder", format!("without captures{unread}"), expected));
+    }
+    found.folders.sort_by(natural_order);
+    Ok(found)
+}
+
+impl CaptureFolders {
+    fn collect(&mut self, path: &Path, depth: usize) -> Result<()> {
+        if is_capture(path) {
+            self.folders.push(path.to_owned());
+            return Ok(());
+        }
+        if depth == 0 {
+            return Ok(());
+        }
         for entry in std::fs::read_dir(path).map_err(Error::read(path))? {
-            let below = entry.map_err(Error::read(path))?.path();
-            if below.is_dir() {
-                collect_folders(&below, depth - 1, found)?;
+            let entry = entry.map_err(Error::read(path))?;
+            let is_hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
+            if !is_hidden && entry.path().is_dir() {
+                let below = self.collect(&entry.path(), depth - 1);
+                self.warnings.extend(below.err().map(|why| format!("{why}, and is left out")));
             }
         }
+        Ok(())
     }
-    Ok(())
 }

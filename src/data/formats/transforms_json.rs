@@ -1,15 +1,17 @@
 //! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with
 //! OpenGL axes}]}, and of the lens, for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x`
-//! and `camera_angle_y` in radians, and the distortion `k1` to `k4`, `p1`, `p2` (spec 10.3).
+//! and `camera_angle_y` in radians, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes have a file of
+//! this kind for each part.
 
 use super::json::null_for_not_a_number;
 use super::natural::natural_order;
+use super::photos::{find_photos, portable};
 use super::{Found, file_in, folder_name};
-use crate::data::capture::{Capture, Frame, Photo, Purpose};
+use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::{PHOTO_EXTENSIONS, read_image_size};
-use crate::scene::{Camera, Intrinsics, nearest_rigid};
+use crate::io::{read_image_size, read_text};
+use crate::scene::{Camera, Intrinsics, nearest_rigid_of_scaled};
 use glam::{DMat4, DVec4};
 use serde_json::Value;
 use std::f64::consts::PI;
@@ -18,21 +20,66 @@ use std::path::{Path, PathBuf};
 /// By which a capture of this format is recognized.
 const FILE_NAME: &str = "transforms.json";
 
-/// Lenses that [`Distortion`] describes.
-const CAMERA_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
+/// Files of NeRF's synthetic scenes: views to learn from, and those that are judged, of which the first that is there counts.
+const TRAIN_FILE: &str = "transforms_train.json";
+const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 
-/// A folder with a `transforms.json`, or a file `transforms….json`.
+/// Lenses that [`Distortion`] describes.
+const CAMERA_MODELS: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", FULL_OPENCV];
+
+/// The lens whose k4 to k6 are a denominator.
+const FULL_OPENCV: &str = "FULL_OPENCV";
+
+/// Keys that together say one thing of a frame's lens: where a frame has one of them, those that all frames share don't count.
+const FAMILIES: [&[&str]; 2] = [
+    &["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"],
+    &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params"],
+];
+
+/// A folder with a `transforms.json`, or with a `transforms_train.json` and others, or a file `transforms….json`.
 pub(super) fn find(path: &Path) -> Option<Found> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
-    let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
-    Some(Box::new(move |purpose| read(&file, purpose)))
+    let file = if itself { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
+    if let Some(file) = file {
+        return Some(Box::new(move |purpose| read(&file, purpose)));
+    }
+    let train = file_in(path, TRAIN_FILE)?;
+    let mut others: Vec<PathBuf> = TEST_FILES.iter().filter_map(|name| file_in(path, name)).collect();
+    Some(Box::new(move |purpose| {
+        let mut capture = read(&train, purpose)?;
+        if !others.is_empty() {
+            let test = others.remove(0);
+            let (frames, changes) = read_frames(&test, purpose)?;
+            capture = capture.with_test(&test, frames, changes, purpose)?;
+        }
+        let unread = others.iter().map(|file| {
+            let views = read_frames(file, purpose).map_or(0, |(frames, _)| frames.len());
+            format!(
+                "{}: its {views} views are left out, as {} has those to hold out",
+                file.display(),
+                TEST_FILES[0]
+            )
+        });
+        Ok(capture.with_warnings(unread.collect()))
+    }))
 }
 
-/// Reads the capture that `file` describes. Frames come in the order of their names, numbers in them by value. Those whose
-/// image isn't there are left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
+/// Reads the capture that `file` describes.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
-    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let (frames, changes) = read_frames(file, purpose)?;
+    Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose)
+}
+
+fn root(file: &Path) -> &Path {
+    file.parent().unwrap_or(Path::new("."))
+}
+
+/// Reads the frames that `file` describes, in the order of their names, numbers in them by value. Those whose image isn't there are
+/// left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
+fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes)> {
+    let text = read_text(file)?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
     let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
         .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
@@ -40,29 +87,27 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
         Some(Value::Array(entries)) => entries,
         other => return Err(Error::input(file, "frames", shown(other), "a list of frames")),
     };
-    let root = file.parent().unwrap_or(Path::new("."));
-    let (mut frames, mut absent) = (vec![], None);
-    for (index, frame) in entries.iter().enumerate() {
-        let fields = Fields { file, index, frame, shared: &json, purpose };
-        let name = fields.file_path()?;
-        match (image_at(root, name), purpose) {
-            (Some(image), _) => frames.push(fields.frame(image, name)?),
-            (None, Purpose::Cameras(_)) => frames.push(fields.frame(root.join(name), name)?),
-            (None, Purpose::Photos) => absent = absent.or(Some(name)),
+    let fields: Vec<Fields> = entries
+        .iter()
+        .enumerate()
+        .map(|(index, frame)| Fields { file, index, frame, shared: &json, purpose })
+        .collect();
+    let names = fields.iter().map(Fields::file_path).collect::<Result<Vec<_>>>()?;
+    let mut bases = vec![root(file).to_owned()];
+    bases.extend(root(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
+    let photos = find_photos(&bases, &names);
+    let (mut frames, mut changes) = (vec![], Changes::default());
+    for ((fields, name), photo) in fields.iter().zip(names).zip(photos) {
+        match (photo, purpose) {
+            (Some(photo), _) => frames.push(fields.frame(photo, name, &mut changes)?),
+            (None, Purpose::Cameras(_)) => {
+                frames.push(fields.frame(root(file).join(name), name, &mut changes)?)
+            }
+            (None, Purpose::Photos) => changes.absent.push(name.to_string()),
         }
     }
-    if let (Some(name), true) = (absent, frames.len() < 2) {
-        let found = format!("{} of {}, {name:?} is not there", frames.len(), entries.len());
-        return Err(Error::input(file, "the number of frames with an image", found, "two or more"));
-    }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Capture::new(folder_name(root), file.to_owned(), frames, purpose)
-}
-
-fn image_at(root: &Path, name: &str) -> Option<PathBuf> {
-    // What is tried behind a `file_path` that names no file.
-    let with_extension = PHOTO_EXTENSIONS.iter().map(|extension| root.join(format!("{name}.{extension}")));
-    std::iter::once(root.join(name)).chain(with_extension).find(|path| path.is_file())
+    Ok((frames, changes))
 }
 
 /// What stands in the file, for an error.
@@ -83,6 +128,11 @@ pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
     opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
 }
 
+/// Whether `value` names the lens `model`.
+fn is_model(value: &Value, model: &str) -> bool {
+    value.as_str().is_some_and(|value| value.eq_ignore_ascii_case(model))
+}
+
 /// A frame's fields, each its own or else the one shared by all.
 struct Fields<'a> {
     file: &'a Path,
@@ -95,8 +145,13 @@ struct Fields<'a> {
 impl<'a> Fields<'a> {
     /// The value, and what to call it.
     fn find(&self, key: &str) -> Option<(&'a Value, String)> {
-        let own = self.frame.get(key).map(|value| (value, self.name(key)));
-        own.or_else(|| self.shared.get(key).map(|value| (value, key.to_string())))
+        if let Some(value) = self.frame.get(key) {
+            return Some((value, self.name(key)));
+        }
+        let family = FAMILIES.iter().find(|family| family.contains(&key)).copied().unwrap_or_default();
+        let has_own = family.iter().any(|key| self.frame.get(key).is_some());
+        let shared = self.shared.get(key).filter(|_| !has_own);
+        shared.map(|value| (value, key.to_string()))
     }
 
     fn name(&self, key: &str) -> String {
@@ -146,20 +201,24 @@ impl<'a> Fields<'a> {
         }
     }
 
-    fn frame(&self, image: PathBuf, name: &str) -> Result<Frame> {
+    fn frame(&self, image: PathBuf, name: &str, changes: &mut Changes) -> Result<Frame> {
         self.check_camera_model()?;
         let (width, height) = match (self.size("w")?, self.size("h")?) {
             (Some(width), Some(height)) => (width, height),
             _ => self.purpose.size(self.file, &format!("frame {}", self.index), read_image_size(&image))?,
         };
-        let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w: self.c2w()?, width, height };
+        let (c2w, scale) = self.c2w()?;
+        if scale != 1. {
+            changes.scaled.push((name.to_string(), scale));
+        }
+        let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w, width, height };
         let distortion = self.distortion()?;
         let refuse =
             |name: &str, (found, expected)| Error::input(self.file, self.name(name), found, expected);
         let intrinsics = camera.intrinsics.check(width, height);
         intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
         distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
-        Ok(Frame { photo: Photo::File(image), name: name.to_string(), camera, distortion })
+        Ok(Frame { photo: Photo::File(image), name: portable(name), camera, distortion })
     }
 
     /// A focal length that isn't given follows from the angle of view, and else equals that of the other axis; a principal
@@ -189,15 +248,24 @@ impl<'a> Fields<'a> {
             ));
         }
         let number = |key: &str| Ok::<_, Error>(self.number(key)?.unwrap_or(0.));
+        let (k4, k5, k6) = (number("k4")?, number("k5")?, number("k6")?);
+        let is_rational = self.find("camera_model").is_some_and(|(model, _)| is_model(model, FULL_OPENCV));
+        for (key, value) in [("k5", k5), ("k6", k6)] {
+            if value != 0. && !is_rational {
+                return Err(self.refuse(key, value, "0, or FULL_OPENCV as camera_model"));
+            }
+        }
+        let (k4, denominator) = if is_rational { (0., [k4, k5, k6]) } else { (k4, [0.; 3]) };
         Ok(Distortion {
-            radial: [number("k1")?, number("k2")?, number("k3")?, number("k4")?],
+            radial: [number("k1")?, number("k2")?, number("k3")?, k4],
+            denominator,
             tangential: [number("p1")?, number("p2")?],
         })
     }
 
     fn check_camera_model(&self) -> Result<()> {
         if let Some((model, name)) = self.find("camera_model")
-            && !CAMERA_MODELS.iter().any(|known| model == known)
+            && !CAMERA_MODELS.iter().any(|known| is_model(model, known))
         {
             let expected = format!("one of {}", CAMERA_MODELS.join(", "));
             return Err(Error::input(self.file, name, shown(Some(model)), expected));
@@ -215,8 +283,8 @@ impl<'a> Fields<'a> {
         Ok(())
     }
 
-    /// `transform_matrix` with OpenCV axes.
-    fn c2w(&self) -> Result<DMat4> {
+    /// `transform_matrix` with OpenCV axes, and the factor that was taken out of its rotation.
+    fn c2w(&self) -> Result<(DMat4, f64)> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");
         let rows: Vec<&[Value]> = value
@@ -243,6 +311,7 @@ impl<'a> Fields<'a> {
             };
         }
         let c2w = from_opengl(&entries);
-        nearest_rigid(&c2w).map_err(|(found, expected)| Error::input(self.file, name, found, expected))
+        nearest_rigid_of_scaled(&c2w)
+            .map_err(|(found, expected)| Error::input(self.file, name, found, expected))
     }
 }

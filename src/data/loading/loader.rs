@@ -310,7 +310,7 @@ impl Shared {
         let in_capture = |why: Error| (Fault::Scene, format!("{}: {why}", capture.file().display()));
         let config = &self.config;
         let cameras = capture.cameras();
-        let (shown, _) = config.holdout.split(cameras.len());
+        let (shown, _) = capture.split(config.holdout);
         let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
         let views = choose_views(config, context, &centres, random).ok_or_else(|| {
             let why = format!("{} views to show, expected {} or more", shown.len(), config.window[0]);

@@ -3,8 +3,9 @@
 use crate::data::capture::Capture;
 use crate::data::dataset::{Dataset, SceneGroup, Split};
 use crate::error::Result;
+use crate::io::Inputs;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Scenes in groups, each of which is opened as a whole, as a file that holds several of them.
 pub trait SceneGroups: Send + Sync + fmt::Debug {
@@ -48,6 +49,7 @@ fn decoded_bytes(capture: &Capture) -> u64 {
 pub struct TrainingScenes {
     captures: Vec<Capture>,
     others: Vec<SceneGroup>,
+    warnings: Vec<String>,
 }
 
 impl TrainingScenes {
@@ -56,9 +58,11 @@ impl TrainingScenes {
     /// # Errors
     /// Nothing known at one of `paths`, or a capture that breaks its format's rules. The others aren't opened yet.
     pub fn find(paths: &[PathBuf]) -> Result<Self> {
-        let mut found = TrainingScenes { captures: vec![], others: vec![] };
+        let mut found = TrainingScenes { captures: vec![], others: vec![], warnings: vec![] };
         for path in paths {
-            for group in Dataset::open(path, Split::Train)?.groups() {
+            let dataset = Dataset::open(path, Split::Train)?;
+            found.warnings.extend_from_slice(dataset.warnings());
+            for group in dataset.groups() {
                 match group.is_folder() {
                     true => found.captures.push(group.open()?.capture(&group.keys[0])?),
                     false => found.others.push(group.clone()),
@@ -66,6 +70,17 @@ impl TrainingScenes {
             }
         }
         Ok(found)
+    }
+
+    /// Returns a line for each folder that couldn't be looked into.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// Adds the files that they are read from to `inputs`, as far as what is written below the folder `output` could be one of them.
+    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+        self.captures.iter().for_each(|capture| capture.add_inputs(inputs));
+        self.others.iter().for_each(|group| group.add_inputs(output, inputs));
     }
 
     /// Those that are kept.

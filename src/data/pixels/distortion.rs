@@ -6,17 +6,20 @@ use crate::scene::{Camera, Intrinsics};
 ///
 /// ```text
 /// r² = x² + y²
-/// L  = 1 + k₁r² + k₂r⁴ + k₃r⁶ + k₄r⁸
+/// L  = (1 + k₁r² + k₂r⁴ + k₃r⁶ + k₄r⁸) / (1 + d₁r² + d₂r⁴ + d₃r⁶)
 /// x' = xL + 2p₁xy + p₂(r² + 2x²)
 /// y' = yL + p₁(r² + 2y²) + 2p₂xy
 /// ```
 ///
 /// which is pixel (fx·x' + cx, fy·y' + cy). The default, all coefficients 0, is the identity. k₁ and k₂ mean the same in
-/// OpenCV, COLMAP and nerfstudio; k₃ in OpenCV and nerfstudio, k₄ in nerfstudio.
+/// OpenCV, COLMAP and nerfstudio; k₃ in OpenCV and nerfstudio, k₄ in nerfstudio. The denominator's d₁ to d₃ are k₄ to k₆ of OpenCV's
+/// rational model, which is COLMAP's FULL_OPENCV.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::data) struct Distortion {
     /// k₁ to k₄.
     pub radial: [f64; 4],
+    /// d₁ to d₃.
+    pub denominator: [f64; 3],
     /// p₁ and p₂.
     pub tangential: [f64; 2],
 }
@@ -31,10 +34,18 @@ impl Distortion {
 
     /// (r², L, dL/dr²).
     fn radial_factor(&self, x: f64, y: f64) -> (f64, f64, f64) {
-        let [k1, k2, k3, k4] = self.radial;
-        let r2 = x * x + y * y;
-        let l = 1. + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
-        (r2, l, k1 + r2 * (2. * k2 + r2 * (3. * k3 + r2 * 4. * k4)))
+        let ([k1, k2, k3, k4], r2) = (self.radial, x * x + y * y);
+        let above = 1. + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
+        let slope = k1 + r2 * (2. * k2 + r2 * (3. * k3 + r2 * 4. * k4));
+        let (below, slope_below) = self.divisor(r2);
+        let l = above / below;
+        (r2, l, (slope - l * slope_below) / below)
+    }
+
+    /// The denominator of L, and its derivative by r².
+    fn divisor(&self, r2: f64) -> (f64, f64) {
+        let [d1, d2, d3] = self.denominator;
+        (1. + r2 * (d1 + r2 * (d2 + r2 * d3)), d1 + r2 * (2. * d2 + r2 * 3. * d3))
     }
 
     /// ∂x'/∂x, ∂x'/∂y = ∂y'/∂x, and ∂y'/∂y at (x, y); with L' = dL/dr²:
@@ -55,7 +66,7 @@ impl Distortion {
     }
 
     /// Checks that no two rays of `camera`'s pinhole image meet in one point of the photo, as they do where a polynomial is
-    /// used beyond the image it was fitted to: the Jacobian's determinant is above 0 all over the image.
+    /// used beyond the image it was fitted to: the Jacobian's determinant and the denominator are above 0 all over the image.
     ///
     /// # Errors
     /// (what was found, what was expected).
@@ -66,16 +77,18 @@ impl Distortion {
         let at = |i: u32, size: u32| f64::from(i) / f64::from(POINTS - 1) * f64::from(size);
         let folds = (0..POINTS * POINTS).any(|i| {
             let (u, v) = (at(i % POINTS, camera.width), at(i / POINTS, camera.height));
-            let [xx, xy, yy] = self.jacobian((u - cx) / fx, (v - cy) / fy);
+            let (x, y) = ((u - cx) / fx, (v - cy) / fy);
+            let [xx, xy, yy] = self.jacobian(x, y);
             let determinant = xx * yy - xy * xy;
-            !(determinant > 0. && determinant.is_finite())
+            !(determinant > 0. && determinant.is_finite() && self.divisor(x * x + y * y).0 > 0.)
         });
         if !folds {
             return Ok(());
         }
-        let Distortion { radial: [k1, k2, k3, k4], tangential: [p1, p2] } = self;
+        let Distortion { radial: [k1, k2, k3, k4], denominator, tangential: [p1, p2] } = self;
+        let over = if *denominator == [0.; 3] { String::new() } else { format!(" over {denominator:?}") };
         let found = format!(
-            "k1 {k1}, k2 {k2}, k3 {k3}, k4 {k4}, p1 {p1}, p2 {p2}, by which the lens folds the image over"
+            "k1 {k1}, k2 {k2}, k3 {k3}, k4 {k4}{over}, p1 {p1}, p2 {p2}, by which the lens folds the image over"
         );
         Err((found, "coefficients by which every pixel sees a ray of its own".into()))
     }
@@ -86,7 +99,9 @@ mod tests {
     use super::*;
     use glam::DMat4;
 
-    const LENS: Distortion = Distortion { radial: [-0.12, 0.05, -0.01, 0.002], tangential: [0.003, -0.002] };
+    const LENS: Distortion =
+        Distortion { radial: [-0.12, 0.05, -0.01, 0.002], denominator: [0.; 3], tangential: [0.003, -0.002] };
+    const RATIONAL: Distortion = Distortion { denominator: [0.3, -0.07, 0.02], ..LENS };
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
 
@@ -107,31 +122,34 @@ mod tests {
     /// Newton's method only gets to the last digit within eight rounds if the Jacobian is the equations' own.
     #[test]
     fn distorting_and_back_is_the_identity() {
-        for i in 0..11 {
-            for j in 0..11 {
-                let (x, y) = (f64::from(i) * 0.16 - 0.8, f64::from(j) * 0.12 - 0.6);
-                let distorted = LENS.apply(x, y);
-                let (u, v) = invert(&LENS, distorted);
-                assert!((u - x).abs() < 1e-13 && (v - y).abs() < 1e-13, "({x}, {y}) became ({u}, {v})");
-            }
+        for (lens, i, j) in
+            [LENS, RATIONAL].iter().flat_map(|lens| (0..121).map(move |n| (lens, n / 11, n % 11)))
+        {
+            let (x, y) = (f64::from(i) * 0.16 - 0.8, f64::from(j) * 0.12 - 0.6);
+            let (u, v) = invert(lens, lens.apply(x, y));
+            assert!((u - x).abs() < 1e-13 && (v - y).abs() < 1e-13, "({x}, {y}) became ({u}, {v})");
         }
         // Worked out by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125.
         let (x, y) = LENS.apply(0.3, -0.4);
         let l = 0.9729765625;
         assert!((x - (0.3 * l - 0.00072 - 0.002 * 0.43)).abs() < 1e-12, "{x}");
         assert!((y - (-0.4 * l + 0.003 * 0.57 + 0.00048)).abs() < 1e-12, "{y}");
+        // Over 1 + 0.075 − 0.004375 + 0.0003125.
+        let (x, _) = RATIONAL.apply(0.3, -0.4);
+        assert!((x - (0.3 * l / 1.0709375 - 0.00072 - 0.002 * 0.43)).abs() < 1e-12, "{x}");
     }
 
     #[test]
     fn the_jacobian_is_that_of_the_equations() {
         let h = 1e-6;
-        for (x, y) in [(0.3, -0.5), (-0.7, 0.2), (0.6, 0.6)] {
+        let points = [(0.3, -0.5), (-0.7, 0.2), (0.6, 0.6)];
+        for (lens, (x, y)) in [LENS, RATIONAL].iter().flat_map(|lens| points.map(|point| (lens, point))) {
             let difference = |dx: f64, dy: f64| {
-                let (a, b) = (LENS.apply(x + dx, y + dy), LENS.apply(x - dx, y - dy));
+                let (a, b) = (lens.apply(x + dx, y + dy), lens.apply(x - dx, y - dy));
                 ((a.0 - b.0) / (2. * h), (a.1 - b.1) / (2. * h))
             };
             let (along_x, along_y) = (difference(h, 0.), difference(0., h));
-            let [xx, xy, yy] = LENS.jacobian(x, y);
+            let [xx, xy, yy] = lens.jacobian(x, y);
             for (found, expected) in [(xx, along_x.0), (xy, along_x.1), (xy, along_y.0), (yy, along_y.1)] {
                 assert!((found - expected).abs() < 1e-8, "{found} {expected}");
             }
@@ -143,9 +161,14 @@ mod tests {
         LENS.check(&CAMERA).expect("a good lens");
         // x − x³ turns back at x = 0.577, which the image reaches.
         for k1 in [-1., f64::NAN, f64::INFINITY] {
-            let (found, _) =
-                Distortion { radial: [k1, 0., 0., 0.], tangential: [0.; 2] }.check(&CAMERA).unwrap_err();
+            let lens = Distortion { radial: [k1, 0., 0., 0.], ..Distortion::default() };
+            let (found, _) = lens.check(&CAMERA).unwrap_err();
             assert!(found.contains(&format!("k1 {k1}")) && found.contains("folds"), "{found}");
         }
+        RATIONAL.check(&CAMERA).expect("a good lens");
+        // 1 / (1 − 3r²) has a pole that the image reaches, and is steep on either side of it.
+        let pole = Distortion { denominator: [-3., 0., 0.], ..Distortion::default() };
+        let (found, _) = pole.check(&CAMERA).unwrap_err();
+        assert!(found.contains("over [-3.0, 0.0, 0.0]") && found.contains("folds"), "{found}");
     }
 }

@@ -28,8 +28,9 @@ impl Cut {
         let (scale_x, scale_y) = (width / full_width, height / full_height);
 
         let aspect = f64::from(size.width) / height;
+        // However long and narrow the size is, something is left of the image.
         let (cut_width, cut_height) =
-            ((height * aspect).min(width).round(), (width / aspect).min(height).round());
+            ((height * aspect).min(width).round().max(1.), (width / aspect).min(height).round().max(1.));
         let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
         Cut {
             // What will be cut away isn't made.
@@ -114,6 +115,16 @@ mod tests {
         assert_eq!(image.to_rgb().dimensions(), (192, 128));
         assert!((fitted.intrinsics.cx - 96.).abs() < 1e-9);
         assert!((fitted.intrinsics.cy - 64.).abs() < 1.); // cut at a whole pixel
+    }
+
+    #[test]
+    fn a_line_is_cut_out_of_a_square() {
+        for size in [[1, 4000], [4000, 1], [11, 2000]] {
+            let (image, fitted) = fit(&RgbImage::new(40, 40), &camera(40, 40), size.into());
+            let (width, height) = image.to_rgb().dimensions();
+            assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
+            looked_at(&camera(40, 40), size.into());
+        }
     }
 
     #[test]

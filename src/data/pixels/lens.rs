@@ -194,7 +194,11 @@ mod tests {
     use glam::{DMat4, DVec3};
     use image::Rgb;
 
-    const LENS: Distortion = Distortion { radial: [-0.12, 0.05, -0.01, 0.002], tangential: [0.003, -0.002] };
+    const LENS: Distortion = Distortion {
+        radial: [-0.12, 0.05, -0.01, 0.002],
+        denominator: [0.1, -0.03, 0.],
+        tangential: [0.003, -0.002],
+    };
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
 
@@ -203,7 +207,7 @@ mod tests {
         let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
         assert_eq!(undistort(photo.clone(), &Distortion::default(), &CAMERA, None), photo);
         // So little that it goes through the interpolation and changes nothing that is visible.
-        let tiny = Distortion { radial: [1e-12, 0., 0., 0.], tangential: [0.; 2] };
+        let tiny = Distortion { radial: [1e-12, 0., 0., 0.], ..Distortion::default() };
         assert_eq!(undistort(photo.clone(), &tiny, &CAMERA, None), photo);
     }
 

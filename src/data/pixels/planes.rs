@@ -1,7 +1,7 @@
 //! Images as the model wants them: a plane of each colour.
 
 use image::{Rgb, RgbImage};
-use tch::Tensor;
+use tch::{Kind, Tensor};
 
 /// Colours of an image.
 pub(in crate::data) const CHANNELS: usize = 3;
@@ -44,8 +44,11 @@ impl Planes {
 
     /// [3, H, W] in [0, 1].
     pub fn to_tensor(&self) -> Tensor {
-        let values: Vec<f32> = self.bytes.iter().map(|&byte| f32::from(byte) / 255.).collect();
-        Tensor::from_slice(&values).view([CHANNELS as i64, self.height as i64, self.width as i64])
+        let bytes = Tensor::from_slice(&self.bytes);
+        let mut values =
+            bytes.view([CHANNELS as i64, self.height as i64, self.width as i64]).to_kind(Kind::Float);
+        // In its place: a second copy of a photo of 16 million pixels is 192 MB.
+        values.divide_scalar_(255.)
     }
 }
 

@@ -6,6 +6,7 @@ mod entry;
 mod heading;
 mod numbers;
 mod plot;
+mod rows;
 mod scenes;
 mod table;
 

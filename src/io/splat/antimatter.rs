@@ -1,7 +1,8 @@
 //! antimatter15's `.splat`, 32 bytes a Gaussian and nothing else (spec 10.14).
 
-use super::Splat;
+use super::invalid::InvalidGaussians;
 use super::values::{Values, normalized};
+use super::{Contents, Splat};
 use crate::error::{Error, Result};
 use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
@@ -14,8 +15,8 @@ const BYTES: usize = 32;
 /// Reads a `.splat`, whose colours are the same from every side.
 ///
 /// # Errors
-/// A file that isn't made of whole Gaussians, a number that isn't finite, a scale below zero.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+/// A file that isn't made of whole Gaussians.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
         let found = format!("{} bytes", bytes.len());
@@ -39,7 +40,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
             .map(|gaussian| normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)))
             .collect(),
     };
-    values.into_splat(path)
+    Ok(values.into_contents(InvalidGaussians::default()))
 }
 
 /// Colours are those that a screen shows, the same from every side.

@@ -1,12 +1,13 @@
 //! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits a Gaussian, of numbers between the bounds of 256 of them, and
 //! a byte for each spherical harmonic above degree 0.
 
-use super::Splat;
+use super::invalid::InvalidGaussians;
 use super::morton::morton_order;
 use super::ply::bases_of_rest;
 use super::ply_body::columns;
 use super::ply_header::{Header, Kind, Scalar};
 use super::values::{Values, normalized};
+use super::{Contents, Splat};
 use crate::error::{Error, Result};
 use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
@@ -38,8 +39,8 @@ pub(super) fn recognizes(bytes: &[u8]) -> bool {
 /// Reads a compressed PLY of any SH degree; older ones have no bounds of colours.
 ///
 /// # Errors
-/// Anything that is missing or of another type, bounds that aren't finite, a file cut short.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+/// Anything that is missing or of another type, a file cut short.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
     expect_type(path, &header, "vertex", &owned(&WORDS), Scalar::U32)?;
@@ -50,9 +51,13 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let bounded = if colours { &BOUNDED[..] } else { &BOUNDED[..2] };
     let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
     let bounds = columns(path, bytes, &header, "chunk", &names, |number| number as f32)?;
+    let mut invalid = InvalidGaussians::default();
     for (chunk, bounds) in bounds.chunks_exact(names.len()).enumerate() {
-        if let Some((bad, name)) = bounds.iter().zip(&names).find(|(bound, _)| !bound.is_finite()) {
-            return Err(Error::input(path, format!("{name} of chunk {chunk}"), bad, "a finite number"));
+        for (bad, name) in bounds.iter().zip(&names).filter(|(bound, _)| !bound.is_finite()) {
+            for row in chunk * CHUNK..words.len().min((chunk + 1) * CHUNK) {
+                let field = || format!("{name} of chunk {chunk}");
+                invalid.add(row, name, field, *bad, "a finite number");
+            }
         }
     }
     let chunks: Vec<&[f32]> = bounds.chunks_exact(names.len()).collect();
@@ -85,7 +90,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
         values.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
     }
-    values.into_splat(path)
+    Ok(values.into_contents(invalid))
 }
 
 /// The bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and how many of all degrees a

@@ -3,29 +3,54 @@
 
 mod antimatter;
 mod compressed_ply;
+mod invalid;
 mod morton;
+mod origin;
 mod ply;
 mod ply_body;
 mod ply_header;
+mod rotations;
 mod spz;
 mod values;
 
+pub use origin::{check_writable_origin, origin_file};
+
 use crate::error::{Error, Result};
 use crate::io::atomic::check_writable_file;
-use crate::render::{HarmonicLimits, fit_harmonics};
-use crate::scene::{Camera, Gaussians};
+use crate::render::{HarmonicLimits, SplatRenderer, fit_harmonics};
+use crate::scene::{Camera, Gaussians, LocalFrame};
+use glam::DVec3;
+use invalid::InvalidGaussians;
+use origin::{read_origin, write_with_origin};
+use rotations::with_rotation;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
 /// What a splat's file holds: the Gaussians of one scene.
 #[derive(Debug)]
 pub struct Splat {
-    /// [1, N, ..], float32 on the host.
+    /// [1, N, ..], float32 on the host, with means relative to `origin`.
     pub gaussians: Gaussians,
+    /// Where in the world the coordinates of the means begin: world = origin + mean.
+    pub origin: DVec3,
+    /// What was left out or changed when the splat was read or made, a sentence each. What is made of it has none.
+    pub warnings: Vec<String>,
+}
+
+/// What a format's reader makes of a file, before its Gaussians are checked.
+struct Contents {
+    gaussians: Gaussians,
+    invalid: InvalidGaussians,
+    warnings: Vec<String>,
 }
 
 impl Splat {
-    /// `gaussians` of one scene, without their gradients.
+    /// Float32 positions that are this share of the scene's typical size apart show in pictures.
+    const COARSE: f64 = 1e-4;
+
+    /// `gaussians` of one scene, in world coordinates, without their gradients. Those whose quaternion has length 0 are left out,
+    /// and counted in [`Splat::warnings`].
     ///
     /// # Errors
     /// More scenes than one.
@@ -33,10 +58,22 @@ impl Splat {
         match gaussians.means.size()[0] {
             1 => {
                 let on_host = gaussians.map(|t| t.detach().to_device(Device::Cpu).to_kind(Kind::Float));
-                Ok(Splat { gaussians: on_host })
+                Ok(Splat::of_rotated(on_host, "the splat", vec![]))
             }
             scenes => Err(Error::Request(format!("a splat holds one scene, found {scenes}"))),
         }
+    }
+
+    /// Leaves out the Gaussians without a rotation, and counts them; `name` is what the warning calls the splat.
+    fn of_rotated(gaussians: Gaussians, name: impl Display, mut warnings: Vec<String>) -> Self {
+        let all = gaussians.count();
+        let (gaussians, left_out) = with_rotation(&gaussians);
+        if left_out > 0 {
+            warnings.push(format!(
+                "{name}: {left_out} of {all} Gaussians are left out, whose rotations have length 0"
+            ));
+        }
+        Splat { gaussians, origin: DVec3::ZERO, warnings }
     }
 
     /// Degree of the spherical harmonics, 0 to 3.
@@ -50,7 +87,42 @@ impl Splat {
         let more = (bases - self.bases()).max(0);
         let sh = self.gaussians.sh.constant_pad_nd([0, 0, 0, more]).narrow(2, 0, bases).contiguous();
         let gaussians = self.gaussians.map(Tensor::shallow_clone);
-        Splat { gaussians: Gaussians { sh, ..gaussians } }
+        Splat { gaussians: Gaussians { sh, ..gaussians }, origin: self.origin, warnings: vec![] }
+    }
+
+    /// Returns the same splat with means relative to `origin`, rounded to float32.
+    pub fn with_origin(&self, origin: DVec3) -> Self {
+        let mut gaussians = self.gaussians.map(Tensor::shallow_clone);
+        if origin != self.origin {
+            let by = Tensor::from_slice(&(self.origin - origin).to_array());
+            gaussians.means = (gaussians.means.to_kind(Kind::Double) + by).to_kind(Kind::Float);
+        }
+        Splat { gaussians, origin, warnings: vec![] }
+    }
+
+    /// Returns the local frame that the splat is rendered in (spec 2.5).
+    pub fn frame(&self) -> LocalFrame {
+        LocalFrame::from_gaussians(&self.gaussians, self.origin)
+    }
+
+    /// Returns what renders the splat from cameras of the world.
+    pub fn renderer(&self) -> SplatRenderer {
+        SplatRenderer::new(&self.gaussians, self.origin, self.frame())
+    }
+
+    /// Says what float32 loses of the positions in world coordinates, where that shows in pictures.
+    pub fn world_loss(&self) -> Option<String> {
+        let frame = self.frame();
+        let farthest = frame.origin.abs().max_element();
+        let spacing = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
+        let share = spacing / frame.typical_distance();
+        (self.origin != DVec3::ZERO && share > Self::COARSE).then(|| {
+            format!(
+                "positions are rounded: {farthest:.3e} units from the origin, float32 has one every {spacing} units, {:.2} % of the \
+                 scene's typical distance",
+                100. * share
+            )
+        })
     }
 
     /// Spherical harmonics of a colour channel.
@@ -70,7 +142,7 @@ struct Format {
     ending: &'static str,
     /// Whether bytes are of it, without a doubt.
     recognizes: fn(&[u8]) -> bool,
-    read: fn(&Path, &[u8]) -> Result<Splat>,
+    read: fn(&Path, &[u8]) -> Result<Contents>,
     write: fn(&Path, &Splat) -> Result<()>,
     limits: fn() -> HarmonicLimits,
 }
@@ -136,41 +208,79 @@ pub fn check_writable_splat(path: &Path) -> Result<()> {
     check_writable_file(path)
 }
 
-/// Reads a splat of the format that it is recognized by, else of the one that the ending of `path` tells.
+/// Reads a splat of the format that it is recognized by, else of the one that the ending of `path` tells. Gaussians whose
+/// quaternion has length 0 are left out, and counted in [`Splat::warnings`].
 ///
 /// # Errors
-/// An ending that is no format's, a file that can't be read or breaks its format's rules.
+/// An ending that is no format's, a file that can't be read or breaks its format's rules, a Gaussian with a number that isn't
+/// finite or is out of its range, and a file without a Gaussian that can be drawn.
 pub fn read_splat(path: &Path) -> Result<Splat> {
+    let Contents { gaussians, invalid, warnings } = read_contents(path)?;
+    invalid.refuse(path)?;
+    drawable(path, gaussians.count(), gaussians, warnings)
+}
+
+/// Reads a splat as [`read_splat`] does, but leaves out the Gaussians with invalid numbers, too.
+///
+/// # Errors
+/// As there, but for invalid numbers.
+pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
+    let Contents { gaussians, invalid, mut warnings } = read_contents(path)?;
+    let valid = invalid.leave_out(path, &gaussians, &mut warnings);
+    drawable(path, gaussians.count(), valid, warnings)
+}
+
+fn read_contents(path: &Path) -> Result<Contents> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     let recognized = FORMATS.iter().find(|format| (format.recognizes)(&bytes));
     (recognized.unwrap_or(named).read)(path, &bytes)
 }
 
-/// Writes a splat in the format that the ending of `path` tells, whole or not at all.
+/// The splat of those of `all` Gaussians in the file that are valid, less those without a rotation.
+fn drawable(path: &Path, all: i64, valid: Gaussians, warnings: Vec<String>) -> Result<Splat> {
+    let splat = Splat::of_rotated(valid, path.display(), warnings);
+    if splat.gaussians.count() == 0 && all > 0 {
+        let found = format!("{all}, none of which can be drawn");
+        let expected = "finite numbers, and rotations whose length isn't 0";
+        return Err(Error::input(path, "the number of Gaussians", found, expected));
+    }
+    Ok(Splat { origin: read_origin(path)?, ..splat })
+}
+
+/// Writes a splat in world coordinates, in the format that the ending of `path` tells, whole or not at all. The origin of an
+/// older splat there is removed. Gaussians whose quaternion has length 0 are left out; [`Splat::of`] counts them.
 ///
 /// # Errors
 /// An ending that is no format's, Gaussians that the format can't hold, such as those with numbers that aren't finite, or the
 /// system's refusal to write.
 pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
-    (format_of(path)?.write)(path, splat)
+    write_local_splat(path, &splat.with_origin(DVec3::ZERO))
 }
 
-/// As [`write_splat`], in spherical harmonics that the format holds and that show `cameras` the same.
+/// Writes a splat as [`write_splat`] does, with coordinates relative to its origin, which goes to [`origin_file`] unless it is
+/// zero.
 ///
 /// # Errors
-/// As there.
-pub fn write_splat_for(path: &Path, splat: &Splat, cameras: &[Camera]) -> Result<()> {
-    write_splat(path, &fit_splat(path, splat, &HarmonicLimits::up_to(splat.sh_degree()), cameras)?)
+/// As [`write_splat`].
+pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
+    let format = format_of(path)?;
+    let (gaussians, _) = with_rotation(&splat.gaussians);
+    let rotated = Splat { gaussians, origin: splat.origin, warnings: vec![] };
+    write_with_origin(path, splat.origin, || (format.write)(path, &rotated))
 }
 
-/// What `cameras` see of `splat` in spherical harmonics within `limits` that the format of `path` holds, too.
+/// Returns `splat` in spherical harmonics within `limits` that the format of `path` holds, too, and that show `cameras` the same.
 ///
 /// # Errors
 /// An ending that is no format's.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.and(&(format_of(path)?.limits)());
-    Ok(Splat { gaussians: fit_harmonics(&splat.gaussians, cameras, &limits) })
+    let frame = splat.frame();
+    let local = frame.gaussians_to_local(&splat.gaussians, splat.origin);
+    let Gaussians { opacities, sh, .. } = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
+    let gaussians = splat.gaussians.map(Tensor::shallow_clone);
+    Ok(Splat { gaussians: Gaussians { opacities, sh, ..gaussians }, origin: splat.origin, warnings: vec![] })
 }
 
 /// Whether all of `numbers`, which are to be written at `path`, are finite.

@@ -3,18 +3,23 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z).
 //! f_rest is channel-major: all reds, all greens, all blues. Written is float32, binary, little-endian.
 
+use super::invalid::InvalidGaussians;
 use super::ply_body::columns;
-use super::ply_header::Header;
-use super::{Splat, all_finite};
+use super::ply_header::{Header, Scalar};
+use super::{Contents, Splat, all_finite};
 use crate::error::{Error, Result};
 use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
-use crate::scene::RawGaussians;
+use crate::scene::{MIN_SCALE, RawGaussians, SH_C0};
 use std::path::Path;
-use tch::Tensor;
+use tch::{Device, Kind, Tensor};
 
 /// Larger logarithms of scales aren't those of a float32.
 const MAX_LOG_SCALE: f32 = 88.;
+
+/// Names of colour channels in point clouds.
+const COLOURS: [[&str; 3]; 3] =
+    [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
 /// Whether `bytes` are a PLY's.
 pub(super) fn recognizes(bytes: &[u8]) -> bool {
@@ -22,20 +27,41 @@ pub(super) fn recognizes(bytes: &[u8]) -> bool {
 }
 
 /// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order,
-/// and others beside them, don't matter.
+/// and others beside them, don't matter. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without
+/// `f_dc_*` their colours are those of `red`, `green` and `blue`.
 ///
 /// # Errors
-/// A missing property, a file cut short, a number that isn't finite.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+/// A missing property, a point cloud, a file cut short.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
-    let rest = match header.element("vertex") {
-        Some(vertex) => (0..).take_while(|k| vertex.has(&format!("f_rest_{k}"))).count(),
-        None => 0,
-    };
+    let vertex = header.element("vertex");
+    let has = |name: &str| vertex.is_some_and(|vertex| vertex.has(name));
+    if vertex.is_some() && !["opacity", "scale_0", "rot_0"].into_iter().any(has) {
+        let found = "a point cloud, without opacity, scale_* and rot_*";
+        return Err(Error::input(path, "the element vertex", found, "the properties of a 3D Gaussian splat"));
+    }
+    let rest = (0..).take_while(|k| has(&format!("f_rest_{k}"))).count();
     let bases = bases_of_rest(path, rest)?;
-    let names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
-    let values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;
-    check(path, &names, &values)?;
+    let mut names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
+    let mut warnings = vec![];
+    let colours = COLOURS.into_iter().find(|names| names.iter().all(|name| has(name)));
+    let colours = colours.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
+    if let Some(colours) = colours {
+        names[3..6].clone_from_slice(&owned(colours));
+        let said = format!("colours are those of {}, for want of f_dc_*", colours.join(", "));
+        warnings.push(format!("{}: {said}", path.display()));
+    }
+    let is_flat = !has("scale_2") && has("scale_1");
+    if is_flat {
+        names.retain(|name| name != "scale_2");
+        let said = "Gaussians are flat in their third direction, for want of scale_2";
+        warnings.push(format!("{}: {said}", path.display()));
+    }
+    let mut values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;
+    if let Some((colours, vertex)) = colours.zip(vertex) {
+        harmonics_from_colours(vertex.scalar(colours[0]), names.len(), &mut values);
+    }
+    let invalid = find_invalid(&names, &values);
 
     let (n, width) = ((values.len() / names.len()) as i64, names.len() as i64);
     let table = Tensor::from_slice(&values).view([1, n, width]);
@@ -47,14 +73,32 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let means = next(3);
     let dc = next(3).unsqueeze(2); // [1, N, 1, 3]
     let rest = next(3 * (bases - 1)).view([1, n, 3, bases - 1]).transpose(2, 3); // channel-major to basis-major
-    let raw = RawGaussians {
-        means,
-        opacity_logits: next(1).squeeze_dim(-1),
-        log_scales: next(3),
-        quaternions: next(4),
-        sh: Tensor::cat(&[dc, rest], 2),
+    let opacity_logits = next(1).squeeze_dim(-1);
+    let log_scales = match is_flat {
+        true => {
+            Tensor::cat(&[next(2), Tensor::full([1, n, 1], MIN_SCALE.ln(), (Kind::Float, Device::Cpu))], 2)
+        }
+        false => next(3),
     };
-    Ok(Splat { gaussians: raw.activate() })
+    let sh = Tensor::cat(&[dc, rest], 2);
+    let raw = RawGaussians { means, opacity_logits, log_scales, quaternions: next(4), sh };
+    Ok(Contents { gaussians: raw.activate(), invalid, warnings })
+}
+
+/// Turns the colours in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, into spherical harmonics of
+/// degree 0. Bytes are of 255, 16 bits without a sign of 65,535; other numbers of 1, or of 255 where one is above 1.
+fn harmonics_from_colours(scalar: Option<Scalar>, width: usize, values: &mut [f32]) {
+    let colours = values.chunks_exact(width).flat_map(|vertex| &vertex[3..6]);
+    let brightest = colours.filter(|colour| colour.is_finite()).fold(0f32, |a, &b| a.max(b));
+    let white = match scalar {
+        Some(Scalar::U8) => 255.,
+        Some(Scalar::U16) => 65535.,
+        _ if brightest > 1. => 255.,
+        _ => 1.,
+    };
+    for colour in values.chunks_exact_mut(width).flat_map(|vertex| &mut vertex[3..6]) {
+        *colour = ((f64::from(*colour) / white - 0.5) / SH_C0) as f32;
+    }
 }
 
 /// Spherical harmonics of a colour channel, where there are so many f_rest.
@@ -69,21 +113,22 @@ pub(super) fn bases_of_rest(path: &Path, rest: usize) -> Result<i64> {
 }
 
 /// Numbers have to be finite, but for logits of 0 and 1 and the logarithm of 0, which other programs write.
-fn check(path: &Path, names: &[String], values: &[f32]) -> Result<()> {
+fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
+    let mut invalid = InvalidGaussians::default();
     for (row, vertex) in values.chunks_exact(names.len()).enumerate() {
         for (name, &value) in names.iter().zip(vertex) {
             let is_scale = name.starts_with("scale_");
-            let infinite = (name == "opacity" && !value.is_nan()) || (is_scale && value == f32::NEG_INFINITY);
-            if !value.is_finite() && !infinite {
-                return Err(Error::input(path, format!("{name} of vertex {row}"), value, "a finite number"));
-            }
-            if is_scale && value > MAX_LOG_SCALE {
-                let expected = format!("a logarithm of at most {MAX_LOG_SCALE}");
-                return Err(Error::input(path, format!("{name} of vertex {row}"), value, expected));
+            let may_be_infinite =
+                (name == "opacity" && !value.is_nan()) || (is_scale && value == f32::NEG_INFINITY);
+            let field = || format!("{name} of vertex {row}");
+            if !value.is_finite() && !may_be_infinite {
+                invalid.add(row, name, field, value, "a finite number");
+            } else if is_scale && value > MAX_LOG_SCALE {
+                invalid.add(row, name, field, value, &format!("a logarithm of at most {MAX_LOG_SCALE}"));
             }
         }
     }
-    Ok(())
+    invalid
 }
 
 /// Any number is one of a PLY.

@@ -75,6 +75,15 @@ impl Element {
     pub fn has(&self, name: &str) -> bool {
         self.properties.iter().any(|property| property.name == name)
     }
+
+    /// The number type of the property `name`, unless it is a list.
+    pub fn scalar(&self, name: &str) -> Option<Scalar> {
+        let property = self.properties.iter().find(|property| property.name == name)?;
+        match property.kind {
+            Kind::Number(scalar) => Some(scalar),
+            Kind::List(..) => None,
+        }
+    }
 }
 
 pub struct Header {

@@ -1,7 +1,8 @@
 //! A splat's numbers on the host, as the formats take and give them that pack each Gaussian into bytes.
 
-use super::{Splat, all_finite};
-use crate::error::{Error, Result};
+use super::invalid::InvalidGaussians;
+use super::{Contents, Splat, all_finite};
+use crate::error::Result;
 use crate::scene::Gaussians;
 use std::path::Path;
 use tch::Tensor;
@@ -64,14 +65,24 @@ impl Values {
         &self.sh[index * self.bases..][..self.bases]
     }
 
-    /// The splat, as it was read at `path`.
-    ///
-    /// # Errors
-    /// Numbers that aren't finite, scales below zero.
-    pub fn into_splat(self, path: &Path) -> Result<Splat> {
+    /// The Gaussians as they were read. To the invalid ones that its reader knows are added those with a number that isn't finite,
+    /// or a scale below zero.
+    pub fn into_contents(self, mut invalid: InvalidGaussians) -> Contents {
+        for row in 0..self.count() {
+            if invalid.contains(row) {
+                continue;
+            }
+            let mut check = |property: &str, values: &[f32], least: f32| {
+                if let Some(&bad) = values.iter().find(|&&value| !(value.is_finite() && value >= least)) {
+                    let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
+                    invalid.add(row, property, || format!("the {property} of Gaussian {row}"), bad, expected);
+                }
+            };
+            check("position", &self.means[row], f32::MIN);
+            check("scale", &self.scales[row], 0.);
+            check("colour", self.sh_of(row).as_flattened(), f32::MIN);
+        }
         let (n, bases) = (self.count() as i64, self.bases as i64);
-        check(path, "the position", &self.means, |value| value.is_finite())?;
-        check(path, "the scale", &self.scales, |value| value.is_finite() && value >= 0.)?;
         let tensor = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape);
         let gaussians = Gaussians {
             means: tensor(self.means.as_flattened(), &[1, n, 3]),
@@ -80,29 +91,19 @@ impl Values {
             opacities: tensor(&self.opacities, &[1, n]),
             sh: tensor(self.sh.as_flattened(), &[1, n, bases, 3]),
         };
-        Ok(Splat { gaussians })
+        Contents { gaussians, invalid, warnings: vec![] }
     }
-}
-
-fn check(path: &Path, what: &str, values: &[[f32; 3]], good: impl Fn(f32) -> bool) -> Result<()> {
-    for (index, of_one) in values.iter().enumerate() {
-        if let Some(bad) = of_one.iter().find(|&&value| !good(value)) {
-            let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
-            return Err(Error::input(path, format!("{what} of Gaussian {index}"), bad, expected));
-        }
-    }
-    Ok(())
 }
 
 fn grouped<const N: usize>(values: &[f32]) -> Vec<[f32; N]> {
     values.as_chunks().0.to_vec()
 }
 
-/// Nothing tells how a quaternion of length 0 is turned: then it isn't.
+/// The quaternion at length 1; of length 0 it stays so.
 pub(super) fn normalized(quaternion: [f32; 4]) -> [f32; 4] {
     let length = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum::<f64>().sqrt();
     match length > 0. {
         true => quaternion.map(|part| (f64::from(part) / length) as f32),
-        false => [1., 0., 0., 0.],
+        false => quaternion,
     }
 }

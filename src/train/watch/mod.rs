@@ -26,8 +26,8 @@ const NAMED: (usize, usize) = (3, 80);
 /// How a run stands.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunState {
-    /// Its folder.
-    pub run: PathBuf,
+    /// Its folder; what isn't UTF-8 of its name is replaced.
+    pub run: String,
     /// Steps done.
     pub step: u64,
     /// Steps in all, by its configuration.
@@ -168,7 +168,7 @@ impl WatchedRun {
         let seconds_since = lines.written.map(|written| written.elapsed().unwrap_or_default().as_secs_f64());
         let (checkpoints, best) = kept(folder);
         let mut state = RunState {
-            run: folder.clone(),
+            run: folder.to_string_lossy().into_owned(),
             step,
             steps,
             stage: last.map(|line| line.stage),

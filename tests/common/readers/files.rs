@@ -4,7 +4,10 @@ use super::{file, folder, load};
 use globalsplat::config::Config;
 use globalsplat::data::{Chunk, Dataset, Split, open_capture, points_of, read_camera_path};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
-use globalsplat::io::{decode_photo, read_splat, read_weights, write_splat};
+use globalsplat::io::{
+    decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights, write_local_splat,
+    write_splat,
+};
 use globalsplat::reconstruct::load_model;
 use globalsplat::train::latest_checkpoint;
 use std::path::Path;
@@ -112,20 +115,46 @@ pub fn photo(bytes: &[u8]) {
 }
 
 pub fn ply(bytes: &[u8]) {
-    let _ = read_splat(&file("ply", "splat.ply", bytes));
+    read_and_repair(&file("ply", "splat.ply", bytes));
 }
 
 pub fn compressed_ply(bytes: &[u8]) {
-    let _ = read_splat(&file("compressed_ply", "splat.compressed.ply", bytes));
+    read_and_repair(&file("compressed_ply", "splat.compressed.ply", bytes));
+}
+
+/// `bytes` are the origin of a splat of one Gaussian; a splat that is read has to come back with it when it was written.
+pub fn splat_origin(bytes: &[u8]) {
+    let splat = file("splat_origin", "splat.splat", &[0; 32]);
+    std::fs::write(origin_file(&splat), bytes).unwrap();
+    let Ok(splat) = read_splat(&splat) else { return };
+    let copy = file("splat_origin", "copy.splat", b"");
+    write_local_splat(&copy, &splat).unwrap();
+    assert_eq!(read_splat(&copy).unwrap().origin, splat.origin);
+    let _ = write_splat(&copy, &splat);
+    let _ = splat.world_loss();
 }
 
 pub fn spz(bytes: &[u8]) {
-    let _ = read_splat(&file("spz", "splat.spz", bytes));
+    read_and_repair(&file("spz", "splat.spz", bytes));
+}
+
+/// What is left of a splat whose invalid Gaussians are left out is finite, and all of it where none are.
+fn read_and_repair(path: &Path) {
+    let Ok(repaired) = read_splat_without_invalid(path) else { return };
+    let g = &repaired.gaussians;
+    for tensor in [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh] {
+        assert_eq!(tensor.isfinite().all().int64_value(&[]), 1);
+    }
+    if let Ok(strict) = read_splat(path) {
+        assert_eq!(strict.gaussians.count(), g.count());
+    }
 }
 
 /// A `.splat`; one that is read has to come back when it was written.
 pub fn antimatter(bytes: &[u8]) {
-    let Ok(splat) = read_splat(&file("antimatter", "splat.splat", bytes)) else { return };
+    let original = file("antimatter", "splat.splat", bytes);
+    read_and_repair(&original);
+    let Ok(splat) = read_splat(&original) else { return };
     let copy = file("antimatter", "copy.splat", b"");
     write_splat(&copy, &splat).unwrap();
     assert_eq!(read_splat(&copy).unwrap().gaussians.count(), splat.gaussians.count());

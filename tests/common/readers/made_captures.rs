@@ -112,7 +112,7 @@ struct Lens {
     coefficients: Option<Vec<Number>>,
 }
 
-const LENS: [&str; 14] = [
+const LENS: [&str; 16] = [
     "w",
     "h",
     "fl_x",
@@ -125,11 +125,13 @@ const LENS: [&str; 14] = [
     "k2",
     "k3",
     "k4",
+    "k5",
+    "k6",
     "p1",
     "p2",
 ];
-const LENS_MODELS: [&str; 6] =
-    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV_FISHEYE"];
+const LENS_MODELS: [&str; 7] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "OPENCV_FISHEYE"];
 
 impl Lens {
     fn add_to(&self, json: &mut Value) {
@@ -202,16 +204,25 @@ struct ColmapImage {
     points: u8,
 }
 
-const COLMAP_MODELS: [(&str, usize); 6] =
-    [("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("FOV", 5)];
+/// In COLMAP's numbering.
+const COLMAP_MODELS: [(&str, usize); 7] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+];
 
 impl ColmapCamera {
     /// Its number and parameters that are right for it, unless others were drawn.
     fn model(&self) -> (usize, Vec<f64>) {
         let model = usize::from(self.model.unsigned_abs()) % COLMAP_MODELS.len();
         let side = f64::from(SIDE);
-        let right = [&[side; 2][..if model == 1 || model == 4 { 2 } else { 1 }], &[side / 2.; 2], &[0.01; 4]]
-            .concat();
+        let right =
+            [&[side; 2][..if [1, 4, 5, 6].contains(&model) { 2 } else { 1 }], &[side / 2.; 2], &[0.01; 8]]
+                .concat();
         let right = right[..COLMAP_MODELS[model].1.min(right.len())].to_vec();
         (model, self.parameters.clone().unwrap_or(right))
     }

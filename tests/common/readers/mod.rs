@@ -20,7 +20,7 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// By the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 29] = [
+pub const READERS: [(&str, Reader); 30] = [
     ("antimatter", files::antimatter),
     ("camera_path", files::camera_path),
     ("cameras_json", files::cameras_json),
@@ -46,6 +46,7 @@ pub const READERS: [(&str, Reader); 29] = [
     ("photo", files::photo),
     ("ply", files::ply),
     ("shard_index", files::shard_index),
+    ("splat_origin", files::splat_origin),
     ("spz", files::spz),
     ("transforms_json", files::transforms_json),
     ("weights", files::weights),

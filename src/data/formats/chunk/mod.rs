@@ -7,7 +7,7 @@ mod write;
 pub use write::{ChunkWriter, INDEX_FILE};
 
 use super::Found;
-use crate::data::capture::{Capture, Frame, Photo, Purpose};
+use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
 use crate::io::{Archive, encoded_image_size};
@@ -32,8 +32,12 @@ pub struct Chunk {
 
 /// `CHUNK.torch#KEY`, or `CHUNK.torch` with one scene alone.
 pub(super) fn find(path: &Path) -> Option<Found> {
-    let keyed =
-        path.to_str().and_then(|path| path.rsplit_once('#')).filter(|(file, _)| is_chunk(file.as_ref()));
+    // A key may have the sign, too, and so may the folders before it.
+    let text = path.to_str().unwrap_or_default();
+    let keyed = text
+        .match_indices('#')
+        .map(|(at, sign)| (&text[..at], &text[at + sign.len()..]))
+        .find(|(file, _)| is_chunk(file.as_ref()));
     if let Some((file, key)) = keyed {
         let (file, key) = (PathBuf::from(file), key.to_string());
         return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
@@ -141,7 +145,7 @@ impl Chunk {
                 let photo = Photo::Part { file: self.bytes.clone(), bytes, name: named.join(&name) };
                 Frame { photo, name, camera, distortion: Distortion::default() }
             });
-        Capture::new(scene.key.clone(), named.clone(), frames.collect(), purpose)
+        Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
     }
 }
 

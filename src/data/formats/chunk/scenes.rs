@@ -24,9 +24,11 @@ pub(super) struct Scene {
 impl Scene {
     /// The numbers of every view's camera, in `file`.
     pub fn cameras(&self, file: &[u8]) -> Vec<f32> {
-        let Array { dtype, size, bytes, .. } = &self.cameras;
-        let size: Vec<i64> = size.iter().map(|&size| size as i64).collect();
-        let cameras = Tensor::from_data_size(&file[bytes.clone()], &size, *dtype).to_kind(Kind::Float);
+        let Array { dtype, size, stride, bytes } = &self.cameras;
+        let counts = |counts: &[usize]| counts.iter().map(|&count| count as i64).collect::<Vec<_>>();
+        let stored = [(bytes.len() / dtype.elt_size_in_bytes()) as i64];
+        let stored = Tensor::from_data_size(&file[bytes.clone()], &stored, *dtype).to_kind(Kind::Float);
+        let cameras = stored.as_strided(counts(size), counts(stride), 0);
         Vec::try_from(cameras.flatten(0, -1)).expect("float32 on the host")
     }
 }
@@ -97,11 +99,11 @@ impl<'v, 'a> Fields<'v, 'a> {
         }
     }
 
-    /// `value`, which is in `field`, as numbers one after the other, in one dimension or two.
+    /// `value`, which is in `field`, as numbers in one dimension or two.
     fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
         let array = Array::of(self.values, &self.archive.storages, value)
             .map_err(|why| format!("{} {why}", self.name(field)))?;
-        match array.is_contiguous() && array.size.len() <= 2 {
+        match array.size.len() <= 2 {
             true => Ok(array),
             false => Err(format!("{} is no plain tensor", self.name(field))),
         }
@@ -118,13 +120,15 @@ impl<'v, 'a> Fields<'v, 'a> {
                 "{field} is {found}, expected Float [{views}, {CAMERA_NUMBERS}] for as many images"
             ));
         }
-        let timestamps = self.array("timestamps", self.get("timestamps")?)?;
-        if timestamps.size != [views] {
-            let (found, field) = (timestamps.size, self.name("timestamps"));
-            return Err(format!("{field} has shape {found:?}, expected [{views}] for as many images"));
+        let timestamps = self.values.entry(self.dict, "timestamps");
+        let timestamps = timestamps.map(|value| self.array("timestamps", value)).transpose()?;
+        if let Some(Array { size, .. }) = timestamps.filter(|timestamps| timestamps.size != [views]) {
+            let field = self.name("timestamps");
+            return Err(format!("{field} has shape {size:?}, expected [{views}] for as many images"));
         }
-        let (key, _url) = (self.text("key")?, self.text("url")?);
+        let key = self.text("key")?;
         let image = |&id: &Id| match self.array("images", self.values.get(id))? {
+            array if !array.is_contiguous() => Err(format!("{} is no plain tensor", self.name("images"))),
             Array { dtype: Kind::Uint8, size, bytes, .. } if size.len() == 1 => Ok(bytes),
             Array { dtype, size, .. } => {
                 let found = format!("{dtype:?} {size:?}");

@@ -2,6 +2,7 @@
 
 use super::{Chunk, EXTENSION, camera_numbers};
 use crate::data::capture::Capture;
+use crate::data::holdout::Holdout;
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
 use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
@@ -88,7 +89,7 @@ impl ChunkWriter {
 
     /// Adds a capture, by its name. JPEG and PNG files are taken as they are, bit for bit, unless their lens distorts, they
     /// lie on their side, or they have other than three channels of 8 bits; then they are encoded anew, a JPEG as a JPEG of
-    /// high quality, everything else as a PNG.
+    /// high quality, everything else as a PNG. The views of a test part of its own are left out.
     ///
     /// # Errors
     /// A name that is there already, photos that can't be read, the system's refusal to write.
@@ -97,8 +98,9 @@ impl ChunkWriter {
             let found = format!("{:?}, which {chunk} holds already", capture.name);
             return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
         }
-        let image = |index| Ok(EncodedImage { bytes: capture.encoded(index)? });
-        let images = (0..capture.len()).into_par_iter().map(image).collect::<Result<Vec<_>>>()?;
+        let (views, _) = capture.split(Holdout::None);
+        let image = |&view| Ok(EncodedImage { bytes: capture.encoded(view)? });
+        let images = views.par_iter().map(image).collect::<Result<Vec<_>>>()?;
         let bytes: usize = images.iter().map(|image| image.bytes.len()).sum();
         if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
             self.write_chunk()?;
@@ -108,8 +110,8 @@ impl ChunkWriter {
         self.waiting.push(SceneToPickle {
             key: capture.name.clone(),
             url: String::new(),
-            timestamps: (0..capture.len() as i64).collect(),
-            cameras: capture.cameras().iter().flat_map(camera_numbers).collect(),
+            timestamps: (0..views.len() as i64).collect(),
+            cameras: capture.cameras()[..views.len()].iter().flat_map(camera_numbers).collect(),
             images,
         });
         Ok(())

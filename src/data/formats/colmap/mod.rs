@@ -8,66 +8,124 @@ mod points;
 pub use points::{Point, points_of};
 
 use super::natural::natural_order;
+use super::photos::{find_photos, portable};
 use super::{Found, folder_name};
-use crate::data::capture::{Capture, Frame, Photo, Purpose};
+use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose, listed};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
+use crate::io::read_text;
 use crate::scene::{Camera, Intrinsics};
 use fields::{Bytes, Words, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Where a model is looked for below a capture's folder, and where its photos are.
-const PLACES: [(&str, &str); 4] = [
-    ("sparse/0", "images"),
-    ("sparse", "images"),
-    ("dense/0/sparse", "dense/0/images"),
-    ("dense/sparse", "dense/images"),
+/// Where models are looked for below a capture's folder, in the place itself or in a numbered folder there, and the folders that
+/// have their photos. Photos of a dense model are other ones: their lens distortion is removed.
+const PLACES: [(&str, &[&str]); 3] =
+    [("sparse", &[""]), ("colmap/sparse", &["", "colmap"]), ("dense/sparse", &["dense"])];
+
+/// A folder of numbered ones, each of which has a model and its photos.
+const DENSE: (&str, &str) = ("dense", "sparse");
+
+/// The folder of photos.
+const PHOTOS: &str = "images";
+
+/// Camera models in COLMAP's numbering, and how many parameters each has.
+const MODELS: [(&str, usize); 18] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
 
-/// Where the photos may be when the folder is the model itself, as `sparse` or `sparse/0` of a capture are.
-const IMAGES_OF_MODEL: [&str; 3] = ["images", "../images", "../../images"];
-
-/// Names and numbers of parameters of the camera models that are read; COLMAP numbers them in this order.
-const MODELS: [(&str, usize); 5] =
-    [("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)];
-
-/// Those that follow in COLMAP's numbering and aren't read.
-const OTHER_MODELS: [&str; 6] =
-    ["OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"];
-
-/// How far a quaternion's length may be from 1.
-const UNIT_TOLERANCE: f64 = 1e-3;
+/// Those that are read.
+const SUPPORTED: [&str; 6] =
+    ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
 
 /// A model's files.
 struct Model {
     cameras: PathBuf,
     images: PathBuf,
-    photos: PathBuf,
+    /// Folders that its photos' names may be below.
+    bases: Vec<PathBuf>,
 }
 
 impl Model {
-    /// The model of the capture in `folder`; binary, if it is there in both forms.
-    fn find(folder: &Path) -> Option<Self> {
-        let of_model = IMAGES_OF_MODEL.into_iter().find(|photos| folder.join(photos).is_dir());
-        let itself = ("", of_model.unwrap_or(IMAGES_OF_MODEL[0]));
-        PLACES.into_iter().chain([itself]).find_map(|(place, photos)| {
-            ["bin", "txt"].into_iter().find_map(|form| {
-                let file = |name: &str| folder.join(place).join(format!("{name}.{form}"));
-                let model =
-                    Model { cameras: file("cameras"), images: file("images"), photos: folder.join(photos) };
-                (model.cameras.is_file() && model.images.is_file()).then_some(model)
-            })
+    /// The model in `folder`, in binary form if it is there in both.
+    fn in_folder(folder: &Path, bases: &[PathBuf]) -> Option<Self> {
+        ["bin", "txt"].into_iter().find_map(|form| {
+            let file = |name: &str| Some(folder.join(format!("{name}.{form}"))).filter(|file| file.is_file());
+            Some(Model { cameras: file("cameras")?, images: file("images")?, bases: bases.to_vec() })
         })
     }
+
+    /// Every model of the capture in `folder`.
+    fn find_all(folder: &Path) -> Vec<Self> {
+        let mut models = vec![];
+        let mut look = |place: &Path, bases: &[PathBuf]| {
+            let places = numbered(place).into_iter().chain([place.to_owned()]);
+            models.extend(places.filter_map(|place| Model::in_folder(&place, bases)));
+        };
+        for (place, bases) in PLACES {
+            look(&folder.join(place), &bases.iter().map(|base| folder.join(base)).collect::<Vec<_>>());
+        }
+        for dense in numbered(&folder.join(DENSE.0)) {
+            look(&dense.join(DENSE.1), std::slice::from_ref(&dense));
+        }
+        // The folder may also be a model, or `sparse` of a capture.
+        let canonical = folder.canonicalize().unwrap_or(folder.to_owned());
+        let bases: Vec<_> = canonical.ancestors().take(3).map(Path::to_owned).collect();
+        match canonical.ends_with(PLACES[0].0) {
+            true => look(folder, &bases),
+            false => models.extend(Model::in_folder(folder, &bases)),
+        }
+        models
+    }
+
+    fn is_text(&self) -> bool {
+        self.images.extension().is_some_and(|form| form == "txt")
+    }
+
+    fn images(&self) -> Result<Vec<ImageEntry>> {
+        if self.is_text() { images_of_text(&self.images) } else { images_of_bytes(&self.images) }
+    }
 }
+
+/// The folders in `folder` whose names are numbers, by these.
+fn numbered(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let is_number = |path: &PathBuf| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir()
+    };
+    let mut folders: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_number).collect();
+    folders.sort_by(natural_order);
+    folders
+}
+
+/// How far a quaternion's length may be from 1 without a word.
+const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// A line of cameras.txt.
 struct CameraEntry {
     id: u32,
-    /// Into [`MODELS`].
-    model: usize,
+    /// Its name, which may be none of [`SUPPORTED`] where no image is of the camera.
+    model: String,
     width: u64,
     height: u64,
     parameters: Vec<f64>,
@@ -85,61 +143,114 @@ struct ImageEntry {
 
 /// A folder with a model.
 pub(super) fn find(folder: &Path) -> Option<Found> {
-    let (folder, model) = (folder.to_owned(), Model::find(folder)?);
-    Some(Box::new(move |purpose| read(&folder, &model, purpose)))
+    let (folder, models) = (folder.to_owned(), Model::find_all(folder));
+    (!models.is_empty()).then(|| -> Found { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
 }
 
-/// Reads `model` as the capture in `folder`. Frames come in the order of their names, numbers in them by value.
-fn read(folder: &Path, model: &Model, purpose: Purpose) -> Result<Capture> {
-    let text = model.cameras.extension().is_some_and(|form| form == "txt");
-    let (cameras, images) = match text {
-        true => (cameras_of_text(&model.cameras)?, images_of_text(&model.images)?),
-        false => (cameras_of_bytes(&model.cameras)?, images_of_bytes(&model.images)?),
+/// Reads the one of `models` with the most photos, the first of several.
+fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Result<Capture> {
+    if models.len() == 1 {
+        return read(folder, &models[0], models[0].images()?, vec![], purpose);
+    }
+    let name = |model: &Model| {
+        model.images.parent().and_then(|place| place.strip_prefix(folder).ok()?.to_str().map(String::from))
     };
-    let mut lenses = BTreeMap::new();
-    for camera in &cameras {
-        if lenses.insert(camera.id, lens(&model.cameras, camera)?).is_some() {
-            return Err(Error::input(
-                &model.cameras,
-                "the camera ids",
-                format!("{} twice", camera.id),
-                "each once",
-            ));
+    let names: Vec<String> = models.iter().map(|model| name(model).unwrap_or_default()).collect();
+    // Where none can be read, the first says why.
+    let sizes: Vec<Option<usize>> =
+        models.iter().map(|model| model.images().ok().map(|images| images.len())).collect();
+    let largest = (0..models.len()).rev().max_by_key(|&model| sizes[model]).expect("a model or more");
+    let model = models.swap_remove(largest);
+    let images = model.images()?;
+    let smaller: Vec<String> = names
+        .iter()
+        .zip(&sizes)
+        .filter(|(_, size)| **size < Some(images.len()))
+        .map(|(name, size)| match size {
+            Some(size) => format!("{name} ({size} photos)"),
+            None => format!("{name} (its images can't be read)"),
+        })
+        .collect();
+    let line = format!(
+        "the largest of {} models is taken, with {} photos; left out: {}",
+        sizes.len(),
+        images.len(),
+        listed(smaller.iter().map(String::as_str))
+    );
+    read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
+}
+
+/// Reads `images` of `model` as the capture in `folder`. Frames come in the order of their names, numbers in them by value; those
+/// whose photo isn't there are left out.
+fn read(
+    folder: &Path,
+    model: &Model,
+    images: Vec<ImageEntry>,
+    lines: Vec<String>,
+    purpose: Purpose,
+) -> Result<Capture> {
+    let entries = match model.is_text() {
+        true => cameras_of_text(&model.cameras)?,
+        false => cameras_of_bytes(&model.cameras)?,
+    };
+    let mut cameras = BTreeMap::new();
+    for camera in entries {
+        let id = camera.id;
+        if cameras.insert(id, camera).is_some() {
+            return Err(Error::input(&model.cameras, "the camera ids", format!("{id} twice"), "each once"));
         }
     }
-    let mut frames = vec![];
-    for image in images {
+    let path = |name: &String| match Path::new(name).is_absolute() {
+        true => name.clone(),
+        false => format!("{PHOTOS}/{name}"),
+    };
+    let paths: Vec<String> = images.iter().map(|image| path(&image.name)).collect();
+    let photos = find_photos(&model.bases, &paths.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut lenses = BTreeMap::new();
+    let (mut frames, mut changes) = (vec![], Changes { lines, ..Changes::default() });
+    for (image, photo) in images.into_iter().zip(photos) {
+        let photo = match (photo.filter(|_| !image.name.is_empty()), purpose) {
+            (Some(photo), _) => photo,
+            (None, Purpose::Cameras(_)) => model.bases[0].join(PHOTOS).join(&image.name),
+            (None, Purpose::Photos) => {
+                changes.absent.push(image.name);
+                continue;
+            }
+        };
         let refuse = |field: &str, found: String, expected: String| {
             let field = format!("{field} of image {} ({})", image.id, image.name);
             Err(Error::input(&model.images, field, found, expected))
         };
-        let Some((camera, distortion)) = lenses.get(&image.camera) else {
-            let expected = format!("one of the {} in {}", lenses.len(), model.cameras.display());
+        let Some(camera) = cameras.get(&image.camera) else {
+            let expected = format!("one of the {} in {}", cameras.len(), model.cameras.display());
             return refuse("camera id", image.camera.to_string(), expected);
+        };
+        let (camera, distortion) = match lenses.get(&camera.id) {
+            Some(lens) => *lens,
+            None => *lenses.entry(camera.id).or_insert(lens(&model.cameras, camera)?),
         };
         let [w, x, y, z] = image.quaternion;
         let rotation = DQuat::from_xyzw(x, y, z, w);
-        if !rotation.is_finite() || (rotation.length() - 1.).abs() > UNIT_TOLERANCE {
-            let expected = "a quaternion (w, x, y, z) of length 1";
+        let length = rotation.length();
+        if !(length > 0. && length.is_finite()) {
+            let expected = "a quaternion (w, x, y, z) of length 1, or of any above 0";
             return refuse("rotation", format!("{:?}", image.quaternion), expected.into());
+        }
+        if (length - 1.).abs() > UNIT_TOLERANCE {
+            changes.scaled.push((image.name.clone(), length));
         }
         let translation = DVec3::from_array(image.translation);
         if !translation.is_finite() {
             return refuse("translation", format!("{:?}", image.translation), "finite numbers".into());
         }
-        let photo = model.photos.join(&image.name);
-        if matches!(purpose, Purpose::Photos) && (image.name.is_empty() || !photo.is_file()) {
-            let expected = format!("the name of an image in {}", model.photos.display());
-            return refuse("name", format!("{:?}, which is not there", image.name), expected);
-        }
         // The inverse of x ↦ Rx + t.
         let inverse = rotation.normalize().conjugate();
         let c2w = DMat4::from_rotation_translation(inverse, -(inverse * translation));
-        let camera = Camera { c2w, ..*camera };
-        frames.push(Frame { photo: Photo::File(photo), name: image.name, camera, distortion: *distortion });
+        let camera = Camera { c2w, ..camera };
+        frames.push(Frame { photo: Photo::File(photo), name: portable(&image.name), camera, distortion });
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Capture::new(folder_name(folder), model.images.clone(), frames, purpose)
+    Capture::new(folder_name(folder), model.images.clone(), frames, changes, purpose)
 }
 
 /// The camera, at the origin, and its distortion.
@@ -152,40 +263,48 @@ fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
         _ => Err(refuse(name, size.to_string(), "a number of pixels".into())),
     };
     let (width, height) = (size("width", entry.width)?, size("height", entry.height)?);
-    let ([fx, fy, cx, cy], k, p) = match (MODELS[entry.model].0, entry.parameters.as_slice()) {
-        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], [0.; 2], [0.; 2]),
-        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], [0.; 2], [0.; 2]),
-        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], [k, 0.], [0.; 2]),
-        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], [k1, k2], [0.; 2]),
-        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy, cx, cy], [k1, k2], [p1, p2]),
+    let none = Distortion::default();
+    let radial = |k1: f64, k2: f64| Distortion { radial: [k1, k2, 0., 0.], ..none };
+    let ([fx, fy, cx, cy], distortion) = match (entry.model.as_str(), entry.parameters.as_slice()) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], none),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], none),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], radial(k, 0.)),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], radial(k1, k2)),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+            ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial(k1, k2) })
+        }
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            let (radial, denominator) = ([k1, k2, k3, 0.], [k4, k5, k6]);
+            ([fx, fy, cx, cy], Distortion { radial, denominator, tangential: [p1, p2] })
+        }
         (model, parameters) => {
-            let expected = format!("{} parameters for {model}", MODELS[entry.model].1);
-            return Err(refuse("the parameters", format!("{parameters:?}"), expected));
+            let Some((_, count)) =
+                MODELS.iter().find(|(known, _)| SUPPORTED.contains(known) && *known == model)
+            else {
+                return Err(refuse("model", entry.model.clone(), format!("one of {}", SUPPORTED.join(", "))));
+            };
+            return Err(refuse(
+                "the parameters",
+                format!("{parameters:?}"),
+                format!("{count} parameters for {model}"),
+            ));
         }
     };
     let intrinsics = Intrinsics { fx, fy, cx, cy };
     intrinsics.check(width, height).map_err(|(name, found, expected)| refuse(&name, found, expected))?;
     let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
-    let distortion = Distortion { radial: [k[0], k[1], 0., 0.], tangential: p };
     distortion.check(&camera).map_err(|(found, expected)| refuse("the distortion", found, expected))?;
     Ok((camera, distortion))
 }
 
-fn unknown_model(file: &Path, camera: u32, model: &str) -> Error {
-    let known = MODELS.map(|(name, _)| name).join(", ");
-    Error::input(file, format!("model of camera {camera}"), model, format!("one of {known}"))
-}
-
 /// CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
 fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
-    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let text = read_text(file)?;
     let mut cameras = vec![];
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
         let mut words = Words { file, number, rest: line };
         let id = words.parse("CAMERA_ID", "a whole number")?;
-        let name: String = words.parse("MODEL", "a camera model")?;
-        let model = MODELS.iter().position(|(known, _)| *known == name);
-        let model = model.ok_or_else(|| unknown_model(file, id, &name))?;
+        let model = words.parse("MODEL", "a camera model")?;
         let (width, height) =
             (words.parse("WIDTH", "a whole number")?, words.parse("HEIGHT", "a whole number")?);
         let mut parameters = vec![];
@@ -199,7 +318,7 @@ fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
 
 /// IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D as X Y POINT3D_ID, which may be empty.
 fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
-    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let text = read_text(file)?;
     let mut images = vec![];
     let mut lines = (1..).zip(text.lines());
     while let Some((number, line)) = lines.next() {
@@ -233,30 +352,25 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
 
 /// The number of cameras (u64), then of each: id (u32), model (i32), width and height (u64), parameters (f64).
 fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
-    const SMALLEST: usize = 4 + 4 + 8 + 8 + 3 * 8;
+    const SMALLEST: usize = 4 + 4 + 8 + 8 + 2 * 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
     let mut bytes = Bytes { file, contents: &contents, at: 0 };
     let mut cameras = vec![];
     for i in 0..bytes.count("the number of cameras", SMALLEST)? {
         let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
         let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
-        let model = usize::try_from(number).ok().filter(|&model| model < MODELS.len());
-        let model = model.ok_or_else(|| {
-            let known =
-                usize::try_from(number).ok().and_then(|n| OTHER_MODELS.get(n.checked_sub(MODELS.len())?));
-            unknown_model(file, id, known.copied().unwrap_or(&format!("number {number}")))
+        let model = usize::try_from(number).ok().and_then(|number| MODELS.get(number));
+        // How many parameters it has isn't known, nor where the next camera begins.
+        let (model, parameters) = model.ok_or_else(|| {
+            let expected = format!("one of {}", SUPPORTED.join(", "));
+            Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
         })?;
         let width = u64::from_le_bytes(bytes.take(|| format!("width of camera {id}"))?);
         let height = u64::from_le_bytes(bytes.take(|| format!("height of camera {id}"))?);
-        let parameters =
-            (0..MODELS[model].1).map(|_| bytes.number(|| format!("the parameters of camera {id}")));
-        cameras.push(CameraEntry {
-            id,
-            model,
-            width,
-            height,
-            parameters: parameters.collect::<Result<_>>()?,
-        });
+        let parameters = (0..*parameters)
+            .map(|_| bytes.number(|| format!("the parameters of camera {id}")))
+            .collect::<Result<_>>()?;
+        cameras.push(CameraEntry { id, model: model.to_string(), width, height, parameters });
     }
     bytes.end()?;
     Ok(cameras)

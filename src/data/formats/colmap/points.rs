@@ -3,6 +3,7 @@
 use super::fields::{Bytes, Words, is_comment};
 use crate::data::capture::Capture;
 use crate::error::{Error, Result};
+use crate::io::read_text;
 use glam::DVec3;
 use std::path::Path;
 
@@ -33,7 +34,7 @@ pub fn points_of(capture: &Capture) -> Result<Vec<Point>> {
 
 /// POINT3D_ID X Y Z R G B ERROR, then the views that see it.
 fn of_text(file: &Path) -> Result<Vec<Point>> {
-    let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
+    let text = read_text(file)?;
     let mut points = vec![];
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
         let mut words = Words { file, number, rest: line };

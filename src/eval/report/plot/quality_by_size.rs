@@ -1,7 +1,7 @@
 //! PSNR against the number of Gaussians: how much quality a method gets out of its size.
 
-use super::super::comparison::Row;
 use super::super::numbers::{decimal, short};
+use super::super::rows::Row;
 use super::axes::{Axis, Margins, bounds, frame};
 use super::labels::{Area, beside_points, shortened};
 use super::{HEIGHT, WIDTH, figure, legend, px};

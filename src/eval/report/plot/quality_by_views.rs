@@ -1,8 +1,8 @@
 //! PSNR against the number of context views: what more photos bring.
 
-use super::super::comparison::{rows, view_counts};
 use super::super::entry::{Entry, dataset_name};
 use super::super::numbers::decimal;
+use super::super::rows::{rows, view_counts};
 use super::axes::{Axis, Margins, bounds, frame, polyline};
 use super::labels::{shortened, spread};
 use super::{HEIGHT, WIDTH, figure, legend, px};

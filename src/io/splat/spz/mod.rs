@@ -4,8 +4,9 @@
 mod axes;
 mod container;
 
-use super::Splat;
+use super::invalid::InvalidGaussians;
 use super::values::{Values, normalized};
+use super::{Contents, Splat};
 use crate::error::{Error, Result};
 use crate::render::HarmonicLimits;
 use axes::Axes;
@@ -35,7 +36,7 @@ const SH_BITS: [u32; 2] = [8, 7];
 ///
 /// # Errors
 /// Another version, a higher SH degree, a file that is damaged or cut short, or claims more than it can hold.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (description, streams) = container::read(path, bytes)?;
     let Description { version, fractional_bits, axes, .. } = description;
     let fixed = |bytes: &[u8; 3]| {
@@ -73,7 +74,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
         bases,
         sh,
     };
-    values.into_splat(path)
+    Ok(values.into_contents(InvalidGaussians::default()))
 }
 
 /// What a byte can say.

@@ -1,0 +1,112 @@
+#!/usr/bin/env bash
+# Runs tests once more as on other machines than this one:
+#   scripts/other_machines.sh            on both of these
+#   scripts/other_machines.sh ordinary   all tests on AVX2 without AVX-512 and bf16, as a user who isn't root and has no home, in a
+#                                        folder with a space that only its owner may write to, in another language and time zone,
+#                                        without standard input; then the demo in small
+#   scripts/other_machines.sh small      tests of what computes, on one core with SSE2
+# Fails at the end if a test did. As root it lets others pass through the folders above the repository until then.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+repository=$PWD
+# `make test` proves that nothing is missing, and counts; what that user can't reach is skipped here.
+unset GLOBALSPLAT_NO_SKIPS GLOBALSPLAT_SKIPPED
+
+folder="$(mktemp -d)"
+clone="$folder/a folder/globalsplat"
+opened=()
+end() {
+    [ ${#opened[@]} -eq 0 ] || chmod o-x "${opened[@]}"
+    rm -rf "$folder"
+}
+trap end EXIT
+
+built="$("${CARGO:-cargo}" test --release --locked --no-run 2>&1)" || {
+    echo "$built" >&2
+    exit 1
+}
+# A line for each program of tests: its name, which is lib, main or that of a file in tests/, and its path.
+tests="$(sed -nE 's|^ *Executable (unittests src/)?(tests/)?([a-z_]+)\.rs \((.*)\)$|\3 \4|p' <<<"$built")"
+
+failed=()
+# Runs the tests $2…, or all, by the command $1.
+run() {
+    local as=$1 name program
+    shift
+    while read -r name program; do
+        [ $# -eq 0 ] || [[ " $* " == *" $name "* ]] || continue
+        [ "${program:0:1}" = / ] || program="$repository/$program"
+        echo "$as: $name"
+        "$as" "$program" --quiet </dev/null || failed+=("$as: $name")
+    done <<<"$tests"
+}
+
+# One whose letters and numbers differ most from English, where it is installed.
+language="$(locale -a 2>/dev/null | grep -im1 '^tr_TR' || echo C)"
+as_ordinary() {
+    local other_user=()
+    [ "$(id -u)" -ne 0 ] || other_user=(setpriv --reuid=65534 --regid=65534 --clear-groups)
+    (
+        cd "$clone"
+        umask 077
+        exec env -u HOME -u TERM -u XDG_CACHE_HOME LC_ALL="$language" TZ=Pacific/Kiritimati NO_COLOR=1 TMPDIR="$folder/a folder/tmp" \
+            GLOBALSPLAT_SIMD=avx2 "${other_user[@]}" "$@" <&-
+    )
+}
+
+as_small() {
+    local core
+    core="$(taskset -cp $$ | sed -E 's/.*[ ,-]([0-9]+)$/\1/')"
+    GLOBALSPLAT_SIMD=portable OMP_NUM_THREADS=1 taskset -c "$core" "$@"
+}
+
+# A copy of what git knows, with links to what was built and installed.
+make_clone() {
+    local made
+    mkdir -p "$clone" "$folder/a folder/tmp"
+    git ls-files -z | xargs -0 cp --parents -t "$clone"
+    for made in target weights .venv web/dist parity/npm/node_modules; do
+        [ ! -e "$made" ] || ln -s "$repository/$made" "$clone/$made"
+    done
+    chmod -R a+rX,go-w "$folder"
+    chmod 1777 "$folder/a folder/tmp"
+}
+
+run_ordinary() {
+    local above=$repository
+    make_clone
+    while [ "$(id -u)" -eq 0 ] && [ "$above" != / ]; do
+        if (((8#$(stat -c %a "$above") & 1) == 0)); then
+            chmod o+x "$above"
+            opened+=("$above")
+        fi
+        above="$(dirname "$above")"
+    done
+    # Python may lie out of reach.
+    as_ordinary .venv/bin/python -c '' 2>/dev/null || export TORCHRUN=/nonexistent
+    run as_ordinary
+    echo "as_ordinary: demo"
+    OUT="$folder/a folder/tmp/demo" CAPTURES=none as_ordinary scripts/demo.sh --dry-run || failed+=("as_ordinary: demo")
+    unset TORCHRUN
+}
+
+run_small() {
+    run as_small lib splat model refine examples
+}
+
+case "${1:-all}" in
+ordinary) run_ordinary ;;
+small) run_small ;;
+all)
+    run_ordinary
+    run_small
+    ;;
+*)
+    echo "other_machines: $1 is no machine, expected ordinary or small" >&2
+    exit 2
+    ;;
+esac
+[ ${#failed[@]} -eq 0 ] || {
+    printf 'other_machines: failed: %s\n' "${failed[@]}" >&2
+    exit 1
+}

@@ -1,0 +1,47 @@
+//! What the commands of `bench` have in common: the configuration that is measured, and tables.
+
+use anyhow::Result;
+use globalsplat::bench::{Part, Section, Spread};
+use globalsplat::config::Config;
+use std::path::Path;
+
+/// The configuration that a measurement is of; without a file, the defaults, which are the paper's main model.
+pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
+    Ok(match file {
+        Some(file) => Config::read(file, set)?,
+        None => Config::parse("", set, "the defaults".as_ref())?,
+    })
+}
+
+/// A line for each section, with its share, and one for the whole.
+pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
+    println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "least", "3 of 4", "share");
+    let row = |name: &str, s: &Spread| {
+        let share = 1e2 * s.median / whole.median;
+        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
+    };
+    sections.iter().for_each(|section| row(section.name, &section.milliseconds));
+    row(name, whole);
+}
+
+/// The parts of a forward pass, beside `whole`.
+pub fn print_parts(title: &str, parts: &[Part], whole: &Spread) {
+    println!(
+        "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
+        "median", "least", "share", "GFLOP", "GB", "of the peak"
+    );
+    for part in parts {
+        let of_peak = match part.gflop > 0. {
+            true => format!("{:>11.1} %", 1e2 * part.share_of_peak),
+            false => String::new(),
+        };
+        let rest = format!("{:>9.2} {:>7.3} {of_peak}", part.gflop, part.gigabytes);
+        print_part(part.name, &part.milliseconds, whole, &rest);
+    }
+}
+
+/// Prints the line of one part: its median and least time in milliseconds, its share of `whole`, and `rest`.
+pub fn print_part(name: &str, s: &Spread, whole: &Spread, rest: &str) {
+    let share = 1e2 * s.median / whole.median;
+    println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
+}

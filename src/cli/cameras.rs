@@ -1,0 +1,43 @@
+//! Cameras for a splat whose capture tells none, and how far from the capture's cameras the splat is.
+
+use anyhow::Result;
+use glam::{DMat4, DVec3};
+use globalsplat::io::Splat;
+use globalsplat::render::SplatRenderer;
+use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_point};
+use tch::Kind;
+
+/// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer; the splat's typical size where it
+/// sees nothing.
+pub fn median_depth(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<f64> {
+    let rendered = renderer.render(&cameras[cameras.len() / 2..][..1])?.remove(0);
+    let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
+    Ok(if seen.numel() == 0 { renderer.frame().typical_distance() } else { seen.median().double_value(&[]) })
+}
+
+/// Around the middle of the splat's opaque part, far enough to see most of it.
+pub fn orbit_around_splat(
+    splat: &Splat,
+    ImageSize { width, height }: ImageSize,
+    frames: usize,
+) -> Vec<Camera> {
+    let g = &splat.gaussians;
+    let means = g.means.view([-1, 3]).to_kind(Kind::Double);
+    let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);
+    let total = weights.sum(Kind::Double).clamp_min(f64::MIN_POSITIVE);
+    let centre = (&means * &weights).sum_dim_intlist([0i64].as_slice(), false, Kind::Double) / &total;
+    let spread = ((&means - &centre).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double)
+        * &weights)
+        .sum(Kind::Double)
+        .divide(&total)
+        .sqrt()
+        .double_value(&[]);
+    let centre = splat.origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
+    // Gaussians in one place are as far apart as they are large.
+    let radius = 3. * if spread > 0. { spread } else { splat.frame().typical_distance() };
+    let (w, h) = (f64::from(width), f64::from(height));
+    let focal = w.min(h);
+    let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };
+    let reference = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
+    orbit_around_point(centre, radius, &reference, frames)
+}

@@ -1,0 +1,37 @@
+//! A splat's scores on views, one after the other.
+
+use super::method::judge_pictures;
+use super::perceptual::Perceptual;
+use super::scores::{CaptureScores, score};
+use crate::data::View;
+use crate::error::Result;
+use crate::render::render_views;
+use crate::scene::Gaussians;
+
+/// Scores a splat on `views`, LPIPS included where `perceptual` is given. `go_on` is asked before each view, with how many are done; when
+/// it says no, means are over these. None where none is done.
+///
+/// # Errors
+/// What the rasterizer refuses.
+pub fn score_views(
+    scene: &str,
+    gaussians: &Gaussians,
+    views: &[View],
+    perceptual: Option<&Perceptual>,
+    mut go_on: impl FnMut(usize) -> bool,
+) -> Result<Option<CaptureScores>> {
+    let mut done = vec![];
+    for view in views {
+        if !go_on(done.len()) {
+            break;
+        }
+        let pictures = [render_views(gaussians, &[view.camera])?.remove(0).rgb];
+        let truth = [view.shallow_clone()];
+        let scores = match perceptual {
+            Some(perceptual) => judge_pictures(scene, &pictures, &truth, None, perceptual),
+            None => score(scene, &pictures, &truth, None),
+        };
+        done.extend(scores?.views);
+    }
+    Ok((!done.is_empty()).then(|| CaptureScores::of(scene, done, Some(gaussians.count()))))
+}

@@ -1,0 +1,51 @@
+//! Checksums of what files hold.
+
+use crate::error::{Error, Result};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// Bytes that are read at a time.
+const BUFFER: usize = 1 << 20;
+
+/// Computes the CRC-32 of the contents of `files`, one after the other, without holding any of them in memory.
+///
+/// # Errors
+/// A file that can't be read.
+pub fn checksum(files: impl IntoIterator<Item = impl AsRef<Path>>) -> Result<u32> {
+    let (mut hasher, mut buffer) = (crc32fast::Hasher::new(), vec![0; BUFFER]);
+    for path in files {
+        let read = Error::read(path.as_ref());
+        let mut file = match File::open(&path) {
+            Ok(file) => file,
+            Err(e) => return Err(read(e)),
+        };
+        loop {
+            match file.read(&mut buffer) {
+                Ok(0) => break,
+                Ok(count) => hasher.update(&buffer[..count]),
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(read(e)),
+            }
+        }
+    }
+    Ok(hasher.finalize())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_read_to_their_end_in_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
+        let bytes: Vec<u8> = (0..2 * BUFFER + 3).map(|i| (i % 251) as u8).collect();
+        std::fs::write(&a, &bytes).unwrap();
+        std::fs::write(&b, "end").unwrap();
+        let all = [bytes.as_slice(), b"end"].concat();
+        assert_eq!(checksum([&a, &b]).unwrap(), crc32fast::hash(&all));
+        assert_ne!(checksum([&b, &a]).unwrap(), crc32fast::hash(&all));
+        assert!(checksum([folder.path().join("c")]).is_err());
+    }
+}

@@ -1,0 +1,100 @@
+//! The files that a command reads, which nothing that it writes may replace.
+
+use crate::error::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::Path;
+
+/// Files that a command reads. They are known by what they are, not by their names: by whatever path or link an output names one of
+/// them, it is refused.
+#[derive(Debug, Clone, Default)]
+pub struct Inputs {
+    files: BTreeMap<FileId, Kind>,
+    /// In which photos lie.
+    photo_folders: BTreeSet<FileId>,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Photo,
+    Other,
+}
+
+/// What tells a file or folder from every other one.
+#[cfg(unix)]
+type FileId = (u64, u64);
+#[cfg(not(unix))]
+type FileId = std::path::PathBuf;
+
+impl Inputs {
+    /// Adds `file`, if it is there.
+    pub fn add(&mut self, file: &Path) {
+        self.files.extend(file_id(file).map(|id| (id, Kind::Other)));
+    }
+
+    /// Adds every file in `folder`, and in folders below it.
+    pub fn add_folder(&mut self, folder: &Path) {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            match entry.file_type() {
+                Ok(kind) if kind.is_dir() => self.add_folder(&entry.path()),
+                _ => self.add(&entry.path()),
+            }
+        }
+    }
+
+    /// Adds the photo `file`, if it is there, and its folder as one of photos.
+    pub fn add_photo(&mut self, file: &Path) {
+        self.files.extend(file_id(file).map(|id| (id, Kind::Photo)));
+        let folder = file.parent().unwrap_or(file);
+        self.photo_folders.extend(file_id(folder));
+    }
+
+    /// Adds all that `others` has.
+    pub fn extend(&mut self, others: Inputs) {
+        self.files.extend(others.files);
+        self.photo_folders.extend(others.photo_folders);
+    }
+
+    /// Checks that a file that is to be written at `path` replaces none of them.
+    ///
+    /// # Errors
+    /// A request error that names the path.
+    pub fn check_file(&self, path: &Path) -> Result<()> {
+        match file_id(path).and_then(|id| self.files.get(&id)) {
+            None => Ok(()),
+            Some(Kind::Photo) => {
+                Err(Error::input(path, "the output", "a photo of the capture", "another name: photos stay"))
+            }
+            Some(Kind::Other) => {
+                Err(Error::input(path, "the output", "a file that this command reads", "another name"))
+            }
+        }
+    }
+
+    /// Checks that a folder for whatever is written is none of photos.
+    ///
+    /// # Errors
+    /// A request error that names the path.
+    pub fn check_folder(&self, path: &Path) -> Result<()> {
+        match file_id(path).is_some_and(|id| self.photo_folders.contains(&id)) {
+            false => Ok(()),
+            true => Err(Error::input(
+                path,
+                "the output",
+                "a folder with the capture's photos",
+                "a folder without them",
+            )),
+        }
+    }
+}
+
+#[cfg(unix)]
+fn file_id(path: &Path) -> Option<FileId> {
+    use std::os::unix::fs::MetadataExt;
+    fs::metadata(path).ok().map(|file| (file.dev(), file.ino()))
+}
+
+#[cfg(not(unix))]
+fn file_id(path: &Path) -> Option<FileId> {
+    path.canonicalize().ok()
+}

@@ -1,0 +1,103 @@
+//! One picture of many, side by side or one below the other, made as they come.
+
+use super::images::{rgb_from_tensor, shrink, tile_horizontally, tile_images, write_image};
+use crate::error::Result;
+use image::RgbImage;
+use std::path::Path;
+use tch::Tensor;
+
+/// Pixels of a picture that programs still open, and that a person still looks at.
+const MOST_PIXELS: i64 = 1 << 26;
+
+/// Pictures that become one, in 8 bits until then. Where they would have more pixels together than programs open, each is shrunk by a
+/// whole factor.
+#[derive(Debug)]
+pub struct Mosaic {
+    is_column: bool,
+    /// Of each of them.
+    most_pixels: i64,
+    images: Vec<RgbImage>,
+    shrunk_by: i64,
+}
+
+impl Mosaic {
+    /// Begins a row of `count` pictures.
+    pub fn row(count: usize) -> Self {
+        let most_pixels = MOST_PIXELS / count.max(1) as i64;
+        Mosaic { is_column: false, most_pixels, images: vec![], shrunk_by: 1 }
+    }
+
+    /// Begins a column of `count` pictures.
+    pub fn column(count: usize) -> Self {
+        Mosaic { is_column: true, ..Mosaic::row(count) }
+    }
+
+    /// Adds a picture that is made of `parts`, [3, H, W] in [0, 1] and of one size, side by side.
+    ///
+    /// # Errors
+    /// libtorch's refusal, as for another shape.
+    pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
+        let factor = self.factor(parts.len(), &parts[0]);
+        let parts: Vec<Tensor> = parts.iter().map(|part| shrink(part, factor)).collect();
+        self.add_shrunk(&parts)
+    }
+
+    /// Returns by how much the sides of a picture have to be divided that is one of `parts` of `part`'s size, [.., H, W].
+    pub fn factor(&mut self, parts: usize, part: &Tensor) -> i64 {
+        let [.., height, width] = part.size()[..] else { panic!("a picture has two sides") };
+        let factor = shrink_factor(parts as i64 * height * width, self.most_pixels);
+        self.shrunk_by = self.shrunk_by.max(factor);
+        factor
+    }
+
+    /// As [`Mosaic::add`], of parts that are shrunk by [`Mosaic::factor`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn add_shrunk(&mut self, parts: &[Tensor]) -> Result<()> {
+        self.images.push(rgb_from_tensor(&tile_horizontally(parts))?);
+        Ok(())
+    }
+
+    /// Returns by how much the sides of the largest pictures were divided: 1 where nothing was shrunk.
+    pub fn shrunk_by(&self) -> i64 {
+        self.shrunk_by
+    }
+
+    /// Writes the whole as a PNG.
+    ///
+    /// # Errors
+    /// The system's refusal to write.
+    pub fn write(self, path: &Path) -> Result<()> {
+        write_image(path, &tile_images(&self.images, self.is_column), false)
+    }
+}
+
+/// Returns the smallest whole number by which sides have to be divided so that of `pixels` no more than `most` are left.
+pub fn shrink_factor(pixels: i64, most: i64) -> i64 {
+    (1..).find(|factor| pixels <= most.max(1) * factor * factor).expect("a whole number")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::{Device, Kind};
+
+    #[test]
+    fn many_large_pictures_are_shrunk_and_few_are_not() {
+        let picture = Tensor::ones([3, 64, 96], (Kind::Float, Device::Cpu)) * 0.5;
+        for (count, most, size, by) in [(2, 1 << 26, [64, 196], 1), (2, 2 * 64 * 96 / 4, [32, 100], 2)] {
+            let mut mosaic = Mosaic { most_pixels: most / count, ..Mosaic::row(2) };
+            for _ in 0..count {
+                mosaic.add(std::slice::from_ref(&picture)).unwrap();
+            }
+            assert_eq!(mosaic.shrunk_by(), by);
+            let file = tempfile::NamedTempFile::with_suffix(".png").unwrap();
+            mosaic.write(file.path()).unwrap();
+            let image = crate::io::read_image(file.path()).unwrap();
+            assert_eq!([image.height(), image.width()], size);
+            assert_eq!((image.get_pixel(0, 0).0, image.get_pixel(size[1] - 1, 0).0), ([128; 3], [128; 3]));
+        }
+        assert_eq!(shrink_factor(16_000_000 * 3, MOST_PIXELS / 300), 15);
+    }
+}

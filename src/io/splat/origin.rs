@@ -1,0 +1,71 @@
+//! The origin of a splat's coordinates, in a file beside it (spec 10.18): `room.ply.origin.json` for `room.ply`.
+
+use crate::error::{Error, Result};
+use crate::io::atomic::{PartialFile, check_writable_file};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use std::ffi::OsString;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// What is added to the splat's name.
+const ENDING: &str = ".origin.json";
+
+#[derive(Serialize, Deserialize)]
+struct Contents {
+    origin: [f64; 3],
+}
+
+/// Returns the path of the file that has the origin of the splat at `path`.
+pub fn origin_file(path: &Path) -> PathBuf {
+    let mut name = OsString::from(path);
+    name.push(ENDING);
+    name.into()
+}
+
+/// Checks that the origin of a splat at `path` could be written beside it: its name is longer. Call it before the work, not after.
+///
+/// # Errors
+/// A request error that names the file.
+pub fn check_writable_origin(path: &Path) -> Result<()> {
+    check_writable_file(&origin_file(path))
+}
+
+/// Returns the origin of the splat at `path`: zero where there is no such file.
+///
+/// # Errors
+/// A file that can't be read or has no origin.
+pub(super) fn read_origin(path: &Path) -> Result<DVec3> {
+    let path = origin_file(path);
+    if !path.is_file() {
+        return Ok(DVec3::ZERO);
+    }
+    let bytes = fs::read(&path).map_err(Error::read(&path))?;
+    let Contents { origin } = serde_json::from_slice(&bytes).map_err(|e| {
+        Error::input(&path, "the JSON", e, "{\"origin\": [x, y, z]}, three numbers in the capture's unit")
+    })?;
+    Ok(DVec3::from_array(origin))
+}
+
+/// Writes the splat at `path` by `write`, and its `origin` beside it; of an origin of zero, an older file is removed. The new
+/// file is written before the splat and renamed after it, so that a full disk leaves both files as they were.
+///
+/// # Errors
+/// What `write` returns, or the system's refusal to write.
+pub(super) fn write_with_origin(
+    path: &Path,
+    origin: DVec3,
+    write: impl FnOnce() -> Result<()>,
+) -> Result<()> {
+    let file = origin_file(path);
+    if origin == DVec3::ZERO {
+        write()?;
+        return if file.is_file() { fs::remove_file(&file).map_err(Error::write(&file)) } else { Ok(()) };
+    }
+    let mut partial = PartialFile::create(&file)?;
+    let json = serde_json::to_vec_pretty(&Contents { origin: origin.to_array() }).expect("numbers");
+    partial.file.write_all(&json).map_err(Error::write(&file))?;
+    write()?;
+    partial.keep()
+}

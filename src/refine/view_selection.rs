@@ -1,0 +1,246 @@
+//! View selection: which photos are compared with which, and which say the same as others. Like multi-view stereo it goes by
+//! parallax and by overlap, at the depth of the scene (Yao et al. 2018, "MVSNet"); parallax is the distance of two cameras in units of
+//! that depth, in radians. How many photos were taken of a place changes nothing.
+
+use crate::scene::Camera;
+use glam::DVec3;
+use std::f64::consts::PI;
+
+/// Photos that each one is compared with, at most.
+const MAX_NEIGHBOURS: usize = 4;
+/// The parallax that is best for comparing, radians: depths are told apart, and both photos show the same.
+const BEST_PARALLAX: f64 = 2.5 * PI / 180.;
+/// The smallest parallax of two photos that are compared with each other, radians. Smaller ones tell less of the depth.
+const MIN_PARALLAX: f64 = PI / 180.;
+/// The smallest share of one photo that another has to show, where the scene's depth is known.
+const MIN_OVERLAP: f64 = 0.3;
+/// Halvings of the smallest parallax, where cameras hardly move.
+const MAX_HALVINGS: i32 = 16;
+/// Cosine of the largest angle between two cameras' axes that are compared.
+const MIN_COSINE: f64 = 0.3;
+/// Photos whose parallax and turn together are at most this, radians, show the same.
+const NEAR_DUPLICATE: f64 = PI / 180.;
+/// Pixels along a side of the grid at which overlap is looked at.
+const GRID: u32 = 5;
+
+/// Returns the function that maps a point to where `camera` sees it, if it does: u and v in pixels, and the depth along its axis.
+pub fn projection(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<> {
+    let (w2c, Camera { intrinsics: k, width, height, .. }) = (camera.c2w.inverse(), *camera);
+    let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
+    move |point| {
+        let p = w2c.transform_point3(point);
+        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
+        (p.z > 0. && inside(u, width) && inside(v, height)).then_some([u, v, p.z])
+    }
+}
+
+/// Returns the largest distance between the first camera and another, by which lengths are measured before a depth is known.
+pub fn extent(cameras: &[Camera]) -> f64 {
+    cameras.iter().map(|camera| distance(camera, &cameras[0])).fold(0., f64::max)
+}
+
+/// Returns up to `count` indices of `cameras`, spread: each is the one that is farthest from all before it, in units of the extent
+/// of all and radians of the axis. The first is 0.
+pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
+    let extent = extent(cameras);
+    let apart = |a: &Camera, b: &Camera| {
+        let moved = if extent > 0. { distance(a, b) / extent } else { 0. };
+        moved + turn(a, b)
+    };
+    let mut chosen = vec![];
+    let mut nearest = vec![f64::INFINITY; cameras.len()];
+    while chosen.len() < count.min(cameras.len()) {
+        // The first of equally far ones.
+        let next = (0..cameras.len()).rev().max_by(|&a, &b| nearest[a].total_cmp(&nearest[b])).expect("one");
+        chosen.push(next);
+        for (camera, nearest) in cameras.iter().zip(&mut nearest) {
+            *nearest = nearest.min(apart(camera, &cameras[next]));
+        }
+        nearest[next] = f64::NEG_INFINITY;
+    }
+    chosen
+}
+
+/// Returns the camera whose distance from camera `index` is nearest to each of `count` distances, the extent of all cameras and its
+/// powers of ½, the farthest first; none where all are farther off than by a factor of √2. They look in about the same direction.
+pub fn at_octaves(index: usize, cameras: &[Camera], count: i32) -> Vec<usize> {
+    let (this, extent) = (&cameras[index], extent(cameras));
+    let comparable = |other: &usize| axis(&cameras[*other]).dot(axis(this)) > MIN_COSINE;
+    let at = |octave: i32| {
+        let off =
+            |other: usize| ((distance(&cameras[other], this) / extent).log2() + f64::from(octave)).abs();
+        let others = (0..cameras.len()).filter(comparable).filter(|&other| off(other) <= 0.5);
+        others.min_by(|&a, &b| off(a).total_cmp(&off(b)))
+    };
+    (0..count).filter_map(at).collect()
+}
+
+/// Whether two cameras show the same of a scene at `depth`: from nearly the same place, in nearly the same direction.
+pub fn are_near_duplicates(a: &Camera, b: &Camera, depth: f64) -> bool {
+    distance(a, b) / depth + turn(a, b) <= NEAR_DUPLICATE
+}
+
+/// Returns the indices of the cameras whose photos tell most of the depths in photo `index`, the nearest first: those with the best
+/// parallax at `depth`, and enough of it to the photo and to each other, and enough overlap. Where all have less, the most that there is
+/// counts as enough. Cameras in the same place tell nothing: where all are, there are none.
+pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
+    let this = &cameras[index];
+    let points = grid(this, depth);
+    let mut others: Vec<Neighbour> = (0..cameras.len())
+        .filter(|&other| axis(&cameras[other]).dot(axis(this)) > MIN_COSINE)
+        .map(|other| Neighbour::of(other, &cameras[other], this, depth, &points))
+        .filter(|other| other.distance > 0.)
+        .collect();
+    let off = |other: &Neighbour| (other.parallax / BEST_PARALLAX).ln().abs();
+    others.sort_by(|a, b| off(a).total_cmp(&off(b)));
+    for min_overlap in [MIN_OVERLAP, 0.] {
+        // Two are better than one, unless they are much nearer to each other.
+        for count in [2, 1] {
+            let halvings = if count == 2 { 1 } else { MAX_HALVINGS };
+            for halving in 0..=halvings {
+                let min_parallax = MIN_PARALLAX * 0.5f64.powi(halving);
+                let chosen = spaced(&others, cameras, min_parallax * depth, min_overlap);
+                if chosen.len() >= count {
+                    return chosen;
+                }
+            }
+        }
+    }
+    // So little parallax that it can't be measured.
+    others.first().map(|other| other.index).into_iter().collect()
+}
+
+struct Neighbour {
+    index: usize,
+    distance: f64,
+    /// By its distance, radians.
+    parallax: f64,
+    /// Share of the grid that it sees.
+    overlap: f64,
+}
+
+impl Neighbour {
+    fn of(index: usize, other: &Camera, this: &Camera, depth: f64, points: &[DVec3]) -> Self {
+        let sees = projection(other);
+        let seen = points.iter().filter(|&&point| sees(point).is_some()).count();
+        let distance = distance(other, this);
+        let overlap = seen as f64 / points.len() as f64;
+        Neighbour { index, distance, parallax: distance / depth, overlap }
+    }
+}
+
+/// The first of `others` that are apart from the photo and from each other, the nearest first.
+fn spaced(others: &[Neighbour], cameras: &[Camera], min_distance: f64, min_overlap: f64) -> Vec<usize> {
+    let mut chosen: Vec<&Neighbour> = vec![];
+    for other in others.iter().filter(|other| other.distance >= min_distance && other.overlap >= min_overlap)
+    {
+        let camera = &cameras[other.index];
+        if chosen.iter().all(|one| distance(&cameras[one.index], camera) >= min_distance) {
+            chosen.push(other);
+        }
+        if chosen.len() == MAX_NEIGHBOURS {
+            break;
+        }
+    }
+    chosen.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index)));
+    chosen.into_iter().map(|other| other.index).collect()
+}
+
+/// Points at `depth` in front of a camera, spread over its picture.
+fn grid(camera: &Camera, depth: f64) -> Vec<DVec3> {
+    let k = camera.intrinsics;
+    let along = |side: u32| (0..GRID).map(move |i| (f64::from(i) + 0.5) / f64::from(GRID) * f64::from(side));
+    let point = |u: f64, v: f64| DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * depth;
+    along(camera.height)
+        .flat_map(|v| along(camera.width).map(move |u| camera.c2w.transform_point3(point(u, v))))
+        .collect()
+}
+
+fn centre(camera: &Camera) -> DVec3 {
+    camera.c2w.w_axis.truncate()
+}
+
+fn axis(camera: &Camera) -> DVec3 {
+    camera.c2w.z_axis.truncate()
+}
+
+fn distance(a: &Camera, b: &Camera) -> f64 {
+    centre(a).distance(centre(b))
+}
+
+/// The angle between two cameras' axes, radians.
+fn turn(a: &Camera, b: &Camera) -> f64 {
+    axis(a).cross(axis(b)).length().atan2(axis(a).dot(axis(b)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+
+    fn camera(c2w: DMat4) -> Camera {
+        let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 32. };
+        Camera { intrinsics, c2w, width: 64, height: 64 }
+    }
+
+    fn along(positions: &[f64]) -> Vec<Camera> {
+        positions.iter().map(|&x| camera(DMat4::from_translation(DVec3::X * x))).collect()
+    }
+
+    #[test]
+    fn neighbours_have_parallax() {
+        // At depth 4, parallax of 1° is 0.07, and of 2.5° 0.17.
+        let even = along(&[0., 0.25, 0.5, 0.75, 1., 1.25]);
+        assert_eq!(neighbours(2, &even, 4.), [1, 3, 0, 4]);
+        // Photos of the same place, or nearly, count once, however near they are.
+        let paused = along(&[0., 0.25, 0.2501, 0.5, 0.5 + 1e-7, 0.49999, 0.75, 1.00001, 1.]);
+        assert_eq!(neighbours(3, &paused, 4.), [2, 6, 0, 8]);
+        // Of a dense video, some frames away.
+        let dense = along(&(0..240).map(|i| f64::from(i) / 240.).collect::<Vec<_>>());
+        let chosen = neighbours(120, &dense, 4.);
+        assert_eq!(chosen.len(), 4);
+        assert!(chosen.iter().all(|&other| (25..=70).contains(&other.abs_diff(120))), "{chosen:?}");
+    }
+
+    #[test]
+    fn little_parallax_is_better_than_none() {
+        let clustered = along(&[0., 1e-3, 2e-3, 4e-3]);
+        assert_eq!(neighbours(0, &clustered, 4.), [3]);
+        assert_eq!(neighbours(0, &along(&[0., 0., 0.]), 4.), [0; 0]);
+        assert_eq!(neighbours(0, &along(&[0., 1e-9]), 4.), [1]);
+        let far_apart = [camera(DMat4::IDENTITY), camera(DMat4::from_rotation_y(1.))];
+        assert_eq!(neighbours(0, &far_apart, 4.), [0; 0]);
+    }
+
+    #[test]
+    fn neighbours_see_the_same() {
+        // The nearer ones look away.
+        let turned = |x: f64| camera(DMat4::from_translation(DVec3::X * x) * DMat4::from_rotation_y(1.1));
+        let cameras = [along(&[0.]), vec![turned(0.2), turned(0.4)], along(&[0.6, 0.8])].concat();
+        assert_eq!(neighbours(0, &cameras, 4.), [3, 4]);
+    }
+
+    #[test]
+    fn what_is_far_from_all_others_comes_first() {
+        let rests = along(&[0., 0., 1e-3, 1., 0.5, 0.999]);
+        assert_eq!(farthest_first(&rests, 3), [0, 3, 4]);
+        assert_eq!(farthest_first(&rests, 9).len(), 6);
+        let turns: Vec<Camera> = [0., 0., 0.3, 1.].map(|angle| camera(DMat4::from_rotation_y(angle))).into();
+        assert_eq!(farthest_first(&turns, 3), [0, 3, 2]);
+    }
+
+    #[test]
+    fn one_photo_at_each_distance_is_looked_at() {
+        let many = along(&[0., 1., 0.98, 0.5, 0.51, 0.126, 1e-5, 0.]);
+        assert_eq!(at_octaves(0, &many, 9), [1, 3, 5]);
+        assert_eq!(at_octaves(0, &along(&[0., 0.]), 9), [0; 0]);
+    }
+
+    #[test]
+    fn near_duplicates_differ_in_nothing_that_shows() {
+        let [a, b, c] = [0., 0.05, 0.2].map(|x| camera(DMat4::from_translation(DVec3::X * x)));
+        assert!(are_near_duplicates(&a, &b, 4.) && !are_near_duplicates(&a, &c, 4.));
+        assert!(!are_near_duplicates(&a, &camera(DMat4::from_rotation_y(0.1)), 4.));
+    }
+}

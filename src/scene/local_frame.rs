@@ -1,0 +1,250 @@
+//! The local frame of a capture or a splat (spec 2.5): an origin near the scene and a unit that fits its size.
+//!
+//! Positions far from the world's origin, or in a unit that is large or small for the scene, don't fit float32 and absolute
+//! thresholds such as the near plane. World coordinates are float64; they become float32 in a local frame only.
+
+use super::{Camera, Gaussians, Similarity};
+use glam::{DMat4, DVec3};
+use tch::{Kind, Tensor};
+
+/// Distances below this share of the largest coordinate are rounding errors of float64.
+const ROUNDING: f64 = 1e-14;
+
+/// A frame with the axes of the world: local = (world − origin) / scale.
+///
+/// The frame of a scene that is scaled by a power of two has exactly the scaled origin and scale, so that local coordinates
+/// have the same bits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocalFrame {
+    /// The local origin, in world coordinates.
+    pub origin: DVec3,
+    /// The length of a local unit in world units, above 0.
+    pub scale: f64,
+}
+
+impl LocalFrame {
+    /// The typical distance from the origin in local units: the near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
+    const TYPICAL_DISTANCE: f64 = 16.;
+
+    /// Returns the frame of a capture, by its camera centres: the origin is their median along each axis, and the median
+    /// distance of the others from it is 16 local units. Where all cameras are in one place, a local unit is a world unit.
+    pub fn from_cameras(cameras: &[Camera]) -> Self {
+        let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
+        Self::from_reaches(&centres, &vec![0.; centres.len()])
+    }
+
+    /// Returns the frame of a splat of one scene, whose means are relative to `origin`: the local origin is their median along
+    /// each axis, and 16 local units are the median of a mean's distance from it plus the Gaussian's largest scale. The frame
+    /// of Gaussians without any extent, or of none, has the world's unit.
+    ///
+    /// # Panics
+    /// More scenes than one.
+    pub fn from_gaussians(gaussians: &Gaussians, origin: DVec3) -> Self {
+        let means: Vec<DVec3> = values(&gaussians.means).chunks_exact(3).map(DVec3::from_slice).collect();
+        let largest = values(&gaussians.scales.amax([-1i64].as_slice(), false));
+        let about_zero = Self::from_reaches(&means, &largest);
+        LocalFrame { origin: origin + about_zero.origin, ..about_zero }
+    }
+
+    /// Returns the frame of balls at `points` with `radii`.
+    fn from_reaches(points: &[DVec3], radii: &[f64]) -> Self {
+        let along = |axis: usize| median(points.iter().map(|point| point[axis]).collect());
+        let origin = DVec3::from_array([0, 1, 2].map(|axis| along(axis).unwrap_or(0.)));
+        let largest = points.iter().map(|point| point.abs().max_element()).fold(0., f64::max);
+        let reaches = points.iter().zip(radii).map(|(point, radius)| point.distance(origin) + radius);
+        let typical = median(reaches.filter(|reach| *reach > ROUNDING * largest).collect());
+        LocalFrame { origin, scale: typical.map_or(1., |typical| typical / Self::TYPICAL_DISTANCE) }
+    }
+
+    /// Returns the typical distance of the scene from the origin, in world units.
+    pub fn typical_distance(&self) -> f64 {
+        Self::TYPICAL_DISTANCE * self.scale
+    }
+
+    /// Returns a world point in local coordinates.
+    pub fn point_to_local(&self, point: DVec3) -> DVec3 {
+        (point - self.origin) / self.scale
+    }
+
+    /// Returns a local point in world coordinates.
+    pub fn point_to_world(&self, point: DVec3) -> DVec3 {
+        point * self.scale + self.origin
+    }
+
+    /// Returns a camera-to-world pose as camera-to-local.
+    pub fn pose_to_local(&self, c2w: &DMat4) -> DMat4 {
+        with_centre(c2w, self.point_to_local(c2w.w_axis.truncate()))
+    }
+
+    /// Returns a camera-to-local pose as camera-to-world.
+    pub fn pose_to_world(&self, c2l: &DMat4) -> DMat4 {
+        with_centre(c2l, self.point_to_world(c2l.w_axis.truncate()))
+    }
+
+    /// Returns a camera of the world as one of the local frame.
+    pub fn camera_to_local(&self, camera: &Camera) -> Camera {
+        Camera { c2w: self.pose_to_local(&camera.c2w), ..*camera }
+    }
+
+    /// Returns cameras of the world as ones of the local frame.
+    pub fn cameras_to_local(&self, cameras: &[Camera]) -> Vec<Camera> {
+        cameras.iter().map(|camera| self.camera_to_local(camera)).collect()
+    }
+
+    /// Returns a similarity to the world as one to the local frame.
+    pub fn similarity_to_local(&self, to_world: &Similarity) -> Similarity {
+        Similarity {
+            translation: self.point_to_local(to_world.translation),
+            scale: to_world.scale / self.scale,
+            ..*to_world
+        }
+    }
+
+    /// Returns `gaussians` in local coordinates, of the same kind. Their means are relative to `origin`, in world units; the
+    /// change of coordinates is in float64.
+    pub fn gaussians_to_local(&self, gaussians: &Gaussians, origin: DVec3) -> Gaussians {
+        self.resized(gaussians, origin - self.origin, 1. / self.scale)
+    }
+
+    /// Returns local `gaussians` in world units, of the same kind, with means relative to this frame's origin.
+    pub fn gaussians_from_local(&self, gaussians: &Gaussians) -> Gaussians {
+        self.resized(gaussians, DVec3::ZERO, self.scale)
+    }
+
+    /// Returns `gaussians` moved by `by` and then scaled about zero.
+    fn resized(&self, gaussians: &Gaussians, by: DVec3, factor: f64) -> Gaussians {
+        let double = |t: &Tensor| t.to_kind(Kind::Double);
+        let by = Tensor::from_slice(&by.to_array()).to_device(gaussians.means.device());
+        let means = ((double(&gaussians.means) + by) * factor).to_kind(gaussians.means.kind());
+        let scales = (double(&gaussians.scales) * factor).to_kind(gaussians.scales.kind());
+        Gaussians { means, scales, ..gaussians.map(Tensor::shallow_clone) }
+    }
+}
+
+fn with_centre(pose: &DMat4, centre: DVec3) -> DMat4 {
+    DMat4 { w_axis: centre.extend(1.), ..*pose }
+}
+
+fn values(tensor: &Tensor) -> Vec<f64> {
+    Vec::try_from(tensor.detach().to_kind(Kind::Double).flatten(0, -1)).expect("numbers of one scene")
+}
+
+/// Returns the lower median; none of no numbers.
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use glam::DMat3;
+    use tch::Device;
+
+    fn camera(centre: DVec3) -> Camera {
+        let intrinsics = Intrinsics { fx: 1., fy: 1., cx: 0.5, cy: 0.5 };
+        let c2w = DMat4::from_translation(centre) * DMat4::from_rotation_y(0.3);
+        Camera { intrinsics, c2w, width: 1, height: 1 }
+    }
+
+    fn cameras(factor: f64, offset: DVec3) -> Vec<Camera> {
+        let place = |i: f64| DVec3::new(0.7 * i, (0.4 * i).sin(), 0.1 * i * i);
+        (0..9).map(|i| camera(place(f64::from(i)) * factor + offset)).collect()
+    }
+
+    fn gaussians(factor: f32) -> Gaussians {
+        let numbers = |n: i64, from: f64, to: f64| {
+            Tensor::linspace(from, to, n, (Kind::Double, Device::Cpu)).sin().to_kind(Kind::Float)
+        };
+        Gaussians {
+            means: numbers(60, 0., 17.).view([1, 20, 3]) * f64::from(factor),
+            scales: (numbers(60, 1., 50.).view([1, 20, 3]) + 1.1) * f64::from(factor),
+            quaternions: numbers(80, 0., 30.).view([1, 20, 4]),
+            opacities: numbers(20, 0., 1.).view([1, 20]),
+            sh: numbers(60, 0., 9.).view([1, 20, 1, 3]),
+        }
+    }
+
+    #[test]
+    fn a_scene_scaled_by_a_power_of_two_has_the_same_local_bits() {
+        let (plain, splat) = (cameras(1., DVec3::ZERO), gaussians(1.));
+        let frame = LocalFrame::from_cameras(&plain);
+        let of_splat = LocalFrame::from_gaussians(&splat, DVec3::ZERO);
+        for exponent in [-40, -20, -3, 5, 20, 40] {
+            let factor = f64::from(exponent).exp2();
+            let scaled = cameras(factor, DVec3::ZERO);
+            let other = LocalFrame::from_cameras(&scaled);
+            assert_eq!((other.origin, other.scale), (frame.origin * factor, frame.scale * factor));
+            for (a, b) in plain.iter().zip(&scaled) {
+                assert_eq!(frame.pose_to_local(&a.c2w), other.pose_to_local(&b.c2w));
+            }
+            let scaled = gaussians(factor as f32);
+            let other = LocalFrame::from_gaussians(&scaled, DVec3::ZERO);
+            assert_eq!((other.origin, other.scale), (of_splat.origin * factor, of_splat.scale * factor));
+            let (a, b) = (
+                of_splat.gaussians_to_local(&splat, DVec3::ZERO),
+                other.gaussians_to_local(&scaled, DVec3::ZERO),
+            );
+            assert!(a.means.equal(&b.means) && a.scales.equal(&b.scales), "2^{exponent}");
+        }
+    }
+
+    #[test]
+    fn local_coordinates_keep_what_float32_loses_far_away() {
+        let plain = LocalFrame::from_cameras(&cameras(1., DVec3::ZERO));
+        for (factor, offset) in [(1e-6, DVec3::ZERO), (1e6, DVec3::ZERO), (1., DVec3::new(1e8, -3e7, 55.))] {
+            let frame = LocalFrame::from_cameras(&cameras(factor, offset));
+            for (a, b) in cameras(1., DVec3::ZERO).iter().zip(cameras(factor, offset)) {
+                let (a, local) = (plain.camera_to_local(a), frame.camera_to_local(&b));
+                assert!(a.c2w.abs_diff_eq(local.c2w, 1e-6), "{} {}", a.c2w, local.c2w);
+                assert!(frame.pose_to_world(&local.c2w).abs_diff_eq(b.c2w, 1e-7), "{factor} {offset}");
+            }
+        }
+        let (splat, offset) = (gaussians(1.), DVec3::new(5e6, 4e5, -1e8));
+        let frame = LocalFrame::from_gaussians(&splat, offset);
+        assert!(frame.origin.distance(offset) < 1.);
+        let back = frame.gaussians_from_local(&frame.gaussians_to_local(&splat, offset));
+        let moved = frame.origin - offset;
+        let expected = &splat.means - Tensor::from_slice(&moved.to_array()).to_kind(Kind::Float);
+        let off = |a: &Tensor, b: &Tensor| (a - b).abs().max().double_value(&[]);
+        assert!(off(&back.means, &expected) < 1e-6 && off(&back.scales, &splat.scales) < 1e-6);
+    }
+
+    /// Neither a long rest, in exactly one place or with jitter, nor a camera that was placed wrongly decides on the unit.
+    #[test]
+    fn rests_and_outliers_do_not_set_the_scale() {
+        let plain = cameras(1., DVec3::ZERO);
+        let typical = LocalFrame::from_cameras(&plain).scale;
+        let rests = [plain.clone(), vec![plain[4]; 100]].concat();
+        let outlier = [plain, vec![camera(DVec3::splat(1e7))]].concat();
+        for cameras in [rests, outlier] {
+            let scale = LocalFrame::from_cameras(&cameras).scale;
+            assert!((0.5..2.).contains(&(scale / typical)), "{scale} {typical}");
+        }
+    }
+
+    #[test]
+    fn cameras_in_one_place_keep_the_unit() {
+        let at = DVec3::new(448_265.12, 5_411_920.65, 135.4);
+        for cameras in [vec![], vec![camera(at)], vec![camera(at); 5]] {
+            let frame = LocalFrame::from_cameras(&cameras);
+            assert_eq!(frame.scale, 1.);
+            assert_eq!(frame.origin, cameras.first().map_or(DVec3::ZERO, |_| at));
+        }
+    }
+
+    #[test]
+    fn a_similarity_to_the_world_becomes_one_to_the_frame() {
+        let frame = LocalFrame::from_cameras(&cameras(3., DVec3::new(9., 8., 7.)));
+        let to_world = Similarity {
+            rotation: DMat3::from_rotation_x(0.4),
+            translation: DVec3::new(4., 5., 6.),
+            scale: 7.,
+        };
+        let apply = |to: &Similarity, x: DVec3| to.scale * (to.rotation * x) + to.translation;
+        let point = DVec3::new(0.3, -0.2, 0.9);
+        let expected = frame.point_to_local(apply(&to_world, point));
+        assert!(apply(&frame.similarity_to_local(&to_world), point).abs_diff_eq(expected, 1e-12));
+    }
+}
