@@ -301,7 +301,11 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
         assert same(read, weights)
     (tmp_path / shards[1]).unlink()
     assert shards[1] in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
-    error = refuse("import", "--from", model, "--out", model, "--max-shard-size", "1KB")
+    # Nothing replaces what it is read from, or hides shards behind a file of their name.
+    assert "a file that this command reads" in refuse("import", "--from", model, "--out", model)
+    single = tmp_path / "single.safetensors"
+    single.write_bytes(model.read_bytes())
+    error = refuse("import", "--from", model, "--out", single, "--max-shard-size", "1KB")
     assert "would be taken for the shards" in error
     config = model.with_name("config.toml")
     as_torch = ["--config", config, "--format", "torch", "--out", tmp_path / "a.ckpt", "--max-shard-size", "1KB"]
