@@ -4,6 +4,7 @@
 #include "chunk.cpp"
 #include "cpu/projection.cpp"
 #include "cpu/splat.cpp"
+#include "cuda/kernel_times.cpp"
 #include "cuda/splat.cpp"
 #include "device.cpp"
 #include "fit.cpp"

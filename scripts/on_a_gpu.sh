@@ -1,13 +1,16 @@
 #!/usr/bin/env bash
-# What only a machine with a GPU can tell, in one call of less than ten minutes: parity of everything on it, what it takes and how
-# fast it is beside the CPU, training and the demo. Goes on where a part fails, and writes one report, OUT/report.md:
+# What only a machine with a GPU can tell: parity of everything on it, what it takes and how fast it is beside the CPU, training. Parts
+# come in order of their worth; where one fails or the time is up, the others are still reported.
 #   scripts/on_a_gpu.sh              on the first GPU
-#   DEVICE=cpu scripts/on_a_gpu.sh --dry-run    the same commands in small, to see that they work
+#   scripts/on_a_gpu.sh --dry-run    the same commands in small, to see that they work, in a minute or two; DEVICE=cpu without a GPU
+#   scripts/on_a_gpu.sh --only 'model*'     the parts of that name; * and ? as in a shell; may be repeated
+#   scripts/on_a_gpu.sh --after raster      the parts that come after that one
 #   DEVICE    cuda or cuda:N (default: cuda)
-#   OUT       where everything goes (default: runs/on_a_gpu)
+#   OUT       gets report.md, figures.json and logs.tar.gz, nothing else (default: runs/on_a_gpu)
+#   SECONDS_IN_ALL  a limit of all parts together (default: 580)
 #   LIBTORCH  the libtorch to run with, where the program was built with another one's path
 #   PYTHON    with torch, for parity (default: .venv/bin/python)
-# Fails if a part did.
+# Fails if a part did. `make gpu-bundle` packs the program for a machine that can't build it.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 device="${DEVICE:-cuda}"
@@ -16,84 +19,160 @@ python="${PYTHON:-.venv/bin/python}"
 globalsplat=target/release/globalsplat
 [ -z "${LIBTORCH:-}" ] || export LD_LIBRARY_PATH="$LIBTORCH/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
 
-if [ "${1:-}" = --dry-run ]; then
+dry=false only=() after=""
+asked="$*"
+while [ $# -gt 0 ]; do
+    case "$1" in
+    --dry-run) dry=true ;;
+    --only) only+=("${2:?--only names parts}") && shift ;;
+    --after) after="${2:?--after names a part}" && shift ;;
+    *)
+        echo "on_a_gpu: $1 is no argument, expected --dry-run, --only PART or --after PART" >&2
+        exit 2
+        ;;
+    esac
+    shift
+done
+
+model=() large=(--gaussians 1000000 --cameras 1 --size 1920x1080 --repeats 20)
+train=(--set train.steps=300)
+if $dry; then
     parity=(--only 'projection_float32')
     raster=(--gaussians 500 --cameras 2 --size 64x64 --repeats 2)
-    views=(2)
-    small=(--set 'data.image_size=[32,32]' --set model.patch_size=16 --set model.latents=16 --set model.width=32)
+    large=(--gaussians 2000 --cameras 1 --size 128x64 --repeats 2)
+    views=(2) repeats=2
+    model=(--set 'data.image_size=[32,32]' --set model.patch_size=16 --set model.latents=16 --set model.width=32)
     batch=1 steps=2 train=(--set train.steps=2 --set curriculum.full_capacity=true)
-    demo=()
 else
     parity=()
     raster=(--repeats 100)
-    views=(12 24 36)
-    small=()
-    batch=16 steps=10 train=(--set train.steps=300)
-    demo=(env DEVICE="$device" CAPTURES=none OUT="$out/demo" scripts/demo.sh)
+    views=(24 12 36) repeats=50
+    batch=4 steps=10
 fi
 
-# Runs of an earlier report would be gone on with.
-rm -rf "$out/first_light" "$out/tiny" "$out/demo"
 mkdir -p "$out"
-report="$out/report.md"
+work="$(mktemp -d)"
+trap 'rm -rf "$work"' EXIT
+mkdir "$work/logs" "$work/figures"
+report="$work/report.md"
 failed=0
 began=$(date +%s)
-limit=580 # seconds, of all parts together
+limit="${SECONDS_IN_ALL:-580}"
 
-# A part of the report: what a command says, within so many seconds.
-part() { # TITLE SECONDS COMMAND…
-    local title=$1 seconds=$2 from left status
+# Whether a part was asked for.
+is_asked() { # NAME
+    local pattern
+    if [ -n "$after" ]; then
+        [ "$1" != "$after" ] || after=""
+        return 1
+    fi
+    [ ${#only[@]} -gt 0 ] || return 0
+    for pattern in "${only[@]}"; do
+        # shellcheck disable=SC2053 # a pattern
+        [[ $1 != $pattern ]] || return 0
+    done
+    return 1
+}
+
+# What is there by now, so that a caller who loses patience has it.
+hand_out() {
+    cp "$report" "$out/report.md"
+    tar -czf "$out/logs.tar.gz" -C "$work" logs
+    "$python" - "$work/figures" "$out/figures.json" <<'PYTHON'
+import json, pathlib, sys
+folder, out = map(pathlib.Path, sys.argv[1:])
+figures = {}
+for file in sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime):
+    try:
+        figures[file.stem] = json.loads(file.read_text())
+    except ValueError:
+        pass  # A part that failed has none.
+out.write_text(json.dumps(figures, indent=1) + "\n")
+PYTHON
+}
+
+# A part of the report: a command, what it says, and the seconds it took, at most so many.
+part() { # NAME SECONDS COMMAND…
+    local name=$1 seconds=$2 from left status log="$work/logs/$1.log" shown
     shift 2
+    shown="$*"
+    [ "$1" != bash ] || shown="${*:7}"
+    is_asked "$name" || return 0
     from=$(date +%s)
     left=$((began + limit - from))
-    timeout "$((seconds < left ? seconds : left > 1 ? left : 1))" "$@" >"$out/part.log" 2>&1
+    if [ "$left" -lt 5 ]; then
+        echo "## $name: left out, the time is up" >>"$report"
+        return 0
+    fi
+    timeout -k 5 "$((seconds < left ? seconds : left))" "$@" >"$log" 2>&1
     status=$?
     {
-        echo "## $title"
+        echo "## $name"
         echo
-        echo "    $*"
+        echo "    ${shown//$work/WORK}"
         echo
         [ $status -eq 0 ] || echo "**FAILED**, exit status $status."
         echo '```text'
-        tail -n 60 "$out/part.log"
+        tail -n 60 "$log"
         echo '```'
         echo "$(($(date +%s) - from)) s"
         echo
     } >>"$report"
-    echo "on_a_gpu: $title: $([ $status -eq 0 ] && echo done || echo FAILED), $(($(date +%s) - from)) s" >&2
+    echo "on_a_gpu: $name: $([ $status -eq 0 ] && echo done || echo "FAILED, exit status $status"), $(($(date +%s) - from)) s" >&2
     [ $status -eq 0 ] || failed=$((failed + 1))
+    hand_out
+}
+
+# A benchmark: its figures as JSON, and as tables in the report.
+bench() { # NAME SECONDS ARGUMENTS…
+    local name=$1 seconds=$2
+    shift 2
+    # shellcheck disable=SC2016 # for the inner shell
+    part "$name" "$seconds" bash -c 'figures=$1 python=$2; shift 2; "$@" --json >"$figures" && "$python" scripts/show_figures.py "$figures"' \
+        bench "$work/figures/$name.json" "$python" "$globalsplat" bench "$@"
 }
 
 {
     echo "# On a GPU"
     echo
-    echo "$(date -u +%Y-%m-%d), \`DEVICE=$device scripts/on_a_gpu.sh $*\`, $(nproc) × $(sed -n 's/^model name[^:]*: //p' /proc/cpuinfo | head -1)"
+    echo "$(date -u +%Y-%m-%d), \`DEVICE=$device scripts/on_a_gpu.sh $asked\`, $(nproc) × $(sed -n 's/^model name[^:]*: //p' /proc/cpuinfo | head -1)"
     echo
 } >"$report"
 
-part "What is there" 120 "$globalsplat" doctor
-[ "$device" = cpu ] || part "The GPU, by its own tool" 20 nvidia-smi
-part "Parity" 150 "$python" parity/run.py --device "$device" ${parity[@]+"${parity[@]}"}
-part "Splat op, CPU" 60 "$globalsplat" bench raster "${raster[@]}"
-part "Splat op" 60 "$globalsplat" bench raster "${raster[@]}" --device "$device"
+part doctor 120 "$globalsplat" doctor
+[ "$device" = cpu ] || part nvidia-smi 20 nvidia-smi
+part parity 200 "$python" parity/run.py --device "$device" --json "$work/figures/parity.json" ${parity[@]+"${parity[@]}"}
+bench raster 60 raster "${raster[@]}" --device "$device"
+if [ "$device" != cpu ] && command -v compute-sanitizer >"$work/found"; then
+    for tool in memcheck racecheck synccheck; do
+        part "$tool" 120 compute-sanitizer --tool "$tool" --error-exitcode 9 --kernel-name regex=gs_ \
+            "$globalsplat" bench raster --gaussians 500 --cameras 2 --size 64x64 --repeats 1 --device "$device"
+    done
+fi
 for count in "${views[@]}"; do
     for precision in bf16 f32; do
-        part "The main model, $count views, $precision" 60 \
-            "$globalsplat" bench model --views "$count" --precision "$precision" --device "$device" ${small[@]+"${small[@]}"}
+        bench "model_${count}_views_$precision" 60 model --views "$count" --precision "$precision" --repeats "$repeats" \
+            --device "$device" ${model[@]+"${model[@]}"}
     done
 done
 for precision in bf16 f32; do
-    part "A training step of the main model, $precision" 90 \
-        "$globalsplat" bench train --batch "$batch" --steps "$steps" --device "$device" --set "train.precision=\"$precision\"" \
-        ${small[@]+"${small[@]}"}
+    bench "train_$precision" 90 train --batch "$batch" --steps "$steps" --device "$device" --set "train.precision=\"$precision\"" \
+        ${model[@]+"${model[@]}"}
 done
+bench train_tiny 60 train --config configs/tiny.toml --batch 2 --steps "$steps" --device "$device" ${model[@]+"${model[@]}"}
+bench raster_million 60 raster "${large[@]}" --device "$device"
+if [ "$device" != cpu ] && command -v ncu >"$work/found"; then
+    part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 40 --launch-count 30 --section SpeedOfLight \
+        --section Occupancy --section LaunchStats "$globalsplat" bench raster --repeats 2 --device "$device"
+fi
+bench raster_cpu 60 raster "${raster[@]}"
 for config in first_light tiny; do
-    part "Training, configs/$config.toml" 90 "$globalsplat" train --device "$device" --config "configs/$config.toml" \
+    part "training_$config" 90 "$globalsplat" train --device "$device" --config "configs/$config.toml" \
         --set 'data.captures=["synth:seed=1,scenes=8,frames=32,size=96"]' --set 'data.validation=[]' --set train.validate_every=0 \
-        "${train[@]}" --out "$out/$config"
+        "${train[@]}" --out "$work/$config"
 done
-[ ${#demo[@]} -eq 0 ] || part "The demo" 240 "${demo[@]}"
 
 echo "$(($(date +%s) - began)) s in all, $failed parts failed." >>"$report"
-echo "on_a_gpu: $report, $failed parts failed" >&2
+hand_out
+echo "on_a_gpu: $out/report.md, $failed parts failed" >&2
 [ "$failed" -eq 0 ]

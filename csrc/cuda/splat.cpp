@@ -19,6 +19,7 @@
 #include "emulated.h"
 #include "frame.h"
 #include "globalsplat-csrc/src/cuda.rs.h"
+#include "kernel_times.h"
 
 namespace globalsplat::cuda {
 namespace {
@@ -35,9 +36,11 @@ class Gpu : public Device {
 
   void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override {
     const at::Device device = options_.device();
-    void* const stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device).native_handle();
-    launch_kernel(device.index(), reinterpret_cast<size_t>(stream), kernel, {uint32_t(blocks.x), uint32_t(blocks.y)},
-                  uint32_t(threads), reinterpret_cast<size_t>(arguments));
+    const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
+    measured_launch(kernel, stream, [&] {
+      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
+                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads), reinterpret_cast<size_t>(arguments));
+    });
   }
 
   uint64_t read(const uint64_t* number) const override {

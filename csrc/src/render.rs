@@ -58,8 +58,20 @@ mod ffi {
         contributing: i64,
     }
 
+    /// What all launches of one of the rasterizer's kernels on a GPU took.
+    #[derive(Debug, Clone)]
+    struct KernelTime {
+        /// Its name.
+        kernel: String,
+        /// How many there were.
+        launches: u32,
+        /// All of them together.
+        milliseconds: f64,
+    }
+
     unsafe extern "C++" {
         include!("cpu/cpu.h");
+        include!("cuda/kernel_times.h");
         include!("splat.h");
         include!("threads.h");
 
@@ -95,6 +107,12 @@ mod ffi {
 
         /// See `csrc/cpu/cpu.h`.
         fn stage_times() -> StageTimes;
+
+        /// See `csrc/cuda/kernel_times.h`.
+        fn measure_kernels(on: bool);
+
+        /// See `csrc/cuda/kernel_times.h`.
+        fn kernel_times() -> Result<Vec<KernelTime>>;
 
         /// See `csrc/cpu/cpu.h`.
         fn simd_level() -> Result<String>;

@@ -22,6 +22,7 @@ pub use train::{Together, TrainReport, bench_train};
 
 use crate::optim::Stopwatch;
 use serde::Serialize;
+use std::borrow::Cow;
 
 /// Of several measurements of the same thing, in milliseconds: the middle one and how far the others lie apart.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -38,7 +39,7 @@ pub struct Spread {
 #[derive(Debug, Serialize)]
 pub struct Section {
     /// What the part is called.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Of a view, or of a step.
     pub milliseconds: Spread,
 }
@@ -65,7 +66,7 @@ impl Measured {
 
     /// Of at least one time.
     fn told(self) -> (Spread, Vec<Section>) {
-        let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
+        let section = |(name, all)| Section { name: Cow::Borrowed(name), milliseconds: Spread::of(all) };
         (Spread::of(self.whole), self.sections.into_iter().map(section).collect())
     }
 }

@@ -5,7 +5,8 @@ use crate::error::Result;
 use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 use crate::optim::Stopwatch;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
-use crate::render::{Cameras, DEFAULT_EPS2D, render};
+use crate::render::cuda::{kernel_times, measure_kernels};
+use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
 use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
@@ -34,14 +35,30 @@ pub struct RasterReport {
     pub forward: Spread,
     /// A call that records gradients, and its backward pass.
     pub forward_backward: Spread,
-    /// In the order of the work, on the CPU.
+    /// In the order of the work: the CPU's stages, or a GPU's kernels, all launches of one together.
     pub stages: Vec<Section>,
+    /// How a GPU's results compare to the CPU's.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub against_cpu: Vec<Agreement>,
     /// What there is to blend, per view.
     pub pairs: Pairs,
     /// Of the CPU.
     pub rates: Option<Rates>,
     /// Largest memory of a GPU's tensors, or resident memory, during the calls less that before them, pictures and gradients included.
     pub working_bytes: u64,
+}
+
+/// How one tensor of a GPU's results compares to the CPU's.
+#[derive(Debug, Serialize)]
+pub struct Agreement {
+    /// Such as `rgb`, or `gradient of means`.
+    pub tensor: &'static str,
+    /// How many numbers it has.
+    pub numbers: i64,
+    /// How many of them have other bits.
+    pub other_bits: i64,
+    /// The norm of the differences over the norm of the CPU's numbers.
+    pub relative_difference: f64,
 }
 
 /// What there is to blend in a view.
@@ -105,11 +122,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
         let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
         let pictures = watch.time("with gradients", || render(&leaves, cameras, DEFAULT_EPS2D))?;
-        let objective = [&pictures.rgb, &pictures.alpha, &pictures.depth]
-            .map(|t| t.sum(Kind::Float))
-            .into_iter()
-            .reduce(|a, b| a + b)
-            .expect("three");
+        let objective = sum_of_pictures(&pictures);
         watch.time("with gradients", || objective.backward());
         if round > 0 {
             let [without, with] = [0, 1].map(|section| watch.sections()[section].1.as_secs_f64());
@@ -125,13 +138,13 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         evaluated: counts.evaluated as f64 / views as f64,
         contributing: counts.contributing as f64 / views as f64,
     };
-    let (stages, rates) = match device {
+    let (stages, rates, against_cpu) = match device {
         Device::Cpu => {
             let stages = sections(&stages, per_view);
             let rates = rates(&stages, &pairs);
-            (stages, Some(rates))
+            (stages, Some(rates), vec![])
         }
-        _ => (vec![], None),
+        _ => (kernels(gaussians, cameras, repeats)?, None, against_cpu(gaussians, cameras)?),
     };
     Ok(RasterReport {
         simd: simd_level()?,
@@ -147,15 +160,77 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         forward: Spread::of(forward),
         forward_backward: Spread::of(forward_backward),
         stages,
+        against_cpu,
         pairs,
         rates,
         working_bytes,
     })
 }
 
+/// An objective that every picture's every number takes part in.
+fn sum_of_pictures(pictures: &Pictures) -> Tensor {
+    let [rgb, alpha, depth] = [&pictures.rgb, &pictures.alpha, &pictures.depth].map(|t| t.sum(Kind::Float));
+    rgb + alpha + depth
+}
+
+/// Measures each kernel of a GPU, in calls of their own: events around every launch slow a call down.
+fn kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
+    let views = (cameras.w2c.size()[0] * cameras.w2c.size()[1]) as f64;
+    let mut all: Vec<(String, Vec<f64>)> = vec![];
+    for _ in 0..repeats {
+        measure_kernels(true);
+        pictures_and_gradients(gaussians, cameras)?;
+        for time in kernel_times()? {
+            let milliseconds = time.milliseconds / views;
+            match all.iter_mut().find(|(kernel, _)| *kernel == time.kernel) {
+                Some((_, known)) => known.push(milliseconds),
+                None => all.push((time.kernel, vec![milliseconds])),
+            }
+        }
+    }
+    measure_kernels(false);
+    let section = |(kernel, all): (String, _)| Section { name: kernel.into(), milliseconds: Spread::of(all) };
+    Ok(all.into_iter().map(section).collect())
+}
+
+/// Compares what a GPU draws, and its gradients, to the CPU's.
+fn against_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Agreement>> {
+    let here = pictures_and_gradients(gaussians, cameras)?;
+    let cpu = pictures_and_gradients(&gaussians.to_device(Device::Cpu), &cameras.to_device(Device::Cpu))?;
+    let agreement = |((tensor, here), (_, cpu)): (&(&'static str, Tensor), &(&'static str, Tensor))| {
+        let here = here.to_device(Device::Cpu);
+        let bits = |t: &Tensor| t.contiguous().view_dtype(Kind::Int);
+        Agreement {
+            tensor,
+            numbers: cpu.numel() as i64,
+            other_bits: bits(&here).not_equal_tensor(&bits(cpu)).sum(Kind::Int64).int64_value(&[]),
+            relative_difference: (&here - cpu).norm().double_value(&[]) / cpu.norm().double_value(&[]),
+        }
+    };
+    Ok(here.iter().zip(&cpu).map(agreement).collect())
+}
+
+/// Draws, and takes the gradients of a sum of all pictures.
+fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<(&'static str, Tensor)>> {
+    let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
+    let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
+    sum_of_pictures(&pictures).backward();
+    let Pictures { rgb, alpha, depth } = pictures;
+    Ok(vec![
+        ("rgb", rgb.detach()),
+        ("alpha", alpha.detach()),
+        ("depth", depth.detach()),
+        ("gradient of means", leaves.means.grad()),
+        ("gradient of scales", leaves.scales.grad()),
+        ("gradient of quaternions", leaves.quaternions.grad()),
+        ("gradient of opacities", leaves.opacities.grad()),
+        ("gradient of sh", leaves.sh.grad()),
+    ])
+}
+
 fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section> {
-    let stage = |name, seconds: fn(&StageTimes) -> f64| Section {
-        name,
+    let stage = |name: &'static str, seconds: fn(&StageTimes) -> f64| Section {
+        name: name.into(),
         milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
     };
     vec![

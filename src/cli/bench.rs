@@ -79,7 +79,7 @@ pub struct Raster {
     #[arg(long, conflicts_with_all = ["splat", "gaussians", "cameras", "size"])]
     scaling: bool,
     /// cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu", conflicts_with = "scaling")]
+    #[arg(long, default_value = "cpu")]
     device: String,
     /// Threads that share the work; by default all cores
     #[arg(long, value_name = "N")]
@@ -106,8 +106,10 @@ impl Raster {
                 Error::Request("--gaussians and --cameras are expected to be 1 or more".into()).into()
             );
         }
+        // Before tensors are made: a device that isn't there is told at once.
+        let device = device::parse(&self.device)?;
         if self.scaling {
-            return self.scaling();
+            return self.scaling(device);
         }
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
@@ -121,7 +123,6 @@ impl Raster {
             }
             _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
-        let device = device::parse(&self.device)?;
         let gaussians = gaussians.to_device(device);
         let cameras = cameras.to_device(device);
         let report = bench_raster(&gaussians, &cameras, self.repeats as usize)?;
@@ -211,12 +212,13 @@ impl Loader {
 }
 
 impl Raster {
-    fn scaling(&self) -> Result<()> {
+    fn scaling(&self, device: Device) -> Result<()> {
         let mut reports = vec![];
         let bar = progress::bar((GAUSSIANS.len() * SIZES.len()) as u64, "scenes");
         for count in GAUSSIANS {
             for (width, height) in SIZES {
                 let (gaussians, cameras) = made_up_scene(count, 1, ImageSize { width, height });
+                let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
                 reports.push(bench_raster(&gaussians, &cameras, self.repeats as usize)?);
                 bar.inc(1);
             }
@@ -227,8 +229,8 @@ impl Raster {
             return Ok(());
         }
         println!(
-            "median milliseconds, forward / forward and backward, {} threads, {}",
-            reports[0].threads, reports[0].simd
+            "median milliseconds, forward / forward and backward, {}, {} threads, {}",
+            reports[0].device, reports[0].threads, reports[0].simd
         );
         print!("{:>10}", "Gaussians");
         for (width, height) in SIZES {
@@ -263,6 +265,12 @@ fn print_report(r: &RasterReport) {
     row("forward+backward", &r.forward_backward);
     for stage in &r.stages {
         row(&format!("  {}", stage.name), &stage.milliseconds);
+    }
+    for agreement in &r.against_cpu {
+        println!(
+            "{:<24} {} of {} numbers have other bits than the CPU's, relative difference {:.1e}",
+            agreement.tensor, agreement.other_bits, agreement.numbers, agreement.relative_difference
+        );
     }
     let millions = |n: f64| n * 1e-6;
     println!(

@@ -20,7 +20,7 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
         let share = 1e2 * s.median / whole.median;
         println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
     };
-    sections.iter().for_each(|section| row(section.name, &section.milliseconds));
+    sections.iter().for_each(|section| row(&section.name, &section.milliseconds));
     row(name, whole);
 }
 
