@@ -96,6 +96,13 @@ impl Encoder {
         rounds.flat_map(StreamRound::products).chain(mixers.flat_map(Mixer::products))
     }
 
+    /// See [`StreamRound::fold_weights`].
+    pub(super) fn fold_weights(&mut self) {
+        let appearance = self.appearance.iter_mut().flat_map(|branch| &mut branch.rounds);
+        let rounds = self.geometry_rounds.iter_mut().chain(appearance);
+        rounds.for_each(|round| round.fold_weights(self.precision));
+    }
+
     /// Whether gradients will come back to its weights from what is computed now.
     pub(super) fn is_followed(&self) -> bool {
         is_followed(&self.memory_registers)

@@ -4,7 +4,7 @@ use super::layers::LAYER_NORM_EPS;
 use super::leaves::leaf;
 use super::parts::{does, part};
 use super::precision::Precision;
-use tch::Tensor;
+use tch::{Kind, Tensor};
 
 /// So many views tell what all have in common, where asking every one costs time.
 const VIEWS_OF_MEAN: usize = 4;
@@ -57,6 +57,11 @@ impl Memory {
         Memory { tokens, common }
     }
 
+    /// The same with tokens of a `kind`.
+    pub(super) fn to_kind(&self, kind: Kind) -> Self {
+        Memory { tokens: self.tokens.to_kind(kind), common: self.common.shallow_clone() }
+    }
+
     /// The same where a backward pass ends.
     pub(super) fn leaf(&self) -> Self {
         Memory { tokens: leaf(&self.tokens), common: self.common.shallow_clone() }
@@ -76,7 +81,7 @@ fn normalized(tokens: &Tensor) -> Tensor {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use tch::{Device, Kind};
+    use tch::Device;
 
     /// Numbers that nobody else draws, between −1 and 1; others for another `step`.
     pub(in super::super) fn uneven(step: f64, size: &[i64]) -> Tensor {

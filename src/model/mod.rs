@@ -55,7 +55,7 @@ pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 use crate::error::Result;
 use layers::{ENCODER_STD, drawn, randn, without_drawing};
 use std::collections::HashSet;
-use tch::{Kind, Tensor, nn};
+use tch::{Device, Kind, Tensor, nn};
 
 /// The whole model.
 #[derive(Debug)]
@@ -127,11 +127,14 @@ impl GlobalSplat {
         self.encoder.memory(&tokens.flatten(1, 2))
     }
 
-    /// The first third and the beginning of the second. Image tokens of many views are large: where nobody asks for gradients, it
-    /// goes view by view.
+    /// The first third and the beginning of the second. On a CPU, where nobody asks for gradients, it goes view by view: image tokens of
+    /// many views are large. A GPU has the memory, and would spend the time on launching small kernels.
     pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Memory {
-        if self.encoder.is_followed() {
-            return self.memory_of(&self.tokens(images, c2w, intrinsics));
+        let is_followed = self.encoder.is_followed();
+        if is_followed || images.device() != Device::Cpu {
+            let memory = self.memory_of(&self.tokens(images, c2w, intrinsics));
+            // Once for all rounds; gradients are added up in float32.
+            return if is_followed { memory } else { memory.to_kind(self.precision().kind()) };
         }
         let of_view = |view| {
             let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
@@ -159,6 +162,12 @@ impl GlobalSplat {
     pub fn set_precision(&mut self, precision: Precision) {
         self.encoder.precision = precision;
         self.decoder.precision = precision;
+    }
+
+    /// Computes once, from weights that don't change any more, what every pass would compute of them: fewer kernels for a GPU to launch,
+    /// for more memory. Afterwards weights that are changed or learned have no effect on that.
+    pub fn fold_weights(&mut self) {
+        tch::no_grad(|| self.encoder.fold_weights());
     }
 
     /// What matrix products are computed in.

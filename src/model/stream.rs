@@ -31,6 +31,16 @@ pub(crate) struct StreamRound {
     mlp_scale: LayerScale,
     blocks: Vec<SelfAttentionBlock>,
     heads: i64,
+    folded: Option<FoldedWeights>,
+}
+
+/// How a round reads the memory, computed once from its weights.
+#[derive(Debug)]
+struct FoldedWeights {
+    /// Keys beside values without what all tokens have in common.
+    keys_and_values: nn::Linear,
+    /// What all values have in common, in float32.
+    common_value: nn::Linear,
 }
 
 impl StreamRound {
@@ -51,7 +61,15 @@ impl StreamRound {
                 .map(|i| SelfAttentionBlock::new(&(vs / "tower" / i), d, config.heads))
                 .collect(),
             heads: config.heads,
+            folded: None,
         }
+    }
+
+    /// Computes once what every pass would compute of the weights that the memory is read with, for products in `precision`.
+    pub fn fold_weights(&mut self, precision: Precision) {
+        let nn::Linear { ws, bs } = self.keys_and_values(0, self.query.ws.size()[0]);
+        let keys_and_values = nn::Linear { ws: precision.operand(&ws), bs };
+        self.folded = Some(FoldedWeights { keys_and_values, common_value: self.common_value() });
     }
 
     /// Layers that compute in the precision of products.
@@ -92,13 +110,23 @@ impl StreamRound {
         let width = query.size()[2] / groups;
         let seen: Vec<Tensor> = (0..groups)
             .map(|group| {
-                let read = self.read(group * width, width);
-                let read = part("keys and values", || precision.linear(&read, &memory.tokens)).chunk(2, -1);
                 let query = query.narrow(-1, group * width, width);
+                let read = part("keys and values", || match &self.folded {
+                    Some(folded) if groups == 1 => precision.linear(&folded.keys_and_values, &memory.tokens),
+                    _ => precision.linear(&self.keys_and_values(group * width, width), &memory.tokens),
+                });
+                let read = read.chunk(2, -1);
                 part("cross-attention", || attention(&query, &read[0], &read[1], self.heads / groups))
             })
             .collect();
-        let (seen, by_all) = (Tensor::cat(&seen, -1), self.read_by_all(memory));
+        let by_all = part("keys and values", || match &self.folded {
+            Some(folded) => Precision::F32.linear(&folded.common_value, &memory.common),
+            None => self.read_by_all(memory),
+        });
+        let seen = match &seen[..] {
+            [seen] => seen.shallow_clone(),
+            several => Tensor::cat(several, -1),
+        };
         part("residual sums", || {
             let out = &seen + &by_all;
             does(0, 0, &[&seen, &out]);
@@ -108,7 +136,7 @@ impl StreamRound {
 
     /// Keys beside values without what all have in common, `width` numbers from `first` on of each: W (γ ⊙ y) = (W diag γ) y, so
     /// all rounds share what their norms have in common, and read it in one product.
-    fn read(&self, first: i64, width: i64) -> nn::Linear {
+    fn keys_and_values(&self, first: i64, width: i64) -> nn::Linear {
         let [gamma, _] = self.memory_affine();
         let rows = [&self.key.ws, &self.value.ws].map(|ws| ws.narrow(0, first, width));
         let weights = Tensor::cat(&rows, 0).to_kind(gamma.kind()); // [2 width, token width]
@@ -120,10 +148,17 @@ impl StreamRound {
         let [gamma, beta] = self.memory_affine();
         let exact = |t: &Tensor| t.to_kind(gamma.kind());
         let value = nn::Linear { ws: exact(&self.value.ws), bs: self.value.bs.as_ref().map(exact) };
-        let of_values =
-            part("keys and values", || Precision::F32.linear(&value, &(&memory.common * gamma + beta)));
+        let of_values = Precision::F32.linear(&value, &(&memory.common * gamma + beta));
         // A gradient of 0, where there would be none: everything that is learned has one.
         of_values + self.key.bs.as_ref().map(exact).expect("a bias") * 0.
+    }
+
+    /// The same as a layer of c: (W_v diag γ) c + (W_v β + b_v).
+    fn common_value(&self) -> nn::Linear {
+        let [gamma, beta] = self.memory_affine();
+        let exact = |t: &Tensor| t.to_kind(gamma.kind());
+        let [value, bias] = [&self.value.ws, self.value.bs.as_ref().expect("a bias")].map(exact);
+        nn::Linear { bs: Some(value.mv(beta) + bias), ws: value * gamma }
     }
 
     /// γ and β of the memory's norm, [token width] each.
@@ -180,6 +215,30 @@ mod tests {
     use super::super::memory::tests::{alike, uneven};
     use super::*;
     use tch::no_grad;
+
+    #[test]
+    fn folded_weights_read_the_same() {
+        let config = ModelConfig { width: 32, heads: 2, rgb_width: 16, ray_width: 8, ..Default::default() };
+        let vs = nn::VarStore::new(Device::Cpu);
+        let mut round = StreamRound::new(&vs.root(), &ModelConfig { heads: 1, ..config });
+        for (name, mut value) in vs.variables() {
+            let is_read_with = ["mem_k", "mem_v", "mem_ln"].iter().any(|layer| name.starts_with(layer));
+            if is_read_with {
+                no_grad(|| value.copy_(&uneven(1.3, &value.size())));
+            }
+        }
+        let (query, memory) = (uneven(0.9, &[2, 9, 32]), Memory::new(&alike(30)));
+        for (precision, most) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
+            let [query, memory] = [query.to_kind(precision.kind()), memory.tokens.to_kind(precision.kind())];
+            let memory = Memory { tokens: memory, common: Memory::new(&alike(30)).common };
+            round.folded = None;
+            let expected = no_grad(|| round.look(&query, &memory, precision));
+            no_grad(|| round.fold_weights(precision));
+            let found = no_grad(|| round.look(&query, &memory, precision));
+            let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
+            assert!(error < most, "{precision}: {error:.1e}");
+        }
+    }
 
     #[test]
     fn tokens_that_are_alike_are_told_apart_in_bf16() {

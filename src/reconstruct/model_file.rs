@@ -213,9 +213,12 @@ impl ModelFile {
             return Err(Error::input(self.weights.path(), "the number of weights", numbers, expected));
         }
         let mut vs = nn::VarStore::new(device);
-        let model = GlobalSplat::to_be_filled(&mut vs, &self.config.model, precision)?;
+        let mut model = GlobalSplat::to_be_filled(&mut vs, &self.config.model, precision)?;
         let ModelFile { weights, config, stage, assumed, .. } = self;
         let lent = fill(weights, &vs)?;
+        if device != Device::Cpu {
+            model.fold_weights();
+        }
         Ok(LoadedModel { model, config, stage, vs, lent, assumed })
     }
 }
