@@ -129,7 +129,7 @@ impl Eval {
         if self.chooses_size() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let mut made = self.method(model).synthesize(scene)?;
+        let mut made = self.method(model).synthesize(scene, device)?;
         warn(&made.warnings);
         let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
         let perceptual = Perceptual::find(device)?;
@@ -353,6 +353,7 @@ impl Eval {
                 index,
                 picture_size,
                 machine: machine(device)?,
+                device,
                 out: &folder,
                 group: &group,
             };

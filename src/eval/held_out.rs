@@ -185,9 +185,10 @@ fn judge_views(
     target: Vec<View>,
 ) -> Result<HeldOutScores> {
     let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
-    let reconstruction = reconstruct(trainer.as_model(), &context, &poses)?;
-    let rendered =
-        render_views(&reconstruction.gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
+    let model = trainer.as_model();
+    let reconstruction = reconstruct(model, &context, &poses)?;
+    let gaussians = reconstruction.gaussians.to_device(model.device);
+    let rendered = render_views(&gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
     let pictures: Vec<Tensor> = rendered.into_iter().map(|rendered| rendered.rgb).collect();
     let ours = score(name, &pictures, &target, Some(reconstruction.gaussians.count()))?;
     let [context, target] = [context, target].map(PhotoSource::Loaded);

@@ -15,7 +15,7 @@ use crate::render::{Rendered, SplatRenderer};
 use crate::scene::{Camera, ImageSize, LocalFrame};
 use glam::{DMat4, DVec3};
 use std::path::{Path, PathBuf};
-use tch::Tensor;
+use tch::{Device, Tensor};
 
 /// Makes pictures of a scene's target views.
 #[derive(Debug, Clone)]
@@ -86,11 +86,11 @@ impl Method<'_> {
         }
     }
 
-    /// Makes pictures of the scene's target views, the first of them at once.
+    /// Makes pictures of the scene's target views, rendered on `device`, the first of them at once.
     ///
     /// # Errors
     /// Whatever the reconstruction fails with, a splat that can't be read, a first photo or picture that can't.
-    pub fn synthesize(&self, scene: EvalScene) -> Result<Synthesis> {
+    pub fn synthesize(&self, scene: EvalScene, device: Device) -> Result<Synthesis> {
         let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
                 let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
@@ -98,12 +98,13 @@ impl Method<'_> {
                 // The normalized world is a local frame already.
                 let frame = LocalFrame { origin: DVec3::ZERO, scale: 1. };
                 let renderer = SplatRenderer::new(&made.gaussians, DVec3::ZERO, frame);
-                let source = PictureSource::Splat(renderer, made.target_poses);
+                let source = PictureSource::Splat(renderer.to_device(device), made.target_poses);
                 (source, Some(splat), Some(made.forward_time.as_secs_f64()))
             }
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
-                (PictureSource::Splat(splat.renderer(), scene.target.poses()), Some(splat), None)
+                let renderer = splat.renderer().to_device(device);
+                (PictureSource::Splat(renderer, scene.target.poses()), Some(splat), None)
             }
             Method::Renders(folder) => (PictureSource::Folder(folder.clone()), None, None),
         };

@@ -20,7 +20,7 @@ use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::mpsc::sync_channel;
-use tch::Tensor;
+use tch::{Device, Tensor};
 
 /// What to evaluate, and where to.
 #[derive(Debug)]
@@ -43,6 +43,8 @@ pub struct Sweep<'a> {
     pub picture_size: ImageSize,
     /// Processor, cores and device.
     pub machine: String,
+    /// What splats are rendered on.
+    pub device: Device,
     /// The folder for `scenes/`.
     pub out: &'a Path,
     /// The processes that share the scenes out. All of them see `out`.
@@ -196,7 +198,7 @@ impl Sweep<'_> {
             scope.spawn(move || loader.send(own, &sender));
             while go_on && let Ok((key, loaded)) = receiver.recv() {
                 let method = self.method.of_scene(&key);
-                let made = loaded.and_then(|scene| method.synthesize(scene));
+                let made = loaded.and_then(|scene| method.synthesize(scene, self.device));
                 let first = made.is_ok().then(|| judges.take()).flatten();
                 let warm_up = first.is_some();
                 if let Some(judges) = first {

@@ -114,7 +114,7 @@ pub fn reconstruct<'a>(
     best_placed(model, photos, &views, &normalization)
 }
 
-/// What the model makes of `views`, those of each photo, seen from the photos' `poses` in a normalized world.
+/// What the model makes of `views`, those of each photo, seen from the photos' `poses` in a normalized world, on the model's device.
 fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, Gaussians)> {
     let Model { network, config, stage, device, lent, .. } = model;
     let posed =
@@ -142,6 +142,5 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, 
         ),
         None => pass(),
     });
-    // Bringing the Gaussians to the host also waits for a GPU.
-    Ok((encoded, decoded.gaussians.to_device(Device::Cpu)))
+    Ok((encoded, decoded.gaussians))
 }

@@ -5,10 +5,11 @@ use crate::data::{View, cameras_at};
 use crate::error::Result;
 use crate::loss::mse;
 use crate::model::Encoded;
-use crate::render::render_views;
+use crate::render::{Rendered, render_views};
 use crate::scene::{Gaussians, Normalization, Placement};
 use glam::DMat4;
 use std::time::Instant;
+use tch::Device;
 
 /// What a placement is changed by: cameras are moved forward, and then the scene is enlarged, by a factor's logarithm.
 const NUDGES: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
@@ -52,6 +53,8 @@ pub(super) fn best_placed(
         }
     }
     let Attempt { placement, tokens, gaussians, .. } = best;
+    // To be written to files. This waits for a GPU.
+    let gaussians = gaussians.to_device(Device::Cpu);
     let forward_time = start.elapsed();
     let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
     let target_poses = c2w[photos.len()..].to_vec();
@@ -81,7 +84,9 @@ impl Attempt {
 /// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.
 fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
     let rendered = render_views(gaussians, &cameras_at(photos, poses))?;
-    let errors =
-        rendered.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
+    let error = |(made, photo): (&Rendered, &View)| {
+        mse(&made.rgb, &photo.image.to_device(made.rgb.device())).double_value(&[])
+    };
+    let errors = rendered.iter().zip(photos).map(error);
     Ok(errors.sum::<f64>() / photos.len() as f64)
 }

@@ -4,7 +4,7 @@ use super::{Cameras, DEFAULT_EPS2D, render};
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, LocalFrame};
 use glam::DVec3;
-use tch::Tensor;
+use tch::{Device, Tensor};
 
 /// What a camera saw of a splat.
 #[derive(Debug)]
@@ -50,18 +50,29 @@ impl SplatRenderer {
         SplatRenderer { gaussians: frame.gaussians_to_local(gaussians, origin), frame }
     }
 
+    /// Renders on `device` from now on.
+    pub fn to_device(self, device: Device) -> Self {
+        SplatRenderer { gaussians: self.gaussians.to_device(device), frame: self.frame }
+    }
+
     /// Returns the frame that the splat is rendered in.
     pub fn frame(&self) -> LocalFrame {
         self.frame
     }
 
-    /// Renders the splat from each camera, which may differ in size. Depth is in world units.
+    /// Renders the splat from each camera, which may differ in size. Pictures are on the host, whatever the device; depth is in world
+    /// units.
     ///
     /// # Errors
     /// Those of [`render`].
     pub fn render(&self, cameras: &[Camera]) -> Result<Vec<Rendered>> {
-        let mut rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
-        rendered.iter_mut().for_each(|view| view.depth = &view.depth * self.frame.scale);
-        Ok(rendered)
+        let rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
+        let to_host = |t: Tensor| t.to_device(Device::Cpu);
+        let finish = |view: Rendered| Rendered {
+            rgb: to_host(view.rgb),
+            alpha: to_host(view.alpha),
+            depth: to_host(view.depth * self.frame.scale),
+        };
+        Ok(rendered.into_iter().map(finish).collect())
     }
 }
