@@ -88,7 +88,7 @@ def main(argv=None):
     answerer = program(options.binary, options.device)
     try:
         for seed in range(options.seed, options.seed + options.repeat):
-            results += hold(names, seed, answerer, options.self_test, progress)
+            results += hold(names, seed, answerer, options.self_test, progress, options.device != "cpu")
     except ProgramError as error:
         progress("")
         print(error, file=sys.stderr)

@@ -86,7 +86,7 @@ def cotangents(rng, request, outputs, doubtful):
     return drawn
 
 
-def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None):
+def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None, on_gpu=False):
     """Yields a Result for every draw of the named cases."""
     drawn_questions = []
     for question in questions(names, seed):
@@ -101,11 +101,12 @@ def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None):
     for done, (question, answer) in enumerate(zip(drawn_questions, answers), start=1):
         drawn = question.drawn
         on_progress(f"comparison, {done} of {len(drawn_questions)} draws: {question.case}, {drawn.label}")
-        findings = compare(answer, question.expected, drawn.tolerance, drawn.doubtful)
+        tolerance = (on_gpu and drawn.on_gpu) or drawn.tolerance
+        findings = compare(answer, question.expected, tolerance, drawn.doubtful)
         doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
         result = Result(
-            question.case, drawn.label, seed, drawn.tolerance, findings, doubtful, question.seconds, drawn.large
+            question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds, drawn.large
         )
         if self_test and result.passed:
-            result.tried, result.blind = undetected(answer, question.expected, drawn.tolerance, drawn.doubtful)
+            result.tried, result.blind = undetected(answer, question.expected, tolerance, drawn.doubtful)
         yield result

@@ -29,6 +29,7 @@ class Draw:
     differentiate: tuple = ()
     module: str = ""
     tolerance: Tolerance = FLOAT32
+    on_gpu: Tolerance | None = None  # instead of `tolerance`, where a library's own rounding is larger there
     gradients: bool = True
     large: bool = False  # the reference computes in float32, on more than one core
     doubtful: np.ndarray | None = None  # pixels on a threshold, [B, C, H, W]
