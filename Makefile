@@ -7,7 +7,7 @@ export PYTHONUTF8 := 1
 .NOTPARALLEL:
 CARGO ?= cargo
 
-.PHONY: all setup venv weights build demo demo-training test checks parity bench docker clean
+.PHONY: all setup venv weights build demo demo-training gpu-bundle test checks parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
@@ -31,6 +31,16 @@ demo: build
 # Trains the shipped weights on a few scenes, and compares views before and after: about 10 minutes.
 demo-training: build
 	@scripts/demo.sh --training
+
+# The program without debug information, and the files of the repository, for scripts/on_a_gpu.sh on a machine that can't build it.
+BUNDLE := target/gpu-bundle
+gpu-bundle: build
+	@rm -rf $(BUNDLE) && mkdir -p $(BUNDLE)/globalsplat/target/release
+	@git archive HEAD | tar -x -C $(BUNDLE)/globalsplat
+	@strip -o $(BUNDLE)/globalsplat/target/release/globalsplat target/release/globalsplat
+	@tar -czf $(BUNDLE).tar.gz -C $(BUNDLE) globalsplat
+	@tar -tzf $(BUNDLE).tar.gz >$(BUNDLE).txt
+	@echo "$(BUNDLE).tar.gz: $$(du -h $(BUNDLE).tar.gz | cut -f1), $$(wc -l <$(BUNDLE).txt) files, listed in $(BUNDLE).txt"
 
 # Every check, also after one has failed; the last line says how many tests were skipped for want of something.
 test:

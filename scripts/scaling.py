@@ -6,7 +6,7 @@
 
 From three measured parts: how many bytes of gradients a step adds up, in which share of a step that can be hidden, both by
 `torchrun … bench train`, and the milliseconds that a GPU takes for a scene. The last was not measured on any GPU yet; it follows
-from a count of operations and a guess at how much of its peak a GPU reaches, and `bench train --device cuda` will tell.
+from a count of operations and a guess at how much of its peak a GPU reaches, beside which docs/gpu.md has what an H200 takes.
 """
 
 import argparse
