@@ -4,9 +4,9 @@
     scripts/scaling.py                      with the numbers below
     scripts/scaling.py --gradients 337.3 --hides 0.4 --scene 40 270
 
-From three measured parts: how many bytes of gradients a step adds up, in which share of a step that can be hidden, both by
-`torchrun … bench train`, and the milliseconds that a GPU takes for a scene. The last was not measured on any GPU yet; it follows
-from a count of operations and a guess at how much of its peak a GPU reaches, beside which docs/gpu.md has what an H200 takes.
+From three parts: how many bytes of gradients a step adds up, in which share of a step that can be hidden, both measured by
+`torchrun … bench train`, and the milliseconds that a GPU takes for a scene. The last follows from a count of operations and a share of
+a GPU's peak; docs/gpu.md has what an H200 takes without L_perc.
 """
 
 import argparse

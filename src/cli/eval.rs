@@ -11,7 +11,7 @@ use globalsplat::eval::{
     PhotoSource, REPORT, Sweep, TABLE, evaluation_files, judge, machine, peak_memory_bytes, write_csv,
     write_evaluation, write_report,
 };
-use globalsplat::io::{Inputs, WeightsFile, check_writable_dir, check_writable_png, checksum, weights_files};
+use globalsplat::io::{Inputs, WeightsFile, check_writable_dir, check_writable_png, checksum};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, context_views};
 use globalsplat::scene::ImageSize;
@@ -253,7 +253,7 @@ impl Eval {
     fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> Inputs {
         let mut inputs = Inputs::default();
         match &self.weights {
-            Some(weights) => weights_files(weights).iter().for_each(|file| inputs.add(file)),
+            Some(weights) => inputs.add_weights(weights),
             None => methods.for_each(|method| method.add_inputs(&mut inputs)),
         }
         inputs

@@ -1,7 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::io::{Inputs, weights_files};
+use globalsplat::io::Inputs;
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
@@ -32,7 +32,7 @@ pub struct Import {
 impl Import {
     pub fn run(self) -> Result<()> {
         let mut inputs = Inputs::default();
-        weights_files(&self.from).iter().for_each(|file| inputs.add(file));
+        inputs.add_weights(&self.from);
         self.out.check(Format::Safetensors, &inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;

@@ -6,7 +6,7 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{Inputs, check_writable_splat, weights_files};
+use globalsplat::io::{Inputs, check_writable_splat};
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
 use globalsplat::scene::{ImageSize, LocalFrame};
@@ -103,8 +103,7 @@ impl Reconstruct {
         let capture = watch.time("photos", || open_capture(&self.scene))?;
         let mut inputs = Inputs::default();
         capture.add_inputs(&mut inputs);
-        let weights = self.weights.iter().flat_map(|path| weights_files(path));
-        weights.for_each(|file| inputs.add(&file));
+        self.weights.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {

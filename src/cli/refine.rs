@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use globalsplat::data::{Capture, Holdout, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, process_age, score_views};
-use globalsplat::io::{Inputs, Splat, check_writable_png, check_writable_splat, read_splat, weights_files};
+use globalsplat::io::{Inputs, Splat, check_writable_png, check_writable_splat, read_splat};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
 use globalsplat::refine::{
@@ -341,10 +341,9 @@ impl Refine {
     fn check_outputs(&self, capture: &Capture) -> Result<()> {
         let mut inputs = Inputs::default();
         capture.add_inputs(&mut inputs);
-        let weights = self.weights.iter().flat_map(|path| weights_files(path));
-        weights.for_each(|file| inputs.add(&file));
+        self.weights.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_file(&self.out)?;
-        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add(splat));
+        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add_splat(splat));
         Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 }

@@ -5,7 +5,7 @@ use globalsplat::config::Config;
 use globalsplat::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::{Inputs, check_writable_dir, weights_files};
+use globalsplat::io::{Inputs, check_writable_dir};
 use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
@@ -140,7 +140,7 @@ impl Train {
         for path in config.data.validation_paths()? {
             Dataset::open(&path, Split::Test)?.add_inputs(&self.out, &mut inputs);
         }
-        self.from.iter().flat_map(|path| weights_files(path)).for_each(|file| inputs.add(&file));
+        self.from.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_folder(&self.out)?;
         let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
         Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)

@@ -123,7 +123,7 @@ impl Method<'_> {
     pub fn add_inputs(&self, inputs: &mut Inputs) {
         match self {
             Method::Model(_) => {}
-            Method::Splat(file) => inputs.add(file),
+            Method::Splat(file) => inputs.add_splat(file),
             Method::Renders(folder) => {
                 let pictures = std::fs::read_dir(folder).into_iter().flatten().flatten();
                 pictures.for_each(|picture| inputs.add_photo(&picture.path()));

@@ -1,5 +1,7 @@
 //! The files that a command reads, which nothing that it writes may replace.
 
+use super::splat::origin_file;
+use super::weights_file::weights_files;
 use crate::error::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -30,6 +32,17 @@ impl Inputs {
     /// Adds `file`, if it is there.
     pub fn add(&mut self, file: &Path) {
         self.files.extend(file_id(file).map(|id| (id, Kind::Other)));
+    }
+
+    /// Adds the files that hold the weights at `path`: one, or an index and what it names.
+    pub fn add_weights(&mut self, path: &Path) {
+        weights_files(path).iter().for_each(|file| self.add(file));
+    }
+
+    /// Adds the splat `file` and the file of its origin.
+    pub fn add_splat(&mut self, file: &Path) {
+        self.add(file);
+        self.add(&origin_file(file));
     }
 
     /// Adds every file in `folder`, and in folders below it.
@@ -97,4 +110,21 @@ fn file_id(path: &Path) -> Option<FileId> {
 #[cfg(not(unix))]
 fn file_id(path: &Path) -> Option<FileId> {
     path.canonicalize().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_splat_is_its_file_and_its_origins() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let splat = folder.path().join("room.ply");
+        let origin = origin_file(&splat);
+        [&splat, &origin].iter().for_each(|file| fs::write(file, "").expect("a file"));
+        let mut inputs = Inputs::default();
+        inputs.add_splat(&splat);
+        assert!(inputs.check_file(&splat).is_err() && inputs.check_file(&origin).is_err());
+        assert!(inputs.check_file(&folder.path().join("other.ply")).is_ok());
+    }
 }

@@ -41,7 +41,7 @@ pub use splat::{
 };
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};
-pub use weights_file::{LentWeights, WeightsFile, is_weights_name, read_weights, weights_files};
+pub use weights_file::{LentWeights, WeightsFile, is_weights_name, read_weights};
 
 pub(crate) use torch_file::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 

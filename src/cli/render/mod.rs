@@ -8,7 +8,7 @@ use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, Inputs, Splat, read_splat, tiled_size, weights_files};
+use globalsplat::io::{DepthScale, Inputs, Splat, read_splat, tiled_size};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{Rendered, SplatRenderer};
@@ -170,8 +170,8 @@ impl Render {
     /// The files that are read, which no output may replace.
     fn inputs(&self, capture: Option<&Capture>) -> Inputs {
         let mut inputs = Inputs::default();
-        let weights = self.weights.iter().flat_map(|path| weights_files(path));
-        weights.chain(self.splat.clone()).for_each(|file| inputs.add(&file));
+        self.weights.iter().for_each(|path| inputs.add_weights(path));
+        self.splat.iter().for_each(|splat| inputs.add_splat(splat));
         capture.inspect(|capture| capture.add_inputs(&mut inputs));
         inputs
     }
