@@ -544,6 +544,27 @@ fn the_synthetic_layout_has_views_to_learn_from_and_views_to_hold_out() {
 }
 
 #[test]
+fn nerfstudios_lists_of_filenames_hold_photos_out() {
+    let folder = photos_alone();
+    let images = in_images(&names());
+    let lists = |held_out: Value| {
+        write_transforms(folder.path(), |contents| {
+            contents["train_filenames"] = json!(images[..2]);
+            contents["val_filenames"] = held_out.clone();
+        });
+    };
+    lists(json!([format!("./{}", images[3])]));
+    let capture = open_capture(folder.path()).unwrap();
+    assert_eq!(capture.split(Holdout::None), (vec![0, 1], vec![2]));
+    assert_eq!(capture.names().collect::<Vec<_>>(), [&images[0], &images[1], &images[3]]);
+    assert_warns(&capture, &["transforms.json", "2 frames are left out"]);
+
+    lists(json!([1]));
+    let error = open_capture(folder.path()).unwrap_err().to_string();
+    assert!(error.contains("val_filenames") && error.contains("a list of file_paths"), "{error}");
+}
+
+#[test]
 fn cameras_of_models_that_are_not_read_do_no_harm_until_they_are_used() {
     let folder = photos_alone();
     let model = folder.path().join("sparse/0");

@@ -14,6 +14,7 @@ use crate::io::{read_image_size, read_text};
 use crate::scene::{Camera, Intrinsics, nearest_rigid_of_scaled};
 use glam::{DMat4, DVec4};
 use serde_json::Value;
+use std::collections::HashSet;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
@@ -23,6 +24,10 @@ const FILE_NAME: &str = "transforms.json";
 /// Files of NeRF's synthetic scenes: views to learn from, and those that are judged, of which the first that is there counts.
 const TRAIN_FILE: &str = "transforms_train.json";
 const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
+
+/// nerfstudio's lists of photos to learn from, and of those that are judged, of which the first that is there counts.
+const TRAIN_LIST: &str = "train_filenames";
+const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
 
 /// Lenses that [`Distortion`] describes.
 const CAMERA_MODELS: [&str; 6] =
@@ -51,11 +56,11 @@ pub(super) fn find(path: &Path) -> Option<Found> {
         let mut capture = read(&train, purpose)?;
         if !others.is_empty() {
             let test = others.remove(0);
-            let (frames, changes) = read_frames(&test, purpose)?;
+            let (frames, changes, _) = read_frames(&test, purpose)?;
             capture = capture.with_test(&test, frames, changes, purpose)?;
         }
         let unread = others.iter().map(|file| {
-            let views = read_frames(file, purpose).map_or(0, |(frames, _)| frames.len());
+            let views = read_frames(file, purpose).map_or(0, |(frames, ..)| frames.len());
             format!(
                 "{}: its {views} views are left out, as {} has those to hold out",
                 file.display(),
@@ -68,8 +73,60 @@ pub(super) fn find(path: &Path) -> Option<Found> {
 
 /// Reads the capture that `file` describes.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
-    let (frames, changes) = read_frames(file, purpose)?;
-    Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose)
+    let (frames, changes, lists) = read_frames(file, purpose)?;
+    let new = |frames| Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose);
+    let Lists { train, test, unread } = lists;
+    // A path of cameras is all of them, in their order.
+    if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
+        return new(frames);
+    }
+    let (held_out, mut rest): (Vec<_>, Vec<_>) =
+        frames.into_iter().partition(|frame| test.contains(&listed(&frame.name)));
+    let others = rest.extract_if(.., |frame| {
+        let name = listed(&frame.name);
+        unread.contains(&name) || train.as_ref().is_some_and(|train| !train.contains(&name))
+    });
+    let others = others.count();
+    let warnings = (others > 0).then(|| {
+        let file = file.display();
+        format!("{file}: {others} frames are left out, as they are neither to learn from nor held out by its lists of filenames")
+    });
+    Ok(new(rest)?
+        .with_test(file, held_out, Changes::default(), purpose)?
+        .with_warnings(warnings.into_iter().collect()))
+}
+
+/// The name of a photo without what lists may write in another way.
+fn listed(name: &str) -> String {
+    portable(name).trim_start_matches("./").to_owned()
+}
+
+/// Names of photos in nerfstudio's lists.
+struct Lists {
+    /// To learn from, where there is such a list.
+    train: Option<HashSet<String>>,
+    /// To be judged.
+    test: HashSet<String>,
+    /// For validation, where others are judged.
+    unread: HashSet<String>,
+}
+
+impl Lists {
+    fn read(file: &Path, json: &Value) -> Result<Self> {
+        let list = |key: &str| match json.get(key) {
+            None | Some(Value::Null) => Ok(None),
+            Some(Value::Array(names)) => {
+                let name = |name: &Value| name.as_str().map(listed);
+                let names: Option<HashSet<_>> = names.iter().map(name).collect();
+                names.map(Some).ok_or_else(|| Error::input(file, key, "no names", "a list of file_paths"))
+            }
+            other => Err(Error::input(file, key, shown(other), "a list of file_paths")),
+        };
+        let [test, validation] = TEST_LISTS.map(list);
+        let mut lists = [test?, validation?].into_iter().flatten();
+        let (test, unread) = (lists.next().unwrap_or_default(), lists.next().unwrap_or_default());
+        Ok(Lists { train: list(TRAIN_LIST)?, test, unread })
+    }
 }
 
 fn root(file: &Path) -> &Path {
@@ -78,7 +135,7 @@ fn root(file: &Path) -> &Path {
 
 /// Reads the frames that `file` describes, in the order of their names, numbers in them by value. Those whose image isn't there are
 /// left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
-fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes)> {
+fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
     let text = read_text(file)?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
     let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
@@ -107,7 +164,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes)> {
         }
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Ok((frames, changes))
+    Ok((frames, changes, Lists::read(file, &json)?))
 }
 
 /// What stands in the file, for an error.
