@@ -65,7 +65,7 @@ pub fn bench_model(
     let stage = config.curriculum.final_stage();
     let yardstick = Yardstick::new(precision, device);
     let ViewBatch { images, c2w, intrinsics, .. } = &context;
-    let mut forward = || {
+    let forward = || {
         let mut watch = Stopwatch::of(device);
         drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
         1e3 * watch.sections()[0].1.as_secs_f64()
@@ -77,8 +77,8 @@ pub fn bench_model(
     for _ in 0..repeats {
         products.push(yardstick.time());
         // A GPU that works faster than kernels are launched is slowed down by the events around every part.
-        let untold = (device != Device::Cpu).then(&mut forward);
-        let told = parts.watch(device, &mut forward);
+        let untold = (device != Device::Cpu).then(forward);
+        let told = parts.watch(device, forward);
         passes.push(untold.unwrap_or(told));
     }
     let peak_gflops = yardstick.gflops(Spread::of(products).least);
