@@ -11,7 +11,7 @@
 
 #define GS_EMULATED
 #define __global__
-#define __launch_bounds__(threads)
+#define __launch_bounds__(...)
 #define GS_SHARED(type, name, extents) type(&name) extents = ::globalsplat::cuda::emulated::shared<type extents>()
 #define threadIdx (::globalsplat::cuda::emulated::thread_index())
 #define blockIdx (::globalsplat::cuda::emulated::block_index())

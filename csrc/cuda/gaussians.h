@@ -74,9 +74,10 @@ __global__ void __launch_bounds__(kGaussianThreads)
   const auto records_of = [&](int64_t k) {
     return raster::SplatRecords<float>{records, first + (view + k) * call.count};
   };
+  const Fold<raster::kCameraNumbers, kWarp> fold;
   const auto sum_over_warp = [&](int64_t k, const float(&numbers)[raster::kCameraNumbers]) {
-    const Folded folded = fold(numbers);
-    if (folded.which >= 0 && own_warp < warps) asked[(view + k) * warps + own_warp].numbers[folded.which] = folded.sum;
+    const float sum = fold(numbers);
+    if (fold.which >= 0 && own_warp < warps) asked[(view + k) * warps + own_warp].numbers[fold.which] = sum;
   };
   with_bases(scene_of(gaussians, blockIdx.y), [&](const Gaussians<float>& scene) {
     raster::lane::project_backward_group(scene, i, end, lenses + view, call.cameras, records_of,

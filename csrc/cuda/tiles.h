@@ -1,6 +1,6 @@
 // Blends tiles, forward and backward: the maths of raster/pixel.h, a pixel a thread and a tile a block (spec 6.4 and 6.5).
 //
-// A warp has 8×4 pixels, two of a tile's 4×4 blocks side by side, and passes by the splats that reach neither.
+// Each half of a warp has one of the tile's 4×4 blocks of pixels, and goes through the splats that reach this block.
 #pragma once
 
 #include "pixel.h"
@@ -9,30 +9,44 @@
 namespace globalsplat::cuda {
 
 inline constexpr int kTileWarps = kTileThreads / kWarp;
-inline constexpr int kBatch = kWarp;  // entries that are taken at a time
+inline constexpr int kHalf = kWarp / 2;       // lanes of a block of pixels
+inline constexpr int kBatch = kWarp;          // entries that are taken at a time
+inline constexpr int kNothing = kBatch;       // the place behind a batch, where a splat without effect is
 static_assert(sizeof(Splat<float>) == 64 && kTileThreads * 2 == kBatch * 16, "a batch's splats are two numbers a thread");
+static_assert(raster::kBlocks == 2 * kTileWarps && raster::kBlock * raster::kBlock == kHalf, "two blocks a warp");
+
+// Blocks of the backward pass that fit a multiprocessor at least: as many as leave enough registers for a thread.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 900
+inline constexpr int kBackwardBlocks = 5;
+#else
+inline constexpr int kBackwardBlocks = 4;
+#endif
 
 using Evaluated = raster::lane::Evaluated<float>;
 
-// Bits of TileEntry::blocks that are this warp's: warps go by rows, two in each.
-inline uint32_t own_blocks() { return 3u << (2 * warp()); }
+// In which half of its warp a thread is, and which of the tile's blocks is that half's: warps go by rows, two in each.
+inline int half() { return lane() / kHalf; }
+inline int own_block() { return 2 * warp() + half(); }
 
 // This thread's pixel.
 struct Pixel {
   int x, y;
   bool inside;    // the picture
   int64_t place;  // in a plane
+  uint32_t eighth;
 
-  explicit Pixel(const Grid& grid) {
-    const int tile = int(blockIdx.x);
-    x = tile % grid.columns * raster::kTile + warp() % 2 * 8 + lane() % 8;
-    y = tile / grid.columns * raster::kTile + warp() / 2 * 4 + lane() / 8;
+  explicit Pixel(const Grid& grid) : eighth(raster::kExp2Eighths[lane() % 8]) {
+    const int tile = int(blockIdx.x), block = own_block(), own = lane() % kHalf;
+    x = tile % grid.columns * raster::kTile + block % 4 * raster::kBlock + own % raster::kBlock;
+    y = tile / grid.columns * raster::kTile + block / 4 * raster::kBlock + own / raster::kBlock;
     inside = x < grid.width && y < grid.height;
     place = int64_t(y) * grid.width + x;
   }
+  // All of a warp together, whose lanes have the table of 2^(i/8): asking another lane is faster than asking memory.
   Evaluated evaluate(const Splat<float>& splat) const {
     Evaluated e;
-    raster::lane::evaluate(splat, float(x) + 0.5f, float(y) + 0.5f, e);
+    raster::lane::evaluate(splat, float(x) + 0.5f, float(y) + 0.5f, e,
+                           [&](uint32_t i) { return __shfl_sync(kAll, eighth, int(i % kWarp)); });
     return e;
   }
 };
@@ -44,14 +58,43 @@ inline Pictures<Number> pictures_of(const Pictures<Number>& all, const Grid& gri
   return {all.rgb + 3 * plane * view, all.alpha + plane * view, all.depth + plane * view};
 }
 
+// Has no α, and all of its numbers are finite.
+inline Splat<float> nothing() {
+  Splat<float> splat{};
+  splat.log2_opacity = -1e30f;
+  return splat;
+}
+
+// Which items of a batch the halves of a warp go through: those that reach their blocks, in their order.
+using Order = uint8_t[2][kBatch];
+
+// Each lane tells by two bits which of the warp's blocks its item reaches. `order` receives both halves' items, and kNothing behind
+// the last; returns how many the longer list has. The warp has to meet before it reads them.
+inline int list_items(uint32_t blocks, Order& order) {
+  int longest = 0;
+  for (int k = 0; k < 2; ++k) {
+    const bool reaches = (blocks >> k & 1) != 0;
+    const unsigned reaching = __ballot_sync(kAll, reaches);
+    const int count = __popc(reaching);
+    order[k][__popc((reaches ? reaching : ~reaching) & before()) + (reaches ? 0 : count)] = uint8_t(reaches ? lane() : kNothing);
+    if (count > longest) longest = count;
+  }
+  return longest;
+}
+
 extern "C" {
 
-// Warps go on by themselves: each keeps those of a batch that reach its pixels.
+// Warps go on by themselves: each fetches those of a batch that reach its pixels.
 __global__ void __launch_bounds__(kTileThreads)
     gs_blend(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
              Pictures<float> pictures) {
-  GS_SHARED(Splat<float>, batches, [kTileWarps][kBatch]);
-  Splat<float>(&batch)[kBatch] = batches[warp()];
+  struct Shared {
+    Splat<float> batch[kBatch + 1];
+    Order order;
+  };
+  GS_SHARED(Shared, of_warps, [kTileWarps]);
+  auto& [batch, orders] = of_warps[warp()];
+  if (lane() == 0) batch[kNothing] = nothing();
   const int64_t tile = int64_t(blockIdx.y) * call.grid.tiles() + blockIdx.x;
   const Pixel pixel(call.grid);
   raster::lane::Pixels<float> sums{pixel.inside ? 1.0f : 0.0f};
@@ -59,12 +102,15 @@ __global__ void __launch_bounds__(kTileThreads)
   for (uint32_t begin = tile_start[tile]; begin < end; begin += kBatch) {
     if (!__any_sync(kAll, sums.transmittance > 0)) break;
     const uint32_t at = begin + uint32_t(lane());
-    const bool reaches = at < end && (entries[at].blocks & own_blocks()) != 0;
-    const unsigned reaching = __ballot_sync(kAll, reaches);
-    if (reaches) batch[__popc(reaching & before())] = splats[entries[at].splat];
+    const uint32_t blocks = at < end ? entries[at].blocks >> (2 * warp()) & 3 : 0;
+    if (blocks != 0) batch[lane()] = splats[entries[at].splat];
+    const int count = list_items(blocks, orders);
     __syncwarp();
-    for (int k = 0; k < __popc(reaching); ++k)
-      raster::lane::add(batch[k], raster::lane::blend<float>(sums.transmittance, pixel.evaluate(batch[k]).raw), sums);
+    const uint8_t(&order)[kBatch] = orders[half()];
+    for (int k = 0; k < count; ++k) {
+      const Splat<float>& splat = batch[order[k]];
+      raster::lane::add(splat, raster::lane::blend<float>(sums.transmittance, pixel.evaluate(splat).raw), sums);
+    }
     __syncwarp();
   }
   if (!pixel.inside) return;
@@ -78,14 +124,25 @@ __global__ void __launch_bounds__(kTileThreads)
 }
 
 // `pictures` are the forward pass's own, `gradients` the loss's with respect to them; one record per entry is written. A splat's
-// sums are added up over each warp's pixels, then over warps, always in the same order.
-__global__ void __launch_bounds__(kTileThreads)
+// sums are added up over each block's pixels, then over blocks, always in the same order.
+__global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
     gs_blend_backward(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
                       Pictures<const float> pictures, Pictures<const float> gradients, SplatGradient<float>* records) {
   constexpr int kNumbers = raster::kSplatGradientNumbers;
-  GS_SHARED(Splat<float>, batch, [kBatch]);
-  GS_SHARED(float, of_warps, [kTileWarps][kBatch][kNumbers]);
-  GS_SHARED(uint32_t, summed, [kTileWarps]);  // bit k: the warp has sums of item k
+  // Two numbers of a splat, and of a sum, a thread.
+  struct alignas(8) Two {
+    float numbers[2];
+  };
+  constexpr int kParts = int(sizeof(Splat<float>) / sizeof(Two)), kSums = kNumbers / 2;
+  // One address is kept, instead of one for each.
+  struct Shared {
+    Splat<float> batch[kBatch + 1];
+    Two sums[raster::kBlocks][kBatch][kSums];
+    uint32_t has_sums[raster::kBlocks];  // bit k: the block has sums of item k
+    Order orders[kTileWarps];
+  };
+  GS_SHARED(Shared, shared, [1]);
+  auto& [batch, of_blocks, summed, orders] = shared[0];
   const int64_t tile = int64_t(blockIdx.y) * call.grid.tiles() + blockIdx.x;
   const int64_t plane = int64_t(call.grid.width) * call.grid.height;
   const Pixel pixel(call.grid);
@@ -100,43 +157,73 @@ __global__ void __launch_bounds__(kTileThreads)
                                                  asked.depth[at]);
   }
 
-  // A batch is fetched while some still add up the last one's sums, which nobody changes before all have fetched theirs.
   const uint32_t end = tile_start[tile + 1];
-  for (uint32_t begin = tile_start[tile]; begin < end; begin += kBatch) {
-    const uint32_t count = end - begin < kBatch ? end - begin : kBatch;
-    for (int k = int(threadIdx.x); k < int(count) * 16; k += kTileThreads)
-      (&batch[k / 16].u)[k % 16] = (&splats[entries[begin + uint32_t(k / 16)].splat].u)[k % 16];
+  // Every warp knows a batch's entries, one a lane, and fetches as many of its splats as there are others' to fetch.
+  const auto fetch_entry = [&](uint32_t begin) {
+    const uint32_t at = begin + uint32_t(lane());
+    return at < end ? entries[at] : TileEntry{0, 0, 0};
+  };
+  const int item = int(threadIdx.x) / kParts, part = int(threadIdx.x) % kParts;
+  const auto fetch_part = [&](const TileEntry& entry, uint32_t begin) {
+    const uint32_t splat = __shfl_sync(kAll, entry.splat, item);
+    return begin + uint32_t(item) < end ? reinterpret_cast<const Two*>(splats + splat)[part] : Two{};
+  };
+  const Fold<kNumbers, kHalf> fold;
+  // Which sums of a batch this thread adds up over blocks.
+  const int sum_item = int(threadIdx.x) / kSums, sum_part = int(threadIdx.x) % kSums;
+
+  uint32_t begin = tile_start[tile];
+  if (begin >= end) return;
+  if (threadIdx.x == 0) batch[kNothing] = nothing();
+  TileEntry entry = fetch_entry(begin), next = fetch_entry(begin + kBatch);
+  Two own = fetch_part(entry, begin);
+  // A batch is put into its place while some still add up the last one's sums, which nobody changes before all have put theirs.
+  for (; begin < end; begin += kBatch) {
+    reinterpret_cast<Two*>(batch + item)[part] = own;
     // Behind what ended all pixels nothing is asked.
     if (!__syncthreads_or(state.transmittance > 0)) {
       for (uint64_t k = uint64_t(begin) * kNumbers + threadIdx.x; k < uint64_t(end) * kNumbers; k += kTileThreads)
         (&records[entries[k / kNumbers].record].power)[k % kNumbers] = 0;
       return;
     }
+    // What comes next is on its way meanwhile.
+    own = fetch_part(next, begin + kBatch);
+    const TileEntry later = fetch_entry(begin + 2 * kBatch);
 
     const bool goes_on = __any_sync(kAll, state.transmittance > 0);
-    const uint32_t own = uint32_t(lane()) < count ? entries[begin + uint32_t(lane())].blocks & own_blocks() : 0;
+    const int count = list_items(goes_on ? entry.blocks >> (2 * warp()) & 3 : 0, orders[warp()]);
+    __syncwarp();
+    const uint8_t(&order)[kBatch] = orders[warp()][half()];
     unsigned has_sums = 0;
-    for (unsigned left = __ballot_sync(kAll, goes_on && own != 0); left != 0; left &= left - 1) {
-      const int item = __ffs(int(left)) - 1;
-      const Evaluated e = pixel.evaluate(batch[item]);
+    for (int k = 0; k < count; ++k) {
+      const int at = order[k];
+      const Splat<float>& splat = batch[at];
+      const Evaluated e = pixel.evaluate(splat);
       // What reaches a block may miss all of its pixels that go on.
       if (!__any_sync(kAll, e.raw > 0 && state.transmittance > 0)) continue;
-      float sums[kNumbers] = {};
-      raster::lane::pass(batch[item], e, state, sums);
-      const Folded folded = fold(sums);
-      if (folded.which >= 0) of_warps[warp()][item][folded.which] = folded.sum;
-      has_sums |= 1u << item;
+      // Adding to −0 costs nothing.
+      float sums[kNumbers];
+      for (float& sum : sums) sum = -0.0f;
+      raster::lane::pass(splat, e, state, sums);
+      const float sum = fold(sums);
+      if (at != kNothing) {
+        if (fold.which >= 0) (&of_blocks[own_block()][at][0].numbers[0])[fold.which] = sum;
+        has_sums |= 1u << at;
+      }
     }
-    if (lane() == 0) summed[warp()] = has_sums;
+    if (lane() % kHalf == 0) summed[own_block()] = has_sums;
     __syncthreads();
 
-    for (int k = int(threadIdx.x); k < int(count) * kNumbers; k += kTileThreads) {
-      const int item = k / kNumbers, number = k % kNumbers;
-      float sum = 0;
-      for (int of = 0; of < kTileWarps; ++of)
-        if (summed[of] >> item & 1) sum += of_warps[of][item][number];
-      (&records[entries[begin + uint32_t(item)].record].power)[number] = sum;
+    if (warp() < kBatch * kSums / kWarp) {
+      const uint32_t record = __shfl_sync(kAll, entry.record, sum_item);
+      Two sum{};
+      for (int of = 0; of < raster::kBlocks; ++of)
+        if (summed[of] >> sum_item & 1)
+          for (int k = 0; k < 2; ++k) sum.numbers[k] += of_blocks[of][sum_item][sum_part].numbers[k];
+      if (begin + uint32_t(sum_item) < end) reinterpret_cast<Two*>(records + record)[sum_part] = sum;
     }
+    entry = next;
+    next = later;
   }
 }
 

@@ -49,7 +49,16 @@ GS_INLINE float value_of(float sum) { return sum; }
 GS_INLINE float add_product(float a, float b, float c) { return fma(a, b, c); }
 GS_INLINE float take_product(float a, float b, float c) { return fnma(a, b, c); }
 GS_INLINE float sqrt(float v) { return ::sqrtf(v); }
-GS_INLINE float reciprocal(float v) { return 1.0f / v; }
+// To the last bit but one, as vectors' is, in one instruction instead of ten.
+GS_INLINE float reciprocal(float v) {
+#ifdef __CUDACC__
+  float result;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(v));
+  return result;
+#else
+  return 1.0f / v;
+#endif
+}
 
 GS_INLINE float select(bool m, float a, float b) { return m ? a : b; }
 GS_INLINE bool less(float a, float b) { return a < b; }
@@ -74,14 +83,19 @@ GS_INLINE T inverse_power_of_two(T v) {
   return inverse.number;
 }
 
-GS_INLINE float exp2_where(bool m, float x) {
+struct Exp2Eighths {
+  uint32_t operator()(uint32_t i) const { return kExp2Eighths[i % 8]; }
+};
+// `eighths(i)` returns kExp2Eighths[i % 8].
+template <class Eighths = Exp2Eighths>
+GS_INLINE float exp2_where(bool m, float x, const Eighths& eighths = {}) {
   const float shifted = x + kToEighths, f = x - (shifted - kToEighths);
   const float p = ((kExp2[3] * f + kExp2[2]) * f + kExp2[1]) * f + kExp2[0];
   union {
     float number;
     uint32_t bits;
   } power, rounded{shifted};
-  power.bits = kExp2Eighths[rounded.bits % 8] + (rounded.bits << 20);
+  power.bits = eighths(rounded.bits) + (rounded.bits << 20);
   return m ? p * power.number : 0;
 }
 

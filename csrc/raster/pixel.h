@@ -63,13 +63,14 @@ GS_INLINE bool may_be_capped(const Splat<T>& s) {
   return s.log2_opacity > T(-0.0015);  // log₂ 0.99896, with room for rounding
 }
 
-template <class T>
-GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Evaluated<T>& e) {
+// `table` is what exp2_where() of the instruction set may be given in addition.
+template <class T, class... Table>
+GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Evaluated<T>& e, const Table&... table) {
   const Offset<T> at = offset_of(s, x, y);
   const Vector<T> exponent = exponent_of(s, at);
   e.p = at.p;
   e.r = at.r;
-  e.raw = exp2_where(reaches<T>(exponent), exponent);
+  e.raw = exp2_where(reaches<T>(exponent), exponent, table...);
 }
 
 // `capped` says whether any α may have to be.
