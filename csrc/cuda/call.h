@@ -61,8 +61,9 @@ __global__ void gs_blend(Call, const Splat<float>* splats, const TileEntry* entr
 __global__ void gs_blend_backward(Call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
                                   Pictures<const float> pictures, Pictures<const float> gradients,
                                   SplatGradient<float>* records);
-__global__ void gs_project_backward(Call, Gaussians<float>, const Lens<float>* lenses, const SplatGradient<float>* records,
-                                    const uint32_t* first, GaussianGradients<float> out, CameraGradient<float>* asked);
+__global__ void gs_project_backward(Call, Gaussians<float>, const Lens<float>* lenses, const Splat<float>* splats,
+                                    const SplatGradient<float>* records, const uint32_t* first,
+                                    GaussianGradients<float> out, CameraGradient<float>* asked);
 __global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* asked, float* w2c);
 }
 

@@ -77,8 +77,10 @@ void Seen::backward(const Device& device, const Arguments& of, const SplatGradie
                     const GaussianGradients<float>& out, float* w2c) const {
   const int warps = parts(call.count, kWarp);
   const Memory asked = w2c == nullptr ? Memory() : room_for<CameraGradient<float>>(device, int64_t(call.views) * warps);
-  GS_LAUNCH(device, gs_project_backward, for_each(call.count, kGaussianThreads, of.scenes), kGaussianThreads, call,
-            of.gaussians, as<Lens<float>>(lenses), records, first, out, as<CameraGradient<float>>(asked));
+  // Where there are several cameras, all warps of a block have the same Gaussians.
+  const int gaussians = call.cameras > 1 ? kWarp : kGaussianThreads;
+  GS_LAUNCH(device, gs_project_backward, for_each(call.count, gaussians, of.scenes), kGaussianThreads, call, of.gaussians,
+            as<Lens<float>>(lenses), as<Splat<float>>(splats), records, first, out, as<CameraGradient<float>>(asked));
   if (w2c != nullptr)
     GS_LAUNCH(device, gs_sum_cameras, for_each(int64_t(call.views) * 16 * kWarp, kGaussianThreads), kGaussianThreads, call.views,
               warps, as<CameraGradient<float>>(asked), w2c);

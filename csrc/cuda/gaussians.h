@@ -64,24 +64,118 @@ __global__ void __launch_bounds__(kGaussianThreads)
 
 // A row of blocks a scene. The records of Gaussian i in a view are first[view·N + i] … first[view·N + i + 1] − 1. Where `asked`
 // isn't null, it receives what the Gaussians of every warp ask of the views' cameras: [views, warps of a view].
-__global__ void __launch_bounds__(kGaussianThreads)
-    gs_project_backward(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, const SplatGradient<float>* records,
-                        const uint32_t* first, GaussianGradients<float> out, CameraGradient<float>* asked) {
-  const int64_t thread = int64_t(blockIdx.x) * blockDim.x + threadIdx.x, view = int64_t(blockIdx.y) * call.cameras;
+//
+// Where there are several cameras, the warps of a block have the same Gaussians and deal the cameras among them; their sums are
+// added up in the warps' order. Spherical harmonics, three quarters of all numbers, go through shared memory, to be read and written
+// as they follow each other.
+__global__ void __launch_bounds__(kGaussianThreads, 4)
+    gs_project_backward(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, const Splat<float>* splats,
+                        const SplatGradient<float>* records, const uint32_t* first, GaussianGradients<float> out,
+                        CameraGradient<float>* asked) {
+  constexpr int kWarps = kGaussianThreads / kWarp, kRow = 3 * raster::kMaxBases + 1;  // an odd number of words: in other banks
+  constexpr int kSums = 14;
+  struct Shared {
+    float sh[kWarps][kWarp][kRow];  // sums of gradients
+    union {
+      float of_all[kWarp][kRow];    // what the warps have in common: coefficients
+      float sums[kWarps][kSums][kWarp];
+    };
+  };
+  GS_SHARED(Shared, shared, [1]);
+  auto& memory = shared[0];
+  const bool is_dealt = call.cameras > 1;
+  const int sharing = is_dealt ? kWarps : 1, member = warp() % sharing;  // warps with the same Gaussians, and which is this
+  const int64_t begin = (int64_t(blockIdx.x) * kWarps + warp() - member) / sharing * kWarp;
+  const int64_t view = int64_t(blockIdx.y) * call.cameras, i = begin + lane(), groups = parts(call.count, kWarp);
   // Threads that are left over have no Gaussian, but take part in sums.
-  const int64_t i = thread < call.count ? thread : call.count, end = i < call.count ? i + 1 : i;
-  const int64_t warps = parts(call.count, kWarp), own_warp = thread / kWarp;
-  const auto records_of = [&](int64_t k) {
-    return raster::SplatRecords<float>{records, first + (view + k) * call.count};
-  };
-  const Fold<raster::kCameraNumbers, kWarp> fold;
-  const auto sum_over_warp = [&](int64_t k, const float(&numbers)[raster::kCameraNumbers]) {
-    const float sum = fold(numbers);
-    if (fold.which >= 0 && own_warp < warps) asked[(view + k) * warps + own_warp].numbers[fold.which] = sum;
-  };
+  const bool is_there = i < call.count;
+  const int there = int(begin >= call.count ? 0 : call.count - begin < kWarp ? call.count - begin : kWarp);
+  float(&sums_of_sh)[kRow] = memory.sh[warp()][lane()];
+  float(*const coefficients)[kRow] = is_dealt ? memory.of_all : memory.sh[warp()];
+
   with_bases(scene_of(gaussians, blockIdx.y), [&](const Gaussians<float>& scene) {
-    raster::lane::project_backward_group(scene, i, end, lenses + view, call.cameras, records_of,
-                                         scene_of(out, scene, blockIdx.y), asked != nullptr, sum_over_warp);
+    const int width = 3 * scene.bases, own = lane() + member * kWarp;
+    for (int k = own; k < there * width; k += sharing * kWarp)
+      coefficients[k / width][k % width] = scene.sh[begin * width + k];
+    __syncthreads();
+
+    raster::lane::GroupGradient<float> sum;
+    bool ever = false;
+    for (int64_t k = member; k < call.cameras; k += sharing) {
+      const int64_t place = (view + k) * call.count + i;
+      const uint32_t from = is_there ? first[place] : 0, to = is_there ? first[place + 1] : 0;
+      float d[raster::kSplatGradientNumbers] = {}, of_camera[raster::kCameraNumbers] = {};
+      for (uint32_t record = from; record < to; ++record) {
+        const auto* const numbers = reinterpret_cast<const Two*>(records + record);
+        for (int n = 0; n < raster::kSplatGradientNumbers; ++n) d[n] += numbers[n / 2].numbers[n % 2];
+      }
+      if (from < to) {
+        // What is read, and computed, twice takes no registers in between.
+        raster::lane::Group<float> group;
+        raster::lane::Projection<float> projection;
+        raster::lane::Shading<float> shading;
+        const Lens<float>& lens = lenses[view + k];
+        float d_r[3];
+        const Splat<float>& splat = splats[place];
+        for (int n = 0; n < 3; ++n) group.mean[n] = scene.means[3 * i + n];
+        raster::lane::look_at_group(group, scene.bases, lens, true, shading);
+        raster::lane::shade_group_backward<float>(
+            scene.bases, shading, {splat.red > 0, splat.green > 0, splat.blue > 0}, d,
+            [&](int n) { return coefficients[lane()][n]; },
+            [&](int n, float x, float y) { sums_of_sh[n] = raster::lane::add_product(x, y, ever ? sums_of_sh[n] : 0); }, d_r);
+        raster::lane::load_shapes(scene, i, i + 1, group);
+        raster::lane::project_group(group, lens, projection);
+        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, asked != nullptr,
+                                             of_camera);
+        ever = true;
+      }
+      if (asked != nullptr) {
+        const Fold<raster::kCameraNumbers, kWarp> fold;
+        const float number = fold(of_camera);
+        if (fold.which >= 0 && begin < call.count) asked[(view + k) * groups + begin / kWarp].numbers[fold.which] = number;
+      }
+    }
+    if (!ever)
+      for (int n = 0; n < width; ++n) sums_of_sh[n] = 0;
+    __syncthreads();
+
+    // Both kinds of sums over warps, and back to where they belong.
+    // What keep() returns nobody can have computed, and kept in registers, before.
+    const auto at = scene_of(out, scene, keep(int(blockIdx.y)));
+    for (int k = own; k < there * width; k += sharing * kWarp) {
+      float number = 0;
+      for (int n = 0; n < sharing; ++n) number += memory.sh[warp() - member + n][k / width][k % width];
+      at.sh[begin * width + k] = number;
+    }
+    if (is_dealt) {
+      float(&own_sums)[kSums][kWarp] = memory.sums[warp()];
+      for (int n = 0; n < 3; ++n) own_sums[n][lane()] = sum.mean[n];
+      for (int n = 0; n < 9; ++n) own_sums[3 + n][lane()] = sum.axes[n];
+      own_sums[12][lane()] = sum.opacity;
+      own_sums[13][lane()] = ever ? 1.0f : 0.0f;
+      __syncthreads();
+      if (member != 0) return;
+      const auto total = [&](int number) {
+        float all = 0;
+        for (const auto& of_warp : memory.sums) all += of_warp[number][lane()];
+        return all;
+      };
+      for (int n = 0; n < 3; ++n) sum.mean[n] = total(n);
+      for (int n = 0; n < 9; ++n) sum.axes[n] = total(3 + n);
+      sum.opacity = total(12);
+      ever = total(13) > 0;
+    }
+    if (!is_there) return;
+    float d_scale[3] = {}, d_quaternion[4] = {};
+    if (ever) {
+      raster::lane::Group<float> group;
+      raster::lane::load_shapes(scene, i, i + 1, group);
+      raster::lane::axes_backward<float>(group, sum.axes, d_scale, d_quaternion);
+    }
+    for (int n = 0; n < 3; ++n) at.means[3 * i + n] = sum.mean[n];
+    for (int n = 0; n < 3; ++n) at.scales[3 * i + n] = d_scale[n];
+    for (int n = 0; n < 4; ++n) at.quaternions[4 * i + n] = d_quaternion[n];
+    at.opacities[i] = sum.opacity;
   });
 }
 

@@ -130,9 +130,6 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
                       Pictures<const float> pictures, Pictures<const float> gradients, SplatGradient<float>* records) {
   constexpr int kNumbers = raster::kSplatGradientNumbers;
   // Two numbers of a splat, and of a sum, a thread.
-  struct alignas(8) Two {
-    float numbers[2];
-  };
   constexpr int kParts = int(sizeof(Splat<float>) / sizeof(Two)), kSums = kNumbers / 2;
   // One address is kept, instead of one for each.
   struct Shared {

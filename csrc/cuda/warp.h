@@ -10,6 +10,11 @@ inline constexpr unsigned kAll = 0xFFFFFFFFu;
 inline int lane() { return int(threadIdx.x) % kWarp; }
 inline int warp() { return int(threadIdx.x) / kWarp; }  // of the block
 
+// Two numbers in one access of memory.
+struct alignas(8) Two {
+  float numbers[2];
+};
+
 // Bits of the lanes before this one.
 inline unsigned before() { return (1u << lane()) - 1; }
 

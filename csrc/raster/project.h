@@ -88,8 +88,9 @@ GS_INLINE void store_columns(const Vector<T>* in, int width, int count, T* rows)
     for (int k = done; k < width; ++k) rows[int64_t(width) * lane + k] = columns[k][lane];
 }
 
+// All but spherical harmonics.
 template <class T>
-GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Group<T>& group) {
+GS_INLINE void load_shapes(const Gaussians<T>& g, int64_t begin, int64_t end, Group<T>& group) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   group.count = int(end - begin < lanes ? end - begin : lanes);
@@ -97,7 +98,6 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   load_columns(g.scales + 3 * begin, 3, 3, group.count, group.scale);
   load_columns(g.quaternions + 4 * begin, 4, 4, group.count, group.unit);
   load_columns(g.opacities + begin, 1, 1, group.count, &group.opacity);
-  load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, 3 * g.bases, group.count, group.sh);
   group.log2_opacity = log2_of<T>(group.opacity);
 
   // Times a power of two, which rounds nothing, squares neither overflow nor underflow.
@@ -118,6 +118,12 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   r[7] = T(2) * (y * z + w * x);
   r[8] = T(1) - T(2) * (x * x + y * y);
   for (int k = 0; k < 9; ++k) group.axes[k] = r[k] * group.scale[k % 3];
+}
+
+template <class T>
+GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Group<T>& group) {
+  load_shapes(g, begin, end, group);
+  load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, 3 * g.bases, group.count, group.sh);
 }
 
 // NaN anywhere in a Gaussian's geometry makes it invisible.
@@ -201,9 +207,9 @@ GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projectio
   for (int k = 0; k < 16; ++k) out[k] = numbers[k];
 }
 
-// Lanes where `visible` is false get a direction of zero.
+// All but colours. Lanes where `visible` is false get a direction of zero.
 template <class T>
-GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
+GS_INLINE void look_at_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
   using V = Vector<T>;
   V distance2{};
   for (int k = 0; k < 3; ++k) {
@@ -213,6 +219,11 @@ GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Ma
   s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});
   for (int k = 0; k < 3; ++k) s.direction[k] *= s.inverse_distance;
   sh_basis<T>(bases, s.direction, s.basis);
+}
+
+template <class T>
+GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
+  look_at_group(g, bases, lens, visible, s);
   for (int channel = 0; channel < 3; ++channel) {
     s.colour[channel] = broadcast<T>(T(0.5));
     for (int k = 0; k < bases; ++k) s.colour[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.colour[channel]);
@@ -247,12 +258,37 @@ struct GroupGradient {
   Vector<T> mean[3] = {}, axes[9] = {}, opacity = {}, sh[kMaxBases * 3] = {};
 };
 
-// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds; in others `d` is 0. Where
-// `of_camera` isn't null, it receives what they ask of the camera through each lane, in CameraGradient's order.
+// What one camera's pixels, summed in `d`, ask of the Gaussians' spherical harmonics, coefficient(n) for number n, and of their means
+// through the direction, which d_r receives. `is_lit` tells where a channel isn't clamped at 0. add_product_to(n, x, y) hears that
+// x·y is to be added to the gradient of number n, after coefficients have been read.
+template <class T, class Coefficient, class AddProductTo>
+GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T> (&is_lit)[3],
+                                    const Vector<T> d[kSplatGradientNumbers], const Coefficient& coefficient,
+                                    const AddProductTo& add_product_to, Vector<T> d_r[3]) {
+  using V = Vector<T>;
+  const V zero{};
+  // The mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
+  V d_colour[3], d_basis[kMaxBases], d_direction[3];
+  for (int channel = 0; channel < 3; ++channel) d_colour[channel] = select(is_lit[channel], d[6 + channel], zero);
+  for (int k = 0; k < bases; ++k) {
+    d_basis[k] = zero;
+    for (int channel = 0; channel < 3; ++channel)
+      d_basis[k] = add_product(coefficient(3 * k + channel), d_colour[channel], d_basis[k]);
+  }
+  for (int k = 0; k < bases; ++k)
+    for (int channel = 0; channel < 3; ++channel) add_product_to(3 * k + channel, s.basis[k], d_colour[channel]);
+  sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);
+  const V along = d_direction[0] * s.direction[0] + d_direction[1] * s.direction[1] + d_direction[2] * s.direction[2];
+  for (int k = 0; k < 3; ++k) d_r[k] = (d_direction[k] - along * s.direction[k]) * s.inverse_distance;
+}
+
+// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds, but for spherical harmonics; in
+// others `d` and `d_r` are 0. Where `of_cameras` holds, `of_camera` receives what they ask of the camera through each lane, in
+// CameraGradient's order.
 template <class T>
-GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T>& lens, const Projection<T>& p,
-                                      const Shading<T>& s, Mask<T> touched, const Vector<T> d[kSplatGradientNumbers],
-                                      GroupGradient<T>& out, Vector<T>* of_camera) {
+GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, Mask<T> touched,
+                                      const Vector<T> d[kSplatGradientNumbers], const Vector<T> d_r[3],
+                                      GroupGradient<T>& out, bool of_cameras, Vector<T> of_camera[kCameraNumbers]) {
   using V = Vector<T>;
   const V zero{};
   const V power = d[0], power_p = d[1], power_r = d[2], power_pp = d[3], power_pr = d[4], power_rr = d[5];
@@ -260,25 +296,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
 
   // α = opacity·e^{−σ} and ν = −α ∂L/∂α, so ∂L/∂opacity = Σ e^{−σ} ∂L/∂α = −Σν / opacity.
   add(out.opacity, -power / g.opacity);
-
-  // Colour, and the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
-  V d_colour[3], d_basis[kMaxBases], d_direction[3], d_r[3];
-  for (int channel = 0; channel < 3; ++channel)
-    d_colour[channel] = select(less(zero, s.colour[channel]), d[6 + channel], zero);
-  for (int k = 0; k < bases; ++k) {
-    d_basis[k] = zero;
-    for (int channel = 0; channel < 3; ++channel) {
-      V& sum = out.sh[3 * k + channel];
-      sum = add_product(s.basis[k], d_colour[channel], sum);
-      d_basis[k] = add_product(g.sh[3 * k + channel], d_colour[channel], d_basis[k]);
-    }
-  }
-  sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);
-  const V along = d_direction[0] * s.direction[0] + d_direction[1] * s.direction[1] + d_direction[2] * s.direction[2];
-  for (int k = 0; k < 3; ++k) {
-    d_r[k] = (d_direction[k] - along * s.direction[k]) * s.inverse_distance;
-    add(out.mean[k], d_r[k]);
-  }
+  for (int k = 0; k < 3; ++k) add(out.mean[k], d_r[k]);
 
   // With U = [[a, b], [0, c]], σ = ln 2·|UΔ|² and Σ2D⁻¹ = 2 ln 2·UᵀU. From M = Σ ν UΔ and W = Σ ν (UΔ)(UΔ)ᵀ,
   // ∂L/∂(u, v) = 2 ln 2·UᵀM and ∂L/∂Σ2D = −2 ln²2·UᵀWU.
@@ -322,7 +340,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, int bases, const Lens<T
       add(out.axes[3 * r + k], w[r] * d_wrs[k] + w[3 + r] * d_wrs[3 + k] + w[6 + r] * d_wrs[6 + k]);
 
   // t = W μ + p, V = W (R S), and r = μ − o with o = −Wᵀ p.
-  if (of_camera == nullptr) return;
+  if (!of_cameras) return;
   for (int r = 0; r < 3; ++r) {
     for (int k = 0; k < 3; ++k)
       of_camera[3 * r + k] =
@@ -397,8 +415,12 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
       project_group(group, lenses[view], projection);
       if (any(projection.visible)) {  // as all are that have records
         shade_group(group, g.bases, lenses[view], touched, shading);
-        project_group_backward(group, g.bases, lenses[view], projection, shading, touched, d, sum,
-                               of_cameras ? of_camera : nullptr);
+        const Mask<T> is_lit[3] = {less(V{}, shading.colour[0]), less(V{}, shading.colour[1]), less(V{}, shading.colour[2])};
+        V d_r[3];
+        shade_group_backward<T>(
+            g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },
+            [&](int n, V x, V y) { sum.sh[n] = add_product(x, y, sum.sh[n]); }, d_r);
+        project_group_backward(group, lenses[view], projection, touched, d, d_r, sum, of_cameras, of_camera);
       }
     }
     if (of_cameras) asked(view, of_camera);
