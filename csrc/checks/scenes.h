@@ -206,6 +206,9 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
     double* const places[] = {&camera.fx, &camera.cy, &camera.rotation[4], &camera.translation[2]};
     *places[n % 4] = strange[n / 4];
   }
+
+  // More pairs of a tile than a GPU sorts in one go.
+  add_scattered("a long list", 8, 8, 1, 1, 10000);
   return scenes;
 }
 

@@ -152,23 +152,22 @@ std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64
 }
 
 std::string sums_differ(uint64_t seed) {
-  constexpr int rows = 3, length = 1500;
+  const size_t lengths[2] = {5000, 1500};
   Random random(seed);
-  std::vector<uint32_t> counts, expected;
-  for (const double value : random.uniform(rows * length, 0, 100)) counts.push_back(uint32_t(value));
-  uint64_t totals[rows], expected_totals[rows];
-  for (int row = 0; row < rows; ++row) {
-    uint32_t sum = 0;
-    for (int k = 0; k < length; ++k) {
-      expected.push_back(sum);
-      sum += counts[size_t(row * length + k)];
+  std::vector<uint32_t> counts[2], sums[2], expected[2];
+  uint64_t total = 0, totals[2] = {};
+  for (int row = 0; row < 2; ++row) {
+    for (const double value : random.uniform(lengths[row], 0, 100)) counts[row].push_back(uint32_t(value));
+    for (const uint32_t count : counts[row]) {
+      expected[row].push_back(uint32_t(totals[row]));
+      totals[row] += count;
     }
-    expected_totals[row] = sum;
+    sums[row].resize(lengths[row]);
   }
   using cuda::gs_scan;
-  GS_LAUNCH(cuda::emulated::Emulator(seed), gs_scan, cuda::Blocks{rows}, 2 * cuda::kWarp, length, counts.data(), totals);
-  const bool right = counts == expected && std::equal(totals, totals + rows, expected_totals);
-  return right ? "" : "sums of what is before differ";
+  const auto row_of = [&](int row) { return cuda::Counts{int64_t(lengths[row]), counts[row].data(), sums[row].data()}; };
+  GS_LAUNCH(cuda::emulated::Emulator(seed), gs_scan, (cuda::Blocks{3, 2}), cuda::kScanThreads, row_of(0), row_of(1), &total);
+  return sums[0] == expected[0] && sums[1] == expected[1] && total == totals[0] ? "" : "sums of what is before differ";
 }
 
 }  // namespace globalsplat::checks

@@ -32,30 +32,35 @@ struct Call {
 inline constexpr int kWarp = 32;
 inline constexpr int kGaussianThreads = 128;  // of a block that takes a Gaussian a thread
 inline constexpr int kTileThreads = 256;      // of a block that takes a tile, a pixel a thread
-inline constexpr int kSortThreads = 256;      // of a block that sorts, and values of a digit
-inline constexpr int kDigitBits = 8;
-inline constexpr int kSortItems = 8;          // keys of a thread
-inline constexpr int kScanItems = 8;          // numbers of a thread
-inline constexpr int kDepthBits = 31;         // of a positive float's
+inline constexpr int kSortThreads = 256;      // of a block that sorts a tile's list
+inline constexpr int kListKeys = 2048;        // of a list that is sorted in shared memory
+inline constexpr int kScanThreads = 512;      // of a block that adds up counts
+inline constexpr int kScanItems = 4;          // counts of a thread
 
-// Where a key of the sort has a pair's tile, counted over all views; below are its depth's bits.
-inline constexpr uint64_t key_of(uint64_t tile) { return tile << kDepthBits; }
+// What pairs of a tile are sorted by: depth, a positive float's bits, then their place among all pairs, Gaussian by Gaussian.
+inline constexpr uint64_t key_of(uint32_t depth, uint32_t pair) { return uint64_t(depth) << 32 | pair; }
+inline constexpr uint32_t pair_of(uint64_t key) { return uint32_t(key); }
+
+// Counts, and where the sums of those before go.
+struct Counts {
+  int64_t length;
+  const uint32_t* counts;
+  uint32_t* sums;
+};
 
 // Warps that a view's Gaussians, or blocks that so many items, are dealt to.
 inline constexpr int parts(int64_t items, int of) { return int((items + of - 1) / of); }
 
-// Described where they are written: gaussians.h, cover.h, sort.h, tiles.h.
+// Described where they are written: gaussians.h, lists.h, sort.h, tiles.h.
 extern "C" {
-__global__ void gs_lenses(Call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses);
+__global__ void gs_lenses(Call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
+                          uint32_t* tile_counts);
 __global__ void gs_project(Call, Gaussians<float>, const Lens<float>* lenses, Splat<float>* splats);
-__global__ void gs_cover(Call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* first, uint64_t* keys,
-                         uint32_t* values, TileEntry* pairs);
-__global__ void gs_scan(int length, uint32_t* counts, uint64_t* totals);
-__global__ void gs_count_digits(uint32_t count, int shift, const uint64_t* keys, uint32_t* table);
-__global__ void gs_scatter(uint32_t count, int shift, const uint64_t* keys, const uint32_t* values, const uint32_t* table,
-                           const uint64_t* totals, uint64_t* sorted_keys, uint32_t* sorted_values);
-__global__ void gs_list(uint32_t count, uint32_t tiles, const uint64_t* keys, const uint32_t* values, const TileEntry* pairs,
-                        TileEntry* entries, uint32_t* tile_start);
+__global__ void gs_cover(Call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first,
+                         uint64_t* keys, TileEntry* pairs);
+__global__ void gs_scan(Counts first, Counts second, uint64_t* total);
+__global__ void gs_sort_lists(Call, const uint32_t* tile_start, uint64_t* keys, uint64_t* spare, const TileEntry* pairs,
+                              TileEntry* entries);
 __global__ void gs_blend(Call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
                          Pictures<float> out);
 __global__ void gs_blend_backward(Call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,

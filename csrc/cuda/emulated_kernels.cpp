@@ -21,10 +21,9 @@ struct Entry<kernel> {
 
 #define GS_KERNEL(name) {#name, Entry<name>::run}
 constexpr Kernel kKernels[] = {
-    GS_KERNEL(gs_lenses),      GS_KERNEL(gs_project),      GS_KERNEL(gs_cover),
-    GS_KERNEL(gs_scan),        GS_KERNEL(gs_count_digits), GS_KERNEL(gs_scatter),
-    GS_KERNEL(gs_list),        GS_KERNEL(gs_blend),        GS_KERNEL(gs_blend_backward),
-    GS_KERNEL(gs_sum_cameras), GS_KERNEL(gs_project_backward),
+    GS_KERNEL(gs_lenses),         GS_KERNEL(gs_project),          GS_KERNEL(gs_cover),
+    GS_KERNEL(gs_scan),           GS_KERNEL(gs_sort_lists),       GS_KERNEL(gs_blend),
+    GS_KERNEL(gs_blend_backward), GS_KERNEL(gs_project_backward), GS_KERNEL(gs_sum_cameras),
 };
 
 }  // namespace

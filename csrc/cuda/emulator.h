@@ -89,4 +89,4 @@ inline uint32_t __float_as_uint(float number) {
   std::memcpy(&bits, &number, sizeof bits);
   return bits;
 }
-inline void atomicAdd(uint32_t* to, uint32_t by) { __atomic_fetch_add(to, by, __ATOMIC_RELAXED); }
+inline uint32_t atomicAdd(uint32_t* to, uint32_t by) { return __atomic_fetch_add(to, by, __ATOMIC_RELAXED); }

@@ -1,8 +1,8 @@
 #include "frame.h"
 
+#include <algorithm>
 #include <limits>
 #include <stdexcept>
-#include <utility>
 
 namespace globalsplat::cuda {
 namespace {
@@ -31,44 +31,19 @@ Call call_of(const Arguments& of) {
   return {int(views), int(of.cameras), int(of.gaussians.count), of.gaussians.bases, {of.width, of.height, columns, rows}};
 }
 
-// Turns each of `rows` rows of counts into sums of those before; `totals` receives a row's sum.
-void scan(const Device& device, int64_t rows, int64_t length, const Memory& counts, const Memory& totals) {
-  // A warp is enough for few, and need not wait for others.
-  const int threads = length <= 4 * kWarp * kScanItems ? kWarp : kSortThreads;
-  GS_LAUNCH(device, gs_scan, Blocks{rows}, threads, int(length), as<uint32_t>(counts), as<uint64_t>(totals));
-}
-
-// Sorts keys of `bits` bits, with their values; equal ones keep their order.
-void sort(const Device& device, uint32_t count, int bits, Memory& keys, Memory& values) {
-  constexpr int digits = 1 << kDigitBits;
-  const int64_t blocks = parts(count, kSortThreads * kSortItems);
-  Memory sorted_keys = room_for<uint64_t>(device, count), sorted_values = room_for<uint32_t>(device, count);
-  const Memory table = room_for<uint32_t>(device, digits * blocks), totals = room_for<uint64_t>(device, digits);
-  for (int shift = 0; shift < bits; shift += kDigitBits) {
-    GS_LAUNCH(device, gs_count_digits, Blocks{blocks}, kSortThreads, count, shift, as<uint64_t>(keys), as<uint32_t>(table));
-    scan(device, digits, blocks, table, totals);
-    GS_LAUNCH(device, gs_scatter, Blocks{blocks}, kSortThreads, count, shift, as<uint64_t>(keys), as<uint32_t>(values),
-              as<uint32_t>(table), as<uint64_t>(totals), as<uint64_t>(sorted_keys), as<uint32_t>(sorted_values));
-    std::swap(keys, sorted_keys);
-    std::swap(values, sorted_values);
-  }
-}
-
-// As many as the numbers below `count` need.
-int bits_of(int64_t count) {
-  int bits = 0;
-  while (int64_t(1) << bits < count) ++bits;
-  return bits;
-}
+// Where tiles' lists begin, and where the last ends.
+int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.grid.tiles() + 1; }
 
 }  // namespace
 
-Seen::Seen(const Device& device, const Arguments& of)
+Seen::Seen(const Device& device, const Arguments& of, bool counts_tiles)
     : call(call_of(of)),
       lenses(room_for<Lens<float>>(device, call.views)),
-      splats(room_for<Splat<float>>(device, int64_t(call.views) * call.count)) {
-  GS_LAUNCH(device, gs_lenses, for_each(call.views, kWarp), kWarp, call, float(of.eps2d), of.w2c, of.intrinsics,
-            as<Lens<float>>(lenses));
+      splats(room_for<Splat<float>>(device, int64_t(call.views) * call.count)),
+      tile_counts(counts_tiles ? room_for<uint32_t>(device, places_of_tiles(call)) : Memory()) {
+  const int64_t threads = counts_tiles ? std::max<int64_t>(call.views, places_of_tiles(call)) : call.views;
+  GS_LAUNCH(device, gs_lenses, for_each(threads, kWarp), kWarp, call, float(of.eps2d), of.w2c, of.intrinsics,
+            as<Lens<float>>(lenses), as<uint32_t>(tile_counts));
   GS_LAUNCH(device, gs_project, for_each(call.count, kGaussianThreads, call.views), kGaussianThreads, call, of.gaussians,
             as<Lens<float>>(lenses), as<Splat<float>>(splats));
 }
@@ -86,35 +61,41 @@ void Seen::backward(const Device& device, const Arguments& of, const SplatGradie
               warps, as<CameraGradient<float>>(asked), w2c);
 }
 
-Frame::Frame(const Device& device, const Arguments& of, const Pictures<float>& out) : seen_(device, of), count_(0) {
+Frame::Frame(const Device& device, const Arguments& of, const Pictures<float>& out) : seen_(device, of, true), count_(0) {
   const Call& call = seen_.call;
-  const int64_t splats = int64_t(call.views) * call.count, tiles = int64_t(call.views) * call.grid.tiles();
+  const int64_t splats = int64_t(call.views) * call.count, places = places_of_tiles(call);
   const int64_t groups = parts(call.count, kWarp) * int64_t(call.views);
   const Blocks blocks = for_each(call.count, kGaussianThreads, call.views);
 
-  const Memory group_pairs = room_for<uint32_t>(device, groups), total = room_for<uint64_t>(device, 1);
-  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(group_pairs), nullptr,
-            nullptr, nullptr, nullptr);
-  scan(device, 1, groups, group_pairs, total);
+  const Memory group_pairs = room_for<uint32_t>(device, groups), pairs_before = room_for<uint32_t>(device, groups);
+  const Memory total = room_for<uint64_t>(device, 1);
+  uint32_t* const tile_counts = as<uint32_t>(seen_.tile_counts);
+  tile_start_ = room_for<uint32_t>(device, places);
+  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(group_pairs),
+            tile_counts + 1, nullptr, nullptr, nullptr);
+  // Sums of what is before a tile go to the place behind the tile's own, where they grow to what is before the next one.
+  GS_LAUNCH(device, gs_scan, for_each(std::max(groups, places), kScanThreads * kScanItems, 2), kScanThreads,
+            (Counts{groups, as<uint32_t>(group_pairs), as<uint32_t>(pairs_before)}),
+            (Counts{places, tile_counts, as<uint32_t>(tile_start_)}), as<uint64_t>(total));
   // The one number that has to be known here: how much memory pairs take.
   const uint64_t count = device.read(as<uint64_t>(total));
-  if (count >= std::numeric_limits<uint32_t>::max())
+  // Behind the last there is room to count on, a few batches.
+  if (count > std::numeric_limits<uint32_t>::max() - 1024)
     throw std::length_error("more than 4 billion (Gaussian, tile) pairs in one go");
   count_ = uint32_t(count);
+  seen_.tile_counts.reset();
 
   first_ = room_for<uint32_t>(device, splats + 1);
   entries_ = room_for<TileEntry>(device, count_);
-  tile_start_ = room_for<uint32_t>(device, tiles + 1);
-  Memory keys = room_for<uint64_t>(device, count_), values = room_for<uint32_t>(device, count_);
+  const Memory keys = room_for<uint64_t>(device, count_), spare = room_for<uint64_t>(device, count_);
   const Memory pairs = room_for<TileEntry>(device, count_);
-  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(group_pairs),
-            as<uint32_t>(first_), as<uint64_t>(keys), as<uint32_t>(values), as<TileEntry>(pairs));
-  sort(device, count_, kDepthBits + bits_of(tiles), keys, values);
-  GS_LAUNCH(device, gs_list, for_each(count_ > tiles ? int64_t(count_) : tiles + 1, kSortThreads), kSortThreads, count_,
-            uint32_t(tiles), as<uint64_t>(keys), as<uint32_t>(values), as<TileEntry>(pairs), as<TileEntry>(entries_),
-            as<uint32_t>(tile_start_));
-  GS_LAUNCH(device, gs_blend, (Blocks{call.grid.tiles(), call.views}), kTileThreads, call, as<Splat<float>>(seen_.splats),
-            as<TileEntry>(entries_), as<uint32_t>(tile_start_), out);
+  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(pairs_before),
+            as<uint32_t>(tile_start_) + 1, as<uint32_t>(first_), as<uint64_t>(keys), as<TileEntry>(pairs));
+  const Blocks tiles{call.grid.tiles(), call.views};
+  GS_LAUNCH(device, gs_sort_lists, tiles, kSortThreads, call, as<uint32_t>(tile_start_), as<uint64_t>(keys),
+            as<uint64_t>(spare), as<TileEntry>(pairs), as<TileEntry>(entries_));
+  GS_LAUNCH(device, gs_blend, tiles, kTileThreads, call, as<Splat<float>>(seen_.splats), as<TileEntry>(entries_),
+            as<uint32_t>(tile_start_), out);
 }
 
 void Frame::backward(const Device& device, const Arguments& of, const Pictures<const float>& pictures,

@@ -17,7 +17,8 @@ struct Arguments {
 
 // All Gaussians as every view sees them.
 struct Seen {
-  Seen(const Device&, const Arguments&);
+  // `counts_tiles`: whether there is to be memory for counts of tiles.
+  Seen(const Device&, const Arguments&, bool counts_tiles = false);
 
   // Writes every gradient of every Gaussian, and of w2c where it isn't null, from the records first[view·N + i] …
   // first[view·N + i + 1] − 1 of every Gaussian i in every view.
@@ -27,6 +28,7 @@ struct Seen {
   Call call;
   Memory lenses;  // Lens[views]
   Memory splats;  // Splat[views][N]
+  Memory tile_counts;  // uint32_t[views · tiles + 1], all 0
 };
 
 // What a forward pass leaves for its backward pass.

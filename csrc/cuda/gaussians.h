@@ -38,12 +38,14 @@ inline void with_bases(Gaussians<float> g, const Body& body) {
 
 extern "C" {
 
-// A view a thread.
-__global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses) {
-  const int64_t view = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (view >= call.views) return;
-  lenses[view] = raster::lens_of(raster::camera_of(w2c + 16 * view, intrinsics + 9 * view), call.grid.width,
-                                 call.grid.height, double(eps2d));
+// A view a thread. Where `tile_counts` isn't null, it is set to 0, for every tile of every view and once more.
+__global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
+                          uint32_t* tile_counts) {
+  const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (k < call.views)
+    lenses[k] = raster::lens_of(raster::camera_of(w2c + 16 * k, intrinsics + 9 * k), call.grid.width, call.grid.height,
+                                double(eps2d));
+  if (tile_counts != nullptr && k <= int64_t(call.views) * call.grid.tiles()) tile_counts[k] = 0;
 }
 
 // A row of blocks a view.

@@ -8,11 +8,13 @@ namespace globalsplat::cuda {
 extern "C" {
 
 // A warp takes 32 splats of a view, a group, and deals the tiles in their boxes to its lanes: most have a few tiles, and some
-// hundreds. In the first pass, where `first` is null, it tells in group_pairs [views, groups] how many tiles its splats reach. In the
-// second, group_pairs tells how many are before it, and every (splat, tile) pair gets its place in pairs, keys and values (of the
-// sort): pairs of a splat are neighbours. first[view·N + i] is where those of Gaussian i begin, first[views·N] where all end.
+// hundreds. In the first pass, where `first` is null, it tells in group_pairs [views, groups] how many tiles its splats reach, and
+// counts in of_tiles [views, tiles] the splats that reach each. In the second, group_pairs tells how many pairs are before the
+// group's, and every (splat, tile) pair gets its place in `pairs`: those of a splat are neighbours. first[view·N + i] is where those
+// of Gaussian i begin, first[views·N] where all end. of_tiles tells where the next key of a tile goes in `keys`, whose order, within
+// a tile, is that in which warps came.
 __global__ void __launch_bounds__(kGaussianThreads)
-    gs_cover(Call call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* first, uint64_t* keys, uint32_t* values,
+    gs_cover(Call call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first, uint64_t* keys,
              TileEntry* pairs) {
   const int groups = parts(call.count, kWarp), group = int(blockIdx.x) * (int(blockDim.x) / kWarp) + warp();
   const int view = int(blockIdx.y);
@@ -47,12 +49,13 @@ __global__ void __launch_bounds__(kGaussianThreads)
       const uint32_t earlier = begin - base;  // of these candidates
       own_first = reached + uint32_t(__popc(earlier < kWarp ? reaching & ((1u << earlier) - 1) : reaching));
     }
-    if (first != nullptr && blocks != 0) {
-      const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & before()));
-      const uint64_t tile = uint64_t(view) * uint64_t(call.grid.tiles()) + uint64_t(y * call.grid.columns + x);
-      keys[record] = key_of(tile) | __float_as_uint(splat.z);
-      values[record] = record;
-      pairs[record] = {uint32_t(&splat - splats), record, blocks};
+    if (blocks != 0) {
+      const uint32_t slot = atomicAdd(&of_tiles[int64_t(view) * call.grid.tiles() + y * call.grid.columns + x], 1u);
+      if (first != nullptr) {
+        const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & before()));
+        keys[slot] = key_of(__float_as_uint(splat.z), record);
+        pairs[record] = {uint32_t(&splat - splats), record, blocks};
+      }
     }
     reached += uint32_t(__popc(reaching));
   }

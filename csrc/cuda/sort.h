@@ -1,134 +1,131 @@
-// A stable radix sort of pairs by tile and depth, eight bits at a time, and prefix sums.
-//
-// A pass: every block counts its keys' digits (gs_count_digits), into a table [256, blocks]; its rows are summed up (gs_scan);
-// and every block puts its keys where their digit's begin, after those of the blocks, warps and lanes before (gs_scatter).
+// Prefix sums, and the order of tiles' lists: by depth, and where depths are equal by Gaussian.
 #pragma once
 
 #include "warp.h"
 
 namespace globalsplat::cuda {
 
-inline constexpr int kDigits = 1 << kDigitBits;
-inline constexpr int kSortWarps = kSortThreads / kWarp;
-inline constexpr int kWarpKeys = kWarp * kSortItems;
-static_assert(kSortThreads == kDigits, "a thread a digit");
-
-inline int digit_of(uint64_t key, int shift) { return int(key >> shift) & (kDigits - 1); }
-
 // Of a thread's number and those of the threads before it in the block, and of all of them. `of_warps` is shared memory that
 // no other sum uses until the block has met once more.
+template <class T>
 struct Sum {
-  uint32_t inclusive, all;
+  T inclusive, all;
 };
-inline Sum block_sum(uint32_t value, uint32_t (&of_warps)[kSortWarps]) {
-  Sum sum{prefix_sum(value), 0};
+template <class T, int warps>
+inline Sum<T> block_sum(T value, T (&of_warps)[warps]) {
+  Sum<T> sum{prefix_sum(value), 0};
   if (lane() == kWarp - 1) of_warps[warp()] = sum.inclusive;
   __syncthreads();
-  for (int k = 0; k < int(blockDim.x) / kWarp; ++k) {
+  for (int k = 0; k < warps; ++k) {
     if (k < warp()) sum.inclusive += of_warps[k];
     sum.all += of_warps[k];
   }
   return sum;
 }
 
+// Sorts keys, `size` of them, a power of two from 64 on, by a bitonic network: the threads of a warp exchange keys that are up to 32
+// apart among 64 that no other warp touches then, and the block meets only where keys are farther apart.
+inline void sort_keys(uint64_t* keys, int size) {
+  const bool has_work = warp() * kWarp < size / 2;
+  for (int sorted = 2; sorted <= size; sorted *= 2)
+    for (int distance = sorted / 2; distance > 0; distance /= 2) {
+      for (int pair = int(threadIdx.x); pair < size / 2; pair += kSortThreads) {
+        const int low = 2 * pair - (pair & (distance - 1)), high = low + distance;
+        const uint64_t a = keys[low], b = keys[high];
+        if ((a > b) == ((low & sorted) == 0)) {
+          keys[low] = b;
+          keys[high] = a;
+        }
+      }
+      const int next = distance > 1 ? distance / 2 : sorted;
+      if (distance > kWarp || (next > kWarp && sorted < size))
+        __syncthreads();
+      else if (has_work)
+        __syncwarp();
+    }
+}
+
 extern "C" {
 
-// A row of `length` counts a block of any size: each becomes the sum of those before it, and totals[row] that of all.
-__global__ void __launch_bounds__(kSortThreads) gs_scan(int length, uint32_t* counts, uint64_t* totals) {
-  GS_SHARED(uint32_t, of_warps, [kSortWarps]);
-  uint32_t* row = counts + int64_t(blockIdx.x) * length;
+// A row of blocks a row of counts: each becomes, in `sums`, the sum of those before it; `total` receives that of all of the first
+// row. A block has kScanThreads·kScanItems of them, and adds up by itself all that are before: nobody waits for others.
+__global__ void __launch_bounds__(kScanThreads) gs_scan(Counts first, Counts second, uint64_t* total) {
+  GS_SHARED(uint64_t, before_of_warps, [kScanThreads / kWarp]);
+  GS_SHARED(uint64_t, of_warps, [kScanThreads / kWarp]);
+  const Counts row = blockIdx.y == 0 ? first : second;
+  const int64_t begin = int64_t(blockIdx.x) * (kScanThreads * kScanItems);
+  if (begin >= row.length && begin > 0) return;
   uint64_t before_these = 0;
-  for (int base = 0; base < length; base += int(blockDim.x) * kScanItems) {
-    const int own = base + int(threadIdx.x) * kScanItems;
-    uint32_t items[kScanItems], total = 0;
-    for (int k = 0; k < kScanItems; ++k) {
-      items[k] = own + k < length ? row[own + k] : 0;
-      total += items[k];
-    }
-    const Sum sum = block_sum(total, of_warps);
-    uint32_t next = uint32_t(before_these) + sum.inclusive - total;
-    for (int k = 0; k < kScanItems && own + k < length; ++k) {
-      row[own + k] = next;
-      next += items[k];
-    }
-    before_these += sum.all;
+  for (int64_t k = threadIdx.x; k < begin; k += kScanThreads) before_these += row.counts[k];
+  before_these = block_sum(before_these, before_of_warps).all;
+
+  const int64_t own = begin + int64_t(threadIdx.x) * kScanItems;
+  uint32_t items[kScanItems];
+  uint64_t sum = 0;
+  for (int k = 0; k < kScanItems; ++k) {
+    items[k] = own + k < row.length ? row.counts[own + k] : 0;
+    sum += items[k];
+  }
+  const Sum<uint64_t> sums = block_sum(sum, of_warps);
+  // Where 32 bits are too few, the total tells.
+  uint32_t next = uint32_t(before_these + sums.inclusive - sum);
+  for (int k = 0; k < kScanItems && own + k < row.length; ++k) {
+    row.sums[own + k] = next;
+    next += items[k];
+  }
+  if (blockIdx.y == 0 && threadIdx.x == 0 && begin + kScanThreads * kScanItems >= row.length)
+    *total = before_these + sums.all;
+}
+
+// A tile a block: its pairs in their order, entries tile_start[tile] … tile_start[tile + 1] − 1. There, `keys` has those of the
+// pairs in any order, and is used up; `spare` is as long.
+__global__ void __launch_bounds__(kSortThreads)
+    gs_sort_lists(Call call, const uint32_t* tile_start, uint64_t* keys, uint64_t* spare, const TileEntry* pairs,
+                  TileEntry* entries) {
+  GS_SHARED(uint64_t, list, [kListKeys]);
+  const int64_t tile = int64_t(blockIdx.y) * call.grid.tiles() + blockIdx.x;
+  const uint32_t begin = tile_start[tile], length = tile_start[tile + 1] - begin;
+  keys += begin;
+  spare += begin;
+  entries += begin;
+  for (uint32_t done = 0; done < length; done += kListKeys) {
+    const int count = int(length - done < kListKeys ? length - done : kListKeys);
+    int size = 2 * kWarp;
+    while (size < count) size *= 2;
+    for (int k = int(threadIdx.x); k < size; k += kSortThreads) list[k] = k < count ? keys[done + uint32_t(k)] : ~uint64_t(0);
+    __syncthreads();
+    sort_keys(list, size);
+    __syncthreads();
+    for (int k = int(threadIdx.x); k < count; k += kSortThreads)
+      if (length <= kListKeys)
+        entries[k] = pairs[pair_of(list[k])];
+      else
+        keys[done + uint32_t(k)] = list[k];
     __syncthreads();
   }
-  if (threadIdx.x == 0) totals[blockIdx.x] = before_these;
-}
+  if (length <= kListKeys) return;
 
-__global__ void __launch_bounds__(kSortThreads)
-    gs_count_digits(uint32_t count, int shift, const uint64_t* keys, uint32_t* table) {
-  GS_SHARED(uint32_t, counts, [kDigits]);
-  counts[threadIdx.x] = 0;
-  __syncthreads();
-  const uint64_t begin = uint64_t(blockIdx.x) * (kSortThreads * kSortItems);
-  for (int k = 0; k < kSortItems; ++k) {
-    const uint64_t at = begin + uint64_t(k) * kSortThreads + threadIdx.x;
-    if (at < count) atomicAdd(&counts[digit_of(keys[at], shift)], 1u);
+  // A longer list is made of several: each key goes behind as many as are before it in its own list and in the neighbour.
+  for (uint64_t run = kListKeys; run < length; run *= 2) {
+    for (uint64_t k = threadIdx.x; k < length; k += kSortThreads) {
+      const uint64_t key = keys[k], own = k / run * run, both = k / (2 * run) * (2 * run), other = own == both ? own + run : both;
+      uint64_t low = other < length ? other : length, high = low + run < length ? low + run : length;
+      const uint64_t first = low;
+      while (low < high) {
+        const uint64_t middle = low + (high - low) / 2;
+        if (keys[middle] < key)
+          low = middle + 1;
+        else
+          high = middle;
+      }
+      spare[both + (k - own) + (low - first)] = key;
+    }
+    uint64_t* const merged = spare;
+    spare = keys;
+    keys = merged;
+    __syncthreads();
   }
-  __syncthreads();
-  table[uint64_t(threadIdx.x) * gridDim.x + blockIdx.x] = counts[threadIdx.x];
-}
-
-__global__ void __launch_bounds__(kSortThreads)
-    gs_scatter(uint32_t count, int shift, const uint64_t* keys, const uint32_t* values, const uint32_t* table,
-               const uint64_t* totals, uint64_t* sorted_keys, uint32_t* sorted_values) {
-  // First how many of a digit a warp has, then where its first goes.
-  GS_SHARED(uint32_t, places, [kSortWarps][kDigits]);
-  GS_SHARED(uint32_t, of_warps, [kSortWarps]);
-  const int digit = int(threadIdx.x);
-  for (int k = 0; k < kSortWarps; ++k) places[k][digit] = 0;
-  __syncthreads();
-
-  const uint64_t begin = (uint64_t(blockIdx.x) * kSortWarps + uint64_t(warp())) * kWarpKeys + uint64_t(lane());
-  uint32_t(&own)[kDigits] = places[warp()];
-  uint64_t key[kSortItems];
-  uint32_t rank[kSortItems];  // among the warp's of that digit
-  for (int k = 0; k < kSortItems; ++k) {
-    const uint64_t at = begin + uint64_t(k) * kWarp;
-    key[k] = at < count ? keys[at] : 0;
-    const int of_key = at < count ? digit_of(key[k], shift) : kDigits;
-    const unsigned alike = __match_any_sync(kAll, of_key);
-    if (at < count) rank[k] = own[of_key] + uint32_t(__popc(alike & before()));
-    __syncwarp();
-    if (at < count && (alike & before()) == 0) own[of_key] += uint32_t(__popc(alike));
-    __syncwarp();
-  }
-
-  // The sum, in which the block meets, also waits for all warps' counts.
-  const uint32_t of_digit = uint32_t(totals[digit]);
-  uint32_t next = block_sum(of_digit, of_warps).inclusive - of_digit + table[uint64_t(digit) * gridDim.x + blockIdx.x];
-  for (int k = 0; k < kSortWarps; ++k) {
-    const uint32_t in_warp = places[k][digit];
-    places[k][digit] = next;
-    next += in_warp;
-  }
-  __syncthreads();
-  for (int k = 0; k < kSortItems; ++k) {
-    const uint64_t at = begin + uint64_t(k) * kWarp;
-    if (at >= count) break;
-    const uint32_t place = own[digit_of(key[k], shift)] + rank[k];
-    sorted_keys[place] = key[k];
-    sorted_values[place] = values[at];
-  }
-}
-
-// The tiles' lists from the sorted pairs: entry k, and where tile k's begin; tile_start has one more than there are tiles.
-__global__ void gs_list(uint32_t count, uint32_t tiles, const uint64_t* keys, const uint32_t* values, const TileEntry* pairs,
-                        TileEntry* entries, uint32_t* tile_start) {
-  const uint64_t k = uint64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (k < count) entries[k] = pairs[values[k]];
-  if (k > tiles) return;
-  uint32_t low = 0, high = count;
-  while (low < high) {
-    const uint32_t middle = low + (high - low) / 2;
-    if (keys[middle] < key_of(k))
-      low = middle + 1;
-    else
-      high = middle;
-  }
-  tile_start[k] = low;
+  for (uint64_t k = threadIdx.x; k < length; k += kSortThreads) entries[k] = pairs[pair_of(keys[k])];
 }
 
 }  // extern "C"
