@@ -114,7 +114,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
       if (from < to) {
         // What is read, and computed, twice takes no registers in between.
         raster::lane::Group<float> group;
-        raster::lane::Projection<float> projection;
+        raster::lane::Projection<float> projection{};  // which is visible, as all are that have records
         raster::lane::Shading<float> shading;
         const Lens<float>& lens = lenses[view + k];
         float d_r[3];
@@ -127,8 +127,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
             [&](int n, float x, float y) { sums_of_sh[n] = raster::lane::add_product(x, y, ever ? sums_of_sh[n] : 0); }, d_r);
         raster::lane::load_shapes(scene, i, i + 1, group);
         raster::lane::project_group(group, lens, projection);
-        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, asked != nullptr,
-                                             of_camera);
+        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, asked != nullptr, of_camera);
         ever = true;
       }
       if (asked != nullptr) {
