@@ -23,26 +23,49 @@ inline Sum<T> block_sum(T value, T (&of_warps)[warps]) {
   return sum;
 }
 
-// Sorts keys, `size` of them, a power of two from 64 on, by a bitonic network: the threads of a warp exchange keys that are up to 32
-// apart among 64 that no other warp touches then, and the block meets only where keys are farther apart.
+// A step of a bitonic network: the lower of two keys, `distance` apart, comes first where `sorted` isn't in the lower one's place.
+inline bool changes_places(uint64_t low, uint64_t high, int place, int sorted) { return (low > high) == ((place & sorted) == 0); }
+
+// The steps of distances up to 32, from the stage that has runs of `sorted` keys in their order on until that of `last`, by a warp in
+// registers, for 64 keys from `place` on: a lane has two of them.
+inline void sort_in_warp(uint64_t* keys, int place, int sorted, int last) {
+  uint64_t own[2] = {keys[place + lane()], keys[place + kWarp + lane()]};
+  for (; sorted <= last; sorted *= 2) {
+    if (sorted > kWarp && changes_places(own[0], own[1], place, sorted)) {
+      const uint64_t low = own[0];
+      own[0] = own[1];
+      own[1] = low;
+    }
+    for (int distance = sorted > kWarp ? kWarp / 2 : sorted / 2; distance > 0; distance /= 2)
+      for (int k = 0; k < 2; ++k) {
+        const uint64_t other = __shfl_xor_sync(kAll, own[k], distance);
+        const bool is_lower = (lane() & distance) == 0, rises = ((place + k * kWarp + lane()) & sorted) == 0;
+        if ((own[k] > other) == (is_lower == rises)) own[k] = other;
+      }
+  }
+  keys[place + lane()] = own[0];
+  keys[place + kWarp + lane()] = own[1];
+}
+
+// Sorts keys, `size` of them, a power of two from 64 on, by a bitonic network. Other warps may use them once the block has met.
 inline void sort_keys(uint64_t* keys, int size) {
-  const bool has_work = warp() * kWarp < size / 2;
-  for (int sorted = 2; sorted <= size; sorted *= 2)
-    for (int distance = sorted / 2; distance > 0; distance /= 2) {
+  constexpr int kPart = 2 * kWarp, kSortWarps = kSortThreads / kWarp;
+  for (int place = warp() * kPart; place < size; place += kSortWarps * kPart) sort_in_warp(keys, place, 2, kPart);
+  for (int sorted = 2 * kPart; sorted <= size; sorted *= 2) {
+    for (int distance = sorted / 2; distance > kWarp; distance /= 2) {
+      __syncthreads();
       for (int pair = int(threadIdx.x); pair < size / 2; pair += kSortThreads) {
-        const int low = 2 * pair - (pair & (distance - 1)), high = low + distance;
-        const uint64_t a = keys[low], b = keys[high];
-        if ((a > b) == ((low & sorted) == 0)) {
-          keys[low] = b;
-          keys[high] = a;
+        const int place = 2 * pair - (pair & (distance - 1));
+        const uint64_t low = keys[place], high = keys[place + distance];
+        if (changes_places(low, high, place, sorted)) {
+          keys[place] = high;
+          keys[place + distance] = low;
         }
       }
-      const int next = distance > 1 ? distance / 2 : sorted;
-      if (distance > kWarp || (next > kWarp && sorted < size))
-        __syncthreads();
-      else if (has_work)
-        __syncwarp();
     }
+    __syncthreads();
+    for (int place = warp() * kPart; place < size; place += kSortWarps * kPart) sort_in_warp(keys, place, sorted, sorted);
+  }
 }
 
 extern "C" {
