@@ -162,7 +162,7 @@ done
 bench train_tiny 60 train --config configs/tiny.toml --batch 2 --steps "$steps" --device "$device" ${model[@]+"${model[@]}"}
 bench raster_million 60 raster "${large[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v ncu >"$work/found"; then
-    part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 40 --launch-count 30 --section SpeedOfLight \
+    part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 20 --launch-count 20 --section SpeedOfLight \
         --section Occupancy --section LaunchStats "$globalsplat" bench raster --repeats 2 --device "$device"
 fi
 bench raster_cpu 60 raster "${raster[@]}"

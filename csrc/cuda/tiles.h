@@ -15,10 +15,13 @@ inline constexpr int kNothing = kBatch;       // the place behind a batch, where
 static_assert(sizeof(Splat<float>) == 64 && kTileThreads * 2 == kBatch * 16, "a batch's splats are two numbers a thread");
 static_assert(raster::kBlocks == 2 * kTileWarps && raster::kBlock * raster::kBlock == kHalf, "two blocks a warp");
 
-// Blocks of the backward pass that fit a multiprocessor at least: as many as leave enough registers for a thread.
+// Blocks that fit a multiprocessor at least: as many as leave enough registers for a thread. Forward, other architectures' compilers do
+// better without being told.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 900
+#define GS_FORWARD_BOUNDS __launch_bounds__(kTileThreads, 8)
 inline constexpr int kBackwardBlocks = 5;
 #else
+#define GS_FORWARD_BOUNDS __launch_bounds__(kTileThreads)
 inline constexpr int kBackwardBlocks = 4;
 #endif
 
@@ -85,7 +88,7 @@ inline int list_items(uint32_t blocks, Order& order) {
 extern "C" {
 
 // Warps go on by themselves: each fetches those of a batch that reach its pixels.
-__global__ void __launch_bounds__(kTileThreads)
+__global__ void GS_FORWARD_BOUNDS
     gs_blend(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
              Pictures<float> pictures) {
   struct Shared {
