@@ -97,7 +97,7 @@ run_ordinary() {
 }
 
 run_small() {
-    run as_small lib model refine examples
+    run as_small lib splat model refine examples
 }
 
 case "${1:-all}" in
