@@ -5,12 +5,12 @@ mod common;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use common::browser::Browser;
+use common::browser::{Browser, Screenshots};
 use common::program::{arg, command, refuse, room, succeed};
 use common::{captures, skip};
 use globalsplat::data::open_capture;
 use globalsplat::eval::psnr;
-use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb, write_png};
+use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb};
 use globalsplat::render::render_views;
 use globalsplat::scene::ImageSize;
 use serde_json::{Value, json};
@@ -144,12 +144,6 @@ fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     (own.rgb.clamp(0., 1.), view.image)
 }
 
-fn keep(name: &str, picture: &Tensor) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/viewers");
-    std::fs::create_dir_all(&folder).unwrap();
-    write_png(&folder.join(format!("{name}.png")), picture).unwrap();
-}
-
 /// How far a picture's pixels are from the nearest colour of depth, in the mean.
 fn from_depth_colours(picture: &Tensor) -> f64 {
     let pixels = picture.flatten(1, 2).transpose(0, 1).contiguous();
@@ -168,11 +162,12 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     let splat = capture.join("reference.ply");
     succeed(&["render", "--splat", arg(&splat), "--scene", arg(&capture), "--html", arg(&page)]);
     let Some(mut shown) = Shown::open(&page) else { return };
+    let screenshots = Screenshots::create();
 
     // From the first camera, as the files say.
     let (own, photo) = expected(&capture, &splat, 0);
     let picture = shown.picture();
-    keep("page-first", &picture);
+    screenshots.save("page-first", &picture);
     println!("the first camera: {:.2} dB", psnr(&picture, &own));
     assert!(psnr(&picture, &own) >= LEAST, "{:.2} dB", psnr(&picture, &own));
     assert_eq!(shown.value("page.walk.at"), 0);
@@ -190,7 +185,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.value(&hide("hidden"));
     let over = shown.screen();
     shown.value(&hide("visible"));
-    keep("page-photo", &over);
+    screenshots.save("page-photo", &over);
     assert!(psnr(&over, &photo) > psnr(&picture, &photo) + 1., "{:.2} dB", psnr(&over, &photo));
     assert!(psnr(&over, &photo) > 28., "{:.2} dB", psnr(&over, &photo));
     shown.value("share.value = 0, share.dispatchEvent(new Event('input'))");
@@ -215,14 +210,14 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     // Depth has the colours of depth, centres are points.
     shown.key("Digit2");
     let depth = shown.picture();
-    keep("page-depth", &depth);
+    screenshots.save("page-depth", &depth);
     assert_eq!(shown.value("document.querySelector('[aria-pressed=true]').id"), "depth");
     let [of_depth, of_photo] = [&depth, &picture].map(from_depth_colours);
     println!("{of_depth:.3} from the colours of depth, in colour {of_photo:.3}");
     assert!(of_depth < 0.05 && of_photo > 0.15, "{of_depth} {of_photo}");
     shown.click("#centres");
     let centres = shown.picture();
-    keep("page-centres", &centres);
+    screenshots.save("page-centres", &centres);
     let black = centres.lt(0.05).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
     assert!((0.5..0.99).contains(&black), "{black} of the points' picture is black");
     shown.click("#colour");
@@ -240,7 +235,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     let before = shown.picture();
     shown.key("KeyC");
     let cameras = shown.picture();
-    keep("page-cameras", &cameras);
+    screenshots.save("page-cameras", &cameras);
     assert!(psnr(&cameras, &before) < 40., "{:.2} dB: no camera is to be seen", psnr(&cameras, &before));
     shown.key("KeyC");
     shown.draw((200., 200.), (300., 210.));

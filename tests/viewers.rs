@@ -1,16 +1,16 @@
 //! Our splats in other people's viewers: what Spark and Babylon.js, which are public and know nothing of each other, show of
-//! them in a browser. The pictures stay in `target/viewers`.
+//! them in a browser. A test that fails keeps the pictures.
 
 mod common;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use common::browser::Browser;
+use common::browser::{Browser, Screenshots};
 use common::program::{arg, succeed};
 use common::{captures, skip};
 use globalsplat::data::open_capture;
 use globalsplat::eval::psnr;
-use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb, write_png};
+use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Camera, ImageSize, Intrinsics};
 use serde_json::{Value, json};
@@ -108,8 +108,7 @@ fn public_viewers_show_our_splats_as_we_do() {
         let to = of(&format!("published.{ending}"));
         succeed(&["convert", arg(&published), arg(&to), "--for-viewers", "--scene", arg(&capture)]);
     }
-    let pictures = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/viewers");
-    std::fs::create_dir_all(&pictures).unwrap();
+    let screenshots = Screenshots::create();
     let camera = first_camera(&capture);
     let files = [
         ("made", of("made.ply"), of("made.ply"), LEAST),
@@ -122,12 +121,12 @@ fn public_viewers_show_our_splats_as_we_do() {
     for (name, original, file, least) in files {
         let splat = read_splat(&original).unwrap();
         let own = render_views(&splat.gaussians, &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
-        write_png(&pictures.join(format!("{name}-own.png")), &own).unwrap();
+        screenshots.save(&format!("{name}-own"), &own);
         let ending = file.extension().unwrap().to_str().unwrap();
         for (viewer, page) in &viewers {
             let what = format!("{name}, .{ending}, in {viewer}");
             let (told, picture) = show(&mut browser, page, &file, &camera);
-            write_png(&pictures.join(format!("{name}-{ending}-{viewer}.png")), &picture).unwrap();
+            screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);
             assert_eq!(told["count"].as_i64(), Some(splat.gaussians.count()), "{what}");
             for (corner, own) in ["low", "high"].iter().zip(bounds(&splat)) {
                 // Spark keeps means in half precision.

@@ -2,12 +2,14 @@
 //!
 //! It is spoken to over two pipes by the DevTools protocol (`--remote-debugging-pipe`): a JSON object, then a zero byte.
 
+use globalsplat::io::write_png;
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
+use tch::Tensor;
 use tempfile::TempDir;
 
 /// A browser that doesn't answer for so long hangs.
@@ -191,5 +193,29 @@ impl Drop for Browser {
         }
         let _ = self.process.kill();
         let _ = self.process.wait();
+    }
+}
+
+/// A temporary folder for a test's screenshots. It is deleted when the test passes. When the test fails, the folder stays and its
+/// path is printed.
+pub struct Screenshots(Option<TempDir>);
+
+impl Screenshots {
+    pub fn create() -> Self {
+        Screenshots(Some(tempfile::tempdir().expect("a folder")))
+    }
+
+    /// Writes a picture [3, H, W] to `<name>.png`.
+    pub fn save(&self, name: &str, picture: &Tensor) {
+        let folder = self.0.as_ref().expect("a folder until it is dropped");
+        write_png(&folder.path().join(format!("{name}.png")), picture).expect("a PNG");
+    }
+}
+
+impl Drop for Screenshots {
+    fn drop(&mut self) {
+        if let Some(folder) = self.0.take().filter(|_| std::thread::panicking()) {
+            println!("screenshots: {}", folder.keep().display());
+        }
     }
 }
