@@ -5,6 +5,7 @@
 #                                        folder with a space that only its owner may write to, in another language and time zone,
 #                                        without standard input; then the demo in small
 #   scripts/other_machines.sh small      tests of what computes, on one core with SSE2
+#   scripts/other_machines.sh ordinary view splat    of the former, those of tests/view.rs and tests/splat.rs alone
 # Fails at the end if a test did. As root it lets others pass through the folders above the repository until then.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -22,7 +23,17 @@ end() {
 }
 trap end EXIT
 
-built="$("${CARGO:-cargo}" test --release --locked --no-run 2>&1)" || {
+# The tests that were asked for by name, all if none was; lib and main are those beside the code.
+chosen=("${@:2}")
+targets=()
+for name in "${chosen[@]}"; do
+    case "$name" in
+    lib) targets+=(--lib) ;;
+    main) targets+=(--bin globalsplat) ;;
+    *) targets+=(--test "$name") ;;
+    esac
+done
+built="$("${CARGO:-cargo}" test --release --locked --no-run "${targets[@]}" 2>&1)" || {
     echo "$built" >&2
     exit 1
 }
@@ -30,18 +41,24 @@ built="$("${CARGO:-cargo}" test --release --locked --no-run 2>&1)" || {
 tests="$(sed -nE 's|^ *Executable (unittests src/)?(tests/)?([a-z_]+)\.rs \((.*)\)$|\3 \4|p' <<<"$built")"
 
 failed=()
-# Runs the tests $2…, or all, by the command $1. Says what they were skipped for want of.
+# Runs the tests $2…, or all, by the command $1; of these, the chosen ones. Says what they were skipped for want of.
 run() {
-    local as=$1 name program
+    local as=$1 name program ran=false
     shift
     : >"$GLOBALSPLAT_SKIPPED"
     chmod a+rw "$GLOBALSPLAT_SKIPPED"
     while read -r name program; do
         [ $# -eq 0 ] || [[ " $* " == *" $name "* ]] || continue
+        [ ${#chosen[@]} -eq 0 ] || [[ " ${chosen[*]} " == *" $name "* ]] || continue
         [ "${program:0:1}" = / ] || program="$repository/$program"
         echo "$as: $name"
+        ran=true
         "$as" "$program" --quiet </dev/null || failed+=("$as: $name")
     done <<<"$tests"
+    $ran || {
+        echo "other_machines: $as runs no test of ${chosen[*]}" >&2
+        exit 2
+    }
     [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped for want of $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 
@@ -93,6 +110,7 @@ run_ordinary() {
         local -x TORCHRUN=/nonexistent
     }
     run as_ordinary
+    [ ${#chosen[@]} -eq 0 ] || return 0
     echo "as_ordinary: demo"
     OUT="$folder/a folder/tmp/demo" CAPTURES=none as_ordinary scripts/demo.sh --dry-run || failed+=("as_ordinary: demo")
 }
