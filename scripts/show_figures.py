@@ -15,7 +15,7 @@ def is_spread(value):
 
 
 def show(figures):
-    plain = {name: value for name, value in figures.items() if not isinstance(value, (dict, list))}
+    plain = {name: value for name, value in figures.items() if value is not None and not isinstance(value, (dict, list))}
     print(", ".join(f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}" for name, value in plain.items()))
     spreads = {name: value for name, value in figures.items() if is_spread(value)}
     rows = [(name, value, {}) for name, value in spreads.items()]
