@@ -38,10 +38,9 @@ rust::Vec<KernelTime> kernel_times() {
     const auto same = [&](const KernelTime& time) { return time.kernel == one.kernel; };
     auto known = std::find_if(times.begin(), times.end(), same);
     if (known == times.end()) {
-      times.push_back({one.kernel, 0, 0});
+      times.push_back({one.kernel, 0});
       known = times.end() - 1;
     }
-    ++known->launches;
     known->milliseconds += one.begin.elapsedTime(one.end);
   }
   return times;

@@ -63,8 +63,6 @@ mod ffi {
     struct KernelTime {
         /// Its name.
         kernel: String,
-        /// How many there were.
-        launches: u32,
         /// All of them together.
         milliseconds: f64,
     }

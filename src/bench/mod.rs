@@ -48,7 +48,7 @@ pub struct Section {
 #[derive(Debug, Default)]
 struct Measured {
     whole: Vec<f64>,
-    sections: Vec<(&'static str, Vec<f64>)>,
+    sections: Vec<(Cow<'static, str>, Vec<f64>)>,
 }
 
 impl Measured {
@@ -56,18 +56,26 @@ impl Measured {
     fn add(&mut self, watch: &mut Stopwatch) {
         let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
         self.whole.push(times.clone().map(|(_, milliseconds)| milliseconds).sum());
-        for (name, milliseconds) in times {
-            match self.sections.iter_mut().find(|(known, _)| *known == name) {
-                Some((_, all)) => all.push(milliseconds),
-                None => self.sections.push((name, vec![milliseconds])),
-            }
+        times.for_each(|(name, milliseconds)| self.add_section(name.into(), milliseconds));
+    }
+
+    /// A section alone.
+    fn add_section(&mut self, name: Cow<'static, str>, milliseconds: f64) {
+        match self.sections.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, all)) => all.push(milliseconds),
+            None => self.sections.push((name, vec![milliseconds])),
         }
     }
 
     /// Of at least one time.
-    fn told(self) -> (Spread, Vec<Section>) {
-        let section = |(name, all)| Section { name: Cow::Borrowed(name), milliseconds: Spread::of(all) };
-        (Spread::of(self.whole), self.sections.into_iter().map(section).collect())
+    fn told(mut self) -> (Spread, Vec<Section>) {
+        (Spread::of(std::mem::take(&mut self.whole)), self.sections())
+    }
+
+    /// The sections alone, in the order in which they were first added.
+    fn sections(self) -> Vec<Section> {
+        let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
+        self.sections.into_iter().map(section).collect()
     }
 }
 

@@ -1,6 +1,6 @@
 //! The splat op: from Gaussians in tensors to pictures, and back to gradients in tensors.
 
-use super::{Section, Spread};
+use super::{Measured, Section, Spread};
 use crate::error::Result;
 use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 use crate::optim::Stopwatch;
@@ -176,21 +176,16 @@ fn sum_of_pictures(pictures: &Pictures) -> Tensor {
 /// Measures each kernel of a GPU, in calls of their own: events around every launch slow a call down.
 fn kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
     let views = (cameras.w2c.size()[0] * cameras.w2c.size()[1]) as f64;
-    let mut all: Vec<(String, Vec<f64>)> = vec![];
+    let mut measured = Measured::default();
     for _ in 0..repeats {
         measure_kernels(true);
         pictures_and_gradients(gaussians, cameras)?;
         for time in kernel_times()? {
-            let milliseconds = time.milliseconds / views;
-            match all.iter_mut().find(|(kernel, _)| *kernel == time.kernel) {
-                Some((_, known)) => known.push(milliseconds),
-                None => all.push((time.kernel, vec![milliseconds])),
-            }
+            measured.add_section(time.kernel.into(), time.milliseconds / views);
         }
     }
     measure_kernels(false);
-    let section = |(kernel, all): (String, _)| Section { name: kernel.into(), milliseconds: Spread::of(all) };
-    Ok(all.into_iter().map(section).collect())
+    Ok(measured.sections())
 }
 
 /// Compares what a GPU draws, and its gradients, to the CPU's.

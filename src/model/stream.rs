@@ -218,9 +218,10 @@ mod tests {
 
     #[test]
     fn folded_weights_read_the_same() {
-        let config = ModelConfig { width: 32, heads: 2, rgb_width: 16, ray_width: 8, ..Default::default() };
+        // An odd number of heads, which a CPU goes through together, as a GPU does with any number.
+        let config = ModelConfig { width: 32, heads: 1, rgb_width: 16, ray_width: 8, ..Default::default() };
         let vs = nn::VarStore::new(Device::Cpu);
-        let mut round = StreamRound::new(&vs.root(), &ModelConfig { heads: 1, ..config });
+        let mut round = StreamRound::new(&vs.root(), &config);
         for (name, mut value) in vs.variables() {
             let is_read_with = ["mem_k", "mem_v", "mem_ln"].iter().any(|layer| name.starts_with(layer));
             if is_read_with {
@@ -229,8 +230,7 @@ mod tests {
         }
         let (query, memory) = (uneven(0.9, &[2, 9, 32]), Memory::new(&alike(30)));
         for (precision, most) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
-            let [query, memory] = [query.to_kind(precision.kind()), memory.tokens.to_kind(precision.kind())];
-            let memory = Memory { tokens: memory, common: Memory::new(&alike(30)).common };
+            let (query, memory) = (query.to_kind(precision.kind()), memory.to_kind(precision.kind()));
             round.folded = None;
             let expected = no_grad(|| round.look(&query, &memory, precision));
             no_grad(|| round.fold_weights(precision));
