@@ -537,8 +537,12 @@ fn interrupt_training(signal: i32) {
         assert!(child.try_wait().expect("a child").is_none(), "it ended by itself");
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
-    // SAFETY: sends a signal to a child that has not been waited for.
-    unsafe { libc::kill(child.id() as i32, signal) };
+    // Again and again, as nobody would: a handler must not write where a product is being computed.
+    while child.try_wait().expect("a child").is_none() {
+        // SAFETY: sends a signal to a child that has not been waited for.
+        unsafe { libc::kill(child.id() as i32, signal) };
+        std::thread::sleep(std::time::Duration::from_micros(50));
+    }
     let output = child.wait_with_output().expect("a child");
     let err = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{err}");

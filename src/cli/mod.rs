@@ -29,6 +29,8 @@ mod reconstruct;
 mod refine;
 mod render;
 mod report;
+mod signals;
+
 mod splat_out;
 mod synth;
 mod train;
@@ -185,7 +187,7 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
 fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
+    signals::on_stop(move || flag.store(true, Ordering::Relaxed))?;
     Ok(stop)
 }
 

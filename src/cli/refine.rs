@@ -1,6 +1,7 @@
 use super::progress::{self, Progress};
 use super::{
-    FAILED, check_views, memory, model, open_capture, parse_size, print_json, say_shrunk, splat_out, warn,
+    FAILED, check_views, memory, model, open_capture, parse_size, print_json, say_shrunk, signals, splat_out,
+    warn,
 };
 use anyhow::Result;
 use clap::{Args, ValueEnum};
@@ -362,7 +363,7 @@ impl StopRequest {
         let request = StopRequest::default();
         request.set_ends_at_once(true);
         let handler = request.clone();
-        ctrlc::set_handler(move || {
+        signals::on_stop(move || {
             let is_second = handler.is_requested.swap(true, Ordering::Relaxed);
             if is_second || handler.ends_at_once.load(Ordering::Relaxed) {
                 eprintln!("globalsplat: {}", if is_second { "stopped at once" } else { NOTHING_YET });
