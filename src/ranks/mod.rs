@@ -28,9 +28,11 @@ pub(crate) mod tests {
         work: impl Fn(Group) -> T + Sync,
     ) -> Vec<T> {
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
+        // Who leaves before the others have met would be missed there, not in what is tested.
+        let have_met = std::sync::Barrier::new(ranks);
         std::thread::scope(|scope| {
             let rank = |rank| {
-                let (store, work) = (store.another().expect("a connection"), &work);
+                let (store, have_met, work) = (store.another().expect("a connection"), &have_met, &work);
                 scope.spawn(move || {
                     let place = Place {
                         rank,
@@ -43,6 +45,7 @@ pub(crate) mod tests {
                         store_is_kept: true,
                     };
                     let group = Group::join_with_timeout(&place, &store, Device::Cpu, seconds);
+                    have_met.wait();
                     work(group.expect("a group"))
                 })
             };
