@@ -63,17 +63,23 @@ fn newer_gpus_get_what_their_driver_compiles_and_older_ones_a_sentence() {
     assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
 }
 
-/// A folder with a driver in it, which loaders find by LD_LIBRARY_PATH.
+/// A folder with a driver in it, which loaders find by LD_LIBRARY_PATH. Beside it lies a toolkit's stub, for linkers alone.
 fn fake_driver() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");
+    let stub = folder.path().join("stub.c");
+    std::fs::write(&stub, "int cuInit(unsigned flags) { return 34; }").expect("a file");
     let compiler = std::env::var("CXX").unwrap_or("c++".into());
-    let compiled = Command::new(compiler)
-        .args(["-x", "c", "-shared", "-fPIC", "tests/common/fake_driver.c", "-o"])
-        .arg(folder.path().join("libcuda.so.1"))
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .status()
-        .expect("the compiler that this was built with");
-    assert!(compiled.success());
+    for (source, library) in
+        [(Path::new("tests/common/fake_driver.c"), "libcuda.so.1"), (&stub, "libcuda.so")]
+    {
+        let compiled = Command::new(&compiler)
+            .args(["-x", "c", "-shared", "-fPIC", "-o"])
+            .args([&folder.path().join(library), source])
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .status()
+            .expect("the compiler that this was built with");
+        assert!(compiled.success());
+    }
     folder
 }
 

@@ -40,6 +40,9 @@ int cuModuleLoadData(void **module, const void *image) {
   *module = module;
   return memcmp(image, "\177ELF", 4) == 0 ? 0 : INVALID_IMAGE;
 }
+// Nothing is launched here.
+int cuModuleGetFunction(void) { return NOT_SUPPORTED; }
+int cuLaunchKernel(void) { return NOT_SUPPORTED; }
 int cuGetErrorName(int error, const char **name) {
   *name = error == MISMATCH ? "CUDA_ERROR_SYSTEM_DRIVER_MISMATCH" : "CUDA_ERROR_UNKNOWN";
   return 0;

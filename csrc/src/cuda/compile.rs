@@ -2,7 +2,7 @@
 
 use super::{
     Result,
-    libraries::{Functions, Program, nvrtc},
+    libraries::{NvrtcFunctions, Program, nvrtc},
 };
 use std::ffi::{CStr, CString, c_char, c_int};
 use std::ptr;
@@ -146,7 +146,7 @@ impl Nvrtc {
     }
 }
 
-impl Functions {
+impl NvrtcFunctions {
     /// # Safety
     /// A program, and terminated texts.
     unsafe fn compile(&self, program: Program, options: &[*const c_char], form: Form) -> Result<Compiled> {

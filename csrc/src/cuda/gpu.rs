@@ -4,16 +4,19 @@ use super::{
     Result, cache,
     compile::{Form, Nvrtc},
     ffi::BlockCounts,
-    libraries::has_driver,
-};
-use cudarc::driver::{
-    result::{self, DriverError},
-    sys,
+    libraries::{DriverFunctions, Handle, driver},
 };
 use std::collections::{HashMap, hash_map::Entry};
-use std::ffi::{CString, c_void};
+use std::ffi::{CStr, CString, c_char, c_int};
 use std::path::PathBuf;
+use std::ptr::null_mut;
 use std::sync::{LazyLock, Mutex, PoisonError};
+
+// Of cuda.h.
+const CUDA_ERROR_NO_DEVICE: c_int = 100;
+const MULTIPROCESSOR_COUNT: c_int = 16;
+const COMPUTE_CAPABILITY_MAJOR: c_int = 75;
+const COMPUTE_CAPABILITY_MINOR: c_int = 76;
 
 /// What the driver says of itself and of the GPUs.
 #[derive(Debug)]
@@ -43,59 +46,73 @@ impl Driver {
     /// # Errors
     /// There is none, or it can't reach the GPUs.
     pub fn find() -> Result<Self> {
-        if !has_driver() {
-            return Err("NVIDIA's driver (libcuda.so.1) is not on the loader's path; it comes with the system, as a package or by \
-                        NVIDIA's installer, and into a container by nvidia-container-toolkit"
-                .into());
+        let driver = driver()?;
+        let (mut count, mut version) = (0, 0);
+        // SAFETY: what is asked for has its place.
+        unsafe {
+            match (driver.cuInit)(0) {
+                CUDA_ERROR_NO_DEVICE => {}
+                started => {
+                    driver.check(started)?;
+                    driver.check((driver.cuDeviceGetCount)(&mut count))?;
+                }
+            }
+            driver.check((driver.cuDriverGetVersion)(&mut version))?;
         }
-        let count = match result::init() {
-            Err(DriverError(sys::CUresult::CUDA_ERROR_NO_DEVICE)) => 0,
-            started => told(started.and_then(|()| result::device::get_count()))?,
-        };
-        let gpus = (0..count).map(Gpu::find).collect::<Result<Vec<_>>>()?;
-        Ok(Driver { version: driver_version()?, gpus })
+        let gpus = (0..count).map(|number| Gpu::find(driver, number)).collect::<Result<Vec<_>>>()?;
+        Ok(Driver { version, gpus })
     }
 }
 
 impl Gpu {
-    fn find(number: i32) -> Result<Self> {
-        use sys::CUdevice_attribute as Attribute;
-        let device = told(result::device::get(number))?;
-        // SAFETY: a device that the driver gave.
-        let attribute =
-            |attribute: Attribute| told(unsafe { result::device::get_attribute(device, attribute) });
-        Ok(Gpu {
-            name: told(result::device::get_name(device))?,
-            architecture: 10 * attribute(Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR)?
-                + attribute(Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR)?,
+    fn find(driver: &DriverFunctions, number: c_int) -> Result<Self> {
+        let (mut device, mut memory, mut name) = (0, 0, [0; 256]);
+        // SAFETY: a device that is there, and places for what is asked for.
+        unsafe {
+            driver.check((driver.cuDeviceGet)(&mut device, number))?;
+            driver.check((driver.cuDeviceTotalMem_v2)(&mut memory, device))?;
+            driver.check((driver.cuDeviceGetName)(name.as_mut_ptr(), name.len() as c_int, device))?;
+        }
+        let attribute = |attribute| {
+            let mut value = 0;
             // SAFETY: as above.
-            memory: told(unsafe { result::device::total_mem(device) })?,
-            multiprocessors: attribute(Attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)?,
+            driver.check(unsafe { (driver.cuDeviceGetAttribute)(&mut value, attribute, device) })?;
+            Ok::<_, String>(value)
+        };
+        Ok(Gpu {
+            // SAFETY: the driver ended it with a 0.
+            name: unsafe { CStr::from_ptr(name.as_ptr()) }.to_string_lossy().into_owned(),
+            architecture: 10 * attribute(COMPUTE_CAPABILITY_MAJOR)? + attribute(COMPUTE_CAPABILITY_MINOR)?,
+            memory,
+            multiprocessors: attribute(MULTIPROCESSOR_COUNT)?,
         })
     }
 }
 
-fn driver_version() -> Result<i32> {
-    let mut version = 0;
-    // SAFETY: the driver is there.
-    told(unsafe { sys::cuDriverGetVersion(&mut version) }.result())?;
-    Ok(version)
-}
-
-fn told<T>(result: std::result::Result<T, DriverError>) -> Result<T> {
-    result.map_err(|error| {
-        let words = [error.error_string(), error.error_name()]
-            .map(|text| text.map_or("unknown".into(), |text| text.to_string_lossy().into_owned()));
-        format!("CUDA's driver fails: {}", words.join(", "))
-    })
+impl DriverFunctions {
+    /// Puts an error into words.
+    fn check(&self, status: c_int) -> Result<()> {
+        if status == 0 {
+            return Ok(());
+        }
+        let words = [self.cuGetErrorString, self.cuGetErrorName].map(|ask| {
+            let mut text: *const c_char = null_mut();
+            // SAFETY: the driver sets a text that stays, or none.
+            unsafe {
+                ask(status, &mut text);
+                if text.is_null() { "unknown".into() } else { CStr::from_ptr(text).to_string_lossy() }
+            }
+        });
+        Err(format!("CUDA's driver fails: {}", words.join(", ")))
+    }
 }
 
 /// The kernels on one device.
 struct Loaded {
     /// The one that torch uses, too.
-    context: sys::CUcontext,
-    module: sys::CUmodule,
-    functions: HashMap<String, sys::CUfunction>,
+    context: Handle,
+    module: Handle,
+    kernels: HashMap<String, Handle>,
 }
 
 // SAFETY: what the driver gives belongs to the process, not to a thread.
@@ -114,25 +131,30 @@ pub struct Prepared {
 
 impl Loaded {
     fn on(number: i32) -> Result<(Self, Prepared)> {
-        let driver = Driver::find()?;
-        let known = driver.gpus.len();
-        let gpu = driver
+        let found = Driver::find()?;
+        let known = found.gpus.len();
+        let gpu = found
             .gpus
             .get(number as usize)
             .ok_or(format!("there are {known} GPUs, not one of number {number}"))?;
         let nvrtc = Nvrtc::find()?;
         let (architecture, form) = nvrtc.target(gpu.architecture)?;
         let file = cache::cache_folder()
-            .map(|folder| folder.join(cache::file_name(&nvrtc, driver.version, architecture, form)));
+            .map(|folder| folder.join(cache::file_name(&nvrtc, found.version, architecture, form)));
+        let driver = driver()?;
+        let (mut device, mut context) = (0, null_mut());
         // SAFETY: a device that is there; its context is kept for good.
-        let context = told(unsafe {
-            result::device::get(number).and_then(|device| {
-                let context = result::primary_ctx::retain(device)?;
-                result::ctx::set_current(context).map(|()| context)
-            })
-        })?;
-        // SAFETY: whole images, of which PTX ends with a 0.
-        let load = |image: &[u8]| told(unsafe { result::module::load_data(image.as_ptr().cast()) });
+        unsafe {
+            driver.check((driver.cuDeviceGet)(&mut device, number))?;
+            driver.check((driver.cuDevicePrimaryCtxRetain)(&mut context, device))?;
+            driver.check((driver.cuCtxSetCurrent)(context))?;
+        }
+        let load = |image: &[u8]| {
+            let mut module = null_mut();
+            // SAFETY: a whole image; PTX ends with a 0.
+            driver.check(unsafe { (driver.cuModuleLoadData)(&mut module, image.as_ptr().cast()) })?;
+            Ok::<_, String>(module)
+        };
         let kept = file.as_deref().and_then(cache::read).and_then(|image| load(&image).ok());
         let was_kept = kept.is_some();
         let (module, file) = match kept {
@@ -148,19 +170,21 @@ impl Loaded {
                 (module?, file.filter(|file| cache::write(file, &image)))
             }
         };
-        let functions = HashMap::new();
-        Ok((Loaded { context, module, functions }, Prepared { architecture, file, was_kept }))
+        let kernels = HashMap::new();
+        Ok((Loaded { context, module, kernels }, Prepared { architecture, file, was_kept }))
     }
 
-    fn function(&mut self, kernel: &str) -> Result<sys::CUfunction> {
-        if let Some(&function) = self.functions.get(kernel) {
-            return Ok(function);
+    fn kernel(&mut self, driver: &DriverFunctions, name: &str) -> Result<Handle> {
+        if let Some(&kernel) = self.kernels.get(name) {
+            return Ok(kernel);
         }
-        let name = CString::new(kernel).map_err(|e| e.to_string())?;
+        let terminated = CString::new(name).map_err(|e| e.to_string())?;
+        let mut kernel = null_mut();
         // SAFETY: a module that is loaded.
-        let function = told(unsafe { result::module::get_function(self.module, name) })?;
-        self.functions.insert(kernel.into(), function);
-        Ok(function)
+        driver
+            .check(unsafe { (driver.cuModuleGetFunction)(&mut kernel, self.module, terminated.as_ptr()) })?;
+        self.kernels.insert(name.into(), kernel);
+        Ok(kernel)
     }
 }
 
@@ -193,13 +217,13 @@ pub unsafe fn launch_kernel(
         Entry::Occupied(known) => known.into_mut(),
         Entry::Vacant(place) => place.insert(Loaded::on(device)?.0),
     };
-    let function = loaded.function(kernel)?;
+    let driver = driver()?;
+    let function = loaded.kernel(driver, kernel)?;
+    let (shared_bytes, extra) = (0, null_mut());
     // SAFETY: the caller's promise.
-    told(unsafe {
-        result::ctx::set_current(loaded.context).and_then(|()| {
-            let (shared_bytes, extra) = (0, std::ptr::null_mut());
-            let (stream, arguments) = (stream as sys::CUstream, arguments as *mut *mut c_void);
-            sys::cuLaunchKernel(
+    let launched = driver.check(unsafe { (driver.cuCtxSetCurrent)(loaded.context) }).and_then(|()| {
+        driver.check(unsafe {
+            (driver.cuLaunchKernel)(
                 function,
                 blocks.x,
                 blocks.y,
@@ -208,12 +232,11 @@ pub unsafe fn launch_kernel(
                 1,
                 1,
                 shared_bytes,
-                stream,
-                arguments,
+                stream as Handle,
+                arguments as *mut Handle,
                 extra,
             )
-            .result()
         })
-    })
-    .map_err(|error| format!("{kernel}: {error}"))
+    });
+    launched.map_err(|error| format!("{kernel}: {error}"))
 }

@@ -2,38 +2,35 @@
 
 use super::Result;
 use libloading::os::unix::{Library, RTLD_GLOBAL, RTLD_LAZY};
-use std::ffi::{CStr, c_char, c_int, c_void};
+use std::ffi::{CStr, c_char, c_int, c_uint, c_void};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Whether the driver is there.
-pub fn has_driver() -> bool {
-    // SAFETY: it has no initializers that need anything.
-    unsafe { cudarc::driver::sys::is_culib_present() }
-}
-
 /// A program that NVRTC compiles.
 pub type Program = *mut c_void;
 
-/// Declares NVRTC's functions, and how they are looked up by their names.
-macro_rules! nvrtc {
-    ($($name:ident ( $($parameter:ty),* ) -> $result:ty;)*) => {
-        /// NVRTC's functions, as in its manual.
+/// What the driver makes: a context, a module, a kernel, a stream.
+pub type Handle = *mut c_void;
+
+/// Declares the functions of a library, and how they are looked up by their names.
+macro_rules! functions {
+    ($(#[$about:meta])* $table:ident, $library:literal: $($name:ident ( $($parameter:ty),* ) -> $result:ty;)*) => {
+        $(#[$about])*
         #[allow(non_snake_case)]
-        pub struct Functions {
+        pub struct $table {
             $(pub $name: unsafe extern "C" fn($($parameter),*) -> $result,)*
         }
 
-        impl Functions {
+        impl $table {
             /// For good.
             fn of(library: Library) -> Result<Self> {
                 // SAFETY: the functions have these parameters, and the library is never unloaded.
                 let functions = unsafe {
-                    Functions {
+                    $table {
                         $($name: *library
                             .get(concat!(stringify!($name), "\0").as_bytes())
-                            .map_err(|e| format!("NVRTC is too old: {e}"))?,)*
+                            .map_err(|e| format!(concat!($library, " is too old: {}"), e))?,)*
                     }
                 };
                 std::mem::forget(library);
@@ -42,7 +39,29 @@ macro_rules! nvrtc {
         }
     };
 }
-nvrtc! {
+
+functions! {
+    /// The driver's functions, as in its manual. They return 0 or the number of an error.
+    DriverFunctions, "NVIDIA's driver":
+    cuInit(c_uint) -> c_int;
+    cuDriverGetVersion(*mut c_int) -> c_int;
+    cuDeviceGetCount(*mut c_int) -> c_int;
+    cuDeviceGet(*mut c_int, c_int) -> c_int;
+    cuDeviceGetName(*mut c_char, c_int, c_int) -> c_int;
+    cuDeviceTotalMem_v2(*mut usize, c_int) -> c_int;
+    cuDeviceGetAttribute(*mut c_int, c_int, c_int) -> c_int;
+    cuDevicePrimaryCtxRetain(*mut Handle, c_int) -> c_int;
+    cuCtxSetCurrent(Handle) -> c_int;
+    cuModuleLoadData(*mut Handle, *const c_void) -> c_int;
+    cuModuleGetFunction(*mut Handle, Handle, *const c_char) -> c_int;
+    cuLaunchKernel(Handle, c_uint, c_uint, c_uint, c_uint, c_uint, c_uint, c_uint, Handle, *mut *mut c_void, *mut *mut c_void) -> c_int;
+    cuGetErrorName(c_int, *mut *const c_char) -> c_int;
+    cuGetErrorString(c_int, *mut *const c_char) -> c_int;
+}
+
+functions! {
+    /// NVRTC's functions, as in its manual. They return 0 or the number of an error.
+    NvrtcFunctions, "NVRTC":
     nvrtcVersion(*mut c_int, *mut c_int) -> c_int;
     nvrtcGetNumSupportedArchs(*mut c_int) -> c_int;
     nvrtcGetSupportedArchs(*mut c_int) -> c_int;
@@ -58,13 +77,29 @@ nvrtc! {
     nvrtcGetPTX(Program, *mut c_char) -> c_int;
 }
 
+/// NVIDIA's driver, loaded once. By its full name, as by torch: a toolkit's `libcuda.so` is a stub for linkers, where one is found.
+///
+/// # Errors
+/// It isn't there, or lacks a function.
+pub fn driver() -> Result<&'static DriverFunctions> {
+    static LOADED: OnceLock<Result<DriverFunctions>> = OnceLock::new();
+    let load = || {
+        let library = load(Path::new("libcuda.so.1")).ok_or(
+            "NVIDIA's driver (libcuda.so.1) is not on the loader's path; it comes with the system, as a package or by NVIDIA's \
+             installer, and into a container by nvidia-container-toolkit",
+        )?;
+        DriverFunctions::of(library)
+    };
+    LOADED.get_or_init(load).as_ref().map_err(String::clone)
+}
+
 /// NVRTC, loaded once: torch's own, which is of its CUDA, else the one on the loader's path.
 ///
 /// # Errors
 /// It isn't there, or lacks a function.
-pub fn nvrtc() -> Result<&'static Functions> {
-    static LOADED: OnceLock<Result<Functions>> = OnceLock::new();
-    LOADED.get_or_init(|| Functions::of(load_nvrtc()?)).as_ref().map_err(String::clone)
+pub fn nvrtc() -> Result<&'static NvrtcFunctions> {
+    static LOADED: OnceLock<Result<NvrtcFunctions>> = OnceLock::new();
+    LOADED.get_or_init(|| NvrtcFunctions::of(load_nvrtc()?)).as_ref().map_err(String::clone)
 }
 
 fn load_nvrtc() -> Result<Library> {
