@@ -10,6 +10,9 @@ use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
 
+/// Pictures of 256×256 that go through the network together on a GPU. Of each, VGG-19 keeps 0.2 GB in float32.
+const AT_ONCE_ON_A_GPU: i64 = 16;
+
 /// A network that compares, with its weights.
 #[derive(Debug)]
 pub enum PerceptualLoss {
@@ -92,21 +95,34 @@ impl PerceptualLoss {
     }
 
     /// The mean over `rendered` [R·B, C, 3, H, W], R times `truth` [B, C, 3, H, W] along the batch: the truth's features are
-    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, as
-    /// layers would keep nearly as much of all pictures as all else of a training step keeps.
+    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, on a GPU
+    /// for a few pictures at a time, as layers would keep nearly as much of all pictures as all else of a training step keeps. How many
+    /// pictures go together depends on their size alone, as the last bits of sums depend on it.
     pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
+        let at_once = match rendered.device() {
+            Device::Cpu => 1,
+            _ => {
+                let pixels: i64 = truth.size()[3..].iter().product();
+                (AT_ONCE_ON_A_GPU * 256 * 256 / pixels).max(1)
+            }
+        };
+        self.loss_by_chunks(rendered, truth, at_once)
+    }
+
+    /// [`PerceptualLoss::loss`] with so many pictures `at_once`.
+    fn loss_by_chunks(&self, rendered: &Tensor, truth: &Tensor, at_once: i64) -> Tensor {
         let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
         let pictures = rendered.detach().reshape([&[repeats][..], &truth.size()].concat());
         let gradient = is_followed(rendered).then(|| pictures.empty_like());
-        let at_once = if rendered.device() == Device::Cpu { 1 } else { count };
-        let share = at_once as f64 / (count * repeats) as f64;
         let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
         for first in (0..count).step_by(at_once as usize) {
-            let truth = truth.narrow(0, first, at_once);
+            let length = at_once.min(count - first);
+            let share = length as f64 / (count * repeats) as f64;
+            let truth = truth.narrow(0, first, length);
             let truth = part("L_perc", || tch::no_grad(|| self.features(&truth)));
             for turn in 0..repeats {
-                let place = |of: &Tensor| of.select(0, turn).narrow(0, first, at_once);
+                let place = |of: &Tensor| of.select(0, turn).narrow(0, first, length);
                 let picture = place(&pictures).detach().set_requires_grad(gradient.is_some());
                 let loss = part("L_perc", || self.compare(&self.features(&picture), &truth)) * share;
                 if let Some(gradient) = &gradient {
@@ -141,6 +157,40 @@ impl PerceptualLoss {
             PerceptualLoss::Lpips(lpips) => {
                 lpips.compare(each(picture).into_iter(), each(truth).into_iter()).mean(None::<Kind>)
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::nn;
+
+    #[test]
+    fn pictures_may_be_compared_in_any_chunks() {
+        tch::manual_seed(3);
+        let vs = nn::VarStore::new(Device::Cpu);
+        let network = Lpips::new(&vs.root(), LpipsNetwork::AlexNet);
+        vs.variables().into_values().for_each(|mut variable| {
+            let _ = tch::no_grad(|| variable.uniform_(0., 0.05));
+        });
+        let loss = PerceptualLoss::Lpips(network);
+        // Twice five pictures.
+        let pictures = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
+        let (rendered, truth) = (pictures(2), pictures(1));
+        let of_chunks = |at_once: i64| {
+            let rendered = rendered.detach().set_requires_grad(true);
+            let loss = loss.loss_by_chunks(&rendered, &truth, at_once);
+            loss.backward();
+            (loss.double_value(&[]), rendered.grad())
+        };
+        let (value, gradient) = of_chunks(5);
+        assert!(value > 0. && gradient.abs().max().double_value(&[]) > 0.);
+        for at_once in [1, 2, 3, 7] {
+            let (other, of_other) = of_chunks(at_once);
+            let off = (&of_other - &gradient).abs().max() / gradient.abs().max();
+            assert!((other / value - 1.).abs() < 1e-6, "{at_once}: {other} instead of {value}");
+            assert!(off.double_value(&[]) < 1e-5, "{at_once}: {off}");
         }
     }
 }
