@@ -6,7 +6,7 @@ use std::{
 };
 
 /// What Rust and C++ know of each other.
-const BRIDGES: [&str; 12] = [
+const BRIDGES: [&str; 13] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
@@ -19,6 +19,7 @@ const BRIDGES: [&str; 12] = [
     "src/ranks.rs",
     "src/render.rs",
     "src/room.rs",
+    "src/tensor_memory.rs",
 ];
 
 /// What every C++ file is compiled with.

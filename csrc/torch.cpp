@@ -15,4 +15,5 @@
 #include "ranks.cpp"
 #include "room.cpp"
 #include "splat.cpp"
+#include "tensor_memory.cpp"
 #include "threads.cpp"

@@ -12,3 +12,4 @@ pub mod processor;
 pub mod ranks;
 pub mod render;
 pub mod room;
+pub mod tensor_memory;

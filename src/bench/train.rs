@@ -229,3 +229,55 @@ pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
         times: LoadTimes::default(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::MemoryEstimate;
+    use globalsplat_csrc::tensor_memory::tensor_bytes_of;
+    use std::path::Path;
+
+    /// Of what tensors take in a step of `settings` at the most, as if it were 1.
+    fn estimated_part(settings: &[&str]) -> f64 {
+        let base = [
+            "model.latents=256",
+            "model.width=128",
+            "model.rgb_width=128",
+            "model.ray_width=64",
+            "model.rounds=2",
+            "data.image_size=[64, 64]",
+            "data.context_views=8",
+            "data.target_views=4",
+            "loss.perceptual=none",
+            "curriculum.full_capacity=true",
+            "train.batch=2",
+        ];
+        let all: Vec<String> = base.iter().chain(settings).map(|set| set.to_string()).collect();
+        let config = Config::parse("", &all, Path::new("test")).unwrap();
+        let ((), found) = tensor_bytes_of(|| {
+            let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
+            let scenes: Vec<_> = (0..2).map(|seed| made_up_scene(&config, seed)).collect();
+            let sample = Sample::by(&scenes, &Upload::to(Device::Cpu));
+            trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
+        });
+        MemoryEstimate::of(&config, Device::Cpu).unwrap().total() as f64 / found as f64
+    }
+
+    #[test]
+    fn a_step_takes_what_is_told() {
+        for settings in [
+            &[][..],
+            &["train.precision=bf16"],
+            &["train.micro_batch=1"],
+            &["train.checkpoint_rounds=true"],
+            &["model.streams=single", "model.self_attention_blocks=4"],
+            &["model.latents=512", "model.rounds=3", "model.sh_degree=0"],
+            &["data.context_views=24", "data.target_views=12"],
+            // Side by side, each slice would be another thread's.
+            &["loss.consistency_alpha=0", "loss.consistency_depth=0", "train.micro_batch=2"],
+        ] {
+            let part = estimated_part(settings);
+            assert!((0.9..1.15).contains(&part), "{settings:?}: {part:.2} of what is taken");
+        }
+    }
+}

@@ -3,9 +3,15 @@ use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{Part, Together, TrainReport, bench_train};
-use globalsplat::error::Error;
+use globalsplat::config::{Config, TrainConfig};
+use globalsplat::error::{Error, panic_message};
+use globalsplat::eval::memory_of;
+use globalsplat::ranks::Group;
+use globalsplat::train::{MemoryEstimate, batch_within};
 use serde_json::json;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
+use tch::Device;
 
 /// A training step, part by part, on made-up scenes: pictures of noise, all Gaussians shown.
 ///
@@ -16,6 +22,7 @@ use std::path::PathBuf;
 #[command(after_help = "Examples:\n  globalsplat bench train\n  \
     globalsplat bench train --config configs/first_light.toml --steps 20\n  \
     globalsplat bench train --set train.checkpoint_rounds=true --json\n  \
+    globalsplat bench train --device cuda --batch auto\n  \
     torchrun --no-python --nproc-per-node=2 target/release/globalsplat bench train --config configs/tiny.toml")]
 pub struct Train {
     /// Configuration file; see configs/
@@ -24,9 +31,9 @@ pub struct Train {
     /// Override a key of it, as in train.checkpoint_rounds=true
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Scenes in a step, whatever train.batch says
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
-    batch: u16,
+    /// Scenes in a step; auto takes train.batch, halved until it fits into the device's memory
+    #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
+    batch: Batch,
     /// Steps that are measured
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     steps: u32,
@@ -41,6 +48,21 @@ pub struct Train {
     json: bool,
 }
 
+/// How many scenes a step has.
+#[derive(Debug, Clone, Copy)]
+enum Batch {
+    Auto,
+    Scenes(usize),
+}
+
+fn parse_batch(text: &str) -> Result<Batch, String> {
+    match text.parse() {
+        Ok(scenes @ 1..=65535) => Ok(Batch::Scenes(scenes)),
+        _ if text == "auto" => Ok(Batch::Auto),
+        _ => Err("expected auto, or a number from 1 to 65535".into()),
+    }
+}
+
 impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
@@ -49,9 +71,17 @@ impl Train {
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
         }
-        config.train.batch = self.batch.into();
         memory::keep_for(&config.train);
-        let report = bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?;
+        let report = match self.batch {
+            Batch::Scenes(scenes) => {
+                config.train.batch = scenes;
+                bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?
+            }
+            Batch::Auto if group.ranks() > 1 => {
+                return Err(Error::Request("--batch auto: expected a number under torchrun".into()).into());
+            }
+            Batch::Auto => self.bench_what_fits(config, device)?,
+        };
         if !is_first {
             return Ok(());
         }
@@ -61,6 +91,37 @@ impl Train {
             print_report(&report);
         }
         Ok(())
+    }
+}
+
+impl Train {
+    /// With the batch that fits by the estimate; where a GPU has too little memory all the same, with half as many scenes.
+    fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
+        let wanted = config.train.batch;
+        let bytes = memory_of(device).unwrap_or(u64::MAX);
+        let fits = batch_within(&config, bytes, device)?;
+        if fits < wanted {
+            let more = TrainConfig { batch: 2 * fits, micro_batch: 0, ..config.train.clone() };
+            let more = MemoryEstimate::of(&Config { train: more, ..config.clone() }, device)?;
+            let [more, bytes] = [more.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
+            eprintln!("{fits} scenes: a step of {} would take {more:.1} GB of {bytes:.1}", 2 * fits);
+        }
+        config.train.batch = fits;
+        config.train.micro_batch = 0;
+        loop {
+            let batch = config.train.batch;
+            let (steps, alone) = (self.steps as usize, Group::alone());
+            let bench = || bench_train(&config, steps, device, alone, self.shard_optimizer);
+            let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
+            match catch_unwind(AssertUnwindSafe(bench)) {
+                Ok(Err(error)) if is_refused(&error.to_string()) => {}
+                Ok(done) => return Ok(done?),
+                Err(panic) if is_refused(panic_message(&*panic)) => {}
+                Err(panic) => resume_unwind(panic),
+            }
+            config.train.batch = batch / 2;
+            eprintln!("{} scenes: there was too little memory for a step of {batch}", batch / 2);
+        }
     }
 }
 

@@ -1,7 +1,9 @@
 use super::{device, print_json, view};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::config::Config;
 use globalsplat::error::Error;
+use globalsplat::eval::memory_of;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::model::{Precision, are_denormals_flushed};
@@ -9,17 +11,26 @@ use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::SHIPPED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
 use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
+use globalsplat::train::MemoryEstimate;
 use serde_json::{Value, json};
 use std::fmt::Display;
+use std::path::PathBuf;
 use tch::Device;
 
 /// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights and the ffmpeg found.
 #[derive(Args)]
-#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels")]
+#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels\n  \
+    globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
 pub struct Doctor {
     /// Compile the kernels for every kind of GPU that NVRTC knows, and tell what each takes of it
     #[arg(long)]
     kernels: bool,
+    /// Tell how much memory a training step by this configuration takes, on a CPU and on a GPU
+    #[arg(long, value_name = "FILE", conflicts_with = "kernels")]
+    config: Option<PathBuf>,
+    /// Override a key of it, as in train.micro_batch=4
+    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
+    set: Vec<String>,
     /// Print it as one JSON object
     #[arg(long)]
     json: bool,
@@ -29,6 +40,9 @@ impl Doctor {
     pub fn run(self) -> Result<()> {
         if self.kernels {
             return Ok(kernels(self.json)?);
+        }
+        if let Some(file) = &self.config {
+            return Ok(memory_of_training(&Config::read(file, &self.set)?, self.json)?);
         }
         let unusable = device::load_cuda().err().unwrap_or("it is for other GPUs, or another driver".into());
         let usable = tch::Cuda::device_count();
@@ -201,6 +215,52 @@ fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str)
             }
         }
     }
+}
+
+/// A column for each kind of device, and whether it fits into those that are here.
+fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()> {
+    let devices = [("cpu", Device::Cpu), ("gpu", Device::Cuda(0))];
+    let [cpu, gpu] = devices.map(|(_, device)| MemoryEstimate::of(config, device));
+    let estimates = [cpu?, gpu?];
+    let driver = Driver::find();
+    let gpus = driver.iter().flat_map(|driver| &driver.gpus).map(|gpu| (gpu.name.clone(), gpu.memory as u64));
+    let here = memory_of(Device::Cpu).map(|bytes| ("this machine".to_string(), bytes));
+    if as_json {
+        let told = devices.iter().zip(&estimates).map(|((name, _), estimate)| {
+            let mut told = json!(estimate);
+            told["total"] = json!(estimate.total());
+            (name.to_string(), told)
+        });
+        print_json(&Value::Object(told.collect()));
+        return Ok(());
+    }
+    let [cpu, gpu] = &estimates;
+    let (batch, at_once) = (cpu.batch, cpu.scenes_at_once);
+    println!(
+        "memory of a training step of {batch} scenes, {at_once} at a time, in GB{:>14}{:>10}",
+        "CPU", "GPU"
+    );
+    let row = |name: &str, of: &dyn Fn(&MemoryEstimate) -> u64| {
+        let [cpu, gpu] = [cpu, gpu].map(|estimate| of(estimate) as f64 * 1e-9);
+        println!("{name:<56}{cpu:>10.2}{gpu:>10.2}");
+    };
+    row("weights and the optimizer's moments", &|of| of.weights);
+    row("photos", &|of| of.photos);
+    row("tokenizer and encoder", &|of| of.encoder);
+    row("heads, Gaussians, pictures and losses", &|of| of.pictures);
+    row("network of L_perc", &|of| of.perceptual);
+    row("together, to 15 %", &MemoryEstimate::total);
+    for ((name, bytes), estimate) in here.into_iter().map(|here| (here, cpu)).chain(gpus.map(|of| (of, gpu)))
+    {
+        let fits = match estimate.total() <= bytes {
+            true => "it fits",
+            false => {
+                "too little: a smaller train.micro_batch, train.checkpoint_rounds=true or train.precision=bf16 takes less"
+            }
+        };
+        println!("{name} has {:.1} GB: {fits}", bytes as f64 * 1e-9);
+    }
+    Ok(())
 }
 
 /// A table, a row for each kernel and a column for each architecture.

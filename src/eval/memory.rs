@@ -1,5 +1,6 @@
 //! How much memory the process has taken, and its tensors on a GPU.
 
+use crate::render::cuda::Driver;
 use globalsplat_csrc::device as ffi;
 use tch::Device;
 
@@ -19,6 +20,18 @@ pub fn device_memory_bytes(device: Device) -> Option<u64> {
     match device {
         Device::Cuda(number) => ffi::peak_bytes(number as i32).ok(),
         _ => None,
+    }
+}
+
+/// The memory of `device`, in bytes, whoever has it now; none where it can't be told.
+pub fn memory_of(device: Device) -> Option<u64> {
+    match device {
+        Device::Cuda(number) => Driver::find().ok()?.gpus.get(number).map(|gpu| gpu.memory as u64),
+        // SAFETY: sysconf only tells numbers.
+        _ => [libc::_SC_PHYS_PAGES, libc::_SC_PAGESIZE]
+            .map(|name| u64::try_from(unsafe { libc::sysconf(name) }).ok())
+            .into_iter()
+            .product(),
     }
 }
 

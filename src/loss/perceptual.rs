@@ -62,6 +62,29 @@ impl PerceptualLoss {
         Ok(Some(loss))
     }
 
+    /// Bytes that the network of `config` takes at the most, with what its layers keep of the pictures of `size` that go through it at a
+    /// time.
+    pub fn bytes_kept(config: &LossConfig, precision: Precision, size: ImageSize, device: Device) -> u64 {
+        // Weights, and numbers for each pixel: what layers give, their gradients, and differences of what is compared.
+        let (weights, of_pixel) = match config.perceptual {
+            PerceptualKind::None => return 0,
+            PerceptualKind::Vgg19 => (20.0e6, 780.),
+            PerceptualKind::LpipsVgg => (14.7e6, 780.),
+            PerceptualKind::LpipsAlex => (2.5e6, 60.),
+        };
+        let number = if precision == Precision::Bf16 { 2.5 } else { 4. };
+        let pixels = i64::from(size.height) * i64::from(size.width);
+        (number * (weights + of_pixel * (Self::at_once(pixels, device) * pixels) as f64)) as u64
+    }
+
+    /// How many pictures of so many pixels go through the network at a time.
+    fn at_once(pixels: i64, device: Device) -> i64 {
+        match device {
+            Device::Cpu => 1,
+            _ => (AT_ONCE_ON_A_GPU * 256 * 256 / pixels).max(1),
+        }
+    }
+
     /// The network in `precision` from now on.
     pub fn with_precision(self, precision: Precision) -> Self {
         match self {
@@ -99,13 +122,8 @@ impl PerceptualLoss {
     /// for a few pictures at a time, as layers would keep nearly as much of all pictures as all else of a training step keeps. How many
     /// pictures go together depends on their size alone, as the last bits of sums depend on it.
     pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
-        let at_once = match rendered.device() {
-            Device::Cpu => 1,
-            _ => {
-                let pixels: i64 = truth.size()[3..].iter().product();
-                (AT_ONCE_ON_A_GPU * 256 * 256 / pixels).max(1)
-            }
-        };
+        let pixels = truth.size()[3..].iter().product();
+        let at_once = Self::at_once(pixels, rendered.device());
         self.loss_by_chunks(rendered, truth, at_once)
     }
 

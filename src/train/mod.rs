@@ -4,6 +4,7 @@ mod checkpoint;
 mod curriculum;
 mod forward_backward;
 mod lock;
+mod memory_estimate;
 mod metrics;
 mod parameter_groups;
 mod preview;
@@ -22,6 +23,7 @@ mod validator;
 mod watch;
 
 pub use checkpoint::{Kept, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use memory_estimate::{MemoryEstimate, batch_within};
 pub use metrics::{Curves, METRICS_FILE};
 pub use run::{CONFIG_FILE, Event, Outcome, Resume, add_run_inputs, run};
 pub use step_report::StepReport;
