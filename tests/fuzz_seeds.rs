@@ -35,3 +35,33 @@ fn every_reader_has_a_fuzz_target() {
         assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");
     }
 }
+
+/// Otherwise `cargo fuzz build` picks newer packages than those that were tested, or fails without a network.
+#[test]
+fn lock_file_of_the_fuzz_targets_is_up_to_date() {
+    let read = |path: &str| {
+        let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap();
+        text.parse::<toml::Table>().unwrap()
+    };
+    let lock = read("fuzz/Cargo.lock");
+    for (manifest, name) in [("Cargo.toml", "globalsplat"), ("csrc/Cargo.toml", "globalsplat-csrc")] {
+        let mut packages = lock["package"].as_array().unwrap().iter();
+        let package = packages.find(|package| package["name"].as_str() == Some(name)).unwrap();
+        // A name, followed by its version where several are locked.
+        let locked: Vec<&str> = package["dependencies"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|dependency| dependency.as_str().unwrap().split(' ').next().unwrap())
+            .collect();
+        let manifest = read(manifest);
+        let tables = ["dependencies", "build-dependencies"]
+            .iter()
+            .filter_map(|table| manifest.get(*table)?.as_table());
+        for (dependency, details) in tables.flatten() {
+            let is_optional =
+                details.get("optional").is_some_and(|optional| optional.as_bool() == Some(true));
+            assert!(is_optional || locked.contains(&dependency.as_str()), "{name} needs {dependency}");
+        }
+    }
+}
