@@ -26,10 +26,10 @@ if command -v clang++ >/dev/null; then
 -fsanitize-ignorelist=$PWD/fuzz/uninstrumented.txt -fno-omit-frame-pointer -gline-tables-only"
 fi
 
-cargo fuzz build
 binaries=fuzz/target/$(rustc -vV | sed -n 's/host: //p')/release
 
 for reader in "${readers[@]}"; do
+    cargo fuzz build "$reader"
     mkdir -p "fuzz/corpus/$reader" "fuzz/artifacts/$reader"
     log=$(mktemp)
     "$binaries/$reader" "fuzz/corpus/$reader" "fuzz/seeds/$reader" "-artifact_prefix=fuzz/artifacts/$reader/" \
