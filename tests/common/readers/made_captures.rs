@@ -155,7 +155,12 @@ impl Lens {
 struct Transforms {
     lens: Option<Lens>,
     frames: Vec<(Name, Pose, Option<Lens>)>,
+    /// By their numbers in [`LISTS`].
+    lists: Vec<(u8, Vec<Name>)>,
 }
+
+/// What frames are for.
+const LISTS: [&str; 3] = ["train_filenames", "test_filenames", "val_filenames"];
 
 /// A `transforms.json`.
 pub fn transforms(bytes: &[u8]) {
@@ -172,6 +177,10 @@ pub fn transforms(bytes: &[u8]) {
         frame
     };
     json["frames"] = made.frames.iter().map(frame).collect();
+    for (which, names) in &made.lists {
+        let names = names.iter().map(|name| name.text("images/"));
+        json[LISTS[usize::from(*which) % LISTS.len()]] = names.collect();
+    }
     let file = file("made_transforms", "transforms.json", json.to_string().as_bytes());
     let _ = open_capture(&file).map(|capture| load(&capture));
 }
