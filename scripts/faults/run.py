@@ -61,6 +61,7 @@ VOLATILE = {
     "seconds",
     "seconds_of",
     "seconds_from_start",
+    "begin_seconds",
     "peak_memory_bytes",
     "samples_per_second",
     "forward_seconds",
@@ -366,6 +367,9 @@ def operations(bench, only):
     train = ["train", "--config", tiny, "--out", out, "--json"]
     export = ["export", "--config", tiny, "--out", out / "model.safetensors", "--json"]
     reconstruct = ["reconstruct", "--weights", weights, "--scene", room, "--out", out / "room.ply", "--json"]
+    quick = ["--views", 3, "--size", "24x24", "--gaussians", 400, "--steps", 4]
+    refine = ["refine", "--scene", room, *quick, "--out", out / "room.ply", "--local-origin"]
+    refine += ["--sheet", out / "sheet.png", "--json"]
     far = inputs / "far.ply"
     shutil.copy(splat, far)
     (inputs / "far.ply.origin.json").write_text(json.dumps({"origin": [5e6, 4e5, 100.0]}))
@@ -417,6 +421,11 @@ def operations(bench, only):
         command = ["convert", out / "room.ply", out / "room.ply", "--sh-degree", 1]
         return Operation(bench, "convert, in place", command).take()
 
+    def over_local_origin():
+        """Onto a splat with an origin, which the new one hasn't."""
+        bench.make(*convert)
+        return Operation(bench, "convert, over a local origin", ["convert", splat, out / "far.spz", "--json"]).take()
+
     def aged(name, command, keep=(), **more):
         return lambda: Operation(bench, name, command, **more).age(keep)
 
@@ -432,8 +441,10 @@ def operations(bench, only):
         ),
         "reconstruct": aged("reconstruct", reconstruct),
         "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
+        "refine --local-origin": aged("refine --local-origin", refine),
         "convert, in place": converted,
         "convert --local-origin": aged("convert --local-origin", convert),
+        "convert, over a local origin": over_local_origin,
         "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
         "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
         "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),
