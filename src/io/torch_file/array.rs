@@ -56,11 +56,12 @@ impl Array {
     }
 }
 
-/// Steps from one element to the next of each dimension where all lie one after the other, the last dimension fastest.
+/// Steps from one element to the next of each dimension where all lie one after the other, the last dimension fastest. Those of a
+/// tensor without elements mean nothing: they are 1 where sizes of any other dimensions overflow.
 pub(crate) fn row_major(size: &[usize]) -> Vec<usize> {
-    let mut stride = vec![1; size.len()];
+    let mut stride = vec![1usize; size.len()];
     for i in (1..size.len()).rev() {
-        stride[i - 1] = stride[i] * size[i].max(1);
+        stride[i - 1] = stride[i].checked_mul(size[i].max(1)).unwrap_or(1);
     }
     stride
 }
@@ -90,5 +91,17 @@ fn numbers(values: &Values, tuple: Id) -> Option<Vec<usize>> {
             items.iter().map(|&item| number(values, item)).collect()
         }
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::row_major;
+
+    #[test]
+    fn steps_of_a_tensor_without_elements_do_not_overflow() {
+        assert_eq!(row_major(&[2, 3, 5]), [15, 5, 1]);
+        assert_eq!(row_major(&[0, 3, 5]), [15, 5, 1]);
+        assert_eq!(row_major(&[0, usize::MAX, 2]), [1, 2, 1]);
     }
 }
