@@ -2,7 +2,7 @@
 
 use super::invalid::InvalidGaussians;
 use super::values::{Values, normalized};
-use super::{Contents, Splat};
+use super::{Contents, Splat, recognize};
 use crate::error::{Error, Result};
 use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
@@ -67,7 +67,7 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let mut order: Vec<usize> = (0..values.count()).collect();
     order.sort_by(|a, b| importance(b).total_cmp(&importance(a)));
     write_atomically(path, |writer| {
-        for index in order {
+        for (place, index) in order.into_iter().enumerate() {
             let mut gaussian = Vec::with_capacity(BYTES);
             for number in values.means[index].iter().chain(&values.scales[index]) {
                 gaussian.extend(number.to_le_bytes());
@@ -76,6 +76,10 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
             gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((values.opacities[index] * 255.).round() as u8);
             gaussian.extend(values.quaternions[index].map(|part| (part * 128. + 128.).round() as u8));
+            // A position whose bytes are another format's magic number is moved by the least that a float32 can be.
+            if place == 0 && recognize(&gaussian).is_some() {
+                gaussian[0] ^= 1;
+            }
             writer.write_all(&gaussian).map_err(Error::write(path))?;
         }
         Ok(())

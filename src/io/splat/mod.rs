@@ -233,8 +233,12 @@ pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
 fn read_contents(path: &Path) -> Result<Contents> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let recognized = FORMATS.iter().find(|format| (format.recognizes)(&bytes));
-    (recognized.unwrap_or(named).read)(path, &bytes)
+    (recognize(&bytes).unwrap_or(named).read)(path, &bytes)
+}
+
+/// Returns the format that `bytes` are of without a doubt.
+fn recognize(bytes: &[u8]) -> Option<&'static Format> {
+    FORMATS.iter().find(|format| (format.recognizes)(bytes))
 }
 
 /// The splat of those of `all` Gaussians in the file that are valid, less those without a rotation.
