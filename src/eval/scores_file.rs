@@ -5,7 +5,11 @@ use super::evaluation::{Evaluation, scene_file_name};
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
 use serde::Serialize;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+
+/// PSNR in dB of pictures in [0, 1], which is 100 where nothing differs; a mean may be rounded.
+const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
 
 pub(super) const SCORES: &str = "scores.json";
 /// The scores for spreadsheets.
@@ -29,14 +33,26 @@ pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
 /// Reads `folder/scores.json`.
 ///
 /// # Errors
-/// A file that is missing, is no JSON, or lacks something.
+/// A file that is missing, is no JSON, or lacks something, or a PSNR that no picture has: plots are drawn over all of them.
 pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     let path = folder.join(SCORES);
     let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
-    serde_json::from_str(&text).map_err(|e| {
+    let evaluation: Evaluation = serde_json::from_str(&text).map_err(|e| {
         let found = format!("not the scores of an evaluation ({e})");
         Error::input(&path, "the file", found, "what globalsplat eval writes")
-    })
+    })?;
+    let check = |name: &str, psnr: f64| match POSSIBLE_PSNR.contains(&psnr) {
+        true => Ok(()),
+        false => Err(Error::input(&path, format!("psnr of {name}"), psnr, "0 to 100 dB")),
+    };
+    check("the summary", evaluation.summary.psnr)?;
+    for scene in evaluation.scenes.iter().map(|scene| &scene.scores) {
+        check(&format!("scene {}", scene.scene), scene.psnr)?;
+        for view in &scene.views {
+            check(&format!("view {} of scene {}", view.image, scene.scene), view.psnr)?;
+        }
+    }
+    Ok(evaluation)
 }
 
 /// A line of `scores.csv`.
