@@ -11,8 +11,11 @@ namespace {
 
 thread_local rust::Vec<rust::String> noted;
 thread_local at::CallbackHandle callback = at::INVALID_CALLBACK_HANDLE;
+thread_local bool only_outermost = false;
+thread_local int within = 0;  // ops that have begun and not ended
 
 std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
+  if (within++ > 0 && only_outermost) return nullptr;
   const auto op = function.operator_name();
   std::string name = op ? c10::toString(*op) : std::string(function.name());
   // `to(device)` comes by the overload with all options, of which it gives the device alone.
@@ -21,11 +24,16 @@ std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
   return nullptr;
 }
 
+void leave(const at::RecordFunction&, at::ObserverContext*) { --within; }
+
 }  // namespace
 
-void note_ops() {
+void note_ops(bool outermost) {
   noted.clear();
-  callback = at::addThreadLocalCallback(at::RecordFunctionCallback(note).needsInputs(true).scopes({at::RecordScope::FUNCTION}));
+  only_outermost = outermost;
+  within = 0;
+  const auto noting = at::RecordFunctionCallback(note, leave).needsInputs(true).scopes({at::RecordScope::FUNCTION});
+  callback = at::addThreadLocalCallback(noting);
 }
 
 rust::Vec<rust::String> noted_ops() {

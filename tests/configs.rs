@@ -7,7 +7,7 @@ use globalsplat::io::read_weights;
 use globalsplat::loss::Term;
 use globalsplat::model::{GlobalSplat, Streams};
 use globalsplat::reconstruct::{SHIPPED_MODEL, shipped_model};
-use globalsplat::train::Trainer;
+use globalsplat::train::{MemoryEstimate, Trainer};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tch::{Device, Kind, nn};
@@ -34,6 +34,17 @@ fn every_configuration_builds_its_model() {
         count += 1;
     }
     assert!(count >= 11);
+}
+
+#[test]
+fn steps_fit_into_the_memory_of_a_large_gpu() {
+    for entry in std::fs::read_dir(folder()).expect("configs/") {
+        let path = entry.expect("an entry").path();
+        let config = Config::read(&path, &[]).expect("a configuration");
+        let bytes = MemoryEstimate::of(&config, Device::Cuda(0)).expect("a model").total();
+        // Of 80 GB, with room for what an estimate doesn't know.
+        assert!(bytes < 60_000_000_000, "{}: {:.1} GB", path.display(), bytes as f64 * 1e-9);
+    }
 }
 
 #[test]

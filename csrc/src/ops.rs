@@ -6,7 +6,7 @@ mod ffi {
         include!("ops.h");
 
         /// See `csrc/ops.h`.
-        fn note_ops();
+        fn note_ops(outermost: bool);
 
         /// See `csrc/ops.h`.
         fn noted_ops() -> Vec<String>;
@@ -16,7 +16,14 @@ mod ffi {
 /// What `work` gives, and the ops that it had libtorch do on this thread, by the names that `csrc/ops.h` tells, in their order: those
 /// inside of others, and of backward passes on the CPU, too.
 pub fn ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
-    ffi::note_ops();
+    ffi::note_ops(false);
+    let done = work();
+    (done, ffi::noted_ops())
+}
+
+/// The same without those inside of others.
+pub fn outermost_ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
+    ffi::note_ops(true);
     let done = work();
     (done, ffi::noted_ops())
 }

@@ -271,7 +271,6 @@ mod tests {
             &["train.micro_batch=1"],
             &["train.checkpoint_rounds=true"],
             &["model.streams=single", "model.self_attention_blocks=4"],
-            &["model.latents=512", "model.rounds=3", "model.sh_degree=0"],
             &["data.context_views=24", "data.target_views=12"],
             // Side by side, each slice would be another thread's.
             &["loss.consistency_alpha=0", "loss.consistency_depth=0", "train.micro_batch=2"],

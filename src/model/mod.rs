@@ -190,3 +190,81 @@ pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
     };
     vs.var("scene_tokens", &[config.latents, config.width], init)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use globalsplat_csrc::ops::outermost_ops_of;
+
+    /// Ops that only look at a tensor another way, or take memory: no kernel of a GPU.
+    const FREE: [&str; 22] = [
+        "aten::alias",
+        "aten::as_strided",
+        "aten::chunk",
+        "aten::detach",
+        "aten::empty.memory_format",
+        "aten::empty_like",
+        "aten::expand",
+        "aten::flatten.using_ints",
+        "aten::narrow",
+        "aten::permute",
+        "aten::reshape",
+        "aten::select.int",
+        "aten::slice.Tensor",
+        "aten::split.Tensor",
+        "aten::squeeze.dim",
+        "aten::t",
+        "aten::transpose.int",
+        "aten::unbind.int",
+        "aten::unflatten.int",
+        "aten::unsqueeze",
+        "aten::view",
+        "aten::view_as",
+    ];
+
+    /// A GPU computes a pass of the main model about as fast as the host tells it what to do.
+    #[test]
+    fn a_pass_takes_few_kernels() {
+        // The main model's layers, narrow. In float64 and by an odd number of heads a CPU is asked for what a GPU is.
+        let config = ModelConfig {
+            latents: 16,
+            width: 24,
+            heads: 3,
+            rgb_width: 16,
+            ray_width: 8,
+            candidates: 4,
+            ..Default::default()
+        };
+        assert_eq!((config.rounds, config.self_attention_blocks), (4, 2), "the main model's");
+        let mut vs = nn::VarStore::new(Device::Cpu);
+        let mut model = GlobalSplat::new(&vs.root(), &config).unwrap();
+        vs.freeze();
+        let computing = |ops: Vec<String>| ops.iter().filter(|op| !FREE.contains(&op.as_str())).count();
+        // Rays are in float32, where linear layers are our own, in blocks, on any of libtorch's threads: they are counted apart.
+        let of_tokens = |views: i64| {
+            let options = (Kind::Float, Device::Cpu);
+            let images = Tensor::rand([1, views, 3, 32, 32], options);
+            let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
+            let (tokens, ops) = outermost_ops_of(|| model.tokens(&images, &c2w, &intrinsics));
+            const LINEAR_LAYERS: usize = 2;
+            let by_others =
+                |op: &String| !["aten::copy_", "mkldnn::_linear_pointwise"].contains(&op.as_str());
+            (
+                tokens.to_kind(Kind::Double),
+                computing(ops.into_iter().filter(by_others).collect()) + LINEAR_LAYERS,
+            )
+        };
+        let (few, many) = (of_tokens(2), of_tokens(24));
+        vs.double();
+        model.fold_weights();
+        let pass = |(tokens, of_tokens): (Tensor, usize)| {
+            let (_, ops) = outermost_ops_of(|| {
+                model.decode(&model.encode_memory(&model.memory_of(&tokens)), Stage::complete(2))
+            });
+            of_tokens + computing(ops)
+        };
+        let kernels = pass(many);
+        assert_eq!(pass(few), kernels, "whatever the number of photos");
+        assert!((200..=450).contains(&kernels), "{kernels}");
+    }
+}

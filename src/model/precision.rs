@@ -51,18 +51,16 @@ impl Precision {
 
     /// `t` as products take it.
     pub(super) fn operand(self, t: &Tensor) -> Tensor {
-        t.to_kind(self.kind())
+        match self {
+            Precision::F32 => t.shallow_clone(),
+            Precision::Bf16 => t.to_kind(self.kind()),
+        }
     }
 
     /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
     pub(crate) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
-        match self {
-            Precision::F32 => product(xs, &layer.ws, layer.bs.as_ref()),
-            Precision::Bf16 => {
-                let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
-                product(&self.operand(xs), &self.operand(&layer.ws), bias.as_ref())
-            }
-        }
+        let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
+        product(&self.operand(xs), &self.operand(&layer.ws), bias.as_ref())
     }
 }
 
