@@ -5,8 +5,8 @@
 
 namespace globalsplat {
 
-// From now on this thread notes every op that it has libtorch do, those of backward passes too; those inside of others unless
-// `outermost` alone are wanted.
+// Begins recording the libtorch ops that this thread runs, backward passes included. With `outermost`, ops called by other ops are left
+// out.
 void note_ops(bool outermost);
 
 // Ends that. The ops by their full names ("aten::add.Tensor"), in their order; what moves a tensor to a device, be it the one where it

@@ -31,13 +31,13 @@ std::string string(rust::Str s) { return {s.data(), s.size()}; }
 
 const at::Tensor& borrowed_tensor(size_t address) { return *reinterpret_cast<const at::Tensor*>(address); }
 
-// The work that `begin` hands to a group, one at a time: c10d's flight recorder, one for all groups of a process, writes down which
-// groups there are without a lock.
-template <class Begin>
-c10::intrusive_ptr<c10d::Work> begun(const Begin& begin) {
+// Starts a collective under a process-wide mutex: c10d's flight recorder, shared by all groups of a process, updates its table of groups
+// without a lock.
+template <class Start>
+c10::intrusive_ptr<c10d::Work> start_one_at_a_time(const Start& start) {
   static std::mutex one_at_a_time;
   const std::lock_guard<std::mutex> lock(one_at_a_time);
-  return begin();
+  return start();
 }
 
 }  // namespace
@@ -81,7 +81,7 @@ Group::Group(Ranks ranks) : ranks_(std::move(ranks)) {}
 void Group::all_reduce(size_t tensor) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> tensors{borrowed_tensor(tensor)};
-  begun([&] { return ranks_->allreduce(tensors); })->wait();
+  start_one_at_a_time([&] { return ranks_->allreduce(tensors); })->wait();
 }
 
 void Group::broadcast(size_t tensor, int32_t from) const {
@@ -89,7 +89,7 @@ void Group::broadcast(size_t tensor, int32_t from) const {
   std::vector<at::Tensor> tensors{borrowed_tensor(tensor).detach()};
   c10d::BroadcastOptions options;
   options.rootRank = from;
-  begun([&] { return ranks_->broadcast(tensors, options); })->wait();
+  start_one_at_a_time([&] { return ranks_->broadcast(tensors, options); })->wait();
 }
 
 void Group::all_gather(size_t tensor, rust::Slice<size_t> out) const {
@@ -99,7 +99,7 @@ void Group::all_gather(size_t tensor, rust::Slice<size_t> out) const {
   sizes.insert(sizes.begin(), ranks_->getSize());
   const at::Tensor all = at::empty(sizes, inputs[0].options());
   std::vector<std::vector<at::Tensor>> outputs{all.unbind(0)};
-  begun([&] { return ranks_->allgather(outputs, inputs); })->wait();
+  start_one_at_a_time([&] { return ranks_->allgather(outputs, inputs); })->wait();
   out[0] = reinterpret_cast<size_t>(new at::Tensor(all));
 }
 
@@ -170,7 +170,7 @@ void Buckets::State::send(const Bucket& bucket) {
     offset += parameter.numel();
   }
   std::vector<at::Tensor> tensors{flat};
-  works.push_back(begun([&] { return ranks->allreduce(tensors); }));
+  works.push_back(start_one_at_a_time([&] { return ranks->allreduce(tensors); }));
   ++sent;
 }
 

@@ -10,7 +10,8 @@ namespace globalsplat {
 namespace {
 
 struct Counter final : c10::MemoryReportingInfoBase {
-  void reportMemoryUsage(void*, int64_t bytes, size_t, size_t, c10::Device) override {
+  void reportMemoryUsage(void*, int64_t bytes, size_t, size_t, c10::Device device) override {
+    if (!device.is_cpu()) return;
     now += bytes;
     most = std::max(most, now);
   }

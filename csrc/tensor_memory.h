@@ -1,14 +1,14 @@
-// How much memory tensors take.
+// How much memory tensors take: what tests measure.
 #pragma once
 
 #include <cstdint>
 
 namespace globalsplat {
 
-// From now on this thread counts the bytes that its tensors on the CPU take, and give back.
+// Begins counting the bytes that this thread's tensors on the CPU take and give back.
 void count_tensor_bytes();
 
-// Ends that: the most that there were at a time beyond those of the beginning.
+// Ends that, and returns the peak.
 uint64_t most_tensor_bytes();
 
 }  // namespace globalsplat

@@ -516,13 +516,13 @@ fn a_stopped_run_ends_with_the_same_bits() {
 
 #[test]
 fn interrupted_training_saves_a_checkpoint() {
-    // What Ctrl-C sends, and what kill and schedulers do.
-    for signal in [libc::SIGINT, libc::SIGTERM] {
-        interrupt_training(signal);
+    // What Ctrl-C sends, what kill and schedulers do, and what comes together where a terminal is closed.
+    for signals in [&[libc::SIGINT][..], &[libc::SIGTERM], &[libc::SIGINT, libc::SIGTERM, libc::SIGHUP]] {
+        interrupt_training(signals);
     }
 }
 
-fn interrupt_training(signal: i32) {
+fn interrupt_training(signals: &[i32]) {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
@@ -539,8 +539,10 @@ fn interrupt_training(signal: i32) {
     }
     // Again and again, as nobody would: a handler must not write where a product is being computed.
     while child.try_wait().expect("a child").is_none() {
-        // SAFETY: sends a signal to a child that has not been waited for.
-        unsafe { libc::kill(child.id() as i32, signal) };
+        for &signal in signals {
+            // SAFETY: sends a signal to a child that has not been waited for.
+            unsafe { libc::kill(child.id() as i32, signal) };
+        }
         std::thread::sleep(std::time::Duration::from_micros(50));
     }
     let output = child.wait_with_output().expect("a child");
@@ -558,6 +560,28 @@ fn a_run_is_not_begun_anew_over_another() {
     succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
     let error = fail(&["train", "--config", arg(&config), "--out", arg(&run), "--resume", "never"], 2);
     assert!(error.contains("--resume never"), "{error}");
+}
+
+#[test]
+fn memory_of_a_step_is_told_before_and_bench_train_takes_the_batch_that_fits() {
+    let (folder, room) = room();
+    let config = tiny_config(folder.path(), &room);
+    let text = succeed(&["doctor", "--config", arg(&config), "--set", "train.batch=3"]);
+    assert!(text.contains("3 scenes, 3 at a time") && text.contains("GB: it fits"), "{text}");
+    let told: Value =
+        serde_json::from_str(&succeed(&["doctor", "--config", arg(&config), "--json"])).expect("JSON");
+    assert_eq!((&told["cpu"]["scenes_at_once"], &told["devices"][0]["fits"]), (&json!(1), &json!(true)));
+    // No machine has room for so many Gaussians.
+    let large = ["--set", "model.latents=1000000", "--set", "model.candidates=1024"];
+    let text = succeed(&[&["doctor", "--config", arg(&config)][..], &large].concat());
+    assert!(text.contains("it does not fit; to save memory: train.checkpoint_rounds=true"), "{text}");
+
+    let bench =
+        ["bench", "train", "--config", arg(&config), "--set", "train.steps=1", "--steps", "1", "--json"];
+    let report: Value =
+        serde_json::from_str(&succeed(&[&bench[..], &["--batch", "auto"]].concat())).expect("JSON");
+    assert_eq!(report["scenes"], 1);
+    assert_eq!(globalsplat(&[&bench[..], &["--batch", "some"]].concat()).status.code(), Some(2));
 }
 
 #[test]

@@ -21,7 +21,7 @@ pub fn ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
     (done, ffi::noted_ops())
 }
 
-/// The same without those inside of others.
+/// Runs `work` and returns its result and the outermost libtorch ops that it ran on this thread, in order.
 pub fn outermost_ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
     ffi::note_ops(true);
     let done = work();

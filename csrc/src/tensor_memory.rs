@@ -13,8 +13,8 @@ mod ffi {
     }
 }
 
-/// What `work` gives, and the bytes that tensors which it made on this thread, on the CPU, took at the most at a time.
-pub fn tensor_bytes_of<T>(work: impl FnOnce() -> T) -> (T, u64) {
+/// Runs `work` and returns its result and the peak of the bytes that its tensors took on this thread, on the CPU.
+pub fn peak_tensor_bytes<T>(work: impl FnOnce() -> T) -> (T, u64) {
     ffi::count_tensor_bytes();
     let done = work();
     (done, ffi::most_tensor_bytes())

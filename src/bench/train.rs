@@ -234,11 +234,11 @@ pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
 mod tests {
     use super::*;
     use crate::train::MemoryEstimate;
-    use globalsplat_csrc::tensor_memory::tensor_bytes_of;
+    use globalsplat_csrc::tensor_memory::peak_tensor_bytes;
     use std::path::Path;
 
-    /// Of what tensors take in a step of `settings` at the most, as if it were 1.
-    fn estimated_part(settings: &[&str]) -> f64 {
+    /// Returns the estimate for a step of `settings`, divided by the measured peak.
+    fn estimate_over_peak(settings: &[&str]) -> f64 {
         let base = [
             "model.latents=256",
             "model.width=128",
@@ -254,7 +254,7 @@ mod tests {
         ];
         let all: Vec<String> = base.iter().chain(settings).map(|set| set.to_string()).collect();
         let config = Config::parse("", &all, Path::new("test")).unwrap();
-        let ((), found) = tensor_bytes_of(|| {
+        let ((), found) = peak_tensor_bytes(|| {
             let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
             let scenes: Vec<_> = (0..2).map(|seed| made_up_scene(&config, seed)).collect();
             let sample = Sample::by(&scenes, &Upload::to(Device::Cpu));
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_takes_what_is_told() {
+    fn estimate_is_near_the_measured_peak() {
         for settings in [
             &[][..],
             &["train.precision=bf16"],
@@ -275,8 +275,8 @@ mod tests {
             // Side by side, each slice would be another thread's.
             &["loss.consistency_alpha=0", "loss.consistency_depth=0", "train.micro_batch=2"],
         ] {
-            let part = estimated_part(settings);
-            assert!((0.9..1.15).contains(&part), "{settings:?}: {part:.2} of what is taken");
+            let ratio = estimate_over_peak(settings);
+            assert!((0.9..1.15).contains(&ratio), "{settings:?}: {ratio:.2} of the measured peak");
         }
     }
 }

@@ -3,11 +3,11 @@ use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{Part, Together, TrainReport, bench_train};
-use globalsplat::config::{Config, TrainConfig};
+use globalsplat::config::Config;
 use globalsplat::error::{Error, panic_message};
-use globalsplat::eval::memory_of;
+use globalsplat::eval::total_memory_bytes;
 use globalsplat::ranks::Group;
-use globalsplat::train::{MemoryEstimate, batch_within};
+use globalsplat::train::batch_within;
 use serde_json::json;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
@@ -31,7 +31,8 @@ pub struct Train {
     /// Override a key of it, as in train.checkpoint_rounds=true
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Scenes in a step; auto takes train.batch, halved until it fits into the device's memory
+    /// Scenes in a step; auto takes the largest of train.batch, half of it, a quarter, … that fits into the device's memory without
+    /// train.micro_batch
     #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
     batch: Batch,
     /// Steps that are measured
@@ -98,13 +99,14 @@ impl Train {
     /// With the batch that fits by the estimate; where a GPU has too little memory all the same, with half as many scenes.
     fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
         let wanted = config.train.batch;
-        let bytes = memory_of(device).unwrap_or(u64::MAX);
-        let fits = batch_within(&config, bytes, device)?;
-        if fits < wanted {
-            let more = TrainConfig { batch: 2 * fits, micro_batch: 0, ..config.train.clone() };
-            let more = MemoryEstimate::of(&Config { train: more, ..config.clone() }, device)?;
-            let [more, bytes] = [more.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
-            eprintln!("{fits} scenes: a step of {} would take {more:.1} GB of {bytes:.1}", 2 * fits);
+        let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
+        let (fits, refused) = batch_within(&config, bytes, device)?;
+        if let Some(refused) = refused {
+            let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
+            eprintln!(
+                "--batch auto: {fits} of {wanted} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
+                refused.batch
+            );
         }
         config.train.batch = fits;
         config.train.micro_batch = 0;
@@ -120,7 +122,7 @@ impl Train {
                 Err(panic) => resume_unwind(panic),
             }
             config.train.batch = batch / 2;
-            eprintln!("{} scenes: there was too little memory for a step of {batch}", batch / 2);
+            eprintln!("--batch auto: {} scenes; there was too little memory for {batch}", batch / 2);
         }
     }
 }

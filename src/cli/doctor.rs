@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
 use globalsplat::error::Error;
-use globalsplat::eval::memory_of;
+use globalsplat::eval::total_memory_bytes;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::model::{Precision, are_denormals_flushed};
@@ -219,29 +219,37 @@ fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str)
 
 /// A column for each kind of device, and whether it fits into those that are here.
 fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()> {
-    let devices = [("cpu", Device::Cpu), ("gpu", Device::Cuda(0))];
-    let [cpu, gpu] = devices.map(|(_, device)| MemoryEstimate::of(config, device));
-    let estimates = [cpu?, gpu?];
+    let cpu = MemoryEstimate::of(config, Device::Cpu)?;
+    let gpu = MemoryEstimate::of(config, Device::Cuda(0))?;
     let driver = Driver::find();
-    let gpus = driver.iter().flat_map(|driver| &driver.gpus).map(|gpu| (gpu.name.clone(), gpu.memory as u64));
-    let here = memory_of(Device::Cpu).map(|bytes| ("this machine".to_string(), bytes));
+    let gpus = driver.iter().flat_map(|driver| &driver.gpus);
+    let machine = total_memory_bytes(Device::Cpu).map(|bytes| ("this machine".to_string(), bytes, cpu));
+    let here: Vec<(String, u64, MemoryEstimate)> =
+        machine.into_iter().chain(gpus.map(|of| (of.name.clone(), of.memory as u64, gpu))).collect();
     if as_json {
-        let told = devices.iter().zip(&estimates).map(|((name, _), estimate)| {
+        let told = |estimate: &MemoryEstimate| {
             let mut told = json!(estimate);
             told["total"] = json!(estimate.total());
-            (name.to_string(), told)
-        });
-        print_json(&Value::Object(told.collect()));
+            told
+        };
+        let devices: Vec<Value> = here
+            .iter()
+            .map(|(name, bytes, needed)| {
+                json!({ "name": name, "memory_bytes": bytes, "fits": needed.fits_into(*bytes) })
+            })
+            .collect();
+        print_json(&json!({ "cpu": told(&cpu), "gpu": told(&gpu), "devices": devices }));
         return Ok(());
     }
-    let [cpu, gpu] = &estimates;
     let (batch, at_once) = (cpu.batch, cpu.scenes_at_once);
     println!(
-        "memory of a training step of {batch} scenes, {at_once} at a time, in GB{:>14}{:>10}",
-        "CPU", "GPU"
+        "{:<56}{:>10}{:>10}",
+        format!("GB in a training step of {batch} scenes, {at_once} at a time"),
+        "CPU",
+        "GPU"
     );
     let row = |name: &str, of: &dyn Fn(&MemoryEstimate) -> u64| {
-        let [cpu, gpu] = [cpu, gpu].map(|estimate| of(estimate) as f64 * 1e-9);
+        let [cpu, gpu] = [&cpu, &gpu].map(|estimate| of(estimate) as f64 * 1e-9);
         println!("{name:<56}{cpu:>10.2}{gpu:>10.2}");
     };
     row("weights and the optimizer's moments", &|of| of.weights);
@@ -250,13 +258,18 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
     row("heads, Gaussians, pictures and losses", &|of| of.pictures);
     row("network of L_perc", &|of| of.perceptual);
     row("together, to 15 %", &MemoryEstimate::total);
-    for ((name, bytes), estimate) in here.into_iter().map(|here| (here, cpu)).chain(gpus.map(|of| (of, gpu)))
-    {
-        let fits = match estimate.total() <= bytes {
-            true => "it fits",
-            false => {
-                "too little: a smaller train.micro_batch, train.checkpoint_rounds=true or train.precision=bf16 takes less"
-            }
+    let train = &config.train;
+    let savings = [
+        (at_once > 1).then(|| format!("train.micro_batch={}", at_once / 2)),
+        (!train.checkpoint_rounds).then(|| "train.checkpoint_rounds=true".to_string()),
+        (train.precision == Precision::F32).then(|| "train.precision=bf16".to_string()),
+    ];
+    let savings = savings.into_iter().flatten().collect::<Vec<_>>().join(", ");
+    for (name, bytes, needed) in here {
+        let fits = match needed.fits_into(bytes) {
+            true => "it fits".to_string(),
+            false if savings.is_empty() => "it does not fit".to_string(),
+            false => format!("it does not fit; to save memory: {savings}"),
         };
         println!("{name} has {:.1} GB: {fits}", bytes as f64 * 1e-9);
     }

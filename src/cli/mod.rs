@@ -30,7 +30,6 @@ mod refine;
 mod render;
 mod report;
 mod signals;
-
 mod splat_out;
 mod synth;
 mod train;

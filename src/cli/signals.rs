@@ -1,22 +1,41 @@
 //! What the user or the system asks for by Ctrl-C, SIGTERM or SIGHUP.
 
+use std::mem::zeroed;
 use std::ptr::{null, null_mut};
 
-/// Calls `act`, in a thread of its own, each time that the process is asked to stop.
+/// Calls `act`, in a thread of its own, each time that the process is asked to stop. Under `nohup`, which has SIGHUP ignored, it stays
+/// ignored.
 ///
-/// The signal's handler runs on the stack that Rust sets aside in the main thread, which the system hands such signals to. In float32
-/// products oneDNN has let the stack pointer point into its buffers (oneDNN's issue 4845, mended in its version 3.12): the frame
-/// of a handler on the thread's own stack would lie amid the heap.
+/// The handler runs on the alternate signal stack (`SA_ONSTACK`) that Rust sets up for the main thread, to which Linux delivers a signal
+/// of the process unless that thread already has one pending. Float32 matrix products of oneDNN before 3.12 point the stack pointer into
+/// their own buffers (oneDNN issue 4845), so a handler on the thread's own stack would overwrite the heap.
 pub fn on_stop(act: impl FnMut() + Send + 'static) -> anyhow::Result<()> {
+    let hang_up = action_of(libc::SIGHUP);
     ctrlc::set_handler(act)?;
     for signal in [libc::SIGINT, libc::SIGTERM, libc::SIGHUP] {
-        // SAFETY: the system fills in the action that is there, and takes it back with one flag more.
-        unsafe {
-            let mut action: libc::sigaction = std::mem::zeroed();
-            libc::sigaction(signal, null(), &mut action);
-            action.sa_flags |= libc::SA_ONSTACK;
-            libc::sigaction(signal, &action, null_mut());
-        }
+        let mut action = action_of(signal);
+        action.sa_flags |= libc::SA_ONSTACK;
+        // One handler at a time: the alternate stack has room for one frame.
+        // SAFETY: a set of signals that is there.
+        unsafe { libc::sigfillset(&mut action.sa_mask) };
+        set_action(signal, &action);
+    }
+    if hang_up.sa_sigaction == libc::SIG_IGN {
+        set_action(libc::SIGHUP, &hang_up);
     }
     Ok(())
+}
+
+fn action_of(signal: libc::c_int) -> libc::sigaction {
+    // SAFETY: an action is plain data, for which zero is a value, and the system fills it in.
+    unsafe {
+        let mut action = zeroed();
+        libc::sigaction(signal, null(), &mut action);
+        action
+    }
+}
+
+fn set_action(signal: libc::c_int, action: &libc::sigaction) {
+    // SAFETY: the action came from the system, with a handler that is there.
+    unsafe { libc::sigaction(signal, action, null_mut()) };
 }

@@ -2,6 +2,7 @@
 
 use crate::render::cuda::Driver;
 use globalsplat_csrc::device as ffi;
+use std::path::{Path, PathBuf};
 use tch::Device;
 
 /// The resident size now, in bytes; where the system doesn't tell, the largest so far.
@@ -23,16 +24,30 @@ pub fn device_memory_bytes(device: Device) -> Option<u64> {
     }
 }
 
-/// The memory of `device`, in bytes, whoever has it now; none where it can't be told.
-pub fn memory_of(device: Device) -> Option<u64> {
+/// The total memory of `device` in bytes: of a GPU, or of the machine, or less where a control group allows the process less. `None` where
+/// it is unknown.
+pub fn total_memory_bytes(device: Device) -> Option<u64> {
     match device {
         Device::Cuda(number) => Driver::find().ok()?.gpus.get(number).map(|gpu| gpu.memory as u64),
-        // SAFETY: sysconf only tells numbers.
-        _ => [libc::_SC_PHYS_PAGES, libc::_SC_PAGESIZE]
-            .map(|name| u64::try_from(unsafe { libc::sysconf(name) }).ok())
-            .into_iter()
-            .product(),
+        _ => {
+            // SAFETY: sysconf only tells numbers.
+            let [pages, page] = [libc::_SC_PHYS_PAGES, libc::_SC_PAGESIZE]
+                .map(|name| u64::try_from(unsafe { libc::sysconf(name) }).ok());
+            let of_machine = pages? * page?;
+            Some(group_limits().fold(of_machine, u64::min))
+        }
     }
+}
+
+/// The limits of the process's control group and of those above it, in bytes (cgroups(7), version 2).
+fn group_limits() -> impl Iterator<Item = u64> {
+    let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let group = groups.lines().find_map(|line| line.strip_prefix("0::/")).unwrap_or_default().to_string();
+    let folders: Vec<PathBuf> =
+        Path::new("/sys/fs/cgroup").join(group).ancestors().map(PathBuf::from).collect();
+    let limit =
+        |folder: PathBuf| std::fs::read_to_string(folder.join("memory.max")).ok()?.trim().parse().ok();
+    folders.into_iter().filter_map(limit)
 }
 
 /// The largest memory that work on `device` took: of tensors on it, or of the process.

@@ -31,7 +31,7 @@ pub use index::{EvaluationIndex, SceneFrames};
 pub use journal::evaluation_files;
 pub use machine::machine;
 pub(crate) use memory::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
-pub use memory::{memory_of, peak_memory_bytes};
+pub use memory::{peak_memory_bytes, total_memory_bytes};
 pub use method::{Method, Picture, Synthesis, judge, judge_pictures};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;

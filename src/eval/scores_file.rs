@@ -8,7 +8,7 @@ use serde::Serialize;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-/// PSNR in dB of pictures in [0, 1], which is 100 where nothing differs; a mean may be rounded.
+/// Range of PSNR in dB for pictures in [0, 1]: identical pictures have 100. The margin is for rounding of means.
 const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
 
 pub(super) const SCORES: &str = "scores.json";
@@ -33,7 +33,7 @@ pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
 /// Reads `folder/scores.json`.
 ///
 /// # Errors
-/// A file that is missing, is no JSON, or lacks something, or a PSNR that no picture has: plots are drawn over all of them.
+/// A missing file, invalid JSON, a missing field, or a PSNR outside 0 to 100 dB, from which plots can't be drawn.
 pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     let path = folder.join(SCORES);
     let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;

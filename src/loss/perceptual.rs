@@ -62,9 +62,15 @@ impl PerceptualLoss {
         Ok(Some(loss))
     }
 
-    /// Bytes that the network of `config` takes at the most, with what its layers keep of the pictures of `size` that go through it at a
-    /// time.
-    pub fn bytes_kept(config: &LossConfig, precision: Precision, size: ImageSize, device: Device) -> u64 {
+    /// Bytes that the network of `config` takes at the most, with what its layers keep of those of `pictures` of `size` that go through it
+    /// at a time.
+    pub fn bytes_kept(
+        config: &LossConfig,
+        precision: Precision,
+        size: ImageSize,
+        pictures: usize,
+        device: Device,
+    ) -> u64 {
         // Weights, and numbers for each pixel: what layers give, their gradients, and differences of what is compared.
         let (weights, of_pixel) = match config.perceptual {
             PerceptualKind::None => return 0,
@@ -74,7 +80,8 @@ impl PerceptualLoss {
         };
         let number = if precision == Precision::Bf16 { 2.5 } else { 4. };
         let pixels = i64::from(size.height) * i64::from(size.width);
-        (number * (weights + of_pixel * (Self::at_once(pixels, device) * pixels) as f64)) as u64
+        let at_once = Self::at_once(pixels, device).min(pictures as i64);
+        (number * (weights + of_pixel * (at_once * pixels) as f64)) as u64
     }
 
     /// How many pictures of so many pixels go through the network at a time.

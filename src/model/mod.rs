@@ -196,8 +196,8 @@ mod tests {
     use super::*;
     use globalsplat_csrc::ops::outermost_ops_of;
 
-    /// Ops that only look at a tensor another way, or take memory: no kernel of a GPU.
-    const FREE: [&str; 22] = [
+    /// Ops that return a view or allocate. `reshape` and `flatten` copy a non-contiguous tensor, and those copies aren't counted.
+    const VIEW_OPS: [&str; 22] = [
         "aten::alias",
         "aten::as_strided",
         "aten::chunk",
@@ -225,7 +225,8 @@ mod tests {
     /// A GPU computes a pass of the main model about as fast as the host tells it what to do.
     #[test]
     fn a_pass_takes_few_kernels() {
-        // The main model's layers, narrow. In float64 and by an odd number of heads a CPU is asked for what a GPU is.
+        // The main model's layers, narrow. In float64 and with an odd number of heads, the CPU takes the same code path
+        // as a GPU.
         let config = ModelConfig {
             latents: 16,
             width: 24,
@@ -239,7 +240,7 @@ mod tests {
         let mut vs = nn::VarStore::new(Device::Cpu);
         let mut model = GlobalSplat::new(&vs.root(), &config).unwrap();
         vs.freeze();
-        let computing = |ops: Vec<String>| ops.iter().filter(|op| !FREE.contains(&op.as_str())).count();
+        let computing = |ops: Vec<String>| ops.iter().filter(|op| !VIEW_OPS.contains(&op.as_str())).count();
         // Rays are in float32, where linear layers are our own, in blocks, on any of libtorch's threads: they are counted apart.
         let of_tokens = |views: i64| {
             let options = (Kind::Float, Device::Cpu);
@@ -247,11 +248,11 @@ mod tests {
             let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
             let (tokens, ops) = outermost_ops_of(|| model.tokens(&images, &c2w, &intrinsics));
             const LINEAR_LAYERS: usize = 2;
-            let by_others =
+            let is_counted =
                 |op: &String| !["aten::copy_", "mkldnn::_linear_pointwise"].contains(&op.as_str());
             (
                 tokens.to_kind(Kind::Double),
-                computing(ops.into_iter().filter(by_others).collect()) + LINEAR_LAYERS,
+                computing(ops.into_iter().filter(is_counted).collect()) + LINEAR_LAYERS,
             )
         };
         let (few, many) = (of_tokens(2), of_tokens(24));

@@ -7,7 +7,8 @@ use crate::model::{GlobalSplat, Precision, Streams};
 use serde::Serialize;
 use tch::{Device, nn};
 
-/// What tensors of a training step take at the most, in bytes: counted by what each layer keeps for its gradient.
+/// What tensors of a training step take at the most, in bytes: counted by what each layer keeps for its gradient. Where a CPU computes
+/// slices side by side, each but the first has gradients of its own beside that.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct MemoryEstimate {
     /// Scenes of a step.
@@ -44,8 +45,8 @@ impl MemoryEstimate {
             count => count.min(batch),
         };
 
-        // Muon has one moment of a matrix, AdamW two of everything. Gradients come while what layers keep goes,
-        // where that is more.
+        // Muon has one moment of a matrix, AdamW two of everything. Without slices or
+        // recomputation each gradient replaces activations that are larger, so gradients add nothing to the peak.
         let moments = if config.train.optimizer == OptimizerKind::Muon { 1. } else { 2. };
         let gradients = if scenes_at_once < batch || config.train.checkpoint_rounds { 1. } else { 0. };
 
@@ -93,7 +94,13 @@ impl MemoryEstimate {
             photos: bytes(batch as f64 * (context + target) * 3. * pixels),
             encoder: bytes(at_once * per_scene + folded),
             pictures: bytes(at_once * pictures),
-            perceptual: PerceptualLoss::bytes_kept(&config.loss, precision, data.image_size, device),
+            perceptual: PerceptualLoss::bytes_kept(
+                &config.loss,
+                precision,
+                data.image_size,
+                scenes_at_once * data.target_views,
+                device,
+            ),
         })
     }
 
@@ -101,17 +108,29 @@ impl MemoryEstimate {
     pub fn total(&self) -> u64 {
         self.weights + self.photos + self.encoder + self.pictures + self.perceptual
     }
+
+    /// Whether a step fits into `bytes` of memory, with the 15 % by which the estimate may be too low.
+    pub fn fits_into(&self, bytes: u64) -> bool {
+        self.total() + self.total() * 3 / 20 <= bytes
+    }
 }
 
-/// The batch of `config`, halved until all its scenes can go through the model together in `bytes` of memory on `device`; at least 1.
+/// The batch of `config`, halved until all its scenes fit at once into `bytes` of memory on `device`, and the estimate of the last one that
+/// did not, if any. A batch of 1 is tried in any case.
 ///
 /// # Errors
 /// As [`MemoryEstimate::of`].
-pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<usize> {
+pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usize, Option<MemoryEstimate>)> {
     let mut config = config.clone();
     config.train.micro_batch = 0;
-    while config.train.batch > 1 && MemoryEstimate::of(&config, device)?.total() > bytes {
+    let mut refused = None;
+    while config.train.batch > 1 {
+        let estimate = MemoryEstimate::of(&config, device)?;
+        if estimate.fits_into(bytes) {
+            break;
+        }
+        refused = Some(estimate);
         config.train.batch /= 2;
     }
-    Ok(config.train.batch)
+    Ok((config.train.batch, refused))
 }

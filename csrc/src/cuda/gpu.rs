@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use std::ptr::null_mut;
 use std::sync::{LazyLock, Mutex, PoisonError};
 
-// Of cuda.h.
+// Values from cuda.h.
 const CUDA_ERROR_NO_DEVICE: c_int = 100;
 const MULTIPROCESSOR_COUNT: c_int = 16;
 const COMPUTE_CAPABILITY_MAJOR: c_int = 75;

@@ -23,7 +23,7 @@ macro_rules! functions {
         }
 
         impl $table {
-            /// For good.
+            /// Looks up every function of `library`, which is never unloaded.
             fn of(library: Library) -> Result<Self> {
                 // SAFETY: the functions have these parameters, and the library is never unloaded.
                 let functions = unsafe {
@@ -77,7 +77,8 @@ functions! {
     nvrtcGetPTX(Program, *mut c_char) -> c_int;
 }
 
-/// NVIDIA's driver, loaded once. By its full name, as by torch: a toolkit's `libcuda.so` is a stub for linkers, where one is found.
+/// Returns NVIDIA's driver, loaded once, as `libcuda.so.1`, as torch loads it: `libcuda.so` may be a CUDA toolkit's stub, which only
+/// linkers use.
 ///
 /// # Errors
 /// It isn't there, or lacks a function.

@@ -76,7 +76,8 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
             gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((values.opacities[index] * 255.).round() as u8);
             gaussian.extend(values.quaternions[index].map(|part| (part * 128. + 128.).round() as u8));
-            // A position whose bytes are another format's magic number is moved by the least that a float32 can be.
+            // A position whose bytes are another format's magic number has its lowest bit flipped, so that readers don't take the file for
+            // that format.
             if place == 0 && recognize(&gaussian).is_some() {
                 gaussian[0] ^= 1;
             }

@@ -236,7 +236,7 @@ fn read_contents(path: &Path) -> Result<Contents> {
     (recognize(&bytes).unwrap_or(named).read)(path, &bytes)
 }
 
-/// Returns the format that `bytes` are of without a doubt.
+/// Returns the format whose magic number `bytes` begin with.
 fn recognize(bytes: &[u8]) -> Option<&'static Format> {
     FORMATS.iter().find(|format| (format.recognizes)(bytes))
 }

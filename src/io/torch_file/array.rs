@@ -56,8 +56,8 @@ impl Array {
     }
 }
 
-/// Steps from one element to the next of each dimension where all lie one after the other, the last dimension fastest. Those of a
-/// tensor without elements mean nothing: they are 1 where sizes of any other dimensions overflow.
+/// Returns the strides of a contiguous tensor, last dimension fastest. Without elements strides are meaningless; one whose product
+/// overflows is 1.
 pub(crate) fn row_major(size: &[usize]) -> Vec<usize> {
     let mut stride = vec![1usize; size.len()];
     for i in (1..size.len()).rev() {
