@@ -124,12 +124,14 @@ __global__ void __launch_bounds__(kSortThreads)
         entries[k] = pairs[pair_of(list[k])];
       else
         keys[done + uint32_t(k)] = list[k];
-    __syncthreads();
+    // The next round begins with each thread's own places in `list`.
   }
   if (length <= kListKeys) return;
 
   // A longer list is made of several: each key goes behind as many as are before it in its own list and in the neighbour.
-  for (uint64_t run = kListKeys; run < length; run *= 2) {
+  for (uint64_t run = kListKeys;; run *= 2) {
+    __syncthreads();
+    if (run >= length) break;
     for (uint64_t k = threadIdx.x; k < length; k += kSortThreads) {
       const uint64_t key = keys[k], own = k / run * run, both = k / (2 * run) * (2 * run), other = own == both ? own + run : both;
       uint64_t low = other < length ? other : length, high = low + run < length ? low + run : length;
@@ -146,7 +148,6 @@ __global__ void __launch_bounds__(kSortThreads)
     uint64_t* const merged = spare;
     spare = keys;
     keys = merged;
-    __syncthreads();
   }
   for (uint64_t k = threadIdx.x; k < length; k += kSortThreads) entries[k] = pairs[pair_of(keys[k])];
 }
