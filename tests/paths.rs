@@ -82,8 +82,13 @@ fn names_that_are_not_utf_8() {
     folder.json(&["export", "--run", "@run", "--out", "@tiny.safetensors"], &["/weights"]);
     folder.json(&["import", "--from", "@tiny.safetensors", "--out", "@imported.safetensors"], &["/weights"]);
 
-    for path in ["@rooms/room_000", "@videos/000000.torch", "@tiny.safetensors", "@rooms/room_000/truth.ply"]
-    {
+    for path in [
+        "@rooms/room_000",
+        "@videos/000000.torch",
+        "@chunks/000000.torch#room_001",
+        "@tiny.safetensors",
+        "@rooms/room_000/truth.ply",
+    ] {
         folder.json(&["inspect", path], &[]);
     }
     std::fs::remove_file(folder.0.join("chunks_too/000000.torch")).expect("a chunk");

@@ -466,9 +466,8 @@ impl Capture {
 
 /// The file in `path`, which may have the key of one of its scenes after a `#`.
 fn described_in(path: &Path) -> PathBuf {
-    let text = path.to_string_lossy();
-    let prefixes = text.match_indices('#').rev().map(|(at, _)| PathBuf::from(&text[..at]));
-    std::iter::once(path.to_owned()).chain(prefixes).find(|file| file.is_file()).unwrap_or_default()
+    let files = io::files_and_keys(path).rev().map(|(file, _)| file);
+    std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
 }
 
 /// Checks the cameras of `frames`, which `file` describes, fits them to their photos, and returns a line for each kind of change.

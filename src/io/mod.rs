@@ -11,6 +11,7 @@ mod film;
 mod images;
 mod inputs;
 mod jpeg;
+mod keyed_path;
 mod mosaic;
 mod npy;
 mod pretrained;
@@ -53,6 +54,7 @@ pub(crate) use event_reader::{EventReader, read_picture};
 pub(crate) use images::{
     PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, subsample, write_jpeg,
 };
+pub(crate) use keyed_path::files_and_keys;
 pub(crate) use mosaic::shrink_factor;
 pub(crate) use pretrained::pretrained_folders;
 pub(crate) use text::read_text;

@@ -10,7 +10,7 @@ use super::Found;
 use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::{Archive, encoded_image_size};
+use crate::io::{Archive, encoded_image_size, files_and_keys};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec4};
 use scenes::{Scene, scenes};
@@ -32,14 +32,7 @@ pub struct Chunk {
 
 /// `CHUNK.torch#KEY`, or `CHUNK.torch` with one scene alone.
 pub(super) fn find(path: &Path) -> Option<Found> {
-    // A key may have the sign, too, and so may the folders before it.
-    let text = path.to_str().unwrap_or_default();
-    let keyed = text
-        .match_indices('#')
-        .map(|(at, sign)| (&text[..at], &text[at + sign.len()..]))
-        .find(|(file, _)| is_chunk(file.as_ref()));
-    if let Some((file, key)) = keyed {
-        let (file, key) = (PathBuf::from(file), key.to_string());
+    if let Some((file, key)) = files_and_keys(path).find(|(file, _)| is_chunk(file)) {
         return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
     }
     let file = is_chunk(path).then(|| path.to_owned())?;
