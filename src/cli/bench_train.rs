@@ -93,9 +93,7 @@ impl Train {
         }
         Ok(())
     }
-}
 
-impl Train {
     /// With the batch that fits by the estimate; where a GPU has too little memory all the same, with half as many scenes.
     fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
         let wanted = config.train.batch;

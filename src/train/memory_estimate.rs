@@ -3,7 +3,7 @@
 use crate::config::{Config, OptimizerKind};
 use crate::error::Result;
 use crate::loss::PerceptualLoss;
-use crate::model::{GlobalSplat, Precision, Streams};
+use crate::model::{GlobalSplat, ModelConfig, Precision, Streams};
 use serde::Serialize;
 use tch::{Device, nn};
 
@@ -33,20 +33,21 @@ impl MemoryEstimate {
     /// # Errors
     /// A model whose numbers don't fit together.
     pub fn of(config: &Config, device: Device) -> Result<Self> {
-        let mut vs = nn::VarStore::new(Device::Cpu);
-        GlobalSplat::to_be_filled(&mut vs, &config.model, Precision::F32)?;
-        let learned = vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64;
+        Ok(Self::of_learned(config, learned_numbers(&config.model)?, device))
+    }
 
+    /// The same of a model that learns so many numbers.
+    fn of_learned(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
         let (model, data) = (&config.model, &config.data);
-        let batch = config.train.batch;
+        let (batch, precision) = (config.train.batch, config.train.precision);
         let scenes_at_once = match config.train.micro_batch {
             0 => batch,
             count => count.min(batch),
         };
 
-        // Muon has one moment of a matrix, AdamW two of everything. Without slices or
-        // recomputation each gradient replaces activations that are larger, so gradients add nothing to the peak.
+        // Muon has one moment of a matrix, AdamW two of everything. Without slices or recomputation each gradient
+        // replaces activations that are larger, so gradients add nothing to the peak.
         let moments = if config.train.optimizer == OptimizerKind::Muon { 1. } else { 2. };
         let gradients = if scenes_at_once < batch || config.train.checkpoint_rounds { 1. } else { 0. };
 
@@ -62,7 +63,7 @@ impl MemoryEstimate {
 
         // Numbers of a slot that the layers of a round keep, in units of the width. In bf16 norms, products, queries, keys, values,
         // what is seen and both sides of GELU are half as large; sums of a stream stay in float32.
-        let (of_reading, of_block, of_mixer, small) = match config.train.precision {
+        let (of_reading, of_block, of_mixer, small) = match precision {
             Precision::F32 => (18., 18., 10., 1.),
             Precision::Bf16 => (10.5, 10., 6., 0.5),
         };
@@ -75,7 +76,7 @@ impl MemoryEstimate {
         let per_scene = slots * 3. * streams + tokens * (2. + 2.7) * token_width + rounds_kept;
         // Keys and values are read by weights that a norm's γ is folded into; bf16 has copies of all weights of products.
         let folded = rounds * streams * 2. * width * token_width
-            + if config.train.precision == Precision::Bf16 { 0.5 * learned } else { 0. };
+            + if precision == Precision::Bf16 { 0.5 * learned } else { 0. };
 
         let candidates = passes * (model.latents * model.candidates) as f64;
         let of_candidate = 10.3 * (14 + 3 * model.sh_bases()) as f64;
@@ -86,8 +87,7 @@ impl MemoryEstimate {
 
         let bytes = |numbers: f64| (FLOAT * numbers) as u64;
         let at_once = scenes_at_once as f64;
-        let precision = config.train.precision;
-        Ok(MemoryEstimate {
+        MemoryEstimate {
             batch,
             scenes_at_once,
             weights: bytes((1. + moments + gradients) * learned),
@@ -101,7 +101,7 @@ impl MemoryEstimate {
                 scenes_at_once * data.target_views,
                 device,
             ),
-        })
+        }
     }
 
     /// All together.
@@ -123,9 +123,10 @@ impl MemoryEstimate {
 pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usize, Option<MemoryEstimate>)> {
     let mut config = config.clone();
     config.train.micro_batch = 0;
+    let learned = learned_numbers(&config.model)?;
     let mut refused = None;
     while config.train.batch > 1 {
-        let estimate = MemoryEstimate::of(&config, device)?;
+        let estimate = MemoryEstimate::of_learned(&config, learned, device);
         if estimate.fits_into(bytes) {
             break;
         }
@@ -133,4 +134,11 @@ pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usiz
         config.train.batch /= 2;
     }
     Ok((config.train.batch, refused))
+}
+
+/// How many numbers a model of `config` learns.
+fn learned_numbers(config: &ModelConfig) -> Result<f64> {
+    let mut vs = nn::VarStore::new(Device::Cpu);
+    GlobalSplat::to_be_filled(&mut vs, config, Precision::F32)?;
+    Ok(vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64)
 }
