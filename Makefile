@@ -75,7 +75,7 @@ parity-pytest:
 parity-self-test:
 	.venv/bin/python parity/run.py --self-test
 parity-kernels:
-	.venv/bin/python parity/run.py --only '[pr][ra]*_float32' --cuda-on-cpu 1 --self-test
+	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test
 
 # How fast this machine runs the rasterizer, how its time grows with Gaussians and pixels, and how fast training data load.
 bench: build

@@ -117,7 +117,7 @@ fn main() {
     cpp()
         .includes(["raster", "cuda"])
         .flag("-ffp-contract=off")
-        .files(["cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
+        .files(["cuda/fitting.cpp", "cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
         .compile("globalsplat_cuda");
     match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
         Ok("x86_64") => {

@@ -3,8 +3,11 @@
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/mul.h>
+#include <ATen/ops/sum.h>
 #include <torch/csrc/autograd/custom_function.h>
 
+#include "cuda/fitting.h"
+#include "cuda/torch_device.h"
 #include "globalsplat-csrc/src/fit.rs.h"
 #include "raster/fit.h"
 #include "raster/optim.h"
@@ -24,31 +27,49 @@ auto by_type(const Tensor& t, Body body) {
   return t.scalar_type() == at::kDouble ? body(0.) : body(0.f);
 }
 
-// A scalar, whose gradient with respect to `of` is known already, if it is asked for.
-Tensor with_gradient(AutogradContext* ctx, double value, const Tensor& gradient, const Tensor& of) {
+// A scalar, and what it came from where a gradient is asked for: the gradient with respect to that, known already.
+Tensor with_gradient(AutogradContext* ctx, const Tensor& value, const Tensor& gradient) {
   if (gradient.defined()) ctx->save_for_backward({gradient});
-  return at::empty({}, of.options()).fill_(value);
+  return value;
 }
 
 Tensor of_argument(AutogradContext* ctx, const Tensor& g) {
   const Tensor gradient = ctx->get_saved_variables()[0];
-  // Mostly the loss itself: nothing to multiply by.
-  return g.item<double>() == 1 ? gradient : at::mul(gradient, g);
+  // Mostly the loss itself: nothing to multiply by. A GPU would have to be waited for to know.
+  return g.is_cpu() && g.item<double>() == 1 ? gradient : at::mul(gradient, g);
 }
 
-// Of two contiguous CPU tensors of one type.
+template <class T>
+T* data_or_null(const Tensor& t) {
+  return t.defined() ? t.data_ptr<T>() : nullptr;
+}
+
+Tensor scalar(double value, const Tensor& like) { return at::empty({}, like.options()).fill_(value); }
+
+Tensor sum_of(const cuda::Parts& parts, const Tensor& like) {
+  return cuda::tensor_of(parts.numbers.get(), {parts.count}, like.options().dtype(at::kDouble)).sum().to(like.scalar_type());
+}
+
+// Of two contiguous tensors of one type and device, whose kernels serve them or which is the CPU.
 struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
+  template <class T>
+  static raster::FitJob<T> job_of(const Tensor& picture, const Tensor& photo) {
+    const int64_t height = picture.size(-2), width = picture.size(-1);
+    return {picture.data_ptr<T>(), photo.data_ptr<T>(), picture.numel() / (height * width), int(width), int(height)};
+  }
+
   static Tensor forward(AutogradContext* ctx, Tensor picture, Tensor photo, double absolute, double similar, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(picture) : Tensor();
+    if (const auto device = cuda::device_of(picture)) {
+      const cuda::Parts parts =
+          cuda::photometric(*device, job_of<float>(picture, photo), absolute, similar, data_or_null<float>(gradient));
+      return with_gradient(ctx, sum_of(parts, picture), gradient);
+    }
     const double value = by_type(picture, [&](auto number) {
       using T = decltype(number);
-      const int64_t height = picture.size(-2), width = picture.size(-1);
-      const raster::FitJob<T> job{picture.data_ptr<T>(), photo.data_ptr<T>(), picture.numel() / (height * width), int(width),
-                                  int(height)};
-      return raster::photometric<T>(job, absolute, similar, differentiable ? gradient.data_ptr<T>() : nullptr,
-                                    threads());
+      return raster::photometric<T>(job_of<T>(picture, photo), absolute, similar, data_or_null<T>(gradient), threads());
     });
-    return with_gradient(ctx, value, gradient, picture);
+    return with_gradient(ctx, scalar(value, picture), gradient);
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
@@ -58,16 +79,24 @@ struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
 
 // The same.
 struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
+  template <class T>
+  static raster::DepthJob<T> job_of(const Tensor& depths, const Tensor& photos) {
+    const int64_t height = depths.size(-2), width = depths.size(-1);
+    return {depths.data_ptr<T>(), photos.data_ptr<T>(), depths.numel() / (height * width), int(width), int(height)};
+  }
+
   static Tensor forward(AutogradContext* ctx, Tensor depths, Tensor photos, double factor, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(depths) : Tensor();
+    if (const auto device = cuda::device_of(depths)) {
+      const cuda::Parts parts =
+          cuda::depth_smoothness(*device, job_of<float>(depths, photos), factor, data_or_null<float>(gradient));
+      return with_gradient(ctx, sum_of(parts, depths), gradient);
+    }
     const double value = by_type(depths, [&](auto number) {
       using T = decltype(number);
-      const int64_t height = depths.size(-2), width = depths.size(-1);
-      const raster::DepthJob<T> job{depths.data_ptr<T>(), photos.data_ptr<T>(), depths.numel() / (height * width), int(width),
-                                    int(height)};
-      return raster::depth_smoothness<T>(job, factor, differentiable ? gradient.data_ptr<T>() : nullptr, threads());
+      return raster::depth_smoothness<T>(job_of<T>(depths, photos), factor, data_or_null<T>(gradient), threads());
     });
-    return with_gradient(ctx, value, gradient, depths);
+    return with_gradient(ctx, scalar(value, depths), gradient);
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
@@ -75,14 +104,15 @@ struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
   }
 };
 
-// Runs `Function` on the first argument's type on the CPU, the others being constants, and leaves its result, on the first's device,
-// to the caller.
+// Runs `Function` where the first argument is, or on the CPU, the others being constants, and leaves its result, on the first's device, to
+// the caller.
 template <class Function, class... Numbers>
 void run(const Tensor& first, const Tensor& second, rust::Slice<size_t> out, Numbers... numbers) {
   const auto type = first.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
-  const auto here = [&](const Tensor& t) { return t.to(at::kCPU, type).contiguous(); };
+  const at::Device device = type == at::kFloat && first.is_cuda() ? first.device() : at::Device(at::kCPU);
+  const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   const bool differentiable = at::GradMode::is_enabled() && first.requires_grad();
-  const Tensor value = Function::apply(here(first), here(second.detach()), numbers..., differentiable);
+  const Tensor value = Function::apply(there(first), there(second.detach()), numbers..., differentiable);
   out[0] = reinterpret_cast<size_t>(new Tensor(value.to(first.device())));
 }
 

@@ -3,7 +3,7 @@
     python parity/run.py                         everything, about a minute
     python parity/run.py --only 'rasterizer*'    the cases of that name
     python parity/run.py --self-test             are wrong answers noticed?
-    python parity/run.py --only '*float32' --cuda-on-cpu 1    the kernels for GPUs, without a GPU
+    python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    the kernels for GPUs, without a GPU
     python parity/run.py --self-test --markdown docs/parity.md    the same, written down
 """
 
@@ -29,7 +29,7 @@ WRONG_REQUEST = 2
 
 def arguments(argv):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", metavar="PATTERN", default="*", help="cases of that name; * and ? as in a shell")
+    parser.add_argument("--only", metavar="PATTERNS", default="*", help="cases of these names, by commas; * and ? as in a shell")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the random numbers (default: 0)")
     parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
     parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
@@ -74,7 +74,7 @@ def progress(text):
 
 def main(argv=None):
     options = arguments(argv)
-    names = [name for name in CASES if fnmatchcase(name, options.only)]
+    names = [name for name in CASES if any(fnmatchcase(name, pattern) for pattern in options.only.split(","))]
     if not names:
         print(f"--only {options.only}: no such case, there are {', '.join(CASES)}", file=sys.stderr)
         return WRONG_REQUEST

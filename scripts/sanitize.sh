@@ -37,7 +37,7 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in raster/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/frame.cpp checks/{checks,refusals,schedules}.cpp; do
+    for source in raster/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/{fitting,frame}.cpp checks/{checks,refusals,schedules}.cpp; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/raster
     done
     compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/raster
@@ -49,7 +49,7 @@ for sanitizer in $sanitizers; do
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster attend fit optim parallel kernels frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
+    for part in $isas raster attend fit optim parallel kernels fitting frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
     # shellcheck disable=SC2086
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done

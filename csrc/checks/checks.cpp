@@ -584,7 +584,9 @@ int64_t orders(bool is_short) {
   };
   begin("sums of kernels");
   for (const uint64_t seed : seeds) expect_none(sums_differ(seed));
-  int64_t count = int64_t(seeds.size());
+  begin("losses of kernels");
+  expect_none(fits_differ(seeds));
+  int64_t count = 2 * int64_t(seeds.size());
   size_t turn = 0;
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);

@@ -1,11 +1,14 @@
 #include "schedules.h"
 
+#include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
 
 #include "../cuda/emulated.h"
+#include "../cuda/fitting.h"
 #include "../cuda/frame.h"
+#include "../raster/kernels.h"
 
 namespace globalsplat::checks {
 namespace {
@@ -168,6 +171,67 @@ std::string sums_differ(uint64_t seed) {
   const auto row_of = [&](int row) { return cuda::Counts{int64_t(lengths[row]), counts[row].data(), sums[row].data()}; };
   GS_LAUNCH(cuda::emulated::Emulator(seed), gs_scan, (cuda::Blocks{3, 2}), cuda::kScanThreads, row_of(0), row_of(1), &total);
   return sums[0] == expected[0] && sums[1] == expected[1] && total == totals[0] ? "" : "sums of what is before differ";
+}
+
+std::string fits_differ(const std::vector<uint64_t>& seeds) {
+  Random random(12);
+  const auto numbers = [&](size_t count) {
+    Numbers values;
+    for (const double value : random.uniform(count, 0, 1)) values.push_back(float(value));
+    return values;
+  };
+  const auto sum_of = [](const cuda::Parts& parts) {
+    double sum = 0;
+    for (int64_t k = 0; k < parts.count; ++k) sum += static_cast<const double*>(parts.numbers.get())[k];
+    return sum;
+  };
+  // Instructions without fused multiply-add round products before adding them.
+  const bool is_fused = std::strcmp(raster::kernels().name, "portable") != 0;
+  // by_cpu(gradient) and by_kernels(device, gradient) give a loss, and the gradient's `all` numbers unless that is null.
+  const auto difference = [&](size_t all, const auto& by_cpu, const auto& by_kernels) -> std::string {
+    Numbers cpu(all), first;
+    const double expected = by_cpu(cpu.data());
+    double value = 0;
+    for (const uint64_t seed : seeds) {
+      const cuda::emulated::Emulator device(seed);
+      Numbers gradient(all, std::nanf(""));
+      const double found = sum_of(by_kernels(device, gradient.data()));
+      if (sum_of(by_kernels(device, nullptr)) != found) return "the gradient changes a loss";
+      if (first.empty()) {
+        value = found;
+        first = gradient;
+      }
+      if (found != value || !same(gradient, first)) return "a loss changes with the order of threads, seed " + std::to_string(seed);
+    }
+    const double off = distance(cpu, first);
+    if (!(is_fused ? same(cpu, first) : off <= 1e-4 * largest(cpu)))
+      return "a loss's gradient differs from the CPU's by " + std::to_string(off);
+    if (!(std::abs(value - expected) <= 1e-6 * (std::abs(expected) + 1))) return "a loss is " + std::to_string(value) + ", on the CPU " + std::to_string(expected);
+    return {};
+  };
+  for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {2, 27, 43}, {3, 12, 75}})
+    for (const auto& [absolute, similar] : {std::array<double, 2>{0.8, 0}, {0, 1}, {0.8, -0.2}}) {
+      const size_t all = size_t(planes * height * width);
+      const Numbers pictures = numbers(all), photos = numbers(all);
+      const raster::FitJob<float> job{pictures.data(), photos.data(), planes, width, height};
+      const double a = absolute, s = similar;
+      const std::string found = difference(
+          all, [&](float* gradient) { return raster::photometric<float>(job, a, s, gradient, 1); },
+          [&](const cuda::Device& device, float* gradient) { return cuda::photometric(device, job, a, s, gradient); });
+      if (!found.empty()) return found;
+    }
+  for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 17, 1}}) {
+    const size_t all = size_t(views * height * width);
+    Numbers depths = numbers(all);
+    const Numbers photos = numbers(3 * all);
+    for (size_t k = 0; k < all; k += 7) depths[k] = 0;
+    const raster::DepthJob<float> job{depths.data(), photos.data(), views, width, height};
+    const std::string found = difference(
+        all, [&](float* gradient) { return raster::depth_smoothness<float>(job, 0.3, gradient, 1); },
+        [&](const cuda::Device& device, float* gradient) { return cuda::depth_smoothness(device, job, 0.3, gradient); });
+    if (!found.empty()) return found;
+  }
+  return {};
 }
 
 }  // namespace globalsplat::checks

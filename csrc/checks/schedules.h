@@ -15,4 +15,7 @@ std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64
 // The same of the sums that sorting needs, of more counts than a block takes in one go.
 std::string sums_differ(uint64_t seed);
 
+// The same of how far pictures are from photos, with their gradients.
+std::string fits_differ(const std::vector<uint64_t>& seeds);
+
 }  // namespace globalsplat::checks

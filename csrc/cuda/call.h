@@ -11,6 +11,7 @@
 namespace globalsplat::cuda {
 
 using raster::CameraGradient;
+using raster::DepthJob;
 using raster::GaussianGradients;
 using raster::Gaussians;
 using raster::Grid;
@@ -36,10 +37,21 @@ inline constexpr int kSortThreads = 256;      // of a block that sorts a tile's 
 inline constexpr int kListKeys = 2048;        // of a list that is sorted in shared memory
 inline constexpr int kScanThreads = 512;      // of a block that adds up counts
 inline constexpr int kScanItems = 4;          // counts of a thread
+inline constexpr int kFitThreads = 256;       // of a block that compares pictures with photos
+inline constexpr int kFitColumns = 32;        // of the windows or pixels that such a block takes
+inline constexpr int kFitRows = 16;
 
 // What pairs of a tile are sorted by: depth, a positive float's bits, then their place among all pairs, Gaussian by Gaussian.
 inline constexpr uint64_t key_of(uint32_t depth, uint32_t pair) { return uint64_t(depth) << 32 | pair; }
 inline constexpr uint32_t pair_of(uint64_t key) { return uint32_t(key); }
+
+// Planes [H, W] of pictures, and those of the photos, and the weights of SSIM's window in each direction.
+struct FitPlanes {
+  const float* pictures;
+  const float* photos;
+  int width, height;
+  float window[raster::kWindow];
+};
 
 // Counts, and where the sums of those before go.
 struct Counts {
@@ -51,7 +63,7 @@ struct Counts {
 // Warps that a view's Gaussians, or blocks that so many items, are dealt to.
 inline constexpr int parts(int64_t items, int of) { return int((items + of - 1) / of); }
 
-// Described where they are written: gaussians.h, lists.h, sort.h, tiles.h.
+// Described where they are written: gaussians.h, lists.h, losses.h, sort.h, tiles.h.
 extern "C" {
 __global__ void gs_lenses(Call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
                           uint32_t* tile_counts);
@@ -69,6 +81,9 @@ __global__ void gs_blend_backward(Call, const Splat<float>* splats, const TileEn
 __global__ void gs_project_backward(Call, Gaussians<float>, const Lens<float>* lenses, const Splat<float>* splats,
                                     const SplatGradient<float>* records, const uint32_t* first,
                                     GaussianGradients<float> out, CameraGradient<float>* asked);
+__global__ void gs_ssim(FitPlanes, double each, float* slopes, double* parts);
+__global__ void gs_fit_gradient(FitPlanes, const float* slopes, double absolute, float similar, float* gradient, double* parts);
+__global__ void gs_unevenness(DepthJob<float>, double each, float* gradient, double* parts);
 __global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* asked, float* w2c);
 }
 

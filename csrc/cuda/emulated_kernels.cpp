@@ -24,6 +24,7 @@ constexpr Kernel kKernels[] = {
     GS_KERNEL(gs_lenses),         GS_KERNEL(gs_project),          GS_KERNEL(gs_cover),
     GS_KERNEL(gs_scan),           GS_KERNEL(gs_sort_lists),       GS_KERNEL(gs_blend),
     GS_KERNEL(gs_blend_backward), GS_KERNEL(gs_project_backward), GS_KERNEL(gs_sum_cameras),
+    GS_KERNEL(gs_ssim),           GS_KERNEL(gs_fit_gradient),     GS_KERNEL(gs_unevenness),
 };
 
 }  // namespace

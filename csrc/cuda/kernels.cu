@@ -9,5 +9,6 @@
 
 #include "gaussians.h"
 #include "lists.h"
+#include "losses.h"
 #include "sort.h"
 #include "tiles.h"

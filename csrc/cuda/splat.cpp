@@ -5,61 +5,18 @@
 #include <ATen/ops/cumsum.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
-#include <ATen/ops/from_blob.h>
 #include <ATen/ops/stack.h>
 #include <ATen/ops/where.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
-#include <c10/core/DeviceGuard.h>
-#include <c10/core/impl/VirtualGuardImpl.h>
 
-#include <cstdlib>
 #include <vector>
 
-#include "emulated.h"
 #include "frame.h"
-#include "globalsplat-csrc/src/cuda.rs.h"
-#include "kernel_times.h"
+#include "torch_device.h"
 
 namespace globalsplat::cuda {
 namespace {
-
-// The GPU that holds a tensor: memory from torch's allocator, kernels in torch's current stream.
-class Gpu : public Device {
- public:
-  explicit Gpu(const Tensor& on) : guard_(on.device()), options_(on.options()) {}
-
-  Memory allocate(size_t bytes) const override {
-    const Tensor held = at::empty({int64_t(bytes)}, options_.dtype(at::kByte));
-    return Memory(held.data_ptr(), [held](void*) {});
-  }
-
-  void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override {
-    const at::Device device = options_.device();
-    const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
-    measured_launch(kernel, stream, [&] {
-      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
-                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads), reinterpret_cast<size_t>(arguments));
-    });
-  }
-
-  uint64_t read(const uint64_t* number) const override {
-    return uint64_t(at::for_blob(const_cast<uint64_t*>(number), {1})
-                        .options(options_.dtype(at::kLong))
-                        .target_device(options_.device())
-                        .make_tensor()
-                        .item<int64_t>());
-  }
-
- private:
-  c10::DeviceGuard guard_;
-  at::TensorOptions options_;
-};
-
-class Emulated : public emulated::Emulator {
- public:
-  explicit Emulated(const Tensor&) : Emulator(std::strtoull(std::getenv("GLOBALSPLAT_CUDA_ON_CPU"), nullptr, 10)) {}
-};
 
 template <class T>
 T* data(const Tensor& t) {
@@ -122,12 +79,7 @@ Gradients splat_backward(const Inputs& in, const globalsplat::Pictures& drawn, c
 
 // The splats' numbers in Splat's order, each [B, C, N], as long as `seen` lives.
 std::vector<Tensor> numbers_of(const Seen& seen, const Inputs& in) {
-  const auto options = in.gaussians.means.options();
-  return at::for_blob(seen.splats.get(), {in.scenes(), in.cameras(), in.count(), 16})
-      .options(options)
-      .target_device(options.device())
-      .make_tensor()
-      .unbind(-1);
+  return tensor_of(seen.splats.get(), {in.scenes(), in.cameras(), in.count(), 16}, in.gaussians.means.options()).unbind(-1);
 }
 constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // places in it
 constexpr double kTwoLn2 = 2 / raster::kLog2E;
@@ -180,7 +132,7 @@ const Backend backend = backend_on<Gpu>(at::kCUDA);
 
 const Backend* emulated_backend() {
   static const Backend emulated = backend_on<Emulated>(at::kCPU);
-  return std::getenv("GLOBALSPLAT_CUDA_ON_CPU") == nullptr ? nullptr : &emulated;
+  return emulation() != nullptr ? &emulated : nullptr;
 }
 
 }  // namespace globalsplat::cuda

@@ -14,22 +14,6 @@ namespace {
 constexpr int kRows = 16;       // that are one task
 constexpr double kSigma = 1.5;  // of SSIM's window, pixels
 
-template <class T>
-const T* window() {
-  static const std::vector<T> weights = [] {
-    std::vector<double> exact(kWindow);
-    double sum = 0;
-    for (int k = 0; k < kWindow; ++k) {
-      const double offset = k - (kWindow - 1) / 2;
-      sum += exact[size_t(k)] = std::exp(-offset * offset / (2 * kSigma * kSigma));
-    }
-    std::vector<T> rounded;
-    for (const double weight : exact) rounded.push_back(T(weight / sum));
-    return rounded;
-  }();
-  return weights.data();
-}
-
 // Σ of body(plane, begin, end, room) over planes and parts of their rows, added in order.
 template <class T, class Body>
 double sum_over_rows(int threads, int64_t planes, int rows, int width, const Body& body) {
@@ -49,6 +33,22 @@ double sum_over_rows(int threads, int64_t planes, int rows, int width, const Bod
 }  // namespace
 
 template <class T>
+const T* ssim_window() {
+  static const std::vector<T> weights = [] {
+    std::vector<double> exact(kWindow);
+    double sum = 0;
+    for (int k = 0; k < kWindow; ++k) {
+      const double offset = k - (kWindow - 1) / 2;
+      sum += exact[size_t(k)] = std::exp(-offset * offset / (2 * kSigma * kSigma));
+    }
+    std::vector<T> rounded;
+    for (const double weight : exact) rounded.push_back(T(weight / sum));
+    return rounded;
+  }();
+  return weights.data();
+}
+
+template <class T>
 double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads) {
   const int64_t pixels = int64_t(job.width) * job.height;
   const int64_t windows = int64_t(job.width - kWindow + 1) * (job.height - kWindow + 1);
@@ -58,7 +58,7 @@ double photometric(const FitJob<T>& job, double absolute, double similar, T* gra
                        job.photos + plane * pixels,
                        slopes.size > 0 ? slopes.data.get() + 3 * windows * plane : nullptr,
                        gradient != nullptr ? gradient + plane * pixels : nullptr,
-                       window<T>(),
+                       ssim_window<T>(),
                        job.width,
                        job.height};
   };
@@ -91,6 +91,8 @@ double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int 
          });
 }
 
+template const float* ssim_window();
+template const double* ssim_window();
 template double photometric(const FitJob<float>&, double, double, float*, int);
 template double photometric(const FitJob<double>&, double, double, double*, int);
 template double depth_smoothness(const DepthJob<float>&, double, float*, int);

@@ -22,14 +22,9 @@ struct FitJob {
 template <class T>
 double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads);
 
-// Pictures' depths, [views, H, W], and the photos, [views, 3, H, W].
+// The weights of SSIM's window in each direction, [11].
 template <class T>
-struct DepthJob {
-  const T* depths;
-  const T* photos;
-  int64_t views;
-  int width, height;
-};
+const T* ssim_window();
 
 // `factor` · the mean over all pairs of neighbouring pixels of how uneven depths are there; see smooth.h. Writes the gradient with
 // respect to the depths, [views, H, W], if it isn't null.

@@ -1,12 +1,7 @@
-// How uneven a picture's depths are where the photo is even, and the gradient, a few rows at a time. Over the pairs of neighbours,
-// side by side or one above the other, with depths a and b and the photo's greys g and h there:
-//
-//   e^{−10 |g − h|} · 2 |a − b| / (a + b),    ∂/∂a = ± e^{−10 |g − h|} · 4b / (a + b)²
-//
-// which is |ln a − ln b| where depths are alike, and at most 2 where one thing ends before another (after Godard et al. 2017,
-// eq. 3). A pair of which one shows nothing, z = 0, counts for nothing.
+// How uneven a picture's depths are where the photo is even, and the gradient (neighbours.h), a few rows at a time.
 #pragma once
 
+#include "neighbours.h"
 #include "simd.h"
 #include "types.h"
 
@@ -30,7 +25,7 @@ GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>&
     if (left > 0) {
       const T* photo = plane.photo + first + i;
       depth = load_some<T>(plane.depth + first + i, left);
-      grey = (load_some<T>(photo, left) + load_some<T>(photo + pixels, left) + load_some<T>(photo + 2 * pixels, left)) * T(1. / 3);
+      grey = grey_of<T>(load_some<T>(photo, left), load_some<T>(photo + pixels, left), load_some<T>(photo + 2 * pixels, left));
     }
     store<T>(to.depth + 1 + i, depth);
     store<T>(to.grey + 1 + i, grey);
@@ -58,15 +53,7 @@ double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* r
       V gradient{};
       // The value of the pairs with a neighbour; their gradient goes to `gradient`.
       const auto pair = [&](const SmoothRow<T>& of, int column) {
-        const V b = load<T>(of.depth + column), difference = a - b, total = a + b;
-        const V step = g - load<T>(of.grey + column);
-        const V exponent = larger(broadcast<T>(T(-kEdge * kLog2E)) * larger(step, -step), broadcast<T>(T(-126)));
-        const Mask<T> counts = both(less(V{}, a), less(V{}, b));
-        const V weight = exp2_where(counts, exponent);
-        const V inverse = select(counts, broadcast<T>(1) / total, V{});
-        const V slope = T(4) * weight * b * inverse * inverse;
-        gradient = gradient + select(less(V{}, difference), slope, select(less(difference, V{}), -slope, V{}));
-        return T(2) * weight * larger(difference, -difference) * inverse;
+        return unevenness_of<T>(a, g, load<T>(of.depth + column), load<T>(of.grey + column), gradient);
       };
       sum = sum + pair(own, i + 2) + pair(below, i + 1);
       if (plane.gradient == nullptr) continue;

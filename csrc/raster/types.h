@@ -180,6 +180,15 @@ struct DepthPlane {
   int width, height;
 };
 
+// The depths of several pictures, [views, H, W], and the photos, [views, 3, H, W].
+template <class T>
+struct DepthJob {
+  const T* depths;
+  const T* photos;
+  int64_t views;
+  int width, height;
+};
+
 // Numbers that a kernel for rows of this width works with.
 inline constexpr int fit_room(int width) { return 6 * (width + 33); }
 

@@ -15,6 +15,8 @@ const HEADERS: &[(&str, &str)] = &[
     ("lane.h", include_str!("../../raster/lane.h")),
     ("lens.h", include_str!("../../raster/lens.h")),
     ("lists.h", include_str!("../../cuda/lists.h")),
+    ("losses.h", include_str!("../../cuda/losses.h")),
+    ("neighbours.h", include_str!("../../raster/neighbours.h")),
     ("pixel.h", include_str!("../../raster/pixel.h")),
     ("project.h", include_str!("../../raster/project.h")),
     ("reach.h", include_str!("../../raster/reach.h")),
@@ -24,6 +26,7 @@ const HEADERS: &[(&str, &str)] = &[
     ("tiles.h", include_str!("../../cuda/tiles.h")),
     ("types.h", include_str!("../../raster/types.h")),
     ("warp.h", include_str!("../../cuda/warp.h")),
+    ("window.h", include_str!("../../raster/window.h")),
     // Of the standard library NVRTC has the functions, but not the headers.
     ("cmath", ""),
     (

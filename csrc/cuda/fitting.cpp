@@ -1,0 +1,57 @@
+#include "fitting.h"
+
+#include <algorithm>
+#include <limits>
+#include <stdexcept>
+
+namespace globalsplat::cuda {
+namespace {
+
+FitPlanes planes_of(const raster::FitJob<float>& job) {
+  FitPlanes planes{job.pictures, job.photos, job.width, job.height, {}};
+  std::copy_n(raster::ssim_window<float>(), raster::kWindow, planes.window);
+  return planes;
+}
+
+// Throws where there are more blocks than a launch may have.
+Blocks blocks_of(int64_t count) {
+  if (count > std::numeric_limits<int32_t>::max()) throw std::length_error("a GPU compares at most 2 billion tiles of pictures in one go");
+  return {count};
+}
+
+Blocks tiles_of(int64_t planes, int columns, int rows) {
+  return blocks_of(planes * parts(columns, kFitColumns) * parts(rows, kFitRows));
+}
+
+}  // namespace
+
+Parts photometric(const Device& device, const raster::FitJob<float>& job, double absolute, double similar, float* gradient) {
+  const FitPlanes planes = planes_of(job);
+  const int columns = job.width - raster::kWindow + 1, rows = job.height - raster::kWindow + 1;
+  const int64_t windows = int64_t(columns) * rows * job.planes, pixels = int64_t(job.width) * job.height * job.planes;
+  const double each_window = similar / double(windows), each_pixel = absolute / double(pixels);
+  const Blocks of_windows = similar != 0 ? tiles_of(job.planes, columns, rows) : Blocks{0};
+  const Blocks of_pixels = absolute != 0 || gradient != nullptr ? tiles_of(job.planes, job.width, job.height) : Blocks{0};
+  const int64_t count = of_windows.x + of_pixels.x;
+  const Memory numbers = device.allocate(size_t(count) * sizeof(double));
+  const Memory slopes =
+      similar != 0 && gradient != nullptr ? device.allocate(size_t(3 * windows) * sizeof(float)) : Memory();
+  auto* const of_block = static_cast<double*>(numbers.get());
+  auto* const of_window = static_cast<float*>(slopes.get());
+  GS_LAUNCH(device, gs_ssim, of_windows, kFitThreads, planes, each_window, of_window, of_block);
+  GS_LAUNCH(device, gs_fit_gradient, of_pixels, kFitThreads, planes, of_window, each_pixel, float(each_window), gradient,
+            of_block + of_windows.x);
+  return {numbers, count};
+}
+
+Parts depth_smoothness(const Device& device, const raster::DepthJob<float>& job, double factor, float* gradient) {
+  const int64_t width = job.width, height = job.height;
+  const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
+  const Blocks blocks = blocks_of((job.views * width * height + kFitThreads - 1) / kFitThreads);
+  const Memory numbers = device.allocate(size_t(blocks.x) * sizeof(double));
+  GS_LAUNCH(device, gs_unevenness, blocks, kFitThreads, job, pairs > 0 ? factor / double(pairs) : 0, gradient,
+            static_cast<double*>(numbers.get()));
+  return {numbers, blocks.x};
+}
+
+}  // namespace globalsplat::cuda

@@ -1,0 +1,148 @@
+// How far pictures are from photos, and gradients: what ../raster/ssim.h and smooth.h do on the CPU, with the same bits but for the sums
+// over blocks, each of which leaves one number in `parts`, times what it counts.
+#pragma once
+
+#include "call.h"
+#include "neighbours.h"
+#include "warp.h"
+#include "window.h"
+
+namespace globalsplat::cuda {
+
+// Columns that a tile's windows read, or whose windows its pixels are in.
+inline constexpr int kFitReach = kFitColumns + raster::kWindow - 1;
+
+// The sum over a block's threads in an order that is always the same, known to the first of them.
+inline double block_sum(double value) {
+  GS_SHARED(double, sums, [kFitThreads / kWarp]);
+  for (int step = kWarp / 2; step > 0; step /= 2) value += __shfl_xor_sync(kAll, value, step);
+  if (lane() == 0) sums[warp()] = value;
+  __syncthreads();
+  double total = 0;
+  if (threadIdx.x == 0)
+    for (const double sum : sums) total += sum;
+  return total;
+}
+
+// The tile of a plane of `columns` × `rows` windows or pixels that a block takes.
+struct FitTile {
+  FitTile(int columns, int rows) {
+    const int across = parts(columns, kFitColumns), tiles = across * parts(rows, kFitRows), tile = int(blockIdx.x) % tiles;
+    plane = int(blockIdx.x) / tiles;
+    left = tile % across * kFitColumns;
+    top = tile / across * kFitRows;
+  }
+  int64_t plane;
+  int left, top;
+};
+
+extern "C" {
+
+// Σ SSIM of a tile of windows times `each`; their slopes go to `slopes`, [planes, 3, H − 10, W − 10], if it isn't null. First the
+// columns of windows are summed up, then the rows of these sums.
+__global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each, float* slopes, double* parts) {
+  const int columns = of.width - raster::kWindow + 1, rows = of.height - raster::kWindow + 1;
+  const FitTile tile(columns, rows);
+  const int64_t pixels = int64_t(of.width) * of.height, windows = int64_t(columns) * rows;
+  GS_SHARED(float, sums, [5][kFitRows][kFitReach]);
+  for (int k = int(threadIdx.x); k < kFitRows * kFitReach; k += kFitThreads) {
+    const int row = tile.top + k / kFitReach, column = tile.left + k % kFitReach;
+    raster::lane::WindowMeans<float> means = {};
+    if (row < rows && column < of.width)
+      for (int n = 0; n < raster::kWindow; ++n) {
+        const int64_t at = tile.plane * pixels + int64_t(row + n) * of.width + column;
+        raster::lane::add_pixels<float>(of.window[n], of.pictures[at], of.photos[at], means);
+      }
+    for (int j = 0; j < 5; ++j) sums[j][k / kFitReach][k % kFitReach] = means[j];
+  }
+  __syncthreads();
+  double sum = 0;
+  for (int k = int(threadIdx.x); k < kFitRows * kFitColumns; k += kFitThreads) {
+    const int row = k / kFitColumns, column = k % kFitColumns;
+    if (tile.top + row >= rows || tile.left + column >= columns) continue;
+    raster::lane::WindowMeans<float> means = {};
+    for (int n = 0; n < raster::kWindow; ++n)
+      for (int j = 0; j < 5; ++j) means[j] = raster::lane::add_product(of.window[n], sums[j][row][column + n], means[j]);
+    raster::lane::WindowSlopes<float> of_window;
+    sum += raster::lane::similarity_of<float>(means, slopes != nullptr, of_window);
+    if (slopes == nullptr) continue;
+    float* const place = slopes + tile.plane * 3 * windows + int64_t(tile.top + row) * columns + tile.left + column;
+    for (int j = 0; j < 3; ++j) place[j * windows] = of_window[j];
+  }
+  const double total = block_sum(sum);
+  if (threadIdx.x == 0) parts[blockIdx.x] = each * total;
+}
+
+// Σ |x − y| of a tile of pixels times `absolute`, and its gradient, plus `similar` times that of Σ SSIM, from all windows' slopes where
+// these aren't null. `gradient`, [planes, H, W], may be null.
+__global__ void __launch_bounds__(kFitThreads)
+    gs_fit_gradient(FitPlanes of, const float* slopes, double absolute, float similar, float* gradient, double* parts) {
+  const int columns = of.width - raster::kWindow + 1, last = of.height - raster::kWindow;
+  const FitTile tile(of.width, of.height);
+  const int64_t pixels = int64_t(of.width) * of.height, windows = int64_t(columns) * (last + 1);
+  GS_SHARED(float, sums, [3][kFitRows][kFitReach]);
+  if (slopes != nullptr) {
+    for (int k = int(threadIdx.x); k < kFitRows * kFitReach; k += kFitThreads) {
+      const int row = tile.top + k / kFitReach, column = tile.left + k % kFitReach - (raster::kWindow - 1);
+      raster::lane::WindowSlopes<float> down = {};
+      if (column >= 0 && column < columns)
+        for (int at = row < raster::kWindow ? 0 : row - raster::kWindow + 1; at <= row && at <= last; ++at)
+          for (int j = 0; j < 3; ++j)
+            down[j] = raster::lane::add_product(
+                of.window[row - at], slopes[(tile.plane * 3 + j) * windows + int64_t(at) * columns + column], down[j]);
+      for (int j = 0; j < 3; ++j) sums[j][k / kFitReach][k % kFitReach] = down[j];
+    }
+    __syncthreads();
+  }
+  double sum = 0;
+  for (int k = int(threadIdx.x); k < kFitRows * kFitColumns; k += kFitThreads) {
+    const int row = k / kFitColumns, column = k % kFitColumns;
+    if (tile.top + row >= of.height || tile.left + column >= of.width) continue;
+    const int64_t at = tile.plane * pixels + int64_t(tile.top + row) * of.width + tile.left + column;
+    const float x = of.pictures[at], y = of.photos[at];
+    sum += raster::lane::magnitude(x - y);
+    if (gradient == nullptr) continue;
+    float slope = raster::lane::gradient_of_difference<float>(x, y, float(absolute));
+    if (slopes != nullptr) {
+      raster::lane::WindowSlopes<float> along = {};
+      for (int n = 0; n < raster::kWindow; ++n)
+        for (int j = 0; j < 3; ++j) along[j] = raster::lane::add_product(of.window[n], sums[j][row][column + n], along[j]);
+      slope = raster::lane::add_gradient_of_similarity<float>(x, y, similar, along, slope);
+    }
+    gradient[at] = slope;
+  }
+  const double total = block_sum(sum);
+  if (threadIdx.x == 0) parts[blockIdx.x] = absolute * total;
+}
+
+// Of a pixel a thread, the pairs with the pixels to the right and below, times `each`; and the gradient of all four pairs, [views, H, W],
+// where it isn't null.
+__global__ void __launch_bounds__(kFitThreads) gs_unevenness(DepthJob<float> of, double each, float* gradient, double* parts) {
+  const int64_t k = int64_t(blockIdx.x) * kFitThreads + threadIdx.x, pixels = int64_t(of.width) * of.height;
+  double sum = 0;
+  if (k < of.views * pixels) {
+    const int64_t view = k / pixels;
+    const int row = int(k % pixels / of.width), column = int(k % of.width);
+    const auto grey = [&](int64_t at) {
+      const float* const photo = of.photos + 3 * view * pixels + at - view * pixels;
+      return raster::lane::grey_of<float>(photo[0], photo[pixels], photo[2 * pixels]);
+    };
+    const float a = of.depths[k], g = grey(k);
+    float slope = 0;
+    // What is beyond the border shows nothing.
+    const auto pair = [&](bool is_there, int64_t other) {
+      return raster::lane::unevenness_of<float>(a, g, is_there ? of.depths[other] : 0, is_there ? grey(other) : 0, slope);
+    };
+    sum = pair(column + 1 < of.width, k + 1) + pair(row + 1 < of.height, k + of.width);
+    if (gradient != nullptr) {
+      pair(column > 0, k - 1);
+      pair(row > 0, k - of.width);
+      gradient[k] = slope * float(each);
+    }
+  }
+  const double total = block_sum(sum);
+  if (threadIdx.x == 0) parts[blockIdx.x] = each * total;
+}
+
+}  // extern "C"
+}  // namespace globalsplat::cuda

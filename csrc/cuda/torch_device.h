@@ -1,0 +1,68 @@
+// Devices that hold torch's tensors: a GPU, or a CPU in its place.
+#pragma once
+
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/from_blob.h>
+#include <c10/core/DeviceGuard.h>
+#include <c10/core/impl/VirtualGuardImpl.h>
+
+#include <cstdlib>
+#include <memory>
+
+#include "device.h"
+#include "emulated.h"
+#include "globalsplat-csrc/src/cuda.rs.h"
+#include "kernel_times.h"
+
+namespace globalsplat::cuda {
+
+// A view of a device's memory as a tensor of `options`, as long as the memory lives.
+inline at::Tensor tensor_of(const void* memory, at::IntArrayRef size, const at::TensorOptions& options) {
+  return at::for_blob(const_cast<void*>(memory), size).options(options).target_device(options.device()).make_tensor();
+}
+
+// The GPU that holds a tensor: memory from torch's allocator, kernels in torch's current stream.
+class Gpu : public Device {
+ public:
+  explicit Gpu(const at::Tensor& on) : guard_(on.device()), options_(on.options()) {}
+
+  Memory allocate(size_t bytes) const override {
+    const at::Tensor held = at::empty({int64_t(bytes)}, options_.dtype(at::kByte));
+    return Memory(held.data_ptr(), [held](void*) {});
+  }
+
+  void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override {
+    const at::Device device = options_.device();
+    const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
+    measured_launch(kernel, stream, [&] {
+      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
+                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads), reinterpret_cast<size_t>(arguments));
+    });
+  }
+
+  uint64_t read(const uint64_t* number) const override {
+    return uint64_t(tensor_of(number, {1}, options_.dtype(at::kLong)).item<int64_t>());
+  }
+
+ private:
+  c10::DeviceGuard guard_;
+  at::TensorOptions options_;
+};
+
+// The variable that asks for a CPU in a GPU's place, a number from which the order of blocks and threads is drawn.
+inline const char* emulation() { return std::getenv("GLOBALSPLAT_CUDA_ON_CPU"); }
+
+class Emulated : public emulated::Emulator {
+ public:
+  explicit Emulated(const at::Tensor&) : Emulator(std::strtoull(emulation(), nullptr, 10)) {}
+};
+
+// The device whose kernels serve a tensor; null where the CPU's own do. These also serve float64, which exists to prove gradients.
+inline std::unique_ptr<Device> device_of(const at::Tensor& t) {
+  if (t.scalar_type() != at::kFloat) return nullptr;
+  if (emulation() != nullptr) return std::make_unique<Emulated>(t);
+  return t.is_cuda() ? std::make_unique<Gpu>(t) : nullptr;
+}
+
+}  // namespace globalsplat::cuda
