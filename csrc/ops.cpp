@@ -2,6 +2,7 @@
 
 #include <ATen/record_function.h>
 
+#include <cstring>
 #include <memory>
 #include <string>
 #include <utility>
@@ -14,8 +15,13 @@ thread_local at::CallbackHandle callback = at::INVALID_CALLBACK_HANDLE;
 thread_local bool only_outermost = false;
 thread_local int within = 0;  // ops that have begun and not ended
 
+// Whether this is a step of autograd's engine, which calls ops, and not an op.
+bool is_of_engine(const at::RecordFunction& function) {
+  return !function.operator_name() && std::strncmp(function.name(), "globalsplat::", 13) != 0;
+}
+
 std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
-  if (within++ > 0 && only_outermost) return nullptr;
+  if (only_outermost && (is_of_engine(function) || within++ > 0)) return nullptr;
   const auto op = function.operator_name();
   std::string name = op ? c10::toString(*op) : std::string(function.name());
   // `to(device)` comes by the overload with all options, of which it gives the device alone.
@@ -24,7 +30,9 @@ std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
   return nullptr;
 }
 
-void leave(const at::RecordFunction&, at::ObserverContext*) { --within; }
+void leave(const at::RecordFunction& function, at::ObserverContext*) {
+  if (only_outermost && !is_of_engine(function)) --within;
+}
 
 }  // namespace
 

@@ -42,11 +42,13 @@ if $dry; then
     large=(--gaussians 2000 --cameras 1 --size 128x64 --repeats 2)
     views=(2) repeats=2
     model=(--set 'data.image_size=[32,32]' --set model.patch_size=16 --set model.latents=16 --set model.width=32)
+    refine=(--gaussians 500 --size 64x64)
     batch=1 steps=2 train=(--set train.steps=2 --set curriculum.full_capacity=true)
 else
     parity=()
     raster=(--repeats 100)
     views=(24 12 36) repeats=50
+    refine=()
     batch=4 steps=10
 fi
 
@@ -160,6 +162,7 @@ for precision in bf16 f32; do
         ${model[@]+"${model[@]}"}
 done
 bench train_tiny 60 train --config configs/tiny.toml --batch 2 --steps "$steps" --device "$device" ${model[@]+"${model[@]}"}
+bench refine 60 refine --steps "$steps" --device "$device" ${refine[@]+"${refine[@]}"}
 bench raster_million 60 raster "${large[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v ncu >"$work/found"; then
     part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 20 --launch-count 20 --section SpeedOfLight \

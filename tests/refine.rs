@@ -188,6 +188,7 @@ fn work_that_is_ended_early_keeps_what_there_is() {
         correct_poses: false,
         correct_exposures: false,
         size: None,
+        device: tch::Device::Cpu,
     };
     let all: Vec<usize> = (0..capture.len()).collect();
     // The number of steps that are done, where the work ends at the first event of a kind.
@@ -346,7 +347,8 @@ fn points_are_begun_with() {
         }
         // Half of them at points, the others where pixels are.
         let views = capture.load_all(None).unwrap();
-        let raw = gaussians_from_photos(&views, &points, None, 1000, 0, |_| true).expect("depths");
+        let raw = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
+            .expect("depths");
         let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun
             .chunks(3)

@@ -10,6 +10,7 @@ use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{ImageSize, RawGaussians};
 use serde::Serialize;
 use std::time::Duration;
+use tch::Device;
 
 /// Photos of the made-up scene.
 const PHOTOS: usize = 8;
@@ -33,11 +34,11 @@ pub struct RefineReport {
     pub milliseconds: Spread,
     /// The mean time of its parts, in the order of the work.
     pub sections: Vec<(&'static str, f64)>,
-    /// Of the time, what isn't rendering, forward or backward.
-    pub other_share: f64,
+    /// Of the time, what isn't rendering, forward or backward; on the CPU alone, whose rasterizer tells its own.
+    pub other_share: Option<f64>,
 }
 
-/// Times `steps` steps on photos of `size` of a made-up scene with `count` Gaussians, which are begun with.
+/// Times `steps` steps on `device`, on photos of `size` of a made-up scene with `count` Gaussians, which are begun with.
 ///
 /// # Errors
 /// What the rasterizer refuses.
@@ -46,8 +47,10 @@ pub fn bench_refine(
     size: ImageSize,
     config: &RefineConfig,
     steps: u64,
+    device: Device,
 ) -> Result<RefineReport> {
     let (gaussians, cameras) = made_up_scene(count, PHOTOS, size);
+    let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
     let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
     let c2w = cameras.w2c.inverse();
     let photos =
@@ -57,7 +60,7 @@ pub fn bench_refine(
     let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
     refine_timed(&mut space, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 
-    let mut stopwatch = Stopwatch::default();
+    let mut stopwatch = Stopwatch::of(device);
     let (mut whole, mut before, mut backward) = (vec![], Duration::ZERO, 0.);
     refine_timed(&mut space, &mut none, &task(steps), &mut stopwatch, |at| {
         whole.push(1e3 * (at.elapsed - before).as_secs_f64());
@@ -71,7 +74,7 @@ pub fn bench_refine(
     for &(name, time) in stopwatch.sections() {
         let time = time.as_secs_f64();
         match name {
-            "backward" => {
+            "backward" if device == Device::Cpu => {
                 sections.push(("render backward", mean(backward)));
                 sections.push(("rest of the backward pass", mean(time - backward)));
             }
@@ -89,6 +92,6 @@ pub fn bench_refine(
         steps,
         milliseconds: Spread::of(whole),
         sections,
-        other_share: 1. - rendering / all,
+        other_share: (device == Device::Cpu).then_some(1. - rendering / all),
     })
 }

@@ -1,4 +1,4 @@
-use super::{memory, parse_size, print_json};
+use super::{device, memory, parse_size, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{RefineReport, bench_refine};
@@ -22,6 +22,9 @@ pub struct Refine {
     /// Change a number of the method
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// cpu, cuda or cuda:N
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: String,
     /// Print the measurements as one JSON object
     #[arg(long)]
     json: bool,
@@ -31,7 +34,8 @@ impl Refine {
     pub fn run(self) -> Result<()> {
         memory::keep();
         let config = RefineConfig::with(&self.set, true)?;
-        let report = bench_refine(self.gaussians as usize, parse_size(&self.size)?, &config, self.steps)?;
+        let (size, device) = (parse_size(&self.size)?, device::parse(&self.device)?);
+        let report = bench_refine(self.gaussians as usize, size, &config, self.steps, device)?;
         if self.json {
             print_json(&serde_json::to_value(&report)?);
         } else {
@@ -56,5 +60,7 @@ fn print_report(r: &RefineReport) {
         "{:<28} {:>10.2} in the middle, {:.2} at the least, 3 of 4 below {:.2}",
         "step", s.median, s.least, s.upper_quartile
     );
-    println!("all but rendering: {:.0} %", 1e2 * r.other_share);
+    if let Some(share) = r.other_share {
+        println!("all but rendering: {:.0} %", 1e2 * share);
+    }
 }

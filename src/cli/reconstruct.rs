@@ -43,7 +43,7 @@ pub struct Reconstruct {
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
     /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
-    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "device", "views_at"])]
+    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "views_at"])]
     refine: Option<f64>,
     /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
     /// in UTM coordinates, float32 loses detail
@@ -83,6 +83,7 @@ impl Reconstruct {
             sheet: None,
             lpips: false,
             set: vec![],
+            device: self.device,
             json: self.json,
         }
     }

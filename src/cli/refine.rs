@@ -1,7 +1,7 @@
 use super::progress::{self, Progress};
 use super::{
-    FAILED, check_views, memory, model, open_capture, parse_size, print_json, say_shrunk, signals, splat_out,
-    warn,
+    FAILED, check_views, device, memory, model, open_capture, parse_size, print_json, say_shrunk, signals,
+    splat_out, warn,
 };
 use anyhow::Result;
 use clap::{Args, ValueEnum};
@@ -22,7 +22,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use tch::Device;
 
 /// As many as the models of the paper's main size make.
 pub const DEFAULT_GAUSSIANS: u32 = 16_384;
@@ -107,6 +106,9 @@ pub struct Refine {
     /// Change a number of the method, as in views=4; docs/refine.md has them
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+    /// Where the splat is optimized: cpu, cuda or cuda:N
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
     /// Print what was done as one JSON object
     #[arg(long)]
     pub json: bool,
@@ -169,7 +171,7 @@ impl Refine {
             warn(&splat.warnings);
         }
         let loaded = needs_model
-            .then(|| model::load(self.weights.as_deref(), Some(Precision::F32), Device::Cpu))
+            .then(|| model::load(self.weights.as_deref(), Some(Precision::F32), options.device))
             .transpose()?;
         let (shown, held_out) = capture.split(holdout);
         let cameras = capture.cameras();
@@ -268,6 +270,7 @@ impl Refine {
             correct_poses: self.correct_poses,
             correct_exposures: self.correct_exposures,
             size,
+            device: device::parse(&self.device)?,
         })
     }
 
@@ -458,7 +461,7 @@ impl Scorer<'_> {
         after: &Gaussians,
         session: &RefineSession,
     ) -> Result<Option<[CaptureScores; 2]>> {
-        let perceptual = Perceptual::find(Device::Cpu)?;
+        let perceptual = Perceptual::find(before.means.device())?;
         let views = match session.held_out() {
             [] => &session.photos()[..session.photos().len().min(LPIPS_PHOTOS)],
             views => views,
@@ -483,7 +486,7 @@ fn sheet_views<'a>(session: &'a RefineSession) -> &'a [View] {
 fn sheet_of(gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<ContactSheet> {
     let mut rows = ContactSheet::new(views.len());
     for view in views {
-        rows.add(&view.image, &render_views(gaussians, &[view.camera])?[0])?;
+        rows.add(&view.image, &render_views(gaussians, &[view.camera])?[0].to_host())?;
     }
     Ok(rows)
 }

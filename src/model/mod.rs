@@ -194,33 +194,7 @@ pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::ops::outermost_ops_of;
-
-    /// Ops that return a view or allocate. `reshape` and `flatten` copy a non-contiguous tensor, and those copies aren't counted.
-    const VIEW_OPS: [&str; 22] = [
-        "aten::alias",
-        "aten::as_strided",
-        "aten::chunk",
-        "aten::detach",
-        "aten::empty.memory_format",
-        "aten::empty_like",
-        "aten::expand",
-        "aten::flatten.using_ints",
-        "aten::narrow",
-        "aten::permute",
-        "aten::reshape",
-        "aten::select.int",
-        "aten::slice.Tensor",
-        "aten::split.Tensor",
-        "aten::squeeze.dim",
-        "aten::t",
-        "aten::transpose.int",
-        "aten::unbind.int",
-        "aten::unflatten.int",
-        "aten::unsqueeze",
-        "aten::view",
-        "aten::view_as",
-    ];
+    use globalsplat_csrc::ops::{computing, outermost_ops_of, without_own_linear_layers};
 
     /// A GPU computes a pass of the main model about as fast as the host tells it what to do.
     #[test]
@@ -240,7 +214,6 @@ mod tests {
         let mut vs = nn::VarStore::new(Device::Cpu);
         let mut model = GlobalSplat::new(&vs.root(), &config).unwrap();
         vs.freeze();
-        let computing = |ops: Vec<String>| ops.iter().filter(|op| !VIEW_OPS.contains(&op.as_str())).count();
         // Rays are in float32, where linear layers are our own, in blocks, on any of libtorch's threads: they are counted apart.
         let of_tokens = |views: i64| {
             let options = (Kind::Float, Device::Cpu);
@@ -248,12 +221,7 @@ mod tests {
             let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
             let (tokens, ops) = outermost_ops_of(|| model.tokens(&images, &c2w, &intrinsics));
             const LINEAR_LAYERS: usize = 2;
-            let is_of_a_block = ["aten::copy_", "aten::linear", "mkldnn::_linear_pointwise"];
-            let is_counted = |op: &String| !is_of_a_block.contains(&op.as_str());
-            (
-                tokens.to_kind(Kind::Double),
-                computing(ops.into_iter().filter(is_counted).collect()) + LINEAR_LAYERS,
-            )
+            (tokens.to_kind(Kind::Double), computing(&without_own_linear_layers(ops)) + LINEAR_LAYERS)
         };
         let (few, many) = (of_tokens(2), of_tokens(24));
         vs.double();
@@ -262,7 +230,7 @@ mod tests {
             let (_, ops) = outermost_ops_of(|| {
                 model.decode(&model.encode_memory(&model.memory_of(&tokens)), Stage::complete(2))
             });
-            of_tokens + computing(ops)
+            of_tokens + computing(&ops)
         };
         let kernels = pass(many);
         assert_eq!(pass(few), kernels, "whatever the number of photos");

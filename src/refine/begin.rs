@@ -8,7 +8,7 @@ use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Standard deviation, in units of the distance between neighbours.
 const EXTENT: f64 = 0.5;
@@ -29,23 +29,24 @@ struct Ball {
 /// `count` Gaussians where the photos agree on what they show, and at `points` of the scene, where some are known. Each is as large
 /// as the part of the pictures that it stands for. Of `known` Gaussians, up to `count`, those stay that the photos don't speak
 /// against. Two views at least. `go_on` is asked before each photo, with how many are done; when it says no, Gaussians lie where the
-/// photos that are done show them, and where none is, nothing is returned.
+/// photos that are done show them, and where none is, nothing is returned. Depths are found on `device`, where the Gaussians then are.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
     known: Option<&RawGaussians>,
     count: usize,
     seed: u64,
+    device: Device,
     go_on: impl FnMut(usize) -> bool,
 ) -> Option<RawGaussians> {
-    let swept = sweep(views, points, go_on);
+    let swept = sweep(views, points, device, go_on);
     if swept.is_empty() {
         return None;
     }
-    let Some(known) = known else { return Some(anew(&swept, points, count, seed)) };
+    let Some(known) = known else { return Some(anew(&swept, points, count, seed).to_device(device)) };
     let kept = known.select(&supported(known, &swept));
     let left = count.saturating_sub(kept.means.size()[1] as usize);
-    Some(kept.and(&anew(&swept, points, left, seed)))
+    Some(kept.and(&anew(&swept, points, left, seed).to_device(device)))
 }
 
 /// Those that are in front of nothing that a photo is sure of, and that at least one photo doesn't hide behind it.
@@ -123,7 +124,7 @@ fn raw(balls: &[Ball]) -> RawGaussians {
         means: of(balls.iter().flat_map(|ball| ball.mean.to_array()).collect(), &[1, n, 3]),
         log_scales: of(balls.iter().flat_map(|ball| [ball.scale.ln(); 3]).collect(), &[1, n, 3]),
         quaternions: of(balls.iter().flat_map(|_| [1., 0., 0., 0.]).collect(), &[1, n, 4]),
-        opacity_logits: Tensor::full([1, n], f64::from(LOGIT), (Kind::Float, tch::Device::Cpu)),
+        opacity_logits: Tensor::full([1, n], f64::from(LOGIT), (Kind::Float, Device::Cpu)),
         sh: of(colours.collect(), &[1, n, 1, 3]),
     }
 }
@@ -133,7 +134,6 @@ mod tests {
     use super::*;
     use crate::scene::{Camera, Intrinsics};
     use glam::DMat4;
-    use tch::Device;
 
     /// Two cameras that are sure of a wall at depth 4, the second of its left half alone.
     #[test]
@@ -188,7 +188,7 @@ mod tests {
         };
         let views = [view(0.), view(0.2)];
         let begun = |known: Option<&RawGaussians>, count: usize, seed: u64| {
-            gaussians_from_photos(&views, &[], known, count, seed, |_| true).expect("depths")
+            gaussians_from_photos(&views, &[], known, count, seed, Device::Cpu, |_| true).expect("depths")
         };
         let known = begun(None, 50, 1);
         let filled = begun(Some(&known), 80, 2);
@@ -196,6 +196,6 @@ mod tests {
         // Nobody is sure of black photos.
         assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
         assert_eq!(begun(Some(&known), 50, 2).means.size(), [1, 50, 3]);
-        assert!(gaussians_from_photos(&views, &[], None, 50, 1, |_| false).is_none());
+        assert!(gaussians_from_photos(&views, &[], None, 50, 1, Device::Cpu, |_| false).is_none());
     }
 }

@@ -6,7 +6,7 @@ use crate::data::{View, ViewBatch};
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Of every photo: how far its camera is from where it was said to be, and by what its colours are larger than the splat's. Over all
 /// photos either has the mean 0, as a scene that is moved or brightened as a whole is the same scene.
@@ -39,14 +39,20 @@ pub struct Correction {
 impl Corrections {
     /// None, ever.
     pub fn none() -> Self {
-        Corrections::new(0, false, false, 1., &RefineConfig::default())
+        Corrections::new(0, false, false, 1., &RefineConfig::default(), Device::Cpu)
     }
 
-    /// None yet, of so many photos. Lengths are measured by `depth`, that of the scene.
-    pub fn new(photos: usize, poses: bool, exposures: bool, depth: f64, config: &RefineConfig) -> Self {
-        let leaf = |numbers: i64| {
-            Tensor::zeros([photos as i64, numbers], (Kind::Float, tch::Device::Cpu)).set_requires_grad(true)
-        };
+    /// None yet, of so many photos. Lengths are measured by `depth`, that of the scene; `device` is that of the photos.
+    pub fn new(
+        photos: usize,
+        poses: bool,
+        exposures: bool,
+        depth: f64,
+        config: &RefineConfig,
+        device: Device,
+    ) -> Self {
+        let options = (Kind::Float, device);
+        let leaf = |numbers: i64| Tensor::zeros([photos as i64, numbers], options).set_requires_grad(true);
         let poses = poses.then(|| leaf(6));
         let exposures = exposures.then(|| leaf(3));
         let group = |name: &str, t: &Option<Tensor>, rate: f64| {
@@ -134,20 +140,17 @@ impl Corrections {
 
 /// The rows `which` of a leaf, less the mean of all.
 fn of(leaf: &Tensor, which: &[i64]) -> Tensor {
-    (leaf - leaf.mean_dim([0].as_slice(), true, None)).index_select(0, &Tensor::from_slice(which))
+    let rows = leaf - leaf.mean_dim([0].as_slice(), true, None);
+    // Positions as a tensor would have to be sent to the device.
+    Tensor::stack(&which.iter().map(|&row| rows.select(0, row)).collect::<Vec<_>>(), 0)
 }
 
 /// Rotations [.., 3, 3] by 2 atan(|v|/2) about vectors v [.., 3] (Cayley): I + (K + K²/2) / (1 + |v|²/4), with K x = v × x.
 fn turn(vectors: &Tensor) -> Tensor {
-    // Row k holds K for the vector along axis k.
-    #[rustfmt::skip]
-    let generators = Tensor::from_slice(&[
-        0f32, 0., 0.,  0., 0., -1.,  0., 1., 0.,
-        0., 0., 1.,  0., 0., 0.,  -1., 0., 0.,
-        0., -1., 0.,  1., 0., 0.,  0., 0., 0.,
-    ]);
-    let shape = [&vectors.size()[..], &[3]].concat();
-    let cross = vectors.matmul(&generators.view([3, 9])).view(shape.as_slice());
+    let [x, y, z] = [0, 1, 2].map(|axis| vectors.select(-1, axis));
+    let none = x.zeros_like();
+    let row = |numbers: [&Tensor; 3]| Tensor::stack(&numbers, -1);
+    let cross = Tensor::stack(&[row([&none, &-&z, &y]), row([&z, &none, &-&x]), row([&-&y, &x, &none])], -2);
     let square = vectors.square().sum_dim_intlist([-1].as_slice(), true, None).unsqueeze(-1);
     let share = (square / 4. + 1.).reciprocal();
     Tensor::eye(3, (vectors.kind(), vectors.device())) + (&cross + cross.matmul(&cross) / 2.) * share
@@ -163,7 +166,6 @@ mod tests {
     use super::*;
     use crate::data::view_batch;
     use crate::scene::{Camera, Intrinsics, pose_to_rows};
-    use tch::Device;
 
     fn view(index: usize) -> View {
         let c2w = DMat4::from_rotation_translation(
@@ -185,7 +187,7 @@ mod tests {
         let views = [view(0), view(1), view(2)];
         let poses: Vec<DMat4> = views.iter().map(|view| view.camera.c2w).collect();
         let batch = view_batch(&views, &poses, Device::Cpu);
-        let learned = Corrections::new(3, true, true, 2., &RefineConfig::default());
+        let learned = Corrections::new(3, true, true, 2., &RefineConfig::default(), Device::Cpu);
         let put = |t: &Option<Tensor>, values: &[f32]| {
             tch::no_grad(|| t.as_ref().unwrap().shallow_clone().view([-1]).copy_(&Tensor::from_slice(values)))
         };

@@ -181,3 +181,54 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
     }
     Ok(depths.median().double_value(&[]))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::made_up_scene;
+    use crate::data::ViewBatch;
+    use crate::scene::{ImageSize, RawGaussians};
+    use globalsplat_csrc::ops::{WAITING, computing, ops_of, outermost_ops_of};
+    use tch::Device;
+
+    /// Photos, Gaussians and what is learned of the photos lie on the device. A step waits for it where memory is taken for pairs of
+    /// splats and tiles, and nowhere else.
+    #[test]
+    fn a_step_moves_nothing_but_what_is_told() {
+        let (gaussians, cameras) = made_up_scene(40, 4, ImageSize { width: 32, height: 24 });
+        let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
+        let c2w = cameras.w2c.inverse();
+        let intrinsics = cameras.intrinsics.shallow_clone();
+        let views = ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c.shallow_clone(), intrinsics };
+        let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "smooth=0.1"].map(String::from);
+        let config = RefineConfig::with(&settings, false).unwrap();
+        let photos = Photos::of(views);
+        let task_of = |steps| Task {
+            photos: &photos,
+            depth: 1.,
+            config: &config,
+            budget: Budget::Steps(steps),
+            seed: 0,
+        };
+        let steps = |count| {
+            let mut space = GaussianSpace::new(&RawGaussians::of(&gaussians), 1., &config);
+            let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
+            refine(&mut space, &mut corrections, &task_of(count), |_| true).unwrap();
+        };
+        let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();
+        let [two, five] = [2, 5].map(|number| ops_of(|| steps(number)).1);
+        let of_a_step = |name: &str| (count(&five, name) - count(&two, name)) as f64 / 3.;
+        let (_, of_a_render) = ops_of(|| render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap());
+        // Both losses bring pictures to photos, and their value back; be it where they are.
+        let sent = count(&of_a_render, "aten::to.device") + 2 * 3;
+        assert_eq!(of_a_step("aten::to.device"), sent as f64);
+        for op in WAITING {
+            // On the CPU, whether a loss is what was asked for, not a multiple.
+            let asked = if op == "aten::_local_scalar_dense" { 2. } else { 0. };
+            assert_eq!(of_a_step(op), asked, "{op}");
+        }
+        let [two, five] = [2, 5].map(|number| computing(&outermost_ops_of(|| steps(number)).1));
+        let kernels = (five - two) / 3;
+        assert!((50..=125).contains(&kernels), "{kernels}");
+    }
+}

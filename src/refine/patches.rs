@@ -7,7 +7,7 @@ use crate::loss::{psnr_of_mse, ssim};
 use crate::render::render_views;
 use crate::scene::{Camera, Gaussians};
 use serde::Serialize;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Views of which a patch is scored, at most.
 const MAX_VIEWS: usize = 8;
@@ -56,7 +56,7 @@ impl Patches {
     pub fn score(&self, gaussians: &Gaussians) -> Result<Option<PatchScores>> {
         let cameras: Vec<Camera> = self.views.iter().map(|view| view.camera).collect();
         let pictures = render_views(gaussians, &cameras)?;
-        let exact = |t: &Tensor| t.to_kind(Kind::Double).clamp(0., 1.);
+        let exact = |t: &Tensor| t.to_device(Device::Cpu).to_kind(Kind::Double).clamp(0., 1.);
         let scores = pictures.iter().zip(&self.views).map(|(picture, view)| {
             let (picture, photo) = (exact(&picture.rgb), exact(&view.image));
             let mse = (&picture - &photo).square().mean(Kind::Double).double_value(&[]);
@@ -85,7 +85,6 @@ mod tests {
     use super::*;
     use crate::scene::Intrinsics;
     use glam::DMat4;
-    use tch::Device;
 
     /// A picture that is scored against itself, patch by patch, has no error: patches show the pixels that the whole shows.
     #[test]

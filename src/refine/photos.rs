@@ -114,7 +114,7 @@ impl Photos {
 
     /// `views`, one at least, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world) stand for the
     /// views' own.
-    pub fn new(views: &[View], poses: &[DMat4], levels: usize) -> Self {
+    pub fn new(views: &[View], poses: &[DMat4], levels: usize, device: Device) -> Self {
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
         for (index, View { camera, .. }) in views.iter().enumerate() {
             groups.entry((camera.height, camera.width)).or_default().push(index);
@@ -122,7 +122,7 @@ impl Photos {
         let group = |indices: Vec<usize>| {
             let (views, poses): (Vec<&View>, Vec<DMat4>) =
                 indices.iter().map(|&i| (&views[i], poses[i])).unzip();
-            Group { indices, views: view_batch(&views, &poses, Device::Cpu) }
+            Group { indices, views: view_batch(&views, &poses, device) }
         };
         let whole = groups.into_values().map(group).collect();
         let mut sizes: Vec<Vec<Group>> = vec![whole];

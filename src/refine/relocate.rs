@@ -34,17 +34,16 @@ pub fn relocate(leaves: &Leaves, dead: f64, random: &mut impl Rng) -> Vec<i64> {
         let opacity = opacity.clamp(LEAST_OPACITY, 1. - 1e-6);
         logits.push((opacity / (1. - opacity)).ln() as f32);
     }
-    let index = |of: &[usize]| Tensor::from_slice(&of.iter().map(|&i| i as i64).collect::<Vec<_>>());
+    let device = leaves.means.device();
+    let index = |of: &[usize]| {
+        Tensor::from_slice(&of.iter().map(|&i| i as i64).collect::<Vec<_>>()).to_device(device)
+    };
+    let numbers = |of: &[f32]| Tensor::from_slice(of).to_device(device);
     let (to, from, at) = (index(&gone), index(&sources), index(&changed));
     tch::no_grad(|| {
         let count = changed.len() as i64;
-        let _ = leaves.opacity_logits.shallow_clone().index_copy_(
-            1,
-            &at,
-            &Tensor::from_slice(&logits).view([1, count]),
-        );
-        let smaller =
-            leaves.log_scales.index_select(1, &at) + Tensor::from_slice(&shrink).view([1, count, 1]);
+        let _ = leaves.opacity_logits.shallow_clone().index_copy_(1, &at, &numbers(&logits).view([1, count]));
+        let smaller = leaves.log_scales.index_select(1, &at) + numbers(&shrink).view([1, count, 1]);
         let _ = leaves.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
         for (_, tensor) in leaves.named() {
             let _ = tensor.shallow_clone().index_copy_(1, &to, &tensor.index_select(1, &from));

@@ -16,7 +16,7 @@ use crate::scene::{Camera, Gaussians, ImageSize, LocalFrame, RawGaussians, Simil
 use glam::{DMat4, DVec3};
 use serde::Serialize;
 use std::time::{Duration, Instant};
-use tch::Tensor;
+use tch::{Device, Tensor};
 
 /// Share of the time or the steps that goes to tokens where Gaussians follow.
 const TOKENS_SHARE: f64 = 0.2;
@@ -60,6 +60,8 @@ pub struct RefineOptions {
     pub correct_exposures: bool,
     /// What photos are cut and resized to; where none is given, they keep their shape, and are made smaller where they are large.
     pub size: Option<ImageSize>,
+    /// Where depths are found, and what is optimized lies.
+    pub device: Device,
 }
 
 /// What is begun with.
@@ -109,7 +111,7 @@ pub struct EvalPoint {
 /// What a session ends with.
 #[derive(Debug)]
 pub struct RefineResult {
-    /// The Gaussians, in the session's frame.
+    /// The Gaussians, in the session's frame and on its device.
     pub gaussians: Gaussians,
     /// Whether these are the ones begun with, which showed the photos better.
     pub is_initial: bool,
@@ -237,15 +239,16 @@ impl<'a> RefineSession<'a> {
         self.reserve = time;
     }
 
-    /// Makes what is begun with, and returns it, in the session's frame. Photos that are nearly equal to others are left out from then
-    /// on.
+    /// Makes what is begun with, and returns it, in the session's frame and on its device. Photos that are nearly equal to others are left
+    /// out from then on.
     ///
     /// # Errors
     /// What the model or the rasterizer refuses, a splat that no camera sees, and an end before there is anything.
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
         let start = match initial {
             Initial::Splat(gaussians, origin) => {
-                Start::Gaussians(RawGaussians::of(&self.frame.gaussians_to_local(gaussians, origin)))
+                let local = self.frame.gaussians_to_local(gaussians, origin);
+                Start::Gaussians(RawGaussians::of(&local.to_device(self.options.device)))
             }
             Initial::Model { loaded, views } => {
                 let data = &loaded.config.data;
@@ -344,8 +347,8 @@ impl<'a> RefineSession<'a> {
         ));
     }
 
-    /// As many Gaussians as were asked for; of `known` ones, those that can be where they are. None where the work is ended before any
-    /// photo has depths.
+    /// As many Gaussians as were asked for, on the session's device; of `known` ones, those that can be where they are. None where the
+    /// work is ended before any photo has depths.
     fn gaussians_from_photos(&mut self, known: Option<&RawGaussians>) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
         let points: Vec<Point> = points_of(self.capture)?.into_iter().map(to_local).collect();
@@ -359,8 +362,8 @@ impl<'a> RefineSession<'a> {
             };
             !is_stopped && !is_late
         };
-        let RefineOptions { gaussians, seed, .. } = *self.options;
-        let made = gaussians_from_photos(&self.photos, &points, known, gaussians, seed, go_on);
+        let RefineOptions { gaussians, seed, device, .. } = *self.options;
+        let made = gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, go_on);
         self.is_stopped |= is_stopped;
         Ok(made)
     }
@@ -396,9 +399,10 @@ impl<'a> RefineSession<'a> {
         };
         let options = self.options;
         let mut space = GaussianSpace::new(&raw, depth, &options.config);
-        let RefineOptions { correct_poses, correct_exposures, config, .. } = options;
+        let RefineOptions { correct_poses, correct_exposures, config, device, .. } = options;
         let count = self.photos.len();
-        let mut corrections = Corrections::new(count, *correct_poses, *correct_exposures, depth, config);
+        let mut corrections =
+            Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
         let poses: Vec<DMat4> = self.cameras().iter().map(|camera| camera.c2w).collect();
         Ok((self.run_phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
     }
@@ -446,8 +450,8 @@ impl<'a> RefineSession<'a> {
             Some(world) => transform(&gaussians, world),
             None => gaussians,
         };
-        let RefineOptions { config, seed, .. } = self.options;
-        let photos = Photos::new(&self.photos, poses, config.levels());
+        let RefineOptions { config, seed, device, .. } = self.options;
+        let photos = Photos::new(&self.photos, poses, config.levels(), *device);
         let budget = match self.options.budget {
             Budget::Steps(steps) => Budget::Steps(((to - from) * steps as f64).round() as u64),
             Budget::Time(time) => {

@@ -77,7 +77,8 @@ impl Space for GaussianSpace {
         self.optimizer.step();
         let due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         if due && progress < config.relocate_until {
-            let changed = Tensor::from_slice(&relocate(&self.leaves, config.dead, random));
+            let changed = relocate(&self.leaves, config.dead, random);
+            let changed = Tensor::from_slice(&changed).to_device(self.leaves.means.device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }

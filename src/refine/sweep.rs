@@ -60,7 +60,7 @@ pub struct Swept {
     pub sure: Tensor,
 }
 
-/// A small photo.
+/// A small photo, on the device that compares it.
 struct Small {
     camera: Camera,
     /// [3, h, w].
@@ -71,11 +71,16 @@ struct Small {
 
 /// Finds depths for the pixels of the views, or where these are many, of some that together show what all of them show: near
 /// duplicates don't count. `points` of the scene, where some are known, tell where it begins. `go_on` is asked before each view, with
-/// how many are done; when it says no, these are all there is.
-pub fn sweep(views: &[View], points: &[Point], mut go_on: impl FnMut(usize) -> bool) -> Vec<Swept> {
-    let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE)).collect();
+/// how many are done; when it says no, these are all there is. The work is done on `device`, and its results are there.
+pub fn sweep(
+    views: &[View],
+    points: &[Point],
+    device: Device,
+    mut go_on: impl FnMut(usize) -> bool,
+) -> Vec<Swept> {
+    let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE, device)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
-    let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE)).collect();
+    let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE, device)).collect();
     let (mut depths, mut swept): (Vec<f64>, Vec<(usize, Swept)>) = (vec![], vec![]);
     for index in farthest_first(&cameras, MOST) {
         if !go_on(swept.len()) {
@@ -173,12 +178,13 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
 }
 
 impl Small {
-    fn of(view: &View, longest_side: f64) -> Self {
+    fn of(view: &View, longest_side: f64, device: Device) -> Self {
         let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
         let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
         let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
         let (height, width) = (resized(camera.height), resized(camera.width));
-        let image = view.image.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
+        let image = view.image.to_device(device).unsqueeze(0);
+        let image = image.adaptive_avg_pool2d([height, width]).squeeze_dim(0);
         let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
@@ -216,7 +222,7 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
 /// The inverse depth of every pixel, of so many evenly from 0 to `nearest`, at which it looks most alike in the others, and the
 /// correlation there, both [h, w].
 fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Tensor, Tensor) {
-    let (size, options) = (this.size(), (Kind::Float, Device::Cpu));
+    let (size, options) = (this.size(), (Kind::Float, this.grey.device()));
     if others.is_empty() {
         return (Tensor::full(size, nearest / 2., options), Tensor::zeros(size, options));
     }
@@ -228,7 +234,7 @@ fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Te
         let (seen, inside) = seen_by(other, this, &planes);
         let (mean, variance) = mean_and_variance(&seen);
         let covariance = around(&(&seen * &own)) - mean * &own_mean;
-        (covariance / (variance * &own_variance).sqrt()).where_self(&inside, &Tensor::from(-1f32))
+        (covariance / (variance * &own_variance).sqrt()).where_scalarother(&inside, -1.)
     };
     let correlations = Tensor::stack(&others.iter().map(alike).collect::<Vec<_>>(), 0);
     let half = (others.len() as i64 / 2).max(1);
@@ -244,7 +250,7 @@ fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
     let rows = to_other.transpose().to_cols_array_2d();
     // In proportion to what the camera sees of a pixel at inverse depth w: rotation · ray + w · translation.
-    let rays = rays(&this.camera.intrinsics, height, width);
+    let rays = rays(&this.camera.intrinsics, height, width, planes.device());
     let coordinate = |row: [f64; 4]| {
         let turned = &rays[0] * row[0] + &rays[1] * row[1] + &rays[2] * row[2]; // [h·w]
         turned + planes * row[3]
@@ -264,8 +270,8 @@ fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
 }
 
 /// x, y and z of the pixels' rays, z being 1, [h·w] each.
-fn rays(intrinsics: &Intrinsics, height: i64, width: i64) -> [Tensor; 3] {
-    let options = (Kind::Float, Device::Cpu);
+fn rays(intrinsics: &Intrinsics, height: i64, width: i64, device: Device) -> [Tensor; 3] {
+    let options = (Kind::Float, device);
     let x = (Tensor::arange(width, options) + 0.5 - intrinsics.cx) / intrinsics.fx;
     let y = (Tensor::arange(height, options) + 0.5 - intrinsics.cy) / intrinsics.fy;
     let all =
@@ -326,18 +332,19 @@ mod tests {
             View { name: String::new(), image: wave.expand([3, 64, 64], false).contiguous(), camera }
         };
         let views = [view(-0.5), view(0.), view(0.5)];
-        for swept in sweep(&views, &[], |_| true) {
+        for swept in sweep(&views, &[], Device::Cpu, |_| true) {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
         // Where points tell that the scene begins at 3, planes lie closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
-        let photos: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE)).collect();
+        let photos: Vec<Small> =
+            views.iter().map(|view| Small::of(view, LONGEST_SIDE, Device::Cpu)).collect();
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // One photo by itself tells nothing, and that is no NaN.
-        let alone = sweep(&views[..1], &[], |_| true);
+        let alone = sweep(&views[..1], &[], Device::Cpu, |_| true);
         assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
     }
 }

@@ -44,6 +44,14 @@ pub struct SplatRenderer {
     frame: LocalFrame,
 }
 
+impl Rendered {
+    /// The same in the memory of the host.
+    pub fn to_host(&self) -> Self {
+        let to_host = |t: &Tensor| t.to_device(Device::Cpu);
+        Rendered { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
+    }
+}
+
 impl SplatRenderer {
     /// Renders `gaussians` of one scene, whose means are relative to `origin`, in `frame`.
     pub fn new(gaussians: &Gaussians, origin: DVec3, frame: LocalFrame) -> Self {
@@ -67,11 +75,9 @@ impl SplatRenderer {
     /// Those of [`render`].
     pub fn render(&self, cameras: &[Camera]) -> Result<Vec<Rendered>> {
         let rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
-        let to_host = |t: Tensor| t.to_device(Device::Cpu);
-        let finish = |view: Rendered| Rendered {
-            rgb: to_host(view.rgb),
-            alpha: to_host(view.alpha),
-            depth: to_host(view.depth * self.frame.scale),
+        let finish = |view: Rendered| {
+            let view = view.to_host();
+            Rendered { depth: view.depth * self.frame.scale, ..view }
         };
         Ok(rendered.into_iter().map(finish).collect())
     }

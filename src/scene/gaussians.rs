@@ -103,9 +103,14 @@ impl RawGaussians {
         self.map(Tensor::shallow_clone)
     }
 
+    /// A copy on `device`, or the same tensors where they are there already.
+    pub fn to_device(&self, device: Device) -> Self {
+        self.map(|t| t.to_device(device))
+    }
+
     /// Those of `indices`, of every scene.
     pub fn select(&self, indices: &[i64]) -> Self {
-        let indices = Tensor::from_slice(indices);
+        let indices = Tensor::from_slice(indices).to_device(self.means.device());
         self.map(|t| t.index_select(1, &indices))
     }
 

@@ -4,12 +4,12 @@ use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
-use crate::model::{ModelConfig, Precision, Stage, Streams};
+use crate::model::{ModelConfig, Precision, Stage, Streams, leaf, pull_back};
 use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
-use globalsplat_csrc::ops::ops_of;
+use globalsplat_csrc::ops::{computing, moves, ops_of, outermost_ops_of, without_own_linear_layers};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
@@ -273,22 +273,42 @@ fn the_network_of_l_perc_has_the_model_s_precision() {
     }
 }
 
-/// Ops whose answer the host waits for: numbers that it reads, and sizes that depend on values.
-const WAITING: [&str; 7] = [
-    "aten::_local_scalar_dense",
-    "aten::equal",
-    "aten::nonzero",
-    "aten::masked_select",
-    "aten::_unique2",
-    "aten::linalg_pinv",
-    "aten::repeat_interleave.Tensor",
-];
+/// Launches of a step are mostly libtorch's ops, forward and backward: those of the main model's layers, of every loss but L_perc's
+/// network, and of tokens. To these come nine of the rasterizer's kernels, and a few of the optimizer's.
+#[test]
+fn a_step_takes_few_kernels() {
+    // Narrow, in float64 and with an odd number of heads, as in the test of a pass.
+    let model =
+        ModelConfig { latents: 16, width: 24, heads: 3, rgb_width: 16, ray_width: 8, ..Default::default() };
+    let mut trainer = far_from_the_start(&config(model, TrainConfig::default()));
+    let (network, sample) = (&trainer.model, Sample::of(&scenes(2), Device::Cpu));
+    let sample = Sample { paired: true, ..sample };
+    let with_gradient = |t: &Tensor| {
+        let leaf = leaf(t);
+        leaf.sum(leaf.kind()).backward();
+        leaf
+    };
+    let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
+    let (tokens, forward) = outermost_ops_of(|| network.tokens(images, c2w, intrinsics));
+    let leaf_of_tokens = with_gradient(&tokens);
+    let (_, backward) = outermost_ops_of(|| pull_back(&[(&tokens, &leaf_of_tokens)]));
+    // Two layers, forward and for the gradients of their weights.
+    let of_tokens = computing(&without_own_linear_layers([forward, backward].concat())) + 2 * 2;
 
-/// That no op of `ops` waits for a GPU, and how many tensors are sent to a device, be it the one where they are.
-fn moves(ops: &[String]) -> usize {
-    let waits = ops.iter().find(|op| WAITING.contains(&op.as_str()));
-    assert!(waits.is_none(), "{waits:?} waits");
-    ops.iter().filter(|op| *op == "aten::to.device").count()
+    let decoded = network.decode(&network.encode(&tokens), STAGE).map(leaf);
+    let cameras = sample.target.cameras();
+    let pictures = render(&decoded.gaussians, &cameras, DEFAULT_EPS2D).expect("pictures");
+    let (_, of_losses) = outermost_ops_of(|| {
+        losses(&trainer.config.loss, None, &sample, &decoded, &pictures, &Share::WHOLE).total.backward();
+    });
+
+    trainer.vs.double();
+    let tokens = leaf(&tokens.to_kind(Kind::Double));
+    let (decoded, forward) = outermost_ops_of(|| network.decode(&network.encode(&tokens), STAGE));
+    let leaves = decoded.map(with_gradient);
+    let (_, backward) = outermost_ops_of(|| pull_back(&decoded.beside(&leaves)));
+    let counts = [of_tokens, computing(&forward), computing(&backward), computing(&of_losses)];
+    assert!((1000..=2100).contains(&counts.iter().sum::<usize>()), "{counts:?}");
 }
 
 #[test]
