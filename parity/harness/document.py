@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 
 from .disturb import BEYOND, FACTOR
-from .table import by_case, doubtful, failures, is_gradient, is_output, undetected
+from .table import by_case, doubtful, failures, is_gradient, is_output, turned, undetected
 from .tolerance import FLOAT32, FLOAT64
 
 WIDTH = 120
@@ -34,6 +34,7 @@ def document(results, command, device):
         ["## Cases", *cases(results)],
         ["## Tolerances of their own", bullets(whys(results))],
         ["## Pixels left out", bullets(doubtful(results))],
+        ["## Close calls decided otherwise", bullets(turned(results))],
         ["## Failures", bullets(failures(results))],
         ["## Would wrong answers be noticed?", *self_test(results)],
     ]

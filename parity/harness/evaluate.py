@@ -1,19 +1,23 @@
 """The reference's answer to a request."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import torch
 
 from .areas import TWINS
+from .close_calls import Turned
 from .exchange import read_request, write_answer
 
 
 class Evaluation:
     """Outputs on construction; gradients when their cotangents are known.
 
-    `dtype` is the precision of the arithmetic; what is not a floating-point number stays what it is.
+    `dtype` is the precision of the arithmetic; what is not a floating-point number stays what it is. Of the twin's close calls, `calls`
+    are decided otherwise.
     """
 
-    def __init__(self, request, dtype):
+    def __init__(self, request, dtype, calls=()):
         def tensors(group, differentiate):
             values = {}
             for name, array in group.items():
@@ -25,7 +29,8 @@ class Evaluation:
 
         params = tensors(request.params, lambda name: True)
         inputs = tensors(request.inputs, lambda name: name in request.differentiate)
-        self.outputs = TWINS[request.module](request.config, params, inputs)
+        with Turned(calls) if calls else nullcontext():
+            self.outputs = TWINS[request.module](request.config, params, inputs)
         self.leaves = {f"grad.param.{name}": value for name, value in params.items()}
         self.leaves |= {f"grad.in.{name}": inputs[name] for name in request.differentiate}
 

@@ -8,6 +8,7 @@ torch tensors. `config` has the program's keys, and parameters have the publishe
 request.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,6 +34,7 @@ class Draw:
     gradients: bool = True
     large: bool = False  # the reference computes in float32, on more than one core
     doubtful: np.ndarray | None = None  # pixels on a threshold, [B, C, H, W]
+    close_calls: Callable[[], list] = list  # of a network, which a GPU may decide otherwise
 
     def __post_init__(self):
         self.gradients = self.gradients and bool(self.params or self.differentiate)

@@ -23,7 +23,7 @@ def table(results):
                 first = "", ""
     lines = layout(rows)
     lines += [f"[{number}] {why}" for number, why in enumerate(whys, start=1)]
-    return "\n".join([*lines, *doubtful(results), *failures(results)])
+    return "\n".join([*lines, *doubtful(results), *turned(results), *failures(results)])
 
 
 def by_case(results):
@@ -77,6 +77,13 @@ def doubtful(results):
     return lines
 
 
+def turned(results):
+    """How many of a network's close calls the program decided otherwise than the reference."""
+    counts = {case: sum(result.turned for result in found) for case, found in by_case(results).items()}
+    what = "numbers within rounding of a threshold lie on its other side"
+    return [f"{case}: {count} {what}" for case, count in counts.items() if count]
+
+
 def failures(results):
     lines = []
     for result in results:
@@ -114,6 +121,7 @@ def as_json(results, **about):
             "passed": result.passed,
             "why": result.tolerance.why,
             "doubtful_pixels": result.doubtful,
+            "turned_close_calls": result.turned,
             "reference_seconds": round(result.seconds, 3),
             "disturbed": result.tried,
             "undetected": result.blind,

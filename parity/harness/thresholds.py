@@ -1,4 +1,4 @@
-"""Where a picture is a step function of its Gaussians, and a network's gradient one of its picture.
+"""Where a picture is a step function of its Gaussians.
 
 A pixel is doubtful when an alpha lies within `margin` (relative) of 1/255 or of the cap 0.999, a transmittance within
 `margin` of 1e-4, or the depths of two Gaussians that both reach it within a hundredth of `margin` of each other without
@@ -7,7 +7,6 @@ being equal: rounding may then decide, and neither the pixel nor its gradient ca
 
 import torch
 from reference import splat
-from reference.loss import lpips, vgg19
 
 MOST_TRIES = 100  # to draw one without a doubt
 
@@ -60,34 +59,3 @@ def of_view(projected, opacities, pixels, margin):
     unordered = (gap > 0) & (gap < 0.01 * margin * depth[1:])
     both = reaches[1:] & reaches[:-1] & goes_on[1:]
     return doubtful | (both & unordered[:, None]).any(0)
-
-
-def closest_call(network, params, pictures):
-    """How near the features of LPIPS come to another gradient: the smallest number before a ReLU, or difference between
-    a pooling window's largest two, as a share of the layer's standard deviation. Arrays of a request."""
-    params = {name: torch.tensor(value).double() for name, value in params.items()}
-    found = lpips.convolutions(network, params, torch.tensor(pictures).double())
-    pooled = [row[-1][0] for row in lpips.NETWORKS[network][:-1]]
-    closest = torch.inf
-    for name, x in found.items():
-        calls = [x.abs().min()]
-        if name in pooled:
-            size = lpips.POOLING[network]
-            first, second = torch.relu(x).unfold(2, size, 2).unfold(3, size, 2).flatten(4).topk(2).values.unbind(-1)
-            calls.append((first - second)[first > 0.0].min())
-        closest = min(closest, min(calls).item() / x.std().item())
-    return closest
-
-
-def closest_call_of_vgg19(params, picture, truth):
-    """The same of VGG-19's loss: before a ReLU, and between the features that are compared, where not both are zero."""
-    params = {name: torch.tensor(value).double() for name, value in params.items()}
-    (_, ours), (_, theirs) = (vgg19.convolutions(params, torch.tensor(t).double()) for t in (picture, truth))
-    closest = torch.inf
-    for place, x in ours.items():
-        calls = [x.abs().min()]
-        if place in vgg19.FACTORS:
-            difference = (torch.relu(x) - torch.relu(theirs[place])).abs()
-            calls.append(difference[difference > 0.0].min())
-        closest = min(closest, min(calls).item() / x.std().item())
-    return closest

@@ -17,13 +17,14 @@ sys.path.insert(0, str(REPOSITORY / "parity"))
 import run  # noqa: E402
 from harness import coverage, draw, exchange, scenes  # noqa: E402
 from harness.areas import CASES  # noqa: E402
+from harness.close_calls import closest, decisions_of_lpips  # noqa: E402
 from harness.compare import compare, judge  # noqa: E402
 from harness.disturb import undetected  # noqa: E402
 from harness.document import document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.hold import hold, questions  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
-from harness.thresholds import closest_call, doubtful_pixels  # noqa: E402
+from harness.thresholds import doubtful_pixels  # noqa: E402
 from harness.tolerance import FLOAT32, FLOAT64, Tolerance  # noqa: E402
 
 from reference.loss.lpips import convolutions  # noqa: E402
@@ -229,13 +230,35 @@ def test_close_calls_of_lpips():
     """A number before a ReLU is 0; a pooling window's largest two are equal."""
     params = draw.lpips_parameters(np.random.default_rng(0), "lpips_alex")
     pictures = draw.uniform(np.random.default_rng(1), 0.0, 1.0, 1, 3, 31, 31)
-    sure = closest_call("lpips_alex", params, pictures)
+    def closest_of(params, pictures):
+        return closest(decisions_of_lpips("lpips_alex", params, [pictures]))
+
+    sure = closest_of(params, pictures)
     assert sure > 0.0
     found = convolutions("lpips_alex", {k: torch.tensor(v) for k, v in params.items()}, torch.tensor(pictures))
     params["conv5.bias"][7] -= found["conv5"][0, 7].item()  # one pixel is left: it becomes 0 but for rounding
-    assert closest_call("lpips_alex", params, pictures) < 1e-5 < sure
+    assert closest_of(params, pictures) < 1e-5 < sure
     flat = np.zeros_like(pictures)  # all of a window is alike, wherever it doesn't see the border
-    assert closest_call("lpips_alex", draw.lpips_parameters(np.random.default_rng(0), "lpips_alex"), flat) < 1e-12
+    assert closest_of(draw.lpips_parameters(np.random.default_rng(0), "lpips_alex"), flat) < 1e-12
+
+
+@pytest.mark.parametrize(("case", "seed"), [("lpips_alex", 1), ("vgg19", 1)])
+def test_close_calls_may_go_either_way_and_nothing_else(case, seed):
+    """A program that decides two otherwise, with rounding, is right; with any other mistake it isn't."""
+    question = next(questions([case], seed))
+    calls = question.drawn.close_calls()
+    otherwise = Evaluation(question.request, torch.float64, calls[1:3]).gradient_arrays(question.request.cotangents)
+    rng = np.random.default_rng(0)
+    answer = {
+        name: (value * (1.0 + 1e-6 * rng.standard_normal(value.shape))).astype(np.float32)
+        for name, value in (question.expected | otherwise).items()
+    }
+    assert not passes(answer, question.expected)
+    expected, turned = question.settled(answer)
+    assert passes(answer, expected) and turned == 2
+    name = max(otherwise, key=lambda name: otherwise[name].size)
+    wrong = answer | {name: answer[name] * np.float32(1.001)}
+    assert not passes(wrong, question.settled(wrong)[0])
 
 
 def test_every_module_has_a_case():

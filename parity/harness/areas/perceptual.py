@@ -5,30 +5,26 @@ import reference.loss.lpips
 import reference.loss.vgg19
 
 from .. import draw
+from ..close_calls import ON_CPU, ON_GPU, calls_within, closest, decisions_of_lpips, decisions_of_vgg19
 from ..draw import uniform
 from ..registry import Draw, by, case, twin
-from ..thresholds import MOST_TRIES, closest_call, closest_call_of_vgg19
+from ..thresholds import MOST_TRIES
 from ..tolerance import Tolerance
 
-# Of a layer's standard deviation, within which a ReLU or a max pooling may decide otherwise: twice what rounding moves
-# numbers by.
-CLOSE_CALL = 5e-6
-
-
 # The weights take no gradient in training; here they have one, which cuDNN computes of 5×5 kernels by an algorithm of its own.
-ON_GPU = Tolerance(
+ON_GPU_TOLERANCE = Tolerance(
     1e-5,
     1e-3,
     why="cuDNN's gradients of 5×5 kernels: 1.3e-4 measured, where those of their biases and of the picture have 2e-6",
 )
 
 
-def sure_pictures(rng, closest, *shapes):
-    """Random pictures of these shapes, drawn until no threshold is a close call."""
+def sure_pictures(rng, decisions, *shapes):
+    """Random pictures of these shapes, drawn until no call is close on a CPU. -> them, and the calls that are close on a GPU."""
     for _ in range(MOST_TRIES):
         pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
-        if closest(*pictures) > CLOSE_CALL:
-            return pictures
+        if closest(decisions(*pictures)) > ON_CPU:
+            return pictures, lambda: calls_within(ON_GPU, decisions(*pictures))
     raise RuntimeError(f"every one of {MOST_TRIES} sets of pictures has a close call")
 
 
@@ -38,12 +34,21 @@ def lpips_draws(rng, network, shapes, dead=()):
     for name in dead:
         params[f"{name}.bias"] -= np.float32(100.0)
     for shape in shapes:
-        picture, truth = sure_pictures(
-            rng, lambda *pair: closest_call(network, params, np.concatenate(pair)), shape, shape
+        (picture, truth), close_calls = sure_pictures(
+            rng, lambda *pair: decisions_of_lpips(network, params, pair), shape, shape
         )
         inputs = {"picture": picture, "truth": truth}
         label = by(*shape) + "".join(f", {name} dead" for name in dead)
-        yield Draw(label, inputs, {"network": network}, params, tuple(inputs), module="lpips", on_gpu=ON_GPU)
+        yield Draw(
+            label,
+            inputs,
+            {"network": network},
+            params,
+            tuple(inputs),
+            module="lpips",
+            on_gpu=ON_GPU_TOLERANCE,
+            close_calls=close_calls,
+        )
 
 
 @case
@@ -70,8 +75,11 @@ def vgg19(rng):
     """The smallest picture that its poolings leave anything of, and odd sides."""
     params = draw.vgg19_parameters(rng)
     for shape in [(1, 3, 16, 16), (1, 3, 19, 17)]:
-        picture, truth = sure_pictures(rng, lambda *pair: closest_call_of_vgg19(params, *pair), shape, shape)
-        yield Draw(by(*shape), {"picture": picture, "truth": truth}, {}, params, ("picture",))
+        (picture, truth), close_calls = sure_pictures(
+            rng, lambda *pair: decisions_of_vgg19(params, [pair]), shape, shape
+        )
+        inputs = {"picture": picture, "truth": truth}
+        yield Draw(by(*shape), inputs, {}, params, ("picture",), close_calls=close_calls)
 
 
 @twin("vgg19")
@@ -84,23 +92,23 @@ def perceptual(rng):
     """Two renderings of the same targets, of which there are one and several. The network's weights are inputs that take no
     gradient."""
     params = draw.vgg19_parameters(rng)
-
-    def closest_to_vgg19(rendered, truth):
-        truth = truth.reshape(-1, 3, 16, 16)
-        return min(closest_call_of_vgg19(params, half, truth) for half in rendered.reshape(2, *truth.shape))
-
-    rendered, truth = sure_pictures(rng, closest_to_vgg19, (2, 2, 3, 16, 16), (1, 2, 3, 16, 16))
-    inputs = {"rendered": rendered, "truth": truth, **params}
-    yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",))
-    params = draw.lpips_parameters(rng, "lpips_alex")
-    rendered, truth = sure_pictures(
+    (rendered, truth), close_calls = sure_pictures(
         rng,
-        lambda *both: closest_call("lpips_alex", params, np.concatenate(both).reshape(-1, 3, 31, 31)),
-        (2, 1, 3, 31, 31),
-        (1, 1, 3, 31, 31),
+        lambda rendered, truth: decisions_of_vgg19(params, [(half, truth) for half in np.split(rendered, 2)]),
+        (2, 2, 3, 16, 16),
+        (1, 2, 3, 16, 16),
     )
     inputs = {"rendered": rendered, "truth": truth, **params}
-    yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",))
+    yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",), close_calls=close_calls)
+    params = draw.lpips_parameters(rng, "lpips_alex")
+
+    def decisions_of_alex(rendered, truth):
+        both = [pictures for half in np.split(rendered, 2) for pictures in (half, truth)]
+        return decisions_of_lpips("lpips_alex", params, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
+
+    (rendered, truth), close_calls = sure_pictures(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
+    inputs = {"rendered": rendered, "truth": truth, **params}
+    yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",), close_calls=close_calls)
 
 
 @twin("perceptual")
