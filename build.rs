@@ -1,4 +1,5 @@
-//! Lets the binary, tests and examples find libtorch again by rpath, and the binary the viewer that its pages have.
+//! Sets the rpath with which the binary, tests and examples find libtorch, and embeds the viewer of the HTML pages in the
+//! binary.
 
 use std::env;
 use std::fs;
@@ -9,9 +10,9 @@ fn main() {
     println!("cargo::rustc-link-arg=-Wl,-rpath,{lib}");
     println!("cargo::rerun-if-changed=build.rs");
 
-    // What scripts/setup.sh bundles where there is npm.
+    // Bundle that scripts/setup.sh builds if npm is available.
     let bundle = Path::new("web/dist/page.js");
-    // What isn't there counts as changed, every time.
+    // Cargo treats a missing file as changed on every build.
     let watched = if bundle.exists() { bundle } else { Path::new("web") };
     println!("cargo::rerun-if-changed={}", watched.display());
     let out = env::var_os("OUT_DIR").expect("cargo names it");

@@ -1,4 +1,4 @@
-// What the splat ops are called with from Rust, checked.
+// Validated arguments of the splat ops.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -9,7 +9,7 @@ namespace globalsplat {
 
 struct SplatArguments;  // shared with Rust, see src/render.rs
 
-// Gaussians and cameras of one call, borrowed.
+// Gaussians and cameras of one call, borrowed:
 //   means [B, N, 3], scales [B, N, 3], quaternions [B, N, 4], opacities [B, N], sh [B, N, bases, 3]
 //   w2c [B, C, 4, 4], intrinsics [B, C, 3, 3] in pixels
 struct Arguments {
@@ -17,11 +17,11 @@ struct Arguments {
   int64_t width, height;
   double eps2d;
 
-  // Throws on shapes and numbers that don't fit.
+  // Throws if shapes or values are invalid.
   void check() const;
 
-  // On `device`, contiguous, of one type: float64 where the means are, float32 else. Moving and converting are differentiable,
-  // so gradients go back to the caller's device and type. Intrinsics get none.
+  // Returns contiguous inputs on `device`, all of one type: float64 if the means are, and float32 otherwise. Moving and converting are
+  // differentiable, so gradients return to the caller's device and type. Intrinsics get no gradient.
   Inputs on(at::Device device) const;
 };
 

@@ -23,7 +23,7 @@ using torch::autograd::tensor_list;
 
 bool is_bf16(const Tensor& t) { return t.scalar_type() == at::kBFloat16; }
 
-// Rows of numbers side by side; of bfloat16 numbers, rows that begin at whole words.
+// Returns a tensor whose rows are contiguous; bfloat16 rows also begin at whole 32-bit words.
 Tensor with_whole_rows(const Tensor& t) {
   const bool whole = t.size(2) == 1 || t.stride(2) == 1;
   return whole && (!is_bf16(t) || t.stride(1) % 2 == 0) ? t : t.contiguous();
@@ -47,7 +47,7 @@ raster::AttentionShape shape_of(const Tensor& q, const Tensor& k, int64_t heads)
   return {q.size(0), heads, q.size(1), k.size(1), int(q.size(2) / heads)};
 }
 
-// oneDNN's, by way of libtorch: it compiles them for the processor, be it for vectors or for tiles.
+// Calls oneDNN's products through libtorch. oneDNN compiles them for the processor, for vectors or for tiles.
 void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const raster::Bf16* a,
               const raster::Bf16* b, float* c) {
   const auto numbers = [](const raster::Bf16* of) { return reinterpret_cast<const at::BFloat16*>(of); };
@@ -56,13 +56,13 @@ void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int
 
 void done() { at::native::cpublas::brgemm_release(true); }
 
-// To be asked for once a call, as there may be no room for their code.
+// Returns the product functions. To be called once per op, because there may be no memory for their code.
 raster::Bf16Products products() {
   expect_room_for_code(0);
   return {multiply, done};
 }
 
-// Libtorch refuses where oneDNN has none, and oneDNN where it was told to do without the instructions for them.
+// Returns true if bf16 products work. libtorch throws if oneDNN doesn't support them, and oneDNN if their instructions are disabled.
 bool has_bf16_products() {
   static const bool has = [] {
     const std::vector<raster::Bf16> zeros(16 * 16);
@@ -131,7 +131,7 @@ size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t h
               raster::kAttentionWidth);
   TORCH_CHECK(k.sizes() == v.sizes() && k.size(0) == q.size(0) && k.size(2) == q.size(2) && k.size(1) > 0, "queries have shape ",
               q.sizes(), ", keys ", k.sizes(), " and values ", v.sizes(), ", expected [B, n, d] and twice [B, m, d] with m > 0");
-  // Profilers see it as they see libtorch's.
+  // Makes the op visible to profilers, like libtorch's own.
   RECORD_FUNCTION("globalsplat::attention", c10::ArrayRef<const c10::IValue>{});
   const Tensor out = AttentionFunction::apply(with_whole_rows(q), with_whole_rows(k), with_whole_rows(v), heads);
   return reinterpret_cast<size_t>(new Tensor(out));

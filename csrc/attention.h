@@ -1,4 +1,4 @@
-// Attention on torch tensors, as Rust calls it through cxx.
+// Attention on torch tensors. Rust calls it through cxx.
 #pragma once
 
 #include <cstddef>
@@ -6,13 +6,13 @@
 
 namespace globalsplat {
 
-// Whether attention() takes heads of that width: of float32 numbers, or of bfloat16 where there are products for them. Throws where
-// memory to find that out is refused.
+// Returns true if attention() supports heads of this width: with float32, or with bfloat16 if bf16 products are available. Throws if the
+// memory for this test can't be allocated.
 bool attention_takes(int64_t width, bool is_bf16);
 
-// softmax(q kᵀ / √(d/h)) v over h heads side by side (raster/attention.h): q [B, n, d], k and v [B, m, d], m at least 1, float32 or
-// bfloat16 on the CPU, any strides; addresses of live tensors. Returns that of a new contiguous tensor [B, n, d] of their kind that the
-// caller owns. Differentiable, once. Throws on what doesn't fit.
+// Computes softmax(q kᵀ / √(d/h)) v over h adjacent heads (raster/attention.h). q is [B, n, d], k and v are [B, m, d] with m at least 1,
+// float32 or bfloat16 on the CPU, with any strides; arguments are addresses of live tensors. Returns the address of a new contiguous tensor
+// [B, n, d] of their kind that the caller owns. Differentiable once. Throws if shapes or types don't fit.
 size_t attention(size_t q, size_t k, size_t v, int64_t heads);
 
 }  // namespace globalsplat

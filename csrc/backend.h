@@ -1,5 +1,5 @@
-// What a kind of device gives to serve the splat ops by itself. splat.cpp does for all of them what is the same: it checks the
-// arguments, moves them, and lets autograd remember.
+// Interface of a backend, which implements the splat ops for one kind of device. splat.cpp does what is common to all backends: it checks
+// the arguments, moves them, and integrates the ops with autograd.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -10,12 +10,12 @@ namespace globalsplat {
 
 using at::Tensor;
 
-// The Gaussians of all scenes, or their gradients; shapes as in arguments.h.
+// Gaussians of all scenes, or their gradients; shapes as in arguments.h.
 struct Gaussians {
   Tensor means, scales, quaternions, opacities, sh;
 };
 
-// What an op reads: on the backend's device, contiguous, all float32 or all float64; shapes as in arguments.h.
+// Inputs of an op: on the backend's device, contiguous, all float32 or all float64; shapes as in arguments.h.
 struct Inputs {
   Gaussians gaussians;
   Tensor w2c, intrinsics;
@@ -23,33 +23,33 @@ struct Inputs {
   double eps2d;           // pixels²
 
   int64_t scenes() const { return w2c.size(0); }
-  int64_t cameras() const { return w2c.size(1); }  // of a scene
-  int64_t count() const { return gaussians.means.size(1); }  // Gaussians of a scene
+  int64_t cameras() const { return w2c.size(1); }  // per scene
+  int64_t count() const { return gaussians.means.size(1); }  // Gaussians per scene
 };
 
-// What a backward pass gives.
+// Results of a backward pass.
 struct Gradients {
   Gaussians gaussians;
-  Tensor w2c;  // [B, C, 4, 4], the last rows 0; undefined where nobody asked
+  Tensor w2c;  // [B, C, 4, 4] with last rows 0; undefined if not requested
 };
 
-// What splat() draws, or its gradients: [B, C, 3, H, W], [B, C, H, W], [B, C, H, W].
+// Outputs of splat(), or their gradients: [B, C, 3, H, W], [B, C, H, W], [B, C, H, W].
 struct Pictures {
   Tensor rgb, alpha, depth;
 };
 
-// What project() makes, or its gradients, of which that of `visible` isn't there; shapes as in splat.h.
+// Outputs of project(), or their gradients, except that `visible` has none; shapes as in splat.h.
 struct Projected {
   Tensor visible, mean2d, conic, depth, colour;
 };
 
-// What a backend's splat() leaves for its splat_backward(), beside tensors.
+// State other than tensors that a backend's splat() passes to its splat_backward().
 struct Kept {
   virtual ~Kept() = default;
 };
 
-// New tensors have the device and the type of the inputs. Gradients come in contiguous, and go out for all five Gaussian tensors,
-// and for w2c `of_cameras`.
+// Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. Backward functions
+// return gradients of all five Gaussian tensors, and of w2c if `of_cameras` is set.
 struct Backend {
   at::DeviceType device;
   Pictures (*splat)(const Inputs&, std::unique_ptr<const Kept>& kept);

@@ -1,11 +1,11 @@
-//! Compiles the C++ beside it against the libtorch that `LIBTORCH` names, and links that.
+//! Compiles the C++ in this folder against the libtorch that `LIBTORCH` names, and links libtorch.
 
 use std::{
     env, fs,
     path::{Path, PathBuf},
 };
 
-/// What Rust and C++ know of each other.
+/// Source files with the cxx bridges between Rust and C++.
 const BRIDGES: [&str; 13] = [
     "src/attention.rs",
     "src/chunk.rs",
@@ -22,7 +22,7 @@ const BRIDGES: [&str; 13] = [
     "src/tensor_memory.rs",
 ];
 
-/// What every C++ file is compiled with.
+/// Returns the compiler settings that all C++ files share.
 fn cpp() -> cc::Build {
     let mut build = cc::Build::new();
     build
@@ -35,10 +35,10 @@ fn cpp() -> cc::Build {
     build
 }
 
-/// The rasterizer's kernels, once per instruction set; `flags` are all supported by any compiler for that target.
+/// Compiles the rasterizer's kernels for one instruction set; every compiler for that target supports all `flags`.
 fn kernels(isa: &str, flags: &[&str]) {
     let mut build = cpp();
-    // GCC 12 takes the undefined values in its own AVX-512 headers for mistakes.
+    // GCC 12 warns of undefined values in its own AVX-512 headers.
     build.flag_if_supported("-Wno-maybe-uninitialized");
     build.define("GS_ISA", isa).flag("-ffp-contract=off").file("raster/kernels_isa.cpp");
     for flag in flags {
@@ -47,7 +47,7 @@ fn kernels(isa: &str, flags: &[&str]) {
     build.compile(&format!("globalsplat_kernels_{isa}"));
 }
 
-/// The folder of libtorch.
+/// Returns the folder of libtorch.
 fn libtorch() -> PathBuf {
     println!("cargo::rerun-if-env-changed=LIBTORCH");
     let folder = PathBuf::from(env::var_os("LIBTORCH").unwrap_or_default());
@@ -61,7 +61,7 @@ fn libtorch() -> PathBuf {
     folder.canonicalize().expect("it was there a moment ago")
 }
 
-/// Folders of NVIDIA's headers, which wheels put beside that of torch.
+/// Returns the include folders of NVIDIA's wheels, which lie beside that of torch.
 fn nvidia(libtorch: &Path) -> Vec<PathBuf> {
     let wheels = fs::read_dir(libtorch.join("../nvidia")).into_iter().flatten();
     let mut folders: Vec<_> = wheels.flatten().map(|wheel| wheel.path().join("include")).collect();
@@ -70,8 +70,8 @@ fn nvidia(libtorch: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// Returns whether Clippy runs this script. Cargo keeps what it builds apart from what other commands build, so the C++ would be
-/// compiled a second time, for a check that links nothing.
+/// Returns `true` if Clippy runs this script. Cargo keeps Clippy's build outputs apart from those of other commands, so the C++
+/// would be compiled a second time for a check that links nothing.
 fn is_clippy() -> bool {
     let wrapper = env::var_os("RUSTC_WORKSPACE_WRAPPER").unwrap_or_default();
     Path::new(&wrapper).file_stem().is_some_and(|name| name == "clippy-driver")
@@ -85,15 +85,15 @@ fn main() {
     }
     let include = libtorch.join("include").into_os_string().into_string().expect("an UTF-8 path");
     let mut torch = cxx_build::bridges(BRIDGES);
-    // Of CUDA and NCCL, where libtorch's wheel came with them.
+    // Headers of CUDA and NCCL, if libtorch's wheel came with them.
     for folder in nvidia(&libtorch) {
         torch.flag("-isystem").flag(folder);
     }
     torch
         .std("c++17")
-        // As libtorch is compiled: without it some of its classes have more fields than there.
+        // libtorch is compiled with NDEBUG: without it some of its classes have more fields here than there.
         .define("NDEBUG", None)
-        // The work is done in raster/ and in libtorch.
+        // The heavy work is done in raster/ and in libtorch.
         .opt_level(1)
         .flag("-isystem")
         .flag(&include)
@@ -113,7 +113,7 @@ fn main() {
             "raster/kernels.cpp",
         ])
         .compile("globalsplat_raster");
-    // Kernels for GPUs give the CPU's bits, so here, too, nothing is fused that isn't written so.
+    // GPU kernels give bit-identical results to the CPU, so no multiply-add is fused here either unless written so.
     cpp()
         .includes(["raster", "cuda"])
         .flag("-ffp-contract=off")
@@ -129,7 +129,7 @@ fn main() {
         _ => kernels("portable", &[]),
     }
 
-    // After our own libraries, which need these: linkers drop what nothing has asked for yet.
+    // After our own libraries, which need these: linkers drop libraries that nothing has referenced yet.
     let lib = libtorch.join("lib");
     println!("cargo::rustc-link-search=native={}", lib.display());
     for library in ["torch_cpu", "c10", "torch"] {

@@ -16,7 +16,7 @@ using at::Tensor;
 
 constexpr int64_t kCameraNumbers = 18;
 
-// `numbers` as a tensor, not copied.
+// Wraps `numbers` as a tensor without copying.
 template <class Numbers>
 Tensor tensor(const Numbers& numbers, at::ScalarType type) {
   const auto count = int64_t(numbers.size());
@@ -29,7 +29,7 @@ std::unique_ptr<std::vector<uint8_t>> pickle_scenes(const rust::Vec<SceneToPickl
   const auto any = c10::AnyType::get();
   c10::impl::GenericList list(any);
   for (const SceneToPickle& scene : scenes) {
-    // A list of anything: a list of tensors would be a type of its own in the pickle.
+    // A list of type Any: a list of tensors would have its own type in the pickle.
     c10::impl::GenericList images(any);
     for (const EncodedImage& image : scene.images) images.push_back(tensor(image.bytes, at::kByte));
     c10::impl::GenericDict dict(c10::StringType::get(), any);
@@ -40,7 +40,7 @@ std::unique_ptr<std::vector<uint8_t>> pickle_scenes(const rust::Vec<SceneToPickl
     dict.insert("key", std::string(scene.key));
     list.push_back(dict);
   }
-  // As torch::pickle_save() does it, but for the types of lists and dicts, which it adds and Python's weights_only refuses.
+  // Like torch::pickle_save(), but without the type tags of lists and dicts, which Python's weights_only mode refuses.
   std::vector<char> pickle;
   torch::jit::Pickler pickler([&](const char* bytes, size_t count) { pickle.insert(pickle.end(), bytes, bytes + count); },
                               nullptr, nullptr, nullptr, nullptr, /*tag_aggregates=*/false);

@@ -1,5 +1,5 @@
-// RealEstate10K-style chunks: a torch.save file with a list of scenes, written by libtorch's own pickler. Reading them needs no
-// torch and is src/data/formats/chunk's.
+// RealEstate10K-style chunks: a torch.save file with a list of scenes, written by libtorch's pickler. They are read without torch by
+// src/data/formats/chunk.
 #pragma once
 
 #include <cstdint>
@@ -13,7 +13,7 @@ namespace globalsplat {
 // Shared with Rust, see src/chunk.rs.
 struct SceneToPickle;
 
-// The bytes of a torch.save file that holds `scenes`.
+// Returns the bytes of a torch.save file with `scenes`.
 std::unique_ptr<std::vector<uint8_t>> pickle_scenes(const rust::Vec<SceneToPickle>& scenes);
 
 }  // namespace globalsplat

@@ -17,7 +17,7 @@ c10::Device by_number(int32_t gpu) { return {c10::kCUDA, static_cast<c10::Device
 
 }  // namespace
 
-// Of the two kinds of events, the backend's own one keeps times.
+// Only events of the backend's default kind record times.
 Mark::Mark(int32_t gpu) : event_(c10::kCUDA, c10::EventFlag::BACKEND_DEFAULT) { event_.record(driver().getStream(by_number(gpu))); }
 
 double Mark::since(const Mark& earlier) const {
@@ -35,7 +35,8 @@ void Copies::hand_over(rust::Slice<size_t> out) const {
   const c10::Stream current = driver().getStream(tensors_.at(0).device());
   done_.block(current);
   for (size_t k = 0; k < out.size(); ++k) {
-    // Freed, their memory isn't given to the next copies before this stream has done what it was given until then.
+    // If a tensor is freed, the allocator then reuses its memory for later copies only after this stream has done the work enqueued until
+    // then.
     tensors_[k].record_stream(current);
     out[k] = reinterpret_cast<size_t>(new at::Tensor(tensors_[k]));
   }

@@ -1,5 +1,5 @@
-// What a GPU does beside its work: copies from the host on a stream of their own, and marks in a stream that tell when it came by. In
-// torch's words for any kind of device, so that no header of CUDA is needed, and a libtorch without it will do.
+// GPU utilities: copies from the host on a separate stream, events that measure time, and memory statistics. They use torch's
+// device-independent interfaces, so they need no CUDA headers and work with a libtorch without CUDA.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -15,12 +15,12 @@
 
 namespace globalsplat {
 
-// When a GPU was done with what had been given to its current stream.
+// Event that records when a GPU has completed the work enqueued in its current stream so far.
 class Mark {
  public:
   explicit Mark(int32_t gpu);
 
-  // Milliseconds from `earlier` on. Waits until the GPU has come by both.
+  // Returns the milliseconds since `earlier`. Waits until the GPU has reached both events.
   double since(const Mark& earlier) const;
 
  private:
@@ -29,13 +29,13 @@ class Mark {
 
 std::unique_ptr<Mark> mark(int32_t gpu);
 
-// New tensors on a GPU, and when they hold what was copied.
+// New tensors on a GPU, and the event after which they hold the copied data.
 class Copies {
  public:
   Copies(std::vector<at::Tensor> tensors, c10::Event done);
 
-  // Leaves the tensors to the caller, once, in their order. What the GPU's current stream is given from now on waits for the copies; the
-  // host doesn't.
+  // Passes the tensors to the caller, once and in order. Work that is enqueued in the GPU's current stream from now on waits for the
+  // copies; the host doesn't.
   void hand_over(rust::Slice<size_t> out) const;
 
  private:
@@ -43,13 +43,14 @@ class Copies {
   c10::Event done_;
 };
 
-// A stream for nothing but copies. One is kept for all of them: memory that is freed serves the stream that it was taken for.
+// Stream that is used only for copies. One stream serves all of them, because freed memory is reused only in the stream for which it was
+// allocated.
 class CopyStream {
  public:
   explicit CopyStream(int32_t gpu);
 
-  // Begins to copy tensors of the host, by their addresses; those that aren't in page-locked memory are brought there first. The
-  // originals may be freed at once.
+  // Starts copying host tensors, given by their addresses. Tensors outside of page-locked memory are first copied into it. The originals
+  // may be freed at once.
   std::unique_ptr<Copies> copy(rust::Slice<const size_t> tensors) const;
 
  private:
@@ -58,14 +59,15 @@ class CopyStream {
 
 std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
 
-// A new tensor of bytes, uninitialized, in page-locked memory of the host: a GPU copies from there by itself. The caller owns it.
+// Allocates an uninitialized byte tensor in page-locked host memory, from which a GPU can copy by itself. The caller owns it.
 void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
 
-// Bytes that tensors on a GPU took at the most, since the program began or since that was forgotten.
+// Returns the peak of the bytes that tensors take on a GPU since the start of the program or the last reset; the second function resets it.
 uint64_t peak_bytes(int32_t gpu);
 void forget_peak_bytes(int32_t gpu);
 
-// CUDA's convolutions of float32 round what they multiply to TF32's 11 bits unless they are told not to, as matrix products are.
+// Disables TF32 in CUDA's float32 convolutions, which by default round factors to TF32's 11 bits. Matrix products don't use TF32 by
+// default.
 void leave_out_tf32();
 
 }  // namespace globalsplat

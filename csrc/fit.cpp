@@ -27,7 +27,7 @@ auto by_type(const Tensor& t, Body body) {
   return t.scalar_type() == at::kDouble ? body(0.) : body(0.f);
 }
 
-// A scalar, and what it came from where a gradient is asked for: the gradient with respect to that, known already.
+// Returns a scalar loss, and saves the gradient of its argument, if requested; it has already been computed.
 Tensor with_gradient(AutogradContext* ctx, const Tensor& value, const Tensor& gradient) {
   if (gradient.defined()) ctx->save_for_backward({gradient});
   return value;
@@ -35,7 +35,8 @@ Tensor with_gradient(AutogradContext* ctx, const Tensor& value, const Tensor& gr
 
 Tensor of_argument(AutogradContext* ctx, const Tensor& g) {
   const Tensor gradient = ctx->get_saved_variables()[0];
-  // Mostly the loss itself: nothing to multiply by. A GPU would have to be waited for to know.
+  // The incoming gradient is usually 1, because the loss itself is differentiated: skip the product. On a GPU this check would have to
+  // wait.
   return g.is_cpu() && g.item<double>() == 1 ? gradient : at::mul(gradient, g);
 }
 
@@ -50,7 +51,7 @@ Tensor sum_of(const cuda::Parts& parts, const Tensor& like) {
   return cuda::tensor_of(parts.numbers.get(), {parts.count}, like.options().dtype(at::kDouble)).sum().to(like.scalar_type());
 }
 
-// Of two contiguous tensors of one type and device, whose kernels serve them or which is the CPU.
+// Photometric loss of two contiguous tensors of one type and device: the CPU, or a GPU that our kernels support.
 struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
   template <class T>
   static raster::FitJob<T> job_of(const Tensor& picture, const Tensor& photo) {
@@ -77,7 +78,7 @@ struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
   }
 };
 
-// The same.
+// Depth smoothness of contiguous tensors of one type and device: the CPU, or a GPU that our kernels support.
 struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
   template <class T>
   static raster::DepthJob<T> job_of(const Tensor& depths, const Tensor& photos) {
@@ -104,8 +105,8 @@ struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
   }
 };
 
-// Runs `Function` where the first argument is, or on the CPU, the others being constants, and leaves its result, on the first's device, to
-// the caller.
+// Runs `Function` on the device of the first argument if it is supported, and on the CPU otherwise; the second argument is constant. The
+// caller owns the result, which is on the device of the first argument.
 template <class Function, class... Numbers>
 void run(const Tensor& first, const Tensor& second, rust::Slice<size_t> out, Numbers... numbers) {
   const auto type = first.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;

@@ -23,16 +23,18 @@ using at::Tensor;
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
 
-// Of the gradient of weights, summed up part by part: both matrices are read along their columns, and more rows fall out of the caches.
+// Number of rows in each part of the sum for a weight gradient. Both matrices are read along their columns, and more rows don't fit into
+// the caches.
 constexpr int64_t kRows = 2048;
 
-// A product is computed in blocks of so many rows; of few rows, also in blocks of so many columns at least, until there are kBlocks.
+// Blocks of a product: kBlockRows rows each. With few rows, columns are split, too, into blocks of at least kBlockColumns, until there are
+// kBlocks.
 constexpr int64_t kBlockRows = 256, kBlockColumns = 256, kBlocks = 16;
 
 using Product = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
                        c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
 
-// What torch's compiler calls for a linear layer. Libtorch may have been built without it.
+// Finds the op that torch's compiler uses for a linear layer. libtorch may have been built without it.
 std::optional<c10::TypedOperatorHandle<Product>> find_product() {
   const auto found = c10::Dispatcher::singleton().findSchema({"mkldnn::_linear_pointwise", ""});
   if (!found) return {};
@@ -44,8 +46,8 @@ const std::optional<c10::TypedOperatorHandle<Product>>& product() {
   return known;
 }
 
-// Whether oneDNN computes products of float32 faster than MKL, to which libtorch gives them: MKL leaves half of the vector units idle on
-// processors that aren't Intel's.
+// Returns true if oneDNN computes float32 products faster than MKL, libtorch's default: MKL leaves half of the vector units idle on
+// processors of other makers than Intel.
 bool is_for_one_dnn() {
 #if defined(__x86_64__)
   static const bool is = [] {
@@ -58,32 +60,32 @@ bool is_for_one_dnn() {
 #endif
 }
 
-// xs [m, k] · weightsᵀ [n, k] + bias, if there is one, in float32 or bfloat16.
+// Computes xs [m, k] · weightsᵀ [n, k] + bias, if there is one, in float32 or bfloat16.
 Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
   if (xs.scalar_type() == at::kBFloat16 || !is_for_one_dnn()) return at::linear(xs, weights, bias);
   return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 
-// Throws std::bad_alloc unless there is memory for a product. Beside the result there may be the weights in oneDNN's order.
+// Throws std::bad_alloc unless there is memory for a product: for the result, and for a copy of the weights in oneDNN's layout.
 void expect_room_for(const Tensor& xs, const Tensor& weights) {
   expect_room_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
 }
 
-// Calls task(0) to task(count - 1), each on one of libtorch's threads. Called there, oneDNN and MKL compute on that thread alone.
+// Calls task(0) to task(count - 1), distributed over libtorch's threads. On such a thread, oneDNN and MKL use only that thread.
 void run_on_libtorch_threads(int64_t count, const std::function<void(int64_t)>& task) {
   std::atomic<int64_t> next{0};
   const auto take_tasks = [&](char**, const int64_t*, int64_t, int64_t) {
-    const at::AutoDispatchBelowAutograd no_gradients;  // each thread has its own mode
+    const at::AutoDispatchBelowAutograd no_gradients;  // this mode is per thread
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
   };
-  // at::parallel_for shares work only where OpenMP compiles it, so it is libtorch's own that is called here. For one element it would
-  // start no threads.
+  // at::parallel_for is parallel only in code that is compiled with OpenMP, so this calls a function in libtorch. For a single element it
+  // would start no threads.
   const Tensor an_element_each = at::empty({std::max(2, at::get_num_threads())}, at::kByte);
   at::TensorIterator::borrowing_nullary_op(an_element_each).for_each(take_tasks, 1);
 }
 
-// The same as multiply(), with the same bits for any number of threads: by how many a library shares a product out decides how it adds
-// up. Here each block is computed by one thread, and which blocks there are depends on the shape alone.
+// Computes multiply() with the same bits for any number of threads. A library splits sums depending on its number of threads. Here each
+// block is computed by one thread, and the blocks depend on the shape alone.
 Tensor multiply_in_blocks(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
   const int64_t m = xs.size(0), n = weights.size(0);
   const auto blocks_of = [](int64_t length, int64_t each) { return (length + each - 1) / each; };
@@ -123,7 +125,7 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
       d_xs = multiply(g, weights.t(), {});
     }
     if (ctx->needs_input_grad(1)) {
-      // Sums of bfloat16 parts would be rounded once more each.
+      // A sum of bfloat16 parts would round each part again.
       const int64_t at_once = g.scalar_type() == at::kBFloat16 ? g.size(0) : kRows;
       for (int64_t first = 0; first < g.size(0); first += at_once) {
         const int64_t rows = std::min(at_once, g.size(0) - first);

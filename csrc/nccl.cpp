@@ -1,5 +1,5 @@
-// Ranks on GPUs. The program isn't linked to libtorch's half for CUDA, which is loaded when a GPU is asked for; so what makes an NCCL
-// group is looked up there by name, and everything else goes through c10d's virtual functions.
+// Ranks on GPUs. The program isn't linked to libtorch's CUDA library, which is loaded when a GPU is requested. The functions that create an
+// NCCL group are therefore looked up by name, and everything else goes through c10d's virtual functions.
 #include "ranks.h"
 
 #if __has_include(<nccl.h>) && __has_include(<cuda_runtime.h>) && __has_include(<crt/host_config.h>) && __has_include(<nv/target>)
@@ -28,7 +28,7 @@ namespace {
 using c10d::ProcessGroupNCCL;
 using Options = ProcessGroupNCCL::Options;
 
-// A function of libtorch's half for CUDA, by its name as the compiler writes it.
+// Returns a function of libtorch's CUDA library, given its mangled name.
 template <class Function>
 Function* loaded(const char* name) {
   void* const function = dlsym(RTLD_DEFAULT, name);
@@ -36,7 +36,7 @@ Function* loaded(const char* name) {
   return reinterpret_cast<Function*>(function);
 }
 
-// A new object by a constructor, which is a function of the place for it and of its arguments.
+// Creates an object with a constructor, which is a function of the object's address and of the arguments.
 template <class T, class... Arguments>
 c10::intrusive_ptr<T> constructed(void (*constructor)(void*, Arguments...), std::common_type_t<Arguments>... arguments) {
   void* const place = ::operator new(sizeof(T));
@@ -52,7 +52,7 @@ c10::intrusive_ptr<T> constructed(void (*constructor)(void*, Arguments...), std:
 }  // namespace
 
 std::unique_ptr<Group> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
-  // Options have a struct of NCCL's inside, which grows from version to version.
+  // Options contain a struct of NCCL that grows from version to version.
   int version = 0;
   loaded<int(int*)>("ncclGetVersion")(&version);
   TORCH_CHECK(version == NCCL_VERSION_CODE, "built for NCCL ", NCCL_VERSION_CODE, ", libtorch has ", version);

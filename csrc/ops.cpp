@@ -13,9 +13,9 @@ namespace {
 thread_local rust::Vec<rust::String> noted;
 thread_local at::CallbackHandle callback = at::INVALID_CALLBACK_HANDLE;
 thread_local bool only_outermost = false;
-thread_local int within = 0;  // ops that have begun and not ended
+thread_local int within = 0;  // number of ops that have begun and not ended
 
-// Whether this is a step of autograd's engine, which calls ops, and not an op.
+// Returns true for a step of autograd's engine, which calls ops but is no op itself.
 bool is_of_engine(const at::RecordFunction& function) {
   return !function.operator_name() && std::strncmp(function.name(), "globalsplat::", 13) != 0;
 }
@@ -24,7 +24,7 @@ std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
   if (only_outermost && (is_of_engine(function) || within++ > 0)) return nullptr;
   const auto op = function.operator_name();
   std::string name = op ? c10::toString(*op) : std::string(function.name());
-  // `to(device)` comes by the overload with all options, of which it gives the device alone.
+  // `to(device)` calls the overload with all options and sets the device alone.
   if (name == "aten::to.dtype_layout" && function.inputs()[1].isNone()) name = "aten::to.device";
   noted.push_back(name);
   return nullptr;

@@ -1,4 +1,4 @@
-// Which ops libtorch is asked for: what tests count.
+// Recording of the libtorch ops that a computation calls, for tests that count them.
 #pragma once
 
 #include "rust/cxx.h"
@@ -9,8 +9,8 @@ namespace globalsplat {
 // are left out.
 void note_ops(bool outermost);
 
-// Ends that. The ops by their full names ("aten::add.Tensor"), in their order; what moves a tensor to a device, be it the one where it
-// is, is "aten::to.device".
+// Ends recording and returns the ops' full names ("aten::add.Tensor") in order. An op that moves a tensor to a device, including the device
+// on which it already is, is "aten::to.device".
 rust::Vec<rust::String> noted_ops();
 
 }  // namespace globalsplat

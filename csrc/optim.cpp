@@ -46,7 +46,7 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
                  rust::Slice<const size_t> second, const AdamWNumbers& of) {
   if (values.empty()) return;
   const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first), v = borrowed(second);
-  // The kernel goes through memory as it lies, and looks at nothing but the type.
+  // The kernel assumes equal memory layouts and checks nothing but the type.
   for (const auto* list : {&x, &g, &m, &v}) {
     TORCH_CHECK(list->size() == x.size(), "every parameter must have a gradient and two moments");
     for (size_t k = 0; k < x.size(); ++k) {
@@ -57,7 +57,7 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
     }
   }
   const at::NoGradGuard no_grad;
-  // All have done as many steps. Made on the device: to send a number there is to wait for it.
+  // All tensors have had the same number of steps. The scalar is created on the device, because copying it there would wait.
   const Tensor steps = at::full({}, double(of.steps), x[0].options().dtype(at::kFloat));
   at::_fused_adamw_(x, g, m, v, {}, std::vector<Tensor>(x.size(), steps), of.learning_rate, of.beta1, of.beta2, of.weight_decay,
                     of.epsilon, /*amsgrad=*/false, /*maximize=*/false);

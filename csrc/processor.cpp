@@ -14,7 +14,7 @@ namespace globalsplat {
 
 namespace {
 
-// Each of the libraries reads a variable of its own when it first chooses a kernel; one that the user has set stays.
+// Sets the variables that the libraries read when they first choose a kernel. Variables that the user has set are kept.
 SimdLimit limit_libraries() {
   struct Level {
     SimdLimit limit;
@@ -33,7 +33,7 @@ SimdLimit limit_libraries() {
   return SimdLimit::None;
 }
 
-// Set before main(), when nothing has chosen a kernel yet and there are no other threads.
+// Set before main(), when no library has chosen a kernel yet and there are no other threads.
 const SimdLimit limit = limit_libraries();
 
 Bf16 found() {
@@ -43,7 +43,7 @@ Bf16 found() {
     const auto found = capabilities.find(name);
     return found != capabilities.end() && found->second.isBool() && found->second.toBool();
   };
-  // What the processor has is of no use where the system doesn't lend it.
+  // The operating system may refuse tile instructions that the processor has.
   if (has("amx_bf16") && at::cpu::init_amx()) return Bf16::Tiles;
   return has("avx512_bf16") ? Bf16::Vectors : Bf16::None;
 }
@@ -59,7 +59,7 @@ Bf16 bf16_of_cpu() {
   return known;
 }
 
-// Convolutions and matrix products need the same: compute capability 8.0.
+// Convolutions and matrix products have the same requirement: compute capability 8.0.
 bool gpu_has_bf16() { return at::detail::getCUDAHooks().supportsBFloat16ConvolutionWithCuDNNv8(); }
 
 void flush_denormals() { at::globalContext().setFlushDenormal(true); }

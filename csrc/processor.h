@@ -1,4 +1,4 @@
-// What the processor has, and how it computes.
+// Features and floating-point modes of the processor.
 #pragma once
 
 #include <cstdint>
@@ -9,23 +9,22 @@ namespace globalsplat {
 
 enum class Bf16 : uint8_t;
 
-// What GLOBALSPLAT_SIMD limits instructions to, those of our kernels and, as if the processor had no others, those of libtorch, oneDNN
-// and MKL: `avx2` hides AVX-512 and bf16, `portable` AVX2 as well.
+// Instruction sets that GLOBALSPLAT_SIMD allows, for our own kernels and for those of libtorch, oneDNN and MKL: `avx2` hides AVX-512 and
+// bf16, `portable` hides AVX2 as well.
 enum class SimdLimit { None, Avx2, Portable };
 SimdLimit simd_limit();
 
-// Whether there are instructions for bf16, as libtorch sees it: without them its products are slower than those of float32. None where
+// Returns the CPU's bf16 instructions, as libtorch sees them; without any, bf16 products are slower than float32 products. None if
 // GLOBALSPLAT_SIMD hides them.
 Bf16 bf16_of_cpu();
 
-// The same of the current GPU.
+// Returns true if the current GPU has bf16 instructions.
 bool gpu_has_bf16();
 
-// The instruction set of libtorch's own kernels, such as "AVX2".
+// Returns the instruction set of libtorch's own kernels, such as "AVX2".
 rust::String libtorch_simd_level();
 
-// Has this thread, and those that it starts from now on, take numbers for 0 that are too small to have all their digits. Where the
-// processor can't, they stay.
+// Makes this thread, and threads that it starts from now on, treat denormal numbers as 0. A no-op on processors that don't support it.
 void flush_denormals();
 
 }  // namespace globalsplat

@@ -65,7 +65,7 @@ std::unique_ptr<Group> gloo([[maybe_unused]] const Store& store, [[maybe_unused]
 #if GLOBALSPLAT_GLOO
   using c10d::ProcessGroupGloo;
   auto options = ProcessGroupGloo::Options::create(std::chrono::seconds(seconds));
-  // As in PyTorch: the network that a person names, or that of this machine's name.
+  // Selects the network interface like PyTorch: the one that the user names, or the one of this machine's host name.
   const char* const interface = std::getenv("GLOO_SOCKET_IFNAME");
   const bool named = interface && *interface;
   options->devices.push_back(named ? ProcessGroupGloo::createDeviceForInterface(interface) : ProcessGroupGloo::createDefaultDevice());
@@ -103,19 +103,19 @@ void Group::all_gather(size_t tensor, rust::Slice<size_t> out) const {
   out[0] = reinterpret_cast<size_t>(new at::Tensor(all));
 }
 
-// What the parameters' hooks share. Backward passes of one step come one after the other, each in one thread.
+// State shared by the parameters' hooks. Backward passes of one step run one after the other, each in one thread.
 struct Buckets::State {
   struct Bucket {
-    size_t first, end;  // of the parameters
-    size_t missing;     // gradients that haven't come yet
+    size_t first, end;  // range of parameters
+    size_t missing;     // gradients not yet computed
   };
 
   Ranks ranks;
   std::vector<at::Tensor> parameters;
   std::vector<size_t> bucket_of;
   std::vector<Bucket> buckets;
-  bool waiting = false;  // for gradients
-  size_t sent = 0;       // buckets
+  bool waiting = false;  // true while gradients are collected
+  size_t sent = 0;       // number of buckets sent
   std::vector<bool> came;
   std::vector<c10::intrusive_ptr<c10d::Work>> works;
   std::exception_ptr error;
@@ -126,7 +126,7 @@ struct Buckets::State {
 
 namespace {
 
-// Tells a state that a parameter has its gradient.
+// Hook that notifies a state that a parameter has its gradient.
 template <class State>
 struct Arrival final : torch::autograd::PostAccumulateGradHook {
   Arrival(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
@@ -141,7 +141,7 @@ struct Arrival final : torch::autograd::PostAccumulateGradHook {
 
 void Buckets::State::arrived(size_t parameter) {
   if (!waiting || error) return;
-  // What is thrown here would end in the middle of the backward pass.
+  // An exception must not leave a hook in the middle of the backward pass.
   try {
     TORCH_CHECK(!came[parameter], "a parameter has had its gradient twice in a step");
     came[parameter] = true;
@@ -157,7 +157,7 @@ void Buckets::State::send(const Bucket& bucket) {
   std::vector<at::Tensor> pieces;
   for (size_t i = bucket.first; i < bucket.end; ++i) {
     const at::Tensor& gradient = parameters[i].grad();
-    // All ranks send as much, whoever has no gradient.
+    // All ranks must send the same amount of data, so missing gradients are sent as zeros.
     pieces.push_back(gradient.defined() ? gradient.reshape(-1) : at::zeros({parameters[i].numel()}, parameters[i].options()));
   }
   const at::Tensor flat = at::cat(pieces);
@@ -165,7 +165,7 @@ void Buckets::State::send(const Bucket& bucket) {
   int64_t offset = 0;
   for (size_t i = bucket.first; i < bucket.end; ++i) {
     const at::Tensor& parameter = parameters[i];
-    // The sum comes to lie where the optimizer looks for it.
+    // The sum replaces the gradient that the optimizer reads.
     if (parameter.grad().defined()) parameter.mutable_grad() = flat.narrow(0, offset, parameter.numel()).view(parameter.sizes());
     offset += parameter.numel();
   }

@@ -1,5 +1,5 @@
-// Processes that train together, the ranks: words that they leave for each other, what they add up, and gradients that are added up while
-// the backward pass still goes on. All of it by libtorch's own c10d, as Rust calls it through cxx. Tensors are addresses of live ones.
+// Communication among processes that train together, the ranks: a key-value store, collectives, and gradients that are summed while the
+// backward pass still runs. All of it uses libtorch's c10d, and Rust calls it through cxx. Tensors are passed as addresses of live tensors.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -18,15 +18,15 @@ namespace globalsplat {
 
 using Ranks = c10::intrusive_ptr<c10d::Backend>;
 
-// Words by their keys, kept by one process for all.
+// Key-value store that one process hosts for all.
 class Store {
  public:
   explicit Store(c10::intrusive_ptr<c10d::Store> store);
 
-  // A connection of its own, for another thread.
+  // Opens another connection, for another thread.
   std::unique_ptr<Store> another() const;
 
-  // Adds to a number, at first 0, and returns the sum.
+  // Adds to a number, initially 0, and returns the sum.
   int64_t add(rust::Str key, int64_t amount) const;
 
   const c10::intrusive_ptr<c10d::Store>& inner() const { return store_; }
@@ -35,27 +35,28 @@ class Store {
   c10::intrusive_ptr<c10d::Store> store_;
 };
 
-// The store at `host`, which this process keeps if it `serves` (at port 0: one that is free); keys of other `prefix`es are others'.
-// Nothing is waited for longer than `seconds`.
+// Connects to the store at `host`. The process hosts the store itself if it `serves` (with port 0: on a free port). Keys with another
+// `prefix` are separate. No operation waits longer than `seconds`.
 std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust::Str prefix, int64_t seconds);
 
-// Whether this build has what ranks need on CPUs (Gloo), and on GPUs (NCCL).
+// Return true if this build supports ranks on CPUs (Gloo) and on GPUs (NCCL).
 bool has_gloo();
 bool has_nccl();
 
-// All ranks. They call the same functions in the same order, with tensors of the same shape, type and kind of device.
+// Process group of all ranks. They must call the same functions in the same order, with tensors of the same shape, type and kind of device.
 class Group {
  public:
   explicit Group(Ranks ranks);
 
-  // The sum over all ranks, in place of what each has. A GPU's work is ordered, not waited for.
+  // Replaces a tensor by its sum over all ranks. Work on a GPU is enqueued, not waited for.
   void all_reduce(size_t tensor) const;
-  // What rank `from` has, in place of what the others have.
+  // Copies the tensor of rank `from` to all other ranks.
   void broadcast(size_t tensor, int32_t from) const;
-  // `out` receives a new tensor that the caller owns: what every rank has, one after the other along a new first dimension.
+  // Gathers a tensor from all ranks. `out` receives a new tensor that the caller owns: the ranks' tensors, stacked along a new first
+  // dimension.
   void all_gather(size_t tensor, rust::Slice<size_t> out) const;
 
-  // After the last call, on all ranks, where all went well: waits for what is under way. Without it NCCL breaks off.
+  // Waits for pending work. To be called on all ranks after the last successful collective; otherwise NCCL aborts.
   void shut_down() const { ranks_->shutdown(); }
 
   const Ranks& ranks() const { return ranks_; }
@@ -64,24 +65,24 @@ class Group {
   Ranks ranks_;
 };
 
-// A call that takes longer than `seconds` fails.
+// Creates a group for CPU tensors. Collectives that take longer than `seconds` fail.
 std::unique_ptr<Group> gloo(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
-// The same for tensors on GPUs. libtorch's half for CUDA must have been loaded.
+// Creates a group for GPU tensors. libtorch's CUDA library must have been loaded. Collectives that take longer than `seconds` fail.
 std::unique_ptr<Group> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 
-// The gradients of a step, added up over all ranks bucket by bucket: each leaves as soon as the backward pass has given all that is in it
-// and the one before it has left, so that the order is the same everywhere.
+// Gradients of a step, summed over all ranks in buckets. A bucket is sent as soon as the backward pass has computed all of its gradients
+// and the previous bucket has been sent, so the order is the same on all ranks.
 class Buckets {
  public:
-  // `parameters` in the order in which their gradients come, about; `bytes` of them make a bucket.
+  // Takes `parameters` in the approximate order in which their gradients are computed, and splits them into buckets of `bytes` bytes.
   Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes);
   ~Buckets();
   Buckets(const Buckets&) = delete;
 
-  // What the backward pass gives from now on is the last of this step.
+  // Announces that the next backward pass is the last of this step.
   void begin() const;
-  // Sends what is left, and waits for all (a GPU's work is ordered, not waited for). Gradients are the ranks' sums now. Returns how many
-  // there are, which must be the same on all ranks.
+  // Sends the remaining buckets and waits for all (work on a GPU is enqueued, not waited for). Gradients are now sums over the ranks.
+  // Returns the number of gradients, which must be the same on all ranks.
   size_t finish() const;
 
  private:

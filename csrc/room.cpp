@@ -9,7 +9,7 @@
 namespace globalsplat {
 
 void expect_room_for_code(int64_t bytes) {
-  // A quarter or half of a MiB for every shape of a product, and each thread has its own of up to 16 in attention.
+  // oneDNN compiles a quarter or half of a MiB for every shape of a product, and in attention each thread has up to 16 shapes.
   const size_t wanted = size_t(bytes) + (size_t(threads()) << 22);
   void* const room = mmap(nullptr, wanted, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
   if (room == MAP_FAILED) throw std::bad_alloc();

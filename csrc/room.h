@@ -1,12 +1,12 @@
-// Memory that is asked for before those are called who don't bear that the system refuses it.
+// Checks of available memory before calls into libraries that don't handle failed allocations.
 #pragma once
 
 #include <cstdint>
 
 namespace globalsplat {
 
-// Throws std::bad_alloc unless the system still gives `bytes`, and as much as oneDNN compiles in one call. Where it has none for the
-// code of a product, oneDNN writes beyond what it has, or frees an address that it never set.
+// Throws std::bad_alloc unless the system can still allocate `bytes`, plus the memory that oneDNN's compiler needs in one call. If the
+// allocation for a product's code fails, oneDNN writes out of bounds or frees an uninitialized pointer.
 void expect_room_for_code(int64_t bytes);
 
 }  // namespace globalsplat

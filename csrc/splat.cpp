@@ -19,15 +19,15 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
 
-// What serves tensors of that device and type. The CPU's backend serves devices that have none, and float64, which exists to prove
-// gradients.
+// Returns the backend for tensors of this device and type. The CPU backend also serves devices without a backend of their own, and float64,
+// which exists to verify gradients.
 const Backend& backend_of(const Tensor& means) {
   if (means.scalar_type() == at::kDouble) return cpu::backend;
   if (const Backend* emulated = cuda::emulated_backend()) return *emulated;
   return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
-// ---- what autograd keeps of a call: the inputs' seven tensors and three numbers, then the op's own tensors ----
+// ---- state that autograd saves for a call: the seven input tensors and three numbers, then the op's own tensors ----
 
 constexpr size_t kInputTensors = 7;
 constexpr size_t kInputs = 10;
@@ -47,10 +47,10 @@ Inputs saved_inputs(AutogradContext* ctx, const tensor_list& t) {
           ctx->saved_data["height"].toInt(), ctx->saved_data["eps2d"].toDouble()};
 }
 
-// Which of the inputs' tensors w2c is.
+// Index of w2c among the input tensors.
 constexpr size_t kW2c = 5;
 
-// As autograd wants them: none for intrinsics and numbers.
+// Returns gradients in autograd's order, undefined for intrinsics and numbers.
 tensor_list gradients_of(const Gradients& gradients) {
   const Gaussians& g = gradients.gaussians;
   tensor_list out = {g.means, g.scales, g.quaternions, g.opacities, g.sh, gradients.w2c};
@@ -107,7 +107,8 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
   }
 };
 
-// Checks the arguments, runs `Function` where a backend can, and leaves its results, on the device of the means, to the caller.
+// Checks the arguments and runs `Function` on a device that has a backend. The caller owns the results, which are on the device of the
+// means.
 template <class Function>
 void run(const SplatArguments& of, rust::Slice<size_t> out) {
   const Arguments a = borrowed(of);

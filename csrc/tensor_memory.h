@@ -1,14 +1,14 @@
-// How much memory tensors take: what tests measure.
+// Measurement of the memory that tensors take, for tests.
 #pragma once
 
 #include <cstdint>
 
 namespace globalsplat {
 
-// Begins counting the bytes that this thread's tensors on the CPU take and give back.
+// Begins counting the bytes that this thread allocates and frees for CPU tensors.
 void count_tensor_bytes();
 
-// Ends that, and returns the peak.
+// Ends counting and returns the peak.
 uint64_t most_tensor_bytes();
 
 }  // namespace globalsplat

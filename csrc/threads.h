@@ -1,12 +1,12 @@
-// Among how many threads our own kernels share their work.
+// Number of threads of our own kernels.
 #pragma once
 
 namespace globalsplat {
 
-// As many as libtorch uses, unless set_threads() has said otherwise.
+// Returns the number of threads: libtorch's, unless set_threads() has set another one.
 int threads();
 
-// From now on; 0: as many as libtorch uses.
+// Sets the number of threads; 0 selects libtorch's.
 void set_threads(int count);
 
 }  // namespace globalsplat

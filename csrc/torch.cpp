@@ -1,4 +1,4 @@
-// Everything that knows torch, as one translation unit: reading torch's headers is half of the work.
+// All code that includes torch, as one translation unit: parsing torch's headers is half of the compilation time.
 #include "arguments.cpp"
 #include "attention.cpp"
 #include "chunk.cpp"

@@ -1,8 +1,8 @@
-//! Gaussians optimized to a photo, with the differentiable splat op, two losses and an optimizer:
+//! Optimizes Gaussians to fit one photo, with the differentiable splat op, two losses and an optimizer:
 //!
 //!     cargo run --release --example fit_image -- photo.jpg fitted.png [STEPS]
 //!
-//! The picture shows the photo, the Gaussians as they began, and as they ended.
+//! The output image shows the photo, the initial render, and the final render.
 
 use globalsplat::data::fit;
 use globalsplat::eval::psnr;
@@ -16,9 +16,9 @@ use std::path::Path;
 use tch::{Device, Kind, Tensor};
 
 const GAUSSIANS: i64 = 4096;
-/// Of the picture's longer side, in pixels.
+/// Length of the image's longer side, in pixels.
 const LONGEST_SIDE: f64 = 256.;
-/// What one minus SSIM counts beside the mean squared error.
+/// Weight of one minus SSIM relative to the mean squared error.
 const SSIM_FACTOR: f64 = 0.02;
 
 fn main() -> Result<()> {
@@ -36,7 +36,7 @@ fn main() -> Result<()> {
     let gaussians = scattered(&camera);
     let mut optimizer = Optimizer::new(groups(&gaussians));
 
-    // [3, H, W], with the way back to every number of every Gaussian.
+    // Renders an image [3, H, W], through which gradients flow back to every parameter of every Gaussian.
     let draw = || -> Result<Tensor> {
         let pictures = render(&gaussians.activate(), &cameras, DEFAULT_EPS2D)?;
         Ok(pictures.rgb.select(0, 0).select(0, 0))
@@ -54,7 +54,7 @@ fn main() -> Result<()> {
     write_png(Path::new(out), &tile_horizontally(&[photo, before.clamp(0., 1.), after.clamp(0., 1.)]))
 }
 
-/// The photo [3, H, W], resized, and a camera that looks along z at a picture of that size.
+/// Returns the photo [3, H, W], resized, and a camera of that size that looks along z.
 fn load(path: &Path) -> Result<(Tensor, Camera)> {
     let image = read_image(path)?;
     let (width, height) = (f64::from(image.width()), f64::from(image.height()));
@@ -67,13 +67,13 @@ fn load(path: &Path) -> Result<(Tensor, Camera)> {
     Ok((planes.to_tensor(), camera))
 }
 
-/// Round grey Gaussians all over the picture, about one unit away, as large as they lie apart.
+/// Returns round grey Gaussians scattered over the image, about one unit away, each about as large as their spacing.
 fn scattered(camera: &Camera) -> RawGaussians {
     let options = (Kind::Float, Device::Cpu);
     let n = GAUSSIANS;
     tch::manual_seed(0);
     let uniform = || Tensor::rand([1, n, 1], options) - 0.5;
-    // What the camera sees in a distance of 1.
+    // Width and height of the camera's view at distance 1.
     let (width, height) =
         (f64::from(camera.width) / camera.intrinsics.fx, f64::from(camera.height) / camera.intrinsics.fy);
     let spacing = (width * height / n as f64).sqrt();
@@ -87,7 +87,7 @@ fn scattered(camera: &Camera) -> RawGaussians {
     }
 }
 
-/// Every kind of number has its own scale, and so its own learning rate.
+/// Returns one parameter group per kind of parameter, since each needs its own learning rate.
 fn groups(gaussians: &RawGaussians) -> Vec<ParameterGroup> {
     let learning_rate = |name: &str| match name {
         "means" => 1e-3,

@@ -1,4 +1,4 @@
-//! Photos to a splat, as `globalsplat reconstruct` does it:
+//! Turns photos into a splat, as `globalsplat reconstruct` does:
 //!
 //!     cargo run --release --example reconstruct -- model.safetensors captures/room room.ply
 
@@ -17,11 +17,11 @@ fn main() -> Result<()> {
     let model = load_model(Path::new(weights), Device::Cpu)?;
     let capture = open_capture(Path::new(scene))?;
     let data = &model.config.data;
-    // As many as the model saw in training, spread over the path of the camera, cut and resized to what it takes.
+    // As many photos as the model saw in training, spread along the camera path, cropped and resized to the model's image size.
     let views = load_context(&capture, Holdout::None, Some(data.context_views), data.image_size)?;
 
     let reconstruction = reconstruct(&model, &views, &[])?;
-    // The model works in a world in which all scenes are alike; this is the way back to the capture's own.
+    // The model works in a normalized coordinate system; this transforms the result back to the capture's own.
     let splat = reconstruction.to_splat()?;
     write_splat(Path::new(out), &splat)?;
     println!("{out}: {} Gaussians from {} photos", splat.gaussians.count(), views.len());

@@ -1,5 +1,5 @@
-//! What a GPU does beside its work: copies from the host on a stream of their own, and marks that tell when it was where. On the CPU
-//! the same calls do the same at once.
+//! Asynchronous copies from the host to a GPU on a stream of their own, and events that time the GPU's work. On the CPU the
+//! same calls run synchronously.
 
 use crate::render::handed_over;
 use cxx::UniquePtr;
@@ -10,7 +10,7 @@ use tch::{Device, Kind, Tensor};
 
 pub(crate) use ffi::leave_out_tf32;
 
-/// CUDA's number of a device, if it is one of CUDA's.
+/// Returns the CUDA device index, or `None` for a device that isn't a CUDA device.
 fn gpu(device: Device) -> Option<i32> {
     match device {
         Device::Cuda(number) => Some(number as i32),
@@ -18,14 +18,14 @@ fn gpu(device: Device) -> Option<i32> {
     }
 }
 
-/// A moment in the work of a device: on a GPU, when it is done with what it was given until then.
+/// Event for timing the work of a device: on a GPU, it is reached when all work queued before it is done.
 pub(crate) enum Moment {
     Host(Instant),
     Gpu(UniquePtr<ffi::Mark>),
 }
 
 impl Moment {
-    /// Now; a GPU isn't waited for.
+    /// Records an event now, without waiting for the GPU.
     pub fn now(device: Device) -> Self {
         match gpu(device) {
             Some(gpu) => Moment::Gpu(ffi::mark(gpu).expect("a GPU that works")),
@@ -33,7 +33,7 @@ impl Moment {
         }
     }
 
-    /// The time since `earlier`, of the same device. A GPU is waited for until it has come by both.
+    /// Returns the time elapsed since `earlier`, an event of the same device. Waits until the GPU has reached both events.
     pub fn since(&self, earlier: &Moment) -> Duration {
         match (self, earlier) {
             (Moment::Gpu(mark), Moment::Gpu(earlier)) => {
@@ -52,36 +52,37 @@ impl fmt::Debug for Moment {
     }
 }
 
-/// The way from the host to a device. To a GPU copies go while it works.
+/// Copies tensors from the host to a device; copies to a GPU overlap with its work.
 pub(crate) struct Upload {
     device: Device,
     stream: Option<UniquePtr<ffi::CopyStream>>,
 }
 
 impl Upload {
-    /// To be kept for all copies to `device`.
+    /// Creates an upload to `device`, to be reused for all copies to it.
     pub fn to(device: Device) -> Self {
         let stream = gpu(device).map(|gpu| ffi::copy_stream(gpu).expect("a GPU that works"));
         Upload { device, stream }
     }
 
-    /// Where it leads.
+    /// Returns the destination device.
     pub fn device(&self) -> Device {
         self.device
     }
 
-    /// Bytes of the host, zeros or anything else, in memory from which they are copied without another copy before.
+    /// Returns uninitialized bytes on the host, in page-locked memory if the device is a GPU, so that they are copied without
+    /// an intermediate buffer.
     pub fn bytes(&self, shape: &[i64]) -> Tensor {
         if self.stream.is_none() {
             return Tensor::empty(shape, (Kind::Uint8, Device::Cpu));
         }
-        // SAFETY: on success the C++ side has put a new tensor there.
+        // SAFETY: on success the C++ side has stored a new tensor in `out`.
         let done = unsafe { handed_over(|out| ffi::page_locked_bytes(shape, out)) };
         let [bytes] = done.expect("memory");
         bytes
     }
 
-    /// Begins to copy `tensors` of the host, which may be dropped at once.
+    /// Starts copying `tensors` from the host; the caller may drop them immediately.
     pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> Uploading<N> {
         match &self.stream {
             Some(stream) => {
@@ -100,19 +101,19 @@ impl fmt::Debug for Upload {
     }
 }
 
-/// Tensors on their way.
+/// Copy of tensors in progress.
 pub(crate) enum Uploading<const N: usize> {
     Done([Tensor; N]),
     Gpu(UniquePtr<ffi::Copies>),
 }
 
 impl<const N: usize> Uploading<N> {
-    /// The tensors on the device. What it is given from now on waits for them, the host doesn't.
+    /// Returns the tensors on the device. Work queued on the device from now on waits for the copy; the host doesn't.
     pub fn arrive(self) -> [Tensor; N] {
         match self {
             Uploading::Done(tensors) => tensors,
             Uploading::Gpu(copies) => {
-                // SAFETY: on success the C++ side has put new tensors there.
+                // SAFETY: on success the C++ side has stored new tensors in `out`.
                 let done = unsafe { handed_over(|out| copies.hand_over(out)) };
                 done.expect("a GPU that works")
             }

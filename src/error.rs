@@ -1,74 +1,74 @@
-//! What can go wrong, told in one sentence.
+//! The library's error type; every message is one sentence.
 
 use std::any::Any;
 use std::path::{Path, PathBuf};
 
-/// The library's result.
+/// Result type of the library.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// What a panic says of itself, on one line: libtorch appends stack traces to its messages.
+/// Returns the message of a panic, cut to its first line because libtorch appends stack traces to its messages.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("an unknown reason");
     text.lines().next().unwrap_or(text)
 }
 
-/// Has libtorch's errors, from now on and in the whole process, carry no stack trace. It is taken for every error, and kills the
-/// process where memory is short.
+/// Disables stack traces in libtorch's errors for the rest of the process. libtorch captures one for every error, and that
+/// kills the process when memory is short.
 pub fn leave_out_stack_traces() {
     globalsplat_csrc::render::leave_out_stack_traces();
 }
 
-/// Every failure of the library. [`Error::is_request`] tells a wrong request from work that failed.
+/// Error of the library. [`Error::is_request`] tells a wrong request from work that failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file holds something that can't be used.
+    /// Invalid value in a file.
     #[error("{}: {field} is {found}, expected {expected}", .file.display())]
     Input {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// Where in the file, in the file's own words.
+        /// Field of the file, in the words of its format.
         field: String,
-        /// What stands there.
+        /// Value found there.
         found: String,
-        /// What could stand there.
+        /// Value or values that were expected.
         expected: String,
     },
-    /// An argument, or a combination of arguments, that can't be met.
+    /// Invalid argument, or invalid combination of arguments.
     #[error("{0}")]
     Request(String),
-    /// The operating system refused to read.
+    /// Failed read of a file or folder.
     #[error("{} can't be read: {source}", .path.display())]
     Read {
-        /// The file or folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's own words.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The operating system refused to write.
+    /// Failed write of a file or folder.
     #[error("{} can't be written: {source}", .path.display())]
     Write {
-        /// The file or folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's own words.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// Work that was under way failed.
+    /// Failure of work after it had started.
     #[error("{0}")]
     Failed(String),
-    /// Processes that work together can't any more: almost always because one of them is gone.
+    /// Failed communication with the other processes, almost always because one of them has ended.
     #[error("the processes have lost each other ({0}); started again, they go on from what was saved")]
     Ranks(String),
-    /// libtorch refused an operation.
+    /// Error reported by libtorch.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
-    /// The C++ side refused an operation.
+    /// Error reported by the C++ side.
     #[error("{0}")]
     Cpp(#[from] cxx::Exception),
 }
 
 impl Error {
-    /// `file`: `field` is `found`, expected `expected`.
+    /// Returns an [`Error::Input`]: in `file`, `field` is `found`, expected `expected`.
     pub fn input(
         file: impl AsRef<Path>,
         field: impl Into<String>,
@@ -83,7 +83,7 @@ impl Error {
         }
     }
 
-    /// The setting `field` is `found`, expected `expected`.
+    /// Returns an [`Error::Request`]: the setting `field` is `found`, expected `expected`.
     pub fn setting(
         field: impl std::fmt::Display,
         found: impl std::fmt::Display,
@@ -92,29 +92,29 @@ impl Error {
         Error::Request(format!("{field} is {found}, expected {expected}"))
     }
 
-    /// For `map_err` on reading.
+    /// Returns a closure for `map_err` that wraps an I/O error in [`Error::Read`].
     pub fn read(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_owned();
         move |source| Error::Read { path, source }
     }
 
-    /// For `map_err` on writing.
+    /// Returns a closure for `map_err` that wraps an I/O error in [`Error::Write`].
     pub fn write(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_owned();
         move |source| Error::Write { path, source }
     }
 
-    /// Whether writing failed for want of room, which may come.
+    /// Returns `true` if a write failed because the disk was full, which may be temporary.
     pub fn is_disk_full(&self) -> bool {
         use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
         matches!(self, Error::Write { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
     }
 
-    /// Whether the request was wrong (exit code 2) rather than the work having failed (exit code 1).
+    /// Returns `true` if the request was wrong (exit code 2), `false` if the work failed (exit code 1).
     pub fn is_request(&self) -> bool {
         match self {
             Error::Input { .. } | Error::Request(_) => true,
-            // A file for which there is no room to be mapped is all right.
+            // The file itself is fine if there was too little memory to map it.
             Error::Read { source, .. } => source.kind() != std::io::ErrorKind::OutOfMemory,
             _ => false,
         }

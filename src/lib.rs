@@ -8,7 +8,7 @@
 //! # fn main() -> globalsplat::Result<()> {
 //! let model = shipped_model(tch::Device::Cpu)?;
 //! let capture = open_capture("captures/room".as_ref())?;
-//! // Twelve photos, spread over the path of the camera and fitted to the model.
+//! // Twelve photos, spread along the camera path and resized to the model's image size.
 //! let views = load_context(&capture, Holdout::None, Some(12), model.config.data.image_size)?;
 //! let reconstruction = reconstruct(&model, &views, &[])?;
 //! write_splat("room.ply".as_ref(), &reconstruction.to_splat()?)?;
@@ -16,12 +16,14 @@
 //! # }
 //! ```
 //!
-//! `examples/` has this as a program, and one that optimizes Gaussians on a photo with the differentiable splat op alone.
+//! `examples/` contains this as a program, and another that optimizes Gaussians to fit one photo with the differentiable splat
+//! op alone.
 //!
-//! Modules, from what a person touches down to the ground; each uses those below it and [`scene`]:
-//! [`eval`] judges, [`train`] trains, [`refine`] makes splats sharp, [`reconstruct`] makes them of photos, [`config`] has what a
-//! run depends on, [`optim`] and [`loss`] are what learning needs, [`data`] reads captures, [`synth`] makes them up, [`io`] has
-//! files, [`ranks`] processes that train together, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] camera maths.
+//! Modules, from the highest level to the lowest; each uses only those after it in this list, and [`scene`]:
+//! [`eval`] computes metrics, [`train`] trains, [`refine`] optimizes a splat per scene, [`reconstruct`] turns photos into
+//! splats, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the losses, [`data`]
+//! reads captures, [`synth`] generates synthetic scenes, [`io`] reads and writes files, [`ranks`] connects the processes of
+//! distributed training, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] the camera maths.
 
 #[doc(hidden)]
 pub mod bench;

@@ -1,9 +1,9 @@
-//! The floor plan: which module may use which, held against every `use` in `src/`.
+//! The layers of the architecture: which module may use which, checked against every `use` in `src/`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// From what a person touches down to the ground: a module uses those after it, and those on the ground.
+/// Layers, from the highest to the lowest: a module may use those after it, and those in [`GROUND`].
 const FLOORS: [&str; 18] = [
     "cli",
     "parity",
@@ -26,13 +26,13 @@ const FLOORS: [&str; 18] = [
 ];
 const GROUND: [&str; 2] = ["scene", "error"];
 
-/// A module by its path, as ["data", "formats", "colmap"].
+/// Path of a module, as ["data", "formats", "colmap"].
 type Module = Vec<String>;
 
 struct Source {
-    /// Without comments and tests.
+    /// Source code without comments and tests.
     text: String,
-    /// Whether it is a `mod.rs`, or `lib.rs`.
+    /// `true` for a `mod.rs`, or `lib.rs`.
     is_parent: bool,
 }
 
@@ -54,7 +54,7 @@ fn arrows_go_down() {
     assert!(arrows > 100, "{arrows} arrows: are all of them found?");
 }
 
-/// Captures and splats can be read, written and drawn where nothing is known of a network.
+/// The modules that read, write and render captures and splats don't depend on the network.
 #[test]
 fn data_know_no_model() {
     let arrows = arrows_of(&sources());
@@ -73,8 +73,8 @@ fn data_know_no_model() {
     assert!(reached.contains("scene") && !reached.contains("model"), "data reach {reached:?}");
 }
 
-/// Of the modules in one folder, each with all that is below it: none uses, by way of whatever others, one that uses it. What a
-/// `mod.rs` holds is for the files below it, and these are for it.
+/// No modules of one folder, each with all its submodules, use each other in a cycle, directly or indirectly. Items of a
+/// `mod.rs` are for the files below it, and these are for it.
 #[test]
 fn files_use_each_other_in_one_direction() {
     let graph = siblings(arrows_of(&sources()));
@@ -85,7 +85,7 @@ fn files_use_each_other_in_one_direction() {
     }
 }
 
-/// Every module has a room in the figure, and a line in CONTRIBUTING.md, where they come in the order of the floors.
+/// Every module has a box in the figure, and a line in CONTRIBUTING.md, where they come in the order of the layers.
 #[test]
 fn the_plan_is_drawn() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -106,7 +106,7 @@ fn circles_and_paths_are_found() {
     let graph = |arrows: &[(&str, &str)]| siblings(arrows.iter().map(|(a, b)| (module(a), module(b))));
     assert!(circle(&graph(&[("a", "b"), ("b", "c"), ("a", "c")])).is_none());
     assert_eq!(circle(&graph(&[("a", "b"), ("b", "c"), ("c", "b")])).map(|circle| circle.len()), Some(3));
-    // Through files below one of them, but not between a parent and its children.
+    // A cycle may go through submodules, but parents and children may use each other.
     assert!(circle(&graph(&[("a::b", "a::c"), ("a::c::d", "a::b"), ("a", "e")])).is_some());
     assert!(circle(&graph(&[("a", "a::b"), ("a::b", "a::c::d"), ("a::c::d", "a")])).is_none());
     let text = "use crate::{a::{B, c::D}, E as F};\nlet x = super::g::h();";
@@ -117,7 +117,7 @@ fn circles_and_paths_are_found() {
     );
 }
 
-/// (user, used), by the file in which what is used is defined.
+/// Returns pairs (user, used), where `used` is the file that defines the item.
 fn arrows_of(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
     let mut arrows = BTreeSet::new();
     for (module, source) in sources {
@@ -133,10 +133,10 @@ fn arrows_of(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
     arrows
 }
 
-/// The file that defines what `path` names when it stands in `module`; re-exports are followed.
+/// Returns the file that defines the item that `path` names in `module`; re-exports are followed.
 fn resolve(sources: &BTreeMap<Module, Source>, module: &Module, path: &[&str]) -> Option<Module> {
     let mut at = match path[0] {
-        // The second is the library, as the program calls it.
+        // `globalsplat` is the library's name in the program.
         "crate" | "globalsplat" => vec![],
         "super" | "self" => module.clone(),
         child => [module.clone(), vec![child.to_string()]].concat(),
@@ -157,7 +157,7 @@ fn resolve(sources: &BTreeMap<Module, Source>, module: &Module, path: &[&str]) -
     sources.contains_key(&at).then_some(at)
 }
 
-/// Where `item` comes from, if `module` is a parent that only re-exports it.
+/// Returns the module that defines `item`, if `module` is a parent that only re-exports it.
 fn re_exported(sources: &BTreeMap<Module, Source>, module: &Module, item: &str) -> Option<Module> {
     let source = sources.get(module).filter(|source| source.is_parent)?;
     let exports = paths(&source.text).into_iter().filter(|path| path.ends_with(&format!("::{item}")));
@@ -168,7 +168,7 @@ fn re_exported(sources: &BTreeMap<Module, Source>, module: &Module, item: &str) 
     })
 }
 
-/// Which of the modules in one folder use which others there, for themselves or for what is below them.
+/// Returns which modules of a folder use which others of that folder, for themselves or for their submodules.
 fn siblings(arrows: impl IntoIterator<Item = (Module, Module)>) -> BTreeMap<Module, BTreeSet<Module>> {
     let mut graph: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
     for (from, to) in arrows {
@@ -180,7 +180,7 @@ fn siblings(arrows: impl IntoIterator<Item = (Module, Module)>) -> BTreeMap<Modu
     graph
 }
 
-/// Some modules each of which uses the next, and the last the first.
+/// Returns a cycle of modules, each of which uses the next, and the last the first.
 fn circle(graph: &BTreeMap<Module, BTreeSet<Module>>) -> Option<Vec<Module>> {
     fn visit(
         graph: &BTreeMap<Module, BTreeSet<Module>>,
@@ -204,8 +204,7 @@ fn circle(graph: &BTreeMap<Module, BTreeSet<Module>>) -> Option<Vec<Module>> {
     graph.keys().find_map(|start| visit(graph, start, &mut vec![], &mut done))
 }
 
-/// All `use`d paths, braces multiplied out, and those that stand in the code and begin with `crate`, `super` or
-/// `globalsplat`.
+/// Returns all `use`d paths, with braces expanded, and all paths in the code that begin with `crate`, `super` or `globalsplat`.
 fn paths(text: &str) -> Vec<String> {
     let mut found = vec![];
     let mut rest = text;
@@ -222,7 +221,7 @@ fn paths(text: &str) -> Vec<String> {
     found
 }
 
-/// Where the next path begins, and whether it is a `use`.
+/// Returns the offset of the next path, and `true` if it is a `use`.
 fn next_path(text: &str) -> Option<(usize, bool)> {
     let inline = ["crate::", "super::", "globalsplat::"].iter().filter_map(|start| text.find(start)).min();
     let used = text.find("use ").map(|at| at + "use ".len());
@@ -233,7 +232,7 @@ fn next_path(text: &str) -> Option<(usize, bool)> {
     }
 }
 
-/// `a::{b, c::{d, e}}` as `a::b`, `a::c::d`, `a::c::e`, each behind `prefix`.
+/// Expands `a::{b, c::{d, e}}` to `a::b`, `a::c::d`, `a::c::e`, each prefixed with `prefix`.
 fn expand(prefix: &str, tree: &str, into: &mut Vec<String>) {
     let tree = tree.trim();
     match tree.split_once('{') {
@@ -261,7 +260,7 @@ fn expand(prefix: &str, tree: &str, into: &mut Vec<String>) {
     }
 }
 
-/// Without comments, and without tests, which may use anything.
+/// Returns the source without comments and without tests, which may use anything.
 fn code(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
     let without = |line: &str| {
@@ -272,7 +271,7 @@ fn code(text: &str) -> String {
     text.lines().map(without).collect()
 }
 
-/// The files of the library and of the program.
+/// Returns the source files of the library and of the program.
 fn sources() -> BTreeMap<Module, Source> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut files: Vec<PathBuf> = vec![];

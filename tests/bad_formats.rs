@@ -1,5 +1,5 @@
-//! Captures of other tools' formats that can't be right: one sentence that names file, field, what was found and what was
-//! expected; exit code 2.
+//! Invalid captures in other tools' formats give one sentence that names file, field, what was found and what was expected, and
+//! exit code 2.
 
 mod common;
 
@@ -10,7 +10,8 @@ use serde_json::{Value, json};
 use std::path::Path;
 use tempfile::TempDir;
 
-/// That the room as `format` with `file` changed is refused, and that the sentence has all of `parts` and the file.
+/// Asserts that the room in `format`, with `file` changed, is refused, and that the message contains all of `parts` and the
+/// file.
 fn refused(format: Format, file: &str, change: impl FnOnce(&mut Vec<u8>), parts: &[&str]) {
     let (_folder, room) = room();
     rewrite(&room, format);
@@ -75,9 +76,9 @@ fn transforms_with_poses_that_are_none() {
     pose(|m| m[1][2] = json!("0"), &["row 1, column 2 of", "is \"0\"", "a number"]);
     pose(|m| m[1][2] = Value::Null, &["NaN", "finite numbers"]);
     pose(|m| m[0][0] = json!(1.5), &["isn't rigid", "a rotation"]);
-    // Within what a cameras.json may be off, and more than the digits of this format are.
+    // Within the tolerance of a cameras.json, but beyond that of this format, whose values have more digits.
     pose(|m| m[0][1] = json!(m[0][1].as_f64().unwrap() + 0.0024), &["isn't rigid", "nearest rotation"]);
-    // Scaled along one axis, and sheared.
+    // Scaled along one axis, and then sheared.
     pose(|m| (0..3).for_each(|i| m[i][0] = json!(m[i][0].as_f64().unwrap() * 0.5)), &["isn't rigid"]);
     pose(
         |m| (0..3).for_each(|i| m[i][0] = json!(m[i][0].as_f64().unwrap() + 0.5 * m[i][1].as_f64().unwrap())),
@@ -150,7 +151,7 @@ fn a_photo_of_another_size_than_transforms_say() {
     }
 }
 
-/// [`refused`] for a text file of a COLMAP model, `from` replaced by `to` in it.
+/// Calls [`refused`] for a text file of a COLMAP model, with `from` replaced by `to`.
 fn refused_text(name: &str, from: &str, to: &str, parts: &[&str]) {
     let change = |bytes: &mut Vec<u8>| {
         let text = String::from_utf8(bytes.clone()).unwrap();
@@ -192,7 +193,7 @@ fn colmap_text_with_images_that_are_none() {
         " 8 004.png",
         &["camera id of image 5 (004.png) is 8", "one of the 1", "cameras.txt"],
     );
-    // The fifth of nine cameras stands in the middle: no rotation, no translation.
+    // The fifth of nine cameras is in the middle: no rotation, no translation.
     images(
         "\n5 1 ",
         "\n5 0 ",
@@ -202,7 +203,7 @@ fn colmap_text_with_images_that_are_none() {
     images("\n5 1 ", "\n5 one ", &["QW in line 10 is \"one\"", "a number"]);
     images(" 7 004.png", "inf 7 004.png", &["TZ in line 10 is", "inf\"", "a number"]);
     images("\n5 1 ", "\n-5 1 ", &["IMAGE_ID in line 10 is \"-5\"", "a whole number"]);
-    // Without the second line of each image the next image stands where its points should.
+    // Without the second line of each image, the next image is read where its points should be.
     images("004.png\n\n", "004.png\n", &["POINTS2D in line 11 is 10 words", "an empty line"]);
 }
 
@@ -212,7 +213,7 @@ fn colmap_binaries_with_values_that_are_none() {
         let change = |bytes: &mut Vec<u8>| bytes[at..at + value.len()].copy_from_slice(value);
         refused(Format::ColmapBinary, &format!("sparse/0/{name}.bin"), change, parts);
     };
-    // A count, then from byte 8 on: id, model, width, height, parameters.
+    // Layout: a count, then from byte 8 on: id, model, width, height, parameters.
     let cameras = |at: usize, value: &[u8], parts: &[&str]| put("cameras", at, value, parts);
     cameras(0, &u64::MAX.to_le_bytes(), &["number of cameras is 18446744073709551615", "1 at most"]);
     cameras(0, &2u64.to_le_bytes(), &["number of cameras is 2", "1 at most"]);
@@ -223,7 +224,7 @@ fn colmap_binaries_with_values_that_are_none() {
     cameras(12, &4i32.to_le_bytes(), &["the parameters of camera 7", "cut short", "after 64 bytes"]);
     cameras(16, &(1u64 << 40).to_le_bytes(), &["width of camera 7 is 1099511627776", "a number of pixels"]);
     cameras(32, &f64::NAN.to_le_bytes(), &["focal length fx of camera 7 is NaN"]);
-    // A count, then from byte 8 on: id, quaternion, translation, camera id, name, points.
+    // Layout: a count, then from byte 8 on: id, quaternion, translation, camera id, name, points.
     let images = |at: usize, value: &[u8], parts: &[&str]| put("images", at, value, parts);
     images(0, &(1u64 << 61).to_le_bytes(), &["number of images is 2305843009213693952", "at most"]);
     images(12, &f64::NAN.to_le_bytes(), &["rotation of image 9 (008.png) is [NaN", "a quaternion"]);
@@ -238,7 +239,7 @@ fn colmap_binaries_with_values_that_are_none() {
     refused(Format::ColmapBinary, "sparse/0/images.bin", endless, &["number of images is 9", "0 at most"]);
 }
 
-/// The room as a binary COLMAP model, opened with every change to `name` that `changes` makes of its bytes.
+/// Opens the room as a binary COLMAP model with each version of the file `name` that `changes` returns, and returns the errors.
 fn open_changed(name: &str, changes: impl Fn(&[u8]) -> Vec<Vec<u8>>) -> (TempDir, Vec<Option<String>>) {
     let (folder, room) = room();
     rewrite(&room, Format::ColmapBinary);
@@ -280,7 +281,7 @@ fn colmap_binaries_with_any_byte_wrong_never_panic() {
             };
             (0..whole.len()).map(at).collect()
         });
-        // What remains are last digits, ids, points, and quaternions, which may be of any length.
+        // The unnoticed changes are of last digits, ids, points, and quaternions, which may have any length.
         let noticed = errors.iter().flatten().count();
         assert!(noticed > errors.len() / 5, "{noticed} of {}", errors.len());
     }

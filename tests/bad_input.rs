@@ -1,5 +1,5 @@
-//! Bad input: one clear sentence that names file, field, what was found and what was expected; exit code 2, or 1 for work
-//! that fails; and nothing half-written.
+//! Bad input gives one clear sentence that names file, field, what was found and what was expected; exit code 2, or 1 for work
+//! that fails; and no partial output.
 
 mod common;
 
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The room with its `cameras.json` changed.
+/// Returns a copy of the room with its `cameras.json` changed.
 fn broken_room(change: impl FnOnce(&mut Value)) -> (tempfile::TempDir, PathBuf) {
     let (folder, room) = room();
     let file = room.join("cameras.json");
@@ -18,7 +18,7 @@ fn broken_room(change: impl FnOnce(&mut Value)) -> (tempfile::TempDir, PathBuf) 
     (folder, room)
 }
 
-/// What scoring the room's own splat against it says.
+/// Returns the error message of evaluating the room's own splat.
 fn refuse_room(room: &Path) -> String {
     let splat = room.join("truth.ply");
     let error = refuse(&["eval", "--splat", arg(&splat), "--scene", arg(room)]);
@@ -69,7 +69,7 @@ fn a_pose_with_nan() {
     let (_folder, room) = room();
     let file = room.join("cameras.json");
     let text = std::fs::read_to_string(&file).unwrap();
-    let at = text.rfind("1.0").unwrap(); // the last pose's last entry
+    let at = text.rfind("1.0").unwrap(); // the last element of the last pose
     std::fs::write(&file, format!("{}NaN{}", &text[..at], &text[at + 3..])).unwrap();
     assert_says(&refuse_room(&room), &["c2w of view 8", "NaN", "finite numbers"]);
 }
@@ -150,7 +150,7 @@ fn an_image_size_that_the_patch_does_not_divide() {
     assert!(!run.exists(), "nothing was begun");
 }
 
-/// The room's splat with its bytes changed.
+/// Returns the error message of inspecting the room's splat with its bytes changed.
 fn broken_splat(change: impl FnOnce(&mut Vec<u8>)) -> String {
     let (folder, room) = room();
     let file = folder.path().join("broken.ply");
@@ -202,7 +202,7 @@ fn a_splat_that_is_something_else() {
     assert_says(&error, &["a list"]);
 }
 
-/// The tiny model's weights with a tensor changed.
+/// Returns the error message of reconstructing with the tiny model's weights after a change of its tensors.
 fn broken_weights(change: impl FnOnce(&mut std::collections::BTreeMap<String, tch::Tensor>)) -> String {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
@@ -340,7 +340,7 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let (splat, config) = (room.join("truth.ply"), tiny_config(folder.path(), &room));
-    // A file where a folder has to be: no rights to bypass, even for root.
+    // A file where a folder must be: this is refused even for root.
     let blocked = room.join("cameras.json").join("below.ply");
     let before = std::fs::read(room.join("cameras.json")).unwrap();
     for arguments in [
@@ -369,10 +369,10 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
     assert_says(&error, &["a folder", "the name of a file"]);
 }
 
-/// Runs the program where no file can grow beyond `kilobytes`: to it, the disk is full.
+/// Runs the program with a file size limit of `kilobytes`, which acts like a full disk.
 #[cfg(unix)]
 fn on_a_full_disk(kilobytes: u32, arguments: &[&str]) -> std::process::Output {
-    // Ignoring SIGXFSZ makes the system refuse the write instead of ending the program.
+    // If SIGXFSZ is ignored, the system refuses the write instead of ending the program.
     let script = format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\"");
     Command::new("bash")
         .args(["-c", &script, "bash", env!("CARGO_BIN_EXE_globalsplat")])
@@ -494,7 +494,7 @@ fn perceptual_losses_without_their_weights() {
         &["is elsewhere/v.safetensors"],
     );
     assert_says(&train("vgg16", "perceptual_factor=1"), &["unknown variant `vgg16`"]);
-    // Another network's weights.
+    // Weights of another network.
     let weights = tiny_weights(folder.path(), &room);
     let named = format!("perceptual_weights={:?}", arg(&weights));
     assert_says(&train("vgg19", &named), &["tiny.safetensors", "features.0."]);

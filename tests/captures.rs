@@ -1,4 +1,4 @@
-//! Published splats of real captures, rendered at the captures' own cameras.
+//! Published splats of real captures, rendered from the captures' own cameras.
 
 mod common;
 
@@ -12,11 +12,11 @@ use globalsplat::render::transform;
 use globalsplat::scene::Similarity;
 use std::path::{Path, PathBuf};
 
-/// Mean PSNR and SSIM over a capture's views that the published splat is known to reach.
+/// Mean PSNR and SSIM over a capture's views that the published splat must reach.
 const PUBLISHED: [(&str, [f64; 2]); 2] =
     [("322261824c4a3003", [29.089, 0.9160]), ("5aca87f95a9412c6", [27.222, 0.9175])];
 
-/// Captures that `table` knows, one at least, with what it says of them; or else none, as other captures are fine, too.
+/// Returns the captures that are in `table`, with its values, at least one; if only other captures are available, none.
 fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
     let Some(paths) = captures() else { return vec![] };
     let known: Vec<_> = paths
@@ -33,7 +33,7 @@ fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
     known
 }
 
-/// Scores the splat that was published for the capture in `folder` at all of its cameras.
+/// Scores the published splat of the capture in `folder` at all of its cameras.
 fn published_scores(folder: &Path, capture: &Capture, perceptual: &Perceptual) -> CaptureScores {
     let scene = EvalScene::all_views(capture, None);
     let mut made =
@@ -51,7 +51,7 @@ fn published_splats_reach_their_scores() {
     }
 }
 
-/// Mean LPIPS over a capture's views, by VGG-16 and AlexNet, that the published splat is known to have.
+/// Mean LPIPS over a capture's views, by VGG-16 and AlexNet, that the published splat must reach.
 const PUBLISHED_LPIPS: [(&str, [f64; 2]); 2] =
     [("322261824c4a3003", [0.1148, 0.0500]), ("5aca87f95a9412c6", [0.1020, 0.0484])];
 
@@ -113,7 +113,7 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
         let before = globalsplat::render::render_views(&splat, &cameras[..2]).expect("pictures");
         let after = globalsplat::render::render_views(&moved, &moved_cameras).expect("pictures");
         for (a, b) in before.iter().zip(&after) {
-            // Not to the last bit: positions of size 10 instead of 1 keep fewer digits in float32.
+            // Not bit-identical: positions of size 10 instead of 1 have fewer fractional digits in float32.
             assert!(globalsplat::eval::psnr(&b.rgb, &a.rgb) > 60.);
             assert!(common::relative_error(&b.depth, &(&a.depth * to.scale)) < 1e-3);
         }

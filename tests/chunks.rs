@@ -1,4 +1,4 @@
-//! Chunks: written and read back, and what is refused.
+//! Chunks: writing, reading back, and invalid files.
 
 mod common;
 
@@ -14,7 +14,8 @@ use zip::{CompressionMethod, ZipWriter};
 
 const SCENES: [&str; 3] = ["room_0", "room_1", "room_2"];
 
-/// Three small captures in `folder`, and chunks of two scenes and of one in `folder/chunks`.
+/// Writes three small captures to `folder`, packs them into chunks of two scenes and of one in `folder/chunks`, and returns
+/// that folder.
 fn packed(folder: &Path) -> PathBuf {
     let chunks = folder.join("chunks");
     std::fs::create_dir(&chunks).unwrap();
@@ -46,7 +47,7 @@ fn a_packed_capture_comes_back() {
             let (found, expected) =
                 (open.capture(key).unwrap(), open_capture(&folder.path().join(key)).unwrap());
             assert_eq!(&found.name, key);
-            // The numbers of a chunk are float32.
+            // The values of a chunk are float32.
             let cameras: Vec<_> = expected.cameras();
             for (a, b) in found.cameras().iter().zip(&cameras) {
                 assert!(a.c2w.abs_diff_eq(b.c2w, 1e-6));
@@ -97,7 +98,7 @@ fn chunks_that_interrupted_work_left_are_taken_over() {
         assert_eq!(writer.finish().unwrap(), 2);
         assert_eq!(read(), before);
     }
-    // Of other work, by its names or by its photos.
+    // Chunks of other captures, recognized by their names or their photos.
     std::fs::remove_file(&files[0]).unwrap();
     let others = ["room_1", "room_0", "room_2"].map(String::from);
     for (keys, first) in [(others, SCENES[0]), (SCENES.map(String::from), SCENES[1])] {
@@ -116,7 +117,7 @@ fn a_data_set_is_found_split_by_split() {
     std::fs::rename(&chunks, root.join("test")).unwrap();
     let dataset = Dataset::open(&root, Split::Test).unwrap();
     assert_eq!((dataset.name.as_str(), dataset.scenes()), ("set", 3));
-    // Folders of captures are data sets as well.
+    // Folders of captures are datasets as well.
     let captures = Dataset::open(folder.path(), Split::Train).unwrap();
     assert!(captures.groups().iter().any(|group| group.keys == ["room_0"]));
 }
@@ -164,7 +165,7 @@ fn pack_and_inspect_tell_what_they_did() {
     assert!(twice.contains("which 000000.torch holds already"), "{twice}");
 }
 
-/// A torch.save archive with `pickle` and one tensor's bytes.
+/// Returns a torch.save archive with `pickle` and the bytes of one tensor.
 fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
@@ -186,23 +187,23 @@ fn assert_refused(pickle: &[u8], for_what: &str) {
     assert!(error.contains(for_what), "{error:?} lacks {for_what:?}");
 }
 
-/// BINUNICODE.
+/// Returns a BINUNICODE opcode with its argument.
 fn text(text: &str) -> Vec<u8> {
     [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
-/// BININT.
+/// Returns a BININT opcode with its argument.
 fn int(value: u32) -> Vec<u8> {
     [b"J", &value.to_le_bytes()[..]].concat()
 }
 
-/// A tensor of `storage` with `size` numbers by `stride` at `offset` of a storage that claims to have 64.
+/// Returns a pickled tensor of `size` with `stride` at `offset` of a storage that claims to have 64 elements.
 fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
     let id = [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cpu"), int(64)];
     tensor_of(&id, offset, size, stride)
 }
 
-/// A tensor of the storage that a persistent id of these parts stands for.
+/// Returns a pickled tensor of the storage with a persistent id of these parts.
 fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
     let tuple = |values: &[u32]| {
         [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
@@ -219,7 +220,7 @@ fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u
     .concat()
 }
 
-/// A list of one scene with one view, its fields given.
+/// Returns the pickle of a list of one scene with one view, its fields given.
 fn scene(cameras: &[u8], timestamps: &[u8], image: &[u8]) -> Vec<u8> {
     let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
     [
@@ -246,7 +247,7 @@ fn good_timestamps() -> Vec<u8> {
 fn what_a_pickle_may_not_do_is_not_done() {
     let folder = tempfile::tempdir().unwrap();
     let trap = folder.path().join("trap");
-    // What Python would run: os.system("touch trap").
+    // Call that Python would execute: os.system("touch trap").
     let command = format!("touch {}", trap.display());
     for module in ["os", "posix"] {
         let program =
@@ -267,7 +268,7 @@ fn unsound_pickles_are_refused() {
     let nested = [b"\x80\x02".to_vec(), b"]".repeat(100_000), b"a".repeat(99_999), b".".to_vec()].concat();
     assert_refused(&nested, "scene 0 is a list, expected a dict");
     assert_refused(b"\x80\x02]r\xff\xff\xff\xff.", "memo 4294967295");
-    // A list that is part of itself.
+    // A list that contains itself.
     assert_refused(b"\x80\x02]q\x00h\x00a.", "scene 0 is a list, expected a dict");
     assert_refused(b"\x80\x02]q\x00(h\x00e.", "scene 0 is a list, expected a dict");
     assert_refused(b"\x80\x02}K\x01a.", "appends to a dict");
@@ -295,7 +296,7 @@ fn only_storages_are_storages() {
         scene(&cameras, &good_timestamps(), &tensor("ByteStorage", 0, &[4], &[1]))
     };
     for id in [
-        // A number where the storage's type belongs, which libtorch takes for an address.
+        // A number instead of the storage's type, which libtorch would use as an address.
         vec![text("storage"), int(u32::MAX), text("0"), text("cpu"), int(64)],
         vec![text("module"), float(), text("0"), text("cpu"), int(64)],
         vec![text("storage"), float(), int(0), text("cpu"), int(64)],
@@ -349,7 +350,7 @@ fn data_saved_on_another_device_are_read_here() {
 
 #[test]
 fn what_is_said_again_and_again_takes_no_more_than_it_says() {
-    // One image and one scene, each referred to in two bytes.
+    // One image and one scene, each referenced many times by two bytes.
     for (views, scenes, fits) in [(50, 50, true), (2000, 50, true), (2000, 2000, false)] {
         let count = views as u32;
         let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
@@ -376,7 +377,7 @@ fn what_is_said_again_and_again_takes_no_more_than_it_says() {
 #[test]
 fn tensors_stay_inside_their_data() {
     let image = |offset, size, stride| tensor("ByteStorage", offset, &[size], &[stride]);
-    // 64 bytes are there: 18 floats aren't, whatever the pickle says about the storage.
+    // The data has 64 bytes, too few for 18 floats, whatever the pickle says about the storage.
     assert_refused(
         &scene(&good_cameras(), &good_timestamps(), &image(0, 4, 1)),
         "cameras of scene 0 reaches beyond its data of 64 bytes",
@@ -401,7 +402,7 @@ fn tensors_stay_inside_their_data() {
     }
     let double = tensor("DoubleStorage", 0, &[1, 8], &[8, 1]);
     assert_refused(&scene(&double, &good_timestamps(), &image(0, 4, 1)), "expected Float [1, 18]");
-    // As much as there is passes, and is then no image.
+    // A tensor of exactly the data's size is accepted here, and then isn't a valid image.
     let chunk = Chunk::parse(Path::new("chunk.torch"), whole(&image(0, 72, 1))).unwrap();
     assert_eq!(chunk.keys().collect::<Vec<_>>(), ["a"]);
     let error = chunk.capture("a").unwrap_err().to_string();
@@ -414,11 +415,11 @@ fn archives_that_inflate_are_refused() {
     let error = refusal(archive(&pickle, &[0; 1 << 20], CompressionMethod::Deflated));
     assert!(error.contains("archive/data.pkl is compressed"), "{error}");
     let mut bytes = archive(&pickle, &[0; 64], CompressionMethod::Stored);
-    // The central directory's second entry claims 4 GB, from where it is.
+    // The central directory's second entry claims 4 GB at its offset.
     let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
     bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
     assert!(refusal(bytes).contains("expected inside the file"));
-    // Both entries of one place: their checksums would be computed again and again.
+    // Both entries at the same offset: their checksums would be computed repeatedly.
     let mut bytes = archive(&pickle, &pickle, CompressionMethod::Stored);
     let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
     bytes[entry + 42..entry + 46].copy_from_slice(&[0; 4]);
@@ -433,7 +434,7 @@ fn damage_is_noticed() {
     for length in (0..bytes.len()).step_by(97) {
         refusal(bytes[..length].to_vec());
     }
-    // Whatever bit flips in what a chunk holds: a reader may not crash, and images may not change unnoticed.
+    // Any flipped bit in a chunk: the reader must not crash, and images must not change unnoticed.
     let image = bytes.windows(4).position(|window| window == b"\x89PNG").unwrap();
     for position in (0..bytes.len()).step_by(31).chain(image..image + 64) {
         let mut flipped = bytes.clone();
@@ -457,7 +458,7 @@ fn what_is_wrong_with_a_scene_is_named() {
     let error = open_capture(&chunk).unwrap_err().to_string();
     assert!(error.contains("it holds 2 scenes, expected") && error.contains("#KEY"), "{error}");
 
-    // NaN in a camera: 18 float32 and an image.
+    // A NaN in a camera: 18 float32 and an image.
     let cameras = [f32::NAN; 18].map(f32::to_le_bytes).concat();
     let png = std::fs::read(folder.path().join("room_0/images/000.png")).unwrap();
     let image = tensor("ByteStorage", 72, &[png.len() as u32], &[1]);
@@ -481,7 +482,7 @@ fn what_is_wrong_with_a_scene_is_named() {
     }
 }
 
-/// A chunk of a scene with two views of one photo, whose dict has `entries` besides `images`.
+/// Returns a chunk of one scene with two views of one photo, whose dict has `entries` besides `images`.
 fn chunk_of(entries: &[(&str, Vec<u8>)], cameras: &[f32]) -> Chunk {
     let mut png = Cursor::new(vec![]);
     image::RgbImage::new(16, 16).write_to(&mut png, image::ImageFormat::Png).unwrap();
@@ -508,7 +509,7 @@ fn cameras_images_and_a_key_are_all_that_a_scene_needs() {
     assert_eq!(expected.len(), 2);
     let poses = expected.cameras();
     assert!((poses[1].c2w.w_axis.x + 2.).abs() < 1e-9 && (poses[1].intrinsics.fy - 9.6).abs() < 1e-6);
-    // Stored column by column, and every other row of more.
+    // Stored in column-major order, and then as every other row of a larger tensor.
     let transposed: Vec<f32> = (0..18).flat_map(|i| [cameras[i], cameras[18 + i]]).collect();
     let spread = [camera(0.), camera(9.), camera(2.)].concat();
     for (numbers, stride) in [(transposed, [1, 2]), (spread, [36, 1])] {

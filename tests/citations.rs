@@ -1,32 +1,32 @@
-//! Every citation of the specification, docs/spec.md, has its section.
+//! Every citation of the specification, docs/spec.md, refers to an existing section.
 //!
 //! A citation is on one line: the word `spec`, a space, and the number of a section, `N` or `N.M`; after a comma, `and` or `to`
 //! may follow further numbers. So `spec 3.1`, `Spec 3`, `spec 3.1 and 3.2`, `spec 3 to 5` and `spec 7.3, 7.5 and 7.6` are
-//! citations. Of `to` both ends are looked up: what lies between is there, as sections are numbered without gaps.
+//! citations. For `to` both ends are looked up: the sections between them exist, as sections are numbered without gaps.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// What may cite, from the repository's root.
+/// Files and folders that may cite the specification, relative to the repository's root.
 const PLACES: [&str; 8] = ["src", "csrc", "parity", "tests", "configs", "scripts", "docs", "README.md"];
-/// The same, where they are there.
+/// Further such files and folders, which need not exist.
 const OPTIONAL_PLACES: [&str; 2] = ["examples", "CONTRIBUTING.md"];
 const SPECIFICATION: &str = "docs/spec.md";
-/// Its examples cite what isn't there.
+/// Path of this file, whose examples cite sections that don't exist.
 const THIS_FILE: &str = "tests/citations.rs";
-/// Outside of the specification; fewer mean that something is wrong with looking for them.
+/// Minimum number of citations outside of the specification; fewer mean that the search is broken.
 const LEAST_CITATIONS: usize = 20;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Whether `c` goes on with a word.
+/// Returns `true` if `c` can be part of a word.
 fn is_word(c: char) -> bool {
     c.is_alphanumeric() || c == '_'
 }
 
-/// What follows each `word` in `line` that isn't a part of a longer one.
+/// Returns the text after each `word` in `line` that isn't part of a longer word.
 fn after_word<'a>(line: &'a str, word: &str) -> Vec<&'a str> {
     let found = line.match_indices(word).filter_map(|(at, _)| {
         let (before, after) = (&line[..at], &line[at + word.len()..]);
@@ -35,14 +35,14 @@ fn after_word<'a>(line: &'a str, word: &str) -> Vec<&'a str> {
     found.collect()
 }
 
-/// The number of a section that `text` begins with, and the rest: digits and points, and a point at the end isn't its own.
+/// Splits off the section number at the start of `text`: digits and points, without a point at the end.
 fn section_number(text: &str) -> Option<(&str, &str)> {
     let end = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let number = text[..end].trim_end_matches('.');
     number.starts_with(|c: char| c.is_ascii_digit()).then(|| (number, &text[number.len()..]))
 }
 
-/// Numbers of the sections that `line` cites.
+/// Returns the numbers of the sections that `line` cites.
 fn citations(line: &str) -> Vec<&str> {
     let mut cited = vec![];
     for after in after_word(line, "spec").into_iter().chain(after_word(line, "Spec")) {
@@ -56,7 +56,7 @@ fn citations(line: &str) -> Vec<&str> {
     cited
 }
 
-/// Numbers of the sections of a specification, `## N Title` and `### N.M Title`, in order.
+/// Returns the numbers of the sections of a specification, `## N Title` and `### N.M Title`, in order.
 fn sections(specification: &str) -> Vec<&str> {
     let headings = specification.lines().filter(|line| line.starts_with("##"));
     let numbers = headings.map(|heading| {
@@ -69,8 +69,8 @@ fn sections(specification: &str) -> Vec<&str> {
     numbers.collect()
 }
 
-/// The text files in `place`, with their paths from the root; none where it isn't there. What is hidden, Python's own or
-/// others' is left out.
+/// Collects the text files in `place`, with their paths from the root; none if it doesn't exist. Skips hidden files, Python's
+/// caches and third-party modules.
 fn texts(place: &str, found: &mut Vec<(String, String)>) {
     let path = root().join(place);
     if path.is_dir() {
@@ -124,7 +124,7 @@ fn every_citation_has_its_section() {
 
 #[test]
 fn nothing_cites_in_the_old_form() {
-    // In two parts, so that looking for it doesn't find it here.
+    // In two parts, so that the search doesn't find this line.
     let old = ["SP", "EC"].concat();
     let mut found = vec![];
     for (file, text) in all_texts() {
@@ -165,10 +165,10 @@ fn citations_are_found() {
         ("spec 7.3, 7.5, and 7.6", &["7.3", "7.5", "7.6"]),
         ("spec 3.1, which has 24 views and 12 more", &["3.1"]),
         ("spec 6.", &["6"]),
-        // Not there, and found not to be.
+        // These sections don't exist, and must be found to be missing.
         ("spec 3.1.2", &["3.1.2"]),
         ("spec 03", &["03"]),
-        // None of them is one.
+        // None of these is a citation.
         ("the spec, 3 of them", &[]),
         ("docs/spec.md 3", &[]),
         ("specs 3, spec. 3, spec3, spec  3, inspec 3, my_spec 3, spec_3 3", &[]),

@@ -1,4 +1,4 @@
-//! Every command as a user runs it.
+//! Every command, run as a user runs it.
 
 mod common;
 
@@ -66,7 +66,7 @@ fn every_simd_level_renders_alike() {
         let splat = room.join("truth.ply");
         let output = command(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"])
             .env("GLOBALSPLAT_SIMD", level)
-            // Without LPIPS, which is no matter of the rasterizer.
+            // Without LPIPS, which is independent of the rasterizer.
             .env("GLOBALSPLAT_WEIGHTS", folder.path())
             .output()
             .expect("a program that starts");
@@ -77,7 +77,7 @@ fn every_simd_level_renders_alike() {
     };
     let scores: Vec<Value> = ["avx512", "avx2", "neon", "portable"].into_iter().filter_map(score).collect();
     assert!(!scores.is_empty());
-    // For other processors there is one alone.
+    // Other processors have only one level.
     if scores.len() < 2 && cfg!(target_arch = "x86_64") {
         skip("a second instruction set", "the processor has none but the portable one");
     }
@@ -87,13 +87,13 @@ fn every_simd_level_renders_alike() {
     }
 }
 
-/// What GLOBALSPLAT_SIMD hides is hidden from libtorch and from the choice of a precision, too, as on a processor without it.
+/// `GLOBALSPLAT_SIMD` also limits libtorch and the choice of a precision, as on a processor without the hidden instructions.
 #[cfg(target_arch = "x86_64")]
 #[test]
 fn a_simd_level_limits_libtorch_and_precision() {
     for (level, libtorch) in [("avx2", "AVX2"), ("portable", "DEFAULT")] {
         let mut doctor = command(&["doctor", "--json"]);
-        // A level may limit these tests themselves.
+        // These tests themselves may run at a limited level.
         for limit in ["ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS"] {
             doctor.env_remove(limit);
         }
@@ -154,7 +154,7 @@ fn memory_before_is_not_counted() {
         let (gaussians, cameras) = globalsplat::bench::made_up_scene(gaussians, 1, [256, 256].into());
         globalsplat::bench::bench_raster(&gaussians, &cameras, 1).expect("a measurement").working_bytes
     };
-    // In one process, the large one first.
+    // Both in one process, the large one first.
     let (first, second) = (working(large), working(small));
     if cfg!(target_os = "linux") {
         assert!(first > 20_000_000 && second < first / 2, "{first} {second}");
@@ -227,8 +227,8 @@ fn bench_model_tells_where_a_pass_goes() {
     let expected = ["tokens", "norms", "queries and outputs", "keys and values", "cross-attention"];
     let more = ["residual sums", "MLPs", "self-attention", "mixer", "heads"];
     assert_eq!(names, [&expected[..], &more].concat());
-    // 8 reads of 4 + 2·4 tokens of 768 numbers for 32 + 32 of keys and values, and of what all have in common for 32 of values: by
-    // 16 + 5 slots.
+    // 8 reads, each of which projects 4 + 2·4 tokens of 768 elements to 32 + 32 elements of keys and values, and a part that
+    // all have in common to 32 of values; queries come from 16 + 5 slots.
     let flop = |name: &str| 1e9 * number(&parts[names.iter().position(|n| *n == name).unwrap()], "gflop");
     assert_eq!(flop("keys and values").round(), 8. * 2. * 768. * (12. * 64. + 32.));
     assert_eq!(flop("cross-attention").round(), 8. * 4. * 21. * 12. * 32.);
@@ -259,7 +259,7 @@ fn a_splat_is_scored_by_its_capture() {
     let (splat, sheet) = (room.join("truth.ply"), room.join("sheet.png"));
     let scores =
         json(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&sheet), "--json"]);
-    // The photos were rendered from this splat: what is left is 8-bit rounding.
+    // The photos were rendered from this splat: the only difference is 8-bit rounding.
     assert!(scores["psnr"].as_f64().unwrap() > 50.);
     assert!(scores["ssim"].as_f64().unwrap() > 0.999);
     assert!(scores["gaussians"].as_u64().unwrap() > 1000);
@@ -267,7 +267,7 @@ fn a_splat_is_scored_by_its_capture() {
     assert_eq!(views.len(), 9);
     assert_eq!(views[2]["image"], "images/002.png");
     assert!(views.iter().all(|v| v["psnr"].is_f64() && v["ssim"].is_f64()));
-    // Three pictures of 6·40 pixels and two gaps wide, nine and eight high.
+    // Three images of 6·40 pixels and two gaps wide, nine images and eight gaps high.
     assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 240 + 2 * 4, 9 * 240 + 8 * 4));
 }
 
@@ -282,7 +282,7 @@ fn lpips_is_reported_where_its_weights_are() {
     let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room)];
     let scores = json(&[&arguments[..], &["--json"]].concat());
     for metric in ["lpips_vgg", "lpips_alex"] {
-        // What is left is 8-bit rounding.
+        // The only difference is 8-bit rounding.
         let mean = scores[metric].as_f64().unwrap();
         assert!(mean > 0. && mean < 0.01, "{metric} {mean}");
         let views = scores["views"].as_array().unwrap();
@@ -419,7 +419,7 @@ fn a_run_goes_from_photos_to_a_splat() {
     assert!(report["held_out"]["psnr"].is_f64() && report["held_out"]["nearest_photo_psnr"].is_f64());
     assert_eq!(report["held_out"]["scenes"][0]["ours"]["views"].as_array().unwrap().len(), 3);
     assert!(run.join("config.toml").is_file());
-    // A line for each of six steps, and one for the validation at the end.
+    // One line for each of six steps, and one for the validation at the end.
     assert_eq!(std::fs::read_to_string(run.join("metrics.jsonl")).unwrap().lines().count(), 7);
 
     let (weights, half) = (folder.path().join("model.safetensors"), folder.path().join("half.safetensors"));
@@ -451,7 +451,7 @@ fn a_run_goes_from_photos_to_a_splat() {
     }
     let curves = std::fs::read_to_string(run.join("curves.svg")).unwrap();
     assert!(curves.matches("<polyline").count() == 3 && curves.contains("held out"), "{curves}");
-    // By the weights that come with the program, and what was done to the photos in one line.
+    // With the embedded weights; one line reports how the photos were selected and resized.
     let output =
         globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
@@ -474,7 +474,7 @@ fn a_run_goes_from_photos_to_a_splat() {
         "--out",
         arg(&splat),
     ]);
-    // In the capture's world: the capture's cameras see what the model's own rendering shows.
+    // In the capture's world coordinates: renders from the capture's cameras match the model's own.
     let by_model = json(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--json"]);
     assert_eq!(by_model["views"].as_array().unwrap().len(), 3);
     assert!(by_model["baselines"]["nearest_photo"]["psnr"].is_f64());
@@ -502,7 +502,7 @@ fn a_stopped_run_ends_with_the_same_bits() {
     };
     let whole = train("whole", "9");
     let parts = train("parts", "9");
-    // As if it had been killed after step 4: the later checkpoint isn't there.
+    // Simulates a process killed after step 4: the later checkpoint is missing.
     std::fs::remove_dir_all(parts.join("step-00000006")).unwrap();
     train("parts", "9");
     for file in ["model.safetensors", "optimizer.safetensors"] {
@@ -516,7 +516,7 @@ fn a_stopped_run_ends_with_the_same_bits() {
 
 #[test]
 fn interrupted_training_saves_a_checkpoint() {
-    // What Ctrl-C sends, what kill and schedulers do, and what comes together where a terminal is closed.
+    // Signals sent by Ctrl-C, by kill and schedulers, and by a closed terminal.
     for signals in [&[libc::SIGINT][..], &[libc::SIGTERM], &[libc::SIGINT, libc::SIGTERM, libc::SIGHUP]] {
         interrupt_training(signals);
     }
@@ -531,16 +531,17 @@ fn interrupt_training(signals: &[i32]) {
         .stderr(std::process::Stdio::piped())
         .spawn()
         .expect("a program that starts");
-    // Until it has done a few steps.
+    // Wait until it has done a few steps.
     let metrics = run.join("metrics.jsonl");
     while std::fs::read_to_string(&metrics).map_or(0, |text| text.lines().count()) < 3 {
         assert!(child.try_wait().expect("a child").is_none(), "it ended by itself");
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
-    // Again and again, as nobody would: a handler must not write where a product is being computed.
+    // Signals arrive far more often than in practice: a handler must not write to memory in which a matrix product is being
+    // computed.
     while child.try_wait().expect("a child").is_none() {
         for &signal in signals {
-            // SAFETY: sends a signal to a child that has not been waited for.
+            // SAFETY: sends a signal to a child process that has not been waited for.
             unsafe { libc::kill(child.id() as i32, signal) };
         }
         std::thread::sleep(std::time::Duration::from_micros(50));
@@ -571,7 +572,7 @@ fn memory_of_a_step_is_told_before_and_bench_train_takes_the_batch_that_fits() {
     let told: Value =
         serde_json::from_str(&succeed(&["doctor", "--config", arg(&config), "--json"])).expect("JSON");
     assert_eq!((&told["cpu"]["scenes_at_once"], &told["devices"][0]["fits"]), (&json!(1), &json!(true)));
-    // No machine has room for so many Gaussians.
+    // No machine has enough memory for that many Gaussians.
     let large = ["--set", "model.latents=1000000", "--set", "model.candidates=1024"];
     let text = succeed(&[&["doctor", "--config", arg(&config)][..], &large].concat());
     assert!(text.contains("it does not fit; to save memory: train.checkpoint_rounds=true"), "{text}");
@@ -597,7 +598,7 @@ fn a_data_set_of_chunks_is_learned_from_and_told_of() {
     let folder = tempfile::tempdir().unwrap();
     let (captures, set) = (folder.path().join("captures"), folder.path().join("set/train"));
     rooms(&captures, 3, 6, 40);
-    // The smallest chunks that there are: two of the rooms share one.
+    // The smallest possible chunks: two of the rooms share one.
     let rooms: Vec<PathBuf> = (0..3).map(|room| captures.join(format!("room_{room:03}"))).collect();
     succeed(&["pack", arg(&rooms[0]), arg(&rooms[1]), "--out", arg(&set)]);
     let more = folder.path().join("more");
@@ -624,7 +625,7 @@ fn a_data_set_of_chunks_is_learned_from_and_told_of() {
     let told: Value = serde_json::from_slice(&train("part", "0.5").stdout).unwrap();
     assert_eq!(told["skipped_scenes"]["in_broken_files"].as_u64(), Some(1));
     assert!(told["skipped_scenes"]["first"].as_str().unwrap().contains("000001.torch"));
-    // Views that are held out of scenes in chunks are asked for as well, of those that can be read.
+    // Held-out views of scenes in chunks are validated as well, for the scenes that can be read.
     let (run, holdout) = (folder.path().join("held_out"), "data.holdout=\"every:3+1\"");
     let settings = ["--set", holdout, "--set", "data.max_bad_share=0.5"];
     let output = globalsplat(

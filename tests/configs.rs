@@ -1,4 +1,4 @@
-//! Every configuration that ships.
+//! Every configuration in `configs/` and the embedded model.
 
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
@@ -26,7 +26,7 @@ fn every_configuration_builds_its_model() {
     for entry in std::fs::read_dir(folder()).expect("configs/") {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
-        // Written out and read back it is the same.
+        // Round trip through TOML.
         let again = Config::parse(&config.to_toml(), &[], &path).expect("a configuration");
         assert_eq!(again, config, "{}", path.display());
         let vs = nn::VarStore::new(Device::Cpu);
@@ -42,7 +42,7 @@ fn steps_fit_into_the_memory_of_a_large_gpu() {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &[]).expect("a configuration");
         let bytes = MemoryEstimate::of(&config, Device::Cuda(0)).expect("a model").total();
-        // Of 80 GB, with room for what an estimate doesn't know.
+        // Of 80 GB, with a margin for what the estimate doesn't include.
         assert!(bytes < 60_000_000_000, "{}: {:.1} GB", path.display(), bytes as f64 * 1e-9);
     }
 }
@@ -75,7 +75,7 @@ fn the_weights_that_come_with_the_program_are_those_of_tiny() {
     }
 }
 
-/// Of a configuration, everything but what makes it one of its kind made small.
+/// Settings that shrink a configuration except for what distinguishes it from others.
 const SHRUNKEN: [&str; 17] = [
     "model.latents=16",
     "model.width=32",
@@ -170,7 +170,7 @@ fn environment_variables_are_filled_in() {
         let set = [format!("data.captures=[{text:?}]")];
         Config::parse("", &set, Path::new("none")).expect("a configuration").data.capture_paths()
     };
-    // A variable that every machine has.
+    // A variable that is set on every machine.
     let value = std::env::var("PATH").expect("PATH");
     assert_eq!(paths("${PATH}/a").unwrap(), [PathBuf::from(format!("{value}/a"))]);
     assert_eq!(paths("${GLOBALSPLAT_NO_SUCH:-b}/c").unwrap(), [PathBuf::from("b/c")]);

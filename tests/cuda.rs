@@ -1,4 +1,4 @@
-//! The kernels for GPUs, as far as a machine without one can tell.
+//! GPU kernels, as far as they can be tested without a GPU.
 
 mod common;
 
@@ -7,10 +7,10 @@ use globalsplat::render::cuda::{Driver, Form, Nvrtc, cache_folder, prepare, usag
 use std::path::Path;
 use std::process::Command;
 
-/// The oldest and the newest that are promised.
+/// Oldest and newest supported GPU architectures.
 const OLDEST: i32 = 75;
 const NEWEST: i32 = 120;
-/// Bytes that every GPU's blocks may share, and threads of the largest block times their registers.
+/// Shared memory in bytes that every GPU grants a block, registers per block, and threads of the largest block.
 const SHARED: u32 = 48 << 10;
 const REGISTERS: u32 = 64 << 10;
 const BLOCK: u32 = 256;
@@ -32,7 +32,7 @@ fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
         assert_eq!(kernels.len(), 12, "{}", compiled.log);
         for kernel in kernels {
             assert!(kernel.spills == 0 && kernel.shared <= SHARED, "{architecture}: {kernel:?}");
-            // Those of 128 threads may have all that there are.
+            // Kernels with blocks of 128 threads may use all registers.
             let threads = if kernel.name.contains("project") { BLOCK / 2 } else { BLOCK };
             assert!(
                 kernel.registers > 0 && kernel.registers * threads <= REGISTERS,
@@ -63,7 +63,8 @@ fn newer_gpus_get_what_their_driver_compiles_and_older_ones_a_sentence() {
     assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
 }
 
-/// A folder with a driver in it, which loaders find by LD_LIBRARY_PATH. Beside it lies a toolkit's stub, for linkers alone.
+/// Returns a folder with a fake driver, which loaders find by LD_LIBRARY_PATH. Beside it is a toolkit's stub, which only
+/// linkers use.
 fn fake_driver() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let stub = folder.path().join("stub.c");
@@ -88,7 +89,7 @@ fn kernels_are_compiled_once() {
     if nvrtc().is_none() {
         return;
     }
-    // The driver is looked for once in a process: this test runs itself again with one.
+    // The driver is looked up once per process: this test runs itself again with a fake one.
     const EXPECTED: &str = "GLOBALSPLAT_TEST_EXPECTED";
     if let Some(expected) = std::env::var_os(EXPECTED) {
         let driver = Driver::find().unwrap();

@@ -1,4 +1,4 @@
-//! Processes that work on the same thing: that they do what one alone does, and what can befall them.
+//! Distributed processes: they compute what one process computes, and they survive failures.
 #![cfg(target_os = "linux")]
 
 mod common;
@@ -18,10 +18,10 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// For anything that takes seconds.
+/// Timeout for everything that normally takes seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// One test at a time: each has processes for all of a small machine's cores.
+/// Serializes the tests: each uses all cores of a small machine.
 fn turn() -> Option<MutexGuard<'static, ()>> {
     static TURN: Mutex<()> = Mutex::new(());
     if !globalsplat_csrc::ranks::has_gloo() {
@@ -34,7 +34,7 @@ fn turn() -> Option<MutexGuard<'static, ()>> {
     Some(TURN.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-/// That of the environment with torch in it that `make venv` makes, or what `TORCHRUN` names.
+/// Returns the `torchrun` of the virtual environment that `make venv` creates, or the one that `TORCHRUN` names.
 fn torchrun() -> Option<PathBuf> {
     let named = std::env::var_os("TORCHRUN").map(PathBuf::from);
     let path = named.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/torchrun"));
@@ -45,13 +45,13 @@ fn torchrun() -> Option<PathBuf> {
     None
 }
 
-/// What was started, and where it writes. It ends with its holder at the latest, and what it started, too.
+/// Started processes, and the folder with their output. Dropping this ends them and their children.
 struct Started {
     processes: Vec<Child>,
     folder: TempDir,
 }
 
-/// How a process ended.
+/// Result of a process.
 struct Ended {
     code: Option<i32>,
     out: String,
@@ -69,7 +69,7 @@ impl Started {
         Started { processes: commands.into_iter().enumerate().map(start).collect(), folder }
     }
 
-    /// `count` ranks by torchrun with `options`.
+    /// Starts `count` ranks by torchrun with `options`.
     fn by_torchrun(torchrun: &Path, count: usize, options: &[&str], arguments: &[&str]) -> Self {
         let mut command = Command::new(torchrun);
         command.args(["--standalone", "--no-python", &format!("--nproc-per-node={count}")]).args(options);
@@ -77,7 +77,8 @@ impl Started {
         Started::start(vec![command])
     }
 
-    /// One rank on each of two machines, which are this one, by torchruns that meet; all are started again once.
+    /// Starts one rank on each of two simulated machines, by torchruns that rendezvous; each torchrun may restart its ranks
+    /// once.
     fn by_two_torchruns(torchrun: &Path, arguments: &[&str]) -> Self {
         let port = free_port();
         let machine = || {
@@ -85,7 +86,7 @@ impl Started {
             command.args(["--no-python", "--nnodes=2", "--nproc-per-node=1", "--max-restarts=1"]);
             command.args(["--rdzv-backend=c10d", "--rdzv-id=test", "--local-addr=127.0.0.1"]);
             command.arg(format!("--rdzv-endpoint=127.0.0.1:{port}"));
-            // As in scripts/slurm_train.sh.
+            // The same setting as in scripts/slurm_train.sh.
             command.env("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1").env("OMP_NUM_THREADS", "1");
             command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments);
             command
@@ -93,12 +94,12 @@ impl Started {
         Started::start(vec![machine(), machine()])
     }
 
-    /// `count` ranks by what all who start processes tell them, and no more.
+    /// Starts `count` ranks with only the environment variables that every launcher sets.
     fn by_environment(count: usize, arguments: &[&str]) -> Self {
         Started::by_environment_of(&vec![arguments.to_vec(); count])
     }
 
-    /// As many ranks as there are lists of arguments.
+    /// Starts one rank per list of arguments.
     fn by_environment_of(arguments: &[Vec<&str>]) -> Self {
         let (port, count) = (free_port(), arguments.len());
         let rank = |rank: usize| {
@@ -117,7 +118,7 @@ impl Started {
         String::from_utf8_lossy(&fs::read(self.folder.path().join(file)).unwrap()).into_owned()
     }
 
-    /// What `find` finds, once it does, while all that was started goes on.
+    /// Polls `find` until it returns a value, while all processes are still running.
     fn wait_for<T>(&mut self, what: &str, mut find: impl FnMut() -> Option<T>) -> T {
         let begun = Instant::now();
         loop {
@@ -130,7 +131,7 @@ impl Started {
         }
     }
 
-    /// Waits until all have ended.
+    /// Waits until all processes have ended.
     fn end(mut self) -> Vec<Ended> {
         let begun = Instant::now();
         let ended = |i: usize, process: &mut Child| loop {
@@ -151,7 +152,7 @@ impl Started {
         codes.into_iter().enumerate().map(ended).collect()
     }
 
-    /// Waits for the process that a torchrun has as rank `rank` since it started all for the `restarts`-th time again.
+    /// Waits for the child of a torchrun that has rank `rank` after the given number of `restarts`.
     fn rank(&mut self, rank: usize, restarts: usize) -> u32 {
         let torchruns: Vec<u32> = self.processes.iter().map(Child::id).collect();
         let variables = [format!("RANK={rank}"), format!("TORCHELASTIC_RESTART_COUNT={restarts}")];
@@ -181,10 +182,10 @@ fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
-/// A process's state and its parent.
+/// Returns the state and the parent of a process.
 fn state(process: u32) -> Option<(char, u32)> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // Its name, in brackets, may be anything.
+    // The process name, in brackets, may contain anything.
     let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
     Some((fields.next()?.parse().ok()?, fields.next()?.parse().ok()?))
 }
@@ -196,11 +197,11 @@ fn children(process: u32) -> Vec<u32> {
 }
 
 fn signal(process: u32, signal: libc::c_int) {
-    // SAFETY: sends a signal to what this test has started and nobody has waited for, or to nobody.
+    // SAFETY: sends a signal to a process that this test started and nobody has waited for, or to none.
     unsafe { libc::kill(process as i32, signal) };
 }
 
-/// Stops a process for a while: what it does is looked at as it is.
+/// Suspends a process, so that its state can be examined.
 fn hold(process: u32) {
     signal(process, libc::SIGSTOP);
     while state(process).is_some_and(|(state, _)| state != 'T') {
@@ -208,7 +209,7 @@ fn hold(process: u32) {
     }
 }
 
-/// What `count` ranks print, of which all but the first keep silent.
+/// Returns the output of `count` ranks that succeed; all but the first print nothing.
 #[track_caller]
 fn succeed_together(count: usize, arguments: &[&str]) -> String {
     let mut ended = Started::by_environment(count, arguments).end();
@@ -220,14 +221,14 @@ fn succeed_together(count: usize, arguments: &[&str]) -> String {
     ended.swap_remove(0).out
 }
 
-/// What the program says of why it ends, among all that torchrun says.
+/// Returns the program's own error messages among all lines that torchrun prints.
 fn sentences(err: &str) -> Vec<&str> {
     let told = err.lines().filter_map(|line| line.strip_prefix("globalsplat: "));
-    // Every half minute it says how far it is.
+    // Exclude the progress line that is printed every half minute.
     told.filter(|line| !(line.starts_with(|c: char| c.is_ascii_digit()) && line.contains(" steps"))).collect()
 }
 
-/// Rooms, and a configuration that looks at them.
+/// Returns a folder of rooms, and a configuration that trains on them.
 fn data(scenes: u32) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let captures = folder.path().join("captures");
@@ -236,10 +237,10 @@ fn data(scenes: u32) -> (TempDir, PathBuf) {
     (folder, config)
 }
 
-/// Lines of metrics.jsonl about steps, and about validations.
+/// Returns the lines of metrics.jsonl about steps, and those about validations.
 fn metrics(run: &Path) -> (Vec<Value>, Vec<Value>) {
     let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-    // The last line may be about to be written.
+    // The last line may be incomplete.
     let lines = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let (validations, steps) = lines.partition(|line| line["validation"].is_object());
     (steps, validations)
@@ -249,7 +250,7 @@ fn numbers(lines: &[Value]) -> Vec<u64> {
     lines.iter().map(|line| line["step"].as_u64().unwrap()).collect()
 }
 
-/// Steps done before each checkpoint.
+/// Returns the number of steps before each checkpoint.
 fn checkpoints(run: &Path) -> Vec<u64> {
     let paths = globalsplat::train::list_checkpoints(run).unwrap();
     paths.iter().map(|path| arg(path).rsplit_once('-').unwrap().1.parse().unwrap()).collect()
@@ -280,7 +281,7 @@ fn assert_close(a: &Value, b: &Value, tolerance: f64) {
     assert!((x - y).abs() <= tolerance * y.abs(), "{x} {y}");
 }
 
-/// That the steps of both runs went alike but for the order in which numbers are added up.
+/// Asserts that the steps of both runs agree up to the order of summation.
 #[track_caller]
 fn assert_same_steps(a: &Path, b: &Path) {
     let (a, b) = (metrics(a).0, metrics(b).0);
@@ -292,7 +293,7 @@ fn assert_same_steps(a: &Path, b: &Path) {
     }
 }
 
-/// That both runs ended with the same bits.
+/// Asserts that both runs ended bit-identically.
 #[track_caller]
 fn assert_same_bits(a: &Path, b: &Path) {
     let [a, b] = [a, b].map(|run| globalsplat::train::latest_checkpoint(run).unwrap());
@@ -309,7 +310,7 @@ fn ranks_train_like_one() {
     let (folder, config) = data(5);
     let of = |name: &str| folder.path().join(name);
     let [one, two] = ["one", "two"].map(of);
-    // At a higher rate AdamW makes much of gradients that are hardly more than what rounding leaves.
+    // At a higher learning rate, AdamW amplifies gradients that are little more than rounding errors.
     let settings = |batch| ["train.steps=12", "train.validate_every=5", "train.learning_rate=2e-4", batch];
     succeed(&text(&train(&config, &one, &settings("train.batch=2"))));
     let arguments = train(&config, &two, &settings("train.batch=1"));
@@ -347,7 +348,7 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let arguments = train(&config, &many, &settings("train.batch=3"));
     let mut started = Started::by_environment(2, &text(&arguments));
     started.wait_for("a step", || (metrics(&many).0.len() >= 4).then_some(()));
-    // Whichever of them is asked to stop, all do.
+    // A stop request to any rank stops all.
     signal(started.processes[1].id(), libc::SIGTERM);
     let ended = started.end();
     assert_eq!((ended[0].code, ended[1].code), (Some(1), Some(0)), "{}", ended[1].err);
@@ -371,11 +372,11 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
 
     let arguments = train(&config, &run, &settings);
     let mut started = Started::by_torchrun(&torchrun, 2, &["--max-restarts=3"], &text(&arguments));
-    // Within a step.
+    // Kill a rank within a step.
     started.wait_for("a step", || (metrics(&run).0.len() >= 5).then_some(()));
     let second = started.rank(1, 0);
     signal(second, libc::SIGKILL);
-    // Within a save. What is held doesn't finish it before it is killed.
+    // Kill a rank within a save. A suspended process doesn't finish the save before it is killed.
     let first = started.rank(0, 1);
     loop {
         started.wait_for("a save", || unfinished_save(&run));
@@ -385,7 +386,7 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
         }
         signal(first, libc::SIGCONT);
     }
-    // Within a validation: its checkpoint is there, and its score never comes, however long the first rank has.
+    // Kill a rank within a validation: its checkpoint exists, but its score never appears, however long the first rank runs.
     let second = started.rank(1, 2);
     let unfinished_validation = || {
         let ((steps, validations), saved) = (metrics(&run), checkpoints(&run).pop());
@@ -433,7 +434,7 @@ fn ranks_of_two_machines_are_started_again() {
     succeed_together(2, &text(&train(&config, &whole, &settings)));
     let mut started = Started::by_two_torchruns(&torchrun, &text(&train(&config, &run, &settings)));
     started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
-    // Of the first, which keeps the store, everything has to be made anew.
+    // Killing the first rank, which hosts the store, restarts everything.
     let first = started.rank(0, 0);
     signal(first, libc::SIGKILL);
     for (machine, ended) in started.end().into_iter().enumerate() {
@@ -443,7 +444,7 @@ fn ranks_of_two_machines_are_started_again() {
     assert_eq!(numbers(&metrics(&run).0), (0..30).collect::<Vec<_>>(), "every step once");
 }
 
-/// That a checkpoint is being written that is newer than all that are whole.
+/// Returns `Some` while a checkpoint is being written that is newer than all complete ones.
 fn unfinished_save(run: &Path) -> Option<()> {
     let entries = fs::read_dir(run.join("checkpoints")).ok()?;
     let names = entries.filter_map(|entry| Some(entry.ok()?.file_name().to_str()?.to_string()));
@@ -472,7 +473,7 @@ fn a_rank_that_dies_ends_all_with_one_sentence() {
         ["the processes have lost each other (", "); started again, they go on from what was saved"];
     assert!(expected.iter().all(|part| sentence.contains(part)), "{sentence}");
 
-    // One alone goes on where two were.
+    // One process resumes a run of two.
     let saved = checkpoints(&run).pop().unwrap();
     assert!((8..40).contains(&saved), "{saved}");
     succeed(&text(&arguments));
@@ -494,14 +495,14 @@ fn a_rank_that_hangs_ends_all_with_one_sentence() {
     let [first, second] = [0, 1].map(|rank| started.rank(rank, 0));
     let begun = Instant::now();
     hold(second);
-    // Nothing works any more: others may.
+    // All processes are blocked: other tests may run.
     drop(turn);
     while state(first).is_some_and(|(state, _)| state != 'Z') {
         assert!(begun.elapsed() < PATIENCE, "the first rank still waits");
         sleep(Duration::from_millis(20));
     }
     assert_eq!(sentences(&started.told("err0")), ["rank 1 of 2 gave no sign of life for 25 seconds"]);
-    // torchrun would give it half a minute more.
+    // torchrun would wait for it half a minute longer.
     signal(second, libc::SIGKILL);
     let ended = started.end().remove(0);
     assert_ne!(ended.code, Some(0));
@@ -524,7 +525,7 @@ fn ranks_load_ahead_from_step_to_step() {
     assert!(before.iter().all(|threads| !threads.is_empty()) && before == after, "{before:?} {after:?}");
 }
 
-/// The threads of a process whose names begin with `name`.
+/// Returns the threads of a process whose names begin with `name`.
 fn threads(process: u32, name: &str) -> Vec<String> {
     let threads = fs::read_dir(format!("/proc/{process}/task")).unwrap().map(|entry| entry.unwrap().path());
     let is_called =
@@ -565,7 +566,7 @@ fn a_mistake_is_told_once() {
         ("train.steps=\"x\"", "train.steps=\"x\": "),
         ("train.stepz=3", "unknown field `stepz`"),
         ("data.captures=[\"nowhere\"]", "nowhere"),
-        // The first rank alone finds this one.
+        // Only the first rank detects this one.
         ("train.keep_checkpoints=3", "config.toml that no run wrote"),
     ];
     fs::create_dir(&run).unwrap();
@@ -614,7 +615,7 @@ fn work_that_is_not_shared_out_is_refused_once() {
     assert!(sentence.starts_with(expected), "{sentence}");
 }
 
-/// What an evaluation wrote, but for how long it took and how much memory that needed.
+/// Returns the result of an evaluation, without times and memory.
 fn evaluation(out: &Path) -> (Value, Vec<String>) {
     let mut scores: Value = serde_json::from_slice(&fs::read(out.join("scores.json")).unwrap()).unwrap();
     for scene in scores["scenes"].as_array_mut().unwrap() {
@@ -626,7 +627,7 @@ fn evaluation(out: &Path) -> (Value, Vec<String>) {
         scores["efficiency"].as_object_mut().unwrap().remove(measured).expect(measured);
     }
     let csv = fs::read_to_string(out.join("scores.csv")).unwrap();
-    // The last column is of times.
+    // The last column contains times.
     (scores, csv.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect())
 }
 
@@ -657,7 +658,7 @@ fn ranks_evaluate_like_one() {
         scores["scenes"].as_array().unwrap().iter().map(|s| s["scene"].as_str().unwrap()).collect();
     assert!(scored == names && csv.len() == 1 + 5 * 2, "{scored:?}");
 
-    // Of those that were stopped one goes on, and a scene that fails is named once.
+    // Stopped evaluations resume, and a scene that fails is reported once.
     let photo = captures.join("room_003/images/003.png");
     fs::write(&photo, "no photo").unwrap();
     for out in [&one, &many] {
@@ -678,13 +679,13 @@ fn ranks_evaluate_like_one() {
 fn bad_data_are_told_of_whichever_rank_finds_them() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(6);
-    // Whose turn it is in sample 1, the second rank's first.
+    // Truncate the photos of the scene of sample 1, the second rank's first.
     for entry in fs::read_dir(folder.path().join("captures/room_003/images")).unwrap() {
         let photo = entry.unwrap().path();
         let bytes = fs::read(&photo).unwrap();
         fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
     }
-    // A step in which every rank loads one sample, and at most two ahead: nobody finds what isn't its own.
+    // One step in which every rank loads one sample, at most two ahead: no rank finds an error in another's sample.
     let settings = |share, batch| ["train.steps=1", "data.ahead=1", "data.threads=1", share, batch];
     let arguments = |run: &str, share, batch| {
         let mut arguments = train(&config, &folder.path().join(run), &settings(share, batch));
@@ -705,7 +706,7 @@ fn bad_data_are_told_of_whichever_rank_finds_them() {
     let two = told(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch=1"))));
     assert_eq!(two["skipped_scenes"], one["skipped_scenes"]);
     assert_eq!(two["skipped_scenes"]["with_broken_images"], 1);
-    // Nor can it be held against what is held out of it.
+    // Its held-out views are not scored, either.
     let judged = |told: &Value| -> Vec<Value> {
         told["held_out"]["scenes"]
             .as_array()
@@ -717,7 +718,7 @@ fn bad_data_are_told_of_whichever_rank_finds_them() {
     assert_eq!((judged(&two), judged(&two).len()), (judged(&one), 5));
 }
 
-/// The script for Slurm with a Slurm of one node, this machine, which starts two processes.
+/// The script for Slurm trains, with a fake Slurm of one node, this machine, which starts two processes.
 #[test]
 fn slurm_s_script_trains() {
     let (Some(_turn), Some(torchrun)) = (turn(), torchrun()) else { return };
@@ -734,7 +735,7 @@ fn slurm_s_script_trains() {
         fs::write(&tool, format!("#!/bin/sh\n{does}\n")).unwrap();
         fs::set_permissions(&tool, fs::Permissions::from_mode(0o755)).unwrap();
     }
-    // Where it is submitted there is a program.
+    // The folder from which the job is submitted contains the program.
     let checkout = folder.path().join("checkout");
     fs::create_dir_all(checkout.join("target/release")).unwrap();
     symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();

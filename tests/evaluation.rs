@@ -1,4 +1,4 @@
-//! The protocol over a data set: `eval --data ROOT --index FILE --out DIR`.
+//! The evaluation protocol on a dataset: `eval --data ROOT --index FILE --out DIR`.
 
 mod common;
 
@@ -11,8 +11,8 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-/// Three rooms of five 256×256 photos in `captures/`, the same in `chunks/`, their splats in `splats/`, and an index of two of
-/// them that also names a scene that isn't there.
+/// Dataset of three rooms with five 256×256 photos each in `captures/`, the same in `chunks/`, their splats in `splats/`, and
+/// an index of two of them that also names a missing scene.
 struct Set {
     folder: TempDir,
 }
@@ -42,7 +42,7 @@ impl Set {
         std::fs::write(self.path("re10k_3v.json"), index.to_string()).unwrap();
     }
 
-    /// The arguments for a subject and a data set.
+    /// Returns the arguments for a subject and a dataset.
     fn arguments(&self, subject: &[&str], data: &str) -> Vec<String> {
         let (data, index, out) = (self.path(data), self.path("re10k_3v.json"), self.path("out"));
         let rest = ["--data", arg(&data), "--index", arg(&index), "--out", arg(&out)];
@@ -50,7 +50,7 @@ impl Set {
     }
 }
 
-/// Runs without LPIPS, which takes longer than all the rest.
+/// Runs the command without LPIPS, which takes longer than all the rest.
 fn run(arguments: &[String], folder: &Path) -> (Option<i32>, String, String) {
     let output = command(&text(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -69,7 +69,7 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
         let evaluation = read_evaluation(&set.path("out")).unwrap();
         let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
         assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));
-        // The splats that the photos were made from, but for the photos' 8 bits.
+        // The photos were rendered from these splats: the only difference is the photos' 8-bit rounding.
         assert!(evaluation.summary.psnr > 50. && evaluation.summary.ssim > 0.999, "{:?}", evaluation.summary);
         assert_eq!((evaluation.dataset.as_str(), evaluation.context_views), ("re10k", 3));
         let views: Vec<&str> =
@@ -96,7 +96,7 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
     assert!(efficiency.forward_seconds > 0. && efficiency.peak_memory_bytes > 1_000_000);
     assert_eq!(first.image_size, [32, 32]);
 
-    // One scene is gone, as if it hadn't been done yet; the other one is believed, whatever it says.
+    // One scene's scores are incomplete, as if it hadn't been done yet; those of the other are reused unchecked.
     let kept = set.path("out/scenes/room_000.json");
     let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
     scores["psnr"] = json!(99.5);
@@ -107,14 +107,14 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
     assert_eq!(second.scenes[0].scores.psnr, 99.5);
     assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
 
-    // Another subject's scores don't go with these.
+    // Scores of another subject must not be mixed with these.
     let splats = set.path("splats");
     let error = refuse(&text(&set.arguments(&["--splat", arg(&splats)], "chunks")));
     assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
-    // Nor do those of the same weights in another precision.
+    // Scores of the same weights in another precision must not, either.
     let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
     let (code, _, err) = run(&half, set.folder.path());
-    // Before it, where bf16 is slower, a line says so.
+    // The line before it may warn that bf16 is slower.
     let refusal = err.lines().last().unwrap_or_default();
     assert!(
         code == Some(2) && refusal.contains("evaluation.json: the evaluation is of tiny.safetensors"),
@@ -144,14 +144,14 @@ fn what_changed_since_is_scored_again() {
     let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let first = read_evaluation(&set.path("out")).unwrap();
-    // Another scene's splat in its place.
+    // Replace a splat by that of another scene.
     std::fs::copy(splats.join("room_001.ply"), splats.join("room_000.ply")).unwrap();
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let second = read_evaluation(&set.path("out")).unwrap();
     assert!(second.scenes[0].scores.psnr < first.scenes[0].scores.psnr - 10.);
     assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
 
-    // LPIPS, once its weights are there.
+    // LPIPS is added once its weights are available.
     if !has_lpips() {
         return;
     }
@@ -161,12 +161,12 @@ fn what_changed_since_is_scored_again() {
     assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
 }
 
-/// Replaces what the file at `path` holds. Its size and its time stay as they were.
+/// Replaces the contents of the file at `path` without changing its size or modification time.
 fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
     let metadata = std::fs::metadata(path).unwrap();
     let (length, modified) = (metadata.len() as usize, metadata.modified().unwrap());
     assert!(bytes.len() <= length, "{} bytes for {length}", bytes.len());
-    // Decoders don't look behind an image's end.
+    // Decoders ignore bytes behind an image's end.
     bytes.resize(length, 0);
     std::fs::write(path, bytes).unwrap();
     let file = std::fs::File::options().write(true).open(path).unwrap();
@@ -186,7 +186,7 @@ fn what_changed_unnoticed_is_scored_again() {
         evaluation.scenes.iter().map(|scene| scene.scores.psnr).collect::<Vec<_>>()
     };
     let first = psnr();
-    // Scores that are believed as long as nothing changes.
+    // Scores that are reused as long as nothing changes.
     let kept = set.path("out/scenes/room_002.json");
     let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
     scores["psnr"] = json!(99.5);
@@ -216,7 +216,7 @@ fn sharded_weights_are_told_apart_by_their_shards() {
     let index_text = std::fs::read(&index).unwrap();
     let arguments =
         |weights: &Path| set.arguments(&["--precision", "f32", "--weights", arg(weights)], "chunks");
-    // By the name that they would have as one file, and by their index's, they are the same.
+    // The name that they would have as one file, and the name of the index, give the same fingerprint.
     for name in [&plain, &index] {
         let (code, _, err) = run(&arguments(name), set.folder.path());
         assert_eq!(code, Some(0), "{err}");
@@ -254,9 +254,9 @@ fn made_up_videos_are_told_apart_by_what_they_depend_on() {
     assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != grey));
 }
 
-/// Largest resident size of this process' children that have ended, in bytes.
+/// Returns the largest resident size of this process's terminated children, in bytes.
 fn peak_of_children() -> u64 {
-    // SAFETY: rusage is plain numbers, for which zero is valid, and getrusage only writes into it.
+    // SAFETY: rusage is plain data for which zero is valid, and getrusage only writes to it.
     let usage = unsafe {
         let mut usage: libc::rusage = std::mem::zeroed();
         libc::getrusage(libc::RUSAGE_CHILDREN, &mut usage);
@@ -267,7 +267,7 @@ fn peak_of_children() -> u64 {
 
 #[test]
 fn photos_are_scored_one_at_a_time() {
-    // As tensors they take 24 MB each, and as much again when they are rendered.
+    // Each takes 24 MB as a tensor, and as much again as a render.
     const PHOTOS: u64 = 40;
     let (width, height) = (1632, 1224);
     let folder = tempfile::tempdir().unwrap();
@@ -305,7 +305,7 @@ fn photos_are_scored_one_at_a_time() {
         let peak = peak_of_children();
         assert!(peak < PHOTOS * 24_000_000, "{subject:?}: {peak} bytes");
     }
-    // 40 rows of three pictures of 816×612, and the gaps.
+    // 40 rows of three images of 816×612, and the gaps.
     let size = read_image(&sheet).unwrap().dimensions();
     assert_eq!(size, (3 * 816 + 2 * 4, PHOTOS as u32 * 612 + (PHOTOS as u32 - 1) * 4));
 }
@@ -346,7 +346,7 @@ fn a_scene_that_fails_is_named_and_the_others_are_scored() {
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (1, 1));
     assert_eq!(evaluation.failures[0].scene, "room_002");
 
-    // Once it is mended, the same command does the rest.
+    // Once the photo is repaired, the same command does the rest.
     std::fs::write(&photo, bytes).unwrap();
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let evaluation = read_evaluation(&set.path("out")).unwrap();
@@ -385,7 +385,7 @@ fn what_data_sets_are_called_is_told_apart() {
         arguments[at + 1] = arg(&set.path(index)).into();
         arguments
     };
-    // Two names, and none that the folder decides for.
+    // The index has two names, and the folder has neither.
     let mut ambiguous = named("chunks", "acid_from_re10k_3v.json");
     let error = refuse(&text(&ambiguous));
     assert!(error.contains("acid_from_re10k_3v.json: ") && error.contains("acid or re10k"), "{error}");
@@ -395,7 +395,7 @@ fn what_data_sets_are_called_is_told_apart() {
     assert_eq!(run(&ambiguous, set.folder.path()).0, Some(0));
     assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, "acid");
 
-    // The folder decides; a part of a word is none.
+    // The folder name decides; a part of a word doesn't count.
     for folder in ["acid/test", "placid/test"] {
         std::fs::create_dir_all(set.path(folder)).unwrap();
         for file in ["000000.torch", "index.json"] {
@@ -415,7 +415,7 @@ fn what_data_sets_are_called_is_told_apart() {
     let error = refuse(&text(&named("acid/test", "re10k_3v.json")));
     assert!(error.contains("acid") && error.contains("re10k") && error.contains("--dataset"), "{error}");
 
-    // Another data set whose folder is called the same.
+    // Another dataset whose folder has the same name.
     let error = refuse(&text(&named("acid/test", "index_3v.json")));
     assert!(
         error.contains("evaluation.json: the evaluation is of ") && error.contains("placid/test"),

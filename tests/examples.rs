@@ -1,4 +1,4 @@
-//! The programs in `examples/`, as a user runs them.
+//! The programs in `examples/`, run as a user runs them.
 
 mod common;
 
@@ -6,10 +6,11 @@ use common::program::{arg, command, room, tiny_weights};
 use std::path::Path;
 use std::process::Command;
 
-/// MKL's products round by where numbers lie in memory, which is elsewhere in each program, unless told otherwise.
+/// Setting that makes MKL's products bit-identical across programs: otherwise their rounding depends on memory alignment.
 const SAME_BITS: (&str, &str) = ("MKL_CBWR", "COMPATIBLE");
 
-/// Standard output of an example that must succeed. `cargo test` has built it; alone, `cargo build --release --examples` does.
+/// Returns the standard output of an example that must succeed. `cargo test` builds it; `cargo build --release --examples`
+/// builds only the examples.
 fn run(name: &str, arguments: &[&str]) -> String {
     let program = Path::new(env!("CARGO_BIN_EXE_globalsplat")).with_file_name("examples").join(name);
     let output =

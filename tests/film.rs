@@ -1,4 +1,4 @@
-//! Films and camera paths: what players make of a film, where its cameras come from, and what is left when it fails.
+//! Videos and camera paths: what players decode, the sources of cameras, and cleanup after failures.
 
 mod common;
 
@@ -18,24 +18,24 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// Whether there is an ffmpeg that writes MP4s; without, the test is skipped.
+/// Returns `true` if there is an ffmpeg that writes MP4s; otherwise, skips the test.
 fn has_ffmpeg() -> bool {
     find_ffmpeg().map_err(|why| skip("ffmpeg", &why)).is_ok()
 }
 
-/// The arguments that render `splat` to `out`, and `more`.
+/// Returns the arguments that render `splat` to `out`, followed by `more`.
 fn render<'a>(splat: &'a Path, out: &'a Path, more: &[&'a str]) -> Vec<&'a str> {
     [&["render", "--splat", arg(splat), "--out", arg(out)][..], more].concat()
 }
 
-/// The pictures in `folder`, by their names.
+/// Returns the images in `folder`, sorted by name.
 fn pictures(folder: &Path) -> Vec<image::RgbImage> {
     let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     files.sort();
     files.iter().map(|file| image::open(file).unwrap().into_rgb8()).collect()
 }
 
-/// In dB, of bytes.
+/// Returns the PSNR of two images in dB, from bytes.
 fn psnr(a: &[u8], b: &[u8]) -> f64 {
     assert_eq!(a.len(), b.len());
     let square = |(&a, &b): (&u8, &u8)| (f64::from(a) - f64::from(b)).powi(2);
@@ -48,7 +48,7 @@ fn names(folder: &Path) -> Vec<String> {
     entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
 }
 
-/// What ffmpeg's prober says of a film's picture.
+/// Returns the description of a video's stream by ffprobe.
 fn probed(film: &Path) -> Value {
     let output = Command::new("ffprobe")
         .args(["-v", "error", "-count_frames", "-show_streams", "-of", "json", arg(film)])
@@ -79,13 +79,13 @@ fn an_mp4_shows_what_the_pictures_show() {
     ] {
         assert_eq!(found[key], expected, "{key}: {found}");
     }
-    // Colour and depth, with a gap.
+    // Colour and depth side by side, with a gap.
     assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(2 * 384 + 4), Some(256)));
     let bytes = fs::read(&film).unwrap();
     let at = |name: &[u8]| bytes.windows(4).position(|four| four == name).unwrap();
     assert!(at(b"moov") < at(b"mdat"), "a page would have to load all of it first");
 
-    // What it says is decoded by another program, and lies beside what the same cameras see in PNGs.
+    // Another program decodes the video, and its frames are compared with PNGs from the same cameras.
     let decoded = Command::new("ffmpeg")
         .args(["-v", "error", "-i", arg(&film), "-sws_flags", "accurate_rnd+full_chroma_int+bicubic"])
         .args(["-f", "rawvideo", "-pix_fmt", "rgb24", "-"])
@@ -99,7 +99,7 @@ fn an_mp4_shows_what_the_pictures_show() {
     let parts = pictures(&views);
     for (i, (frame, parts)) in frames.iter().zip(parts.chunks(2)).enumerate() {
         let mut picture = image::RgbImage::from_pixel(772, 256, image::Rgb([255; 3]));
-        // By name: 000.png, then 000_depth.png.
+        // Sorted by name: 000.png, then 000_depth.png.
         image::imageops::replace(&mut picture, &parts[0], 0, 0);
         image::imageops::replace(&mut picture, &parts[1], 388, 0);
         let likeness = psnr(frame, &picture);
@@ -107,7 +107,7 @@ fn an_mp4_shows_what_the_pictures_show() {
         assert!(likeness > 33., "frame {i} of the film is {likeness} dB like its picture");
     }
 
-    // An odd side loses a line, and nothing else.
+    // An odd side is cropped by one line, and nothing else.
     let odd = folder.path().join("odd.mp4");
     succeed(&render(&splat, &odd, &["--scene", arg(&room), "--size", "33x41"]));
     let found = probed(&odd);
@@ -140,11 +140,11 @@ fn a_browser_plays_an_mp4_from_disk() {
         })",
     );
     assert!(told[0].as_i64() >= Some(2), "{told}");
-    // Nine frames, 20 a second.
+    // Nine frames at 20 frames per second.
     assert!((told[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{told}");
     assert_eq!((told[2].as_i64(), told[3].as_i64()), (Some(384), Some(256)));
     for (i, picture) in pictures(&views).iter().enumerate().step_by(4) {
-        // To the middle of the frame.
+        // Seek to the middle of the frame.
         browser.evaluate(&format!(
             "new Promise((done) => {{
                 const v = document.querySelector('video');
@@ -153,7 +153,7 @@ fn a_browser_plays_an_mp4_from_disk() {
             }})",
             (i as f64 + 0.5) / 20.
         ));
-        // When it says that it is there, a canvas may still be given the frame before.
+        // When the event fires, a canvas may still get the previous frame.
         let mut look = || {
             browser.evaluate(
                 "new Promise((done) => {
@@ -161,7 +161,7 @@ fn a_browser_plays_an_mp4_from_disk() {
                     requestAnimationFrame(() => requestAnimationFrame(done));
                 })",
             );
-            // A page from disk may not read a film's pixels back; what it shows can be seen all the same.
+            // A page from disk may not read the pixels of a video; a screenshot shows them all the same.
             let clip = json!({"x": 0, "y": 0, "width": 384, "height": 256, "scale": 1});
             let shot = browser.call("Page.captureScreenshot", json!({"format": "png", "clip": clip}));
             let png =
@@ -184,7 +184,7 @@ fn a_browser_plays_an_mp4_from_disk() {
     assert!(browser.errors().is_empty(), "{:?}", browser.errors());
 }
 
-/// A folder with an `ffmpeg` that is this script, alone on the path but for what a script needs.
+/// Returns a folder with this script as `ffmpeg`, for use as the path; the script itself finds the system's tools.
 fn with_ffmpeg(script: &str) -> TempDir {
     use std::os::unix::fs::PermissionsExt;
     let folder = tempfile::tempdir().unwrap();
@@ -194,7 +194,7 @@ fn with_ffmpeg(script: &str) -> TempDir {
     folder
 }
 
-/// The sentence of a film that can't be made with what is on `path`, its exit code, and that nothing is left.
+/// Returns the error message and the exit code of a video that can't be written with `path`, and asserts that no file is left.
 fn no_film(path: &Path, splat: &Path) -> (String, Option<i32>) {
     let out = tempfile::tempdir().unwrap();
     let film = out.path().join("film.mp4");
@@ -218,7 +218,7 @@ fn an_mp4_without_an_encoder_is_refused_before_anything_is_read() {
     let other = with_ffmpeg("echo ' V....D mpeg4  MPEG-4 part 2'");
     let (told, code) = no_film(other.path(), absent);
     assert!(code == Some(2) && told.contains("lacks libx264") && told.contains(".gif"), "{told}");
-    // A GIF needs nothing.
+    // A GIF needs no ffmpeg.
     let (folder, room) = room();
     let film = folder.path().join("film.gif");
     let splat = room.join("truth.ply");
@@ -258,7 +258,7 @@ fn ctrl_c_leaves_no_half_film() {
                 .stderr(Stdio::piped())
                 .spawn()
                 .unwrap();
-        // Frames go out as they are rendered.
+        // Frames are written as they are rendered.
         let partial = out.path().join(format!(".film.{ending}.globalsplat-partial"));
         let deadline = Instant::now() + Duration::from_secs(60);
         let written = || fs::metadata(&partial).is_ok_and(|file| ending == "mp4" || file.len() > 100_000);
@@ -287,7 +287,7 @@ fn a_gif_lasts_as_long_as_it_should() {
     while let Some(frame) = decoder.read_next_frame().unwrap() {
         delays.push(frame.delay);
     }
-    // Half a second, though no hundredths are a 24th.
+    // Half a second in total, although 1/24 s is not a whole number of hundredths.
     assert_eq!((delays.len(), delays.iter().sum::<u16>()), (12, 50), "{delays:?}");
 
     let told = refuse(&render(&splat, &film, &[&orbit[..], &["--fps", "60"]].concat()));
@@ -309,7 +309,7 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
     assert_eq!((views.len(), path.len()), (9, 25));
     assert_eq!(path, pictures(&along));
     assert!(psnr(&views[0], &path[0]) > 50. && psnr(&views[8], &path[24]) > 50.);
-    // Every view is passed, and what lies between resembles its neighbours more than views do.
+    // The path passes every view, and its frames resemble their neighbours more than the views do.
     for (i, view) in views.iter().enumerate() {
         let nearest = path.iter().map(|frame| psnr(view, frame)).fold(0., f64::max);
         println!("view {i}: {nearest:.1} dB");
@@ -325,7 +325,7 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
 fn all_pictures_have_one_scale_of_depth() {
     let (folder, room) = room();
     let splat = room.join("truth.ply");
-    // From one place, with eight times the focal length: what is in the middle is as far away in both.
+    // Same position, eight times the focal length: the centre has the same depth in both.
     let mut wide = open_capture(&room).unwrap().cameras()[8];
     (wide.intrinsics.cx, wide.intrinsics.cy) = (20., 20.);
     let mut long = wide;
@@ -334,7 +334,7 @@ fn all_pictures_have_one_scale_of_depth() {
     write_cameras_json(&path, &[String::new(), String::new()], &[wide, long]).unwrap();
     succeed(&render(&splat, &out, &["--path", arg(&path), "--depth", "--size", "320x320"]));
     let [_, wide, _, long] = <[_; 4]>::try_from(pictures(&out)).unwrap();
-    // The middle of the one, enlarged, is the other.
+    // The centre of the one, enlarged, equals the other.
     let middle = image::imageops::crop_imm(&wide, 140, 140, 40, 40).to_image();
     let middle = image::imageops::resize(&middle, 320, 320, image::imageops::FilterType::Triangle);
     let likeness = psnr(&middle, &long);
@@ -369,7 +369,7 @@ fn a_path_takes_every_format_and_needs_no_photos() {
         fs::remove_dir_all(room.join("images")).unwrap();
         assert!(open_capture(&room).is_err(), "the photos are gone");
         assert_same(&room, &cameras, 1e-9);
-        // A file of cameras under any name.
+        // A file of cameras may have any name.
         for file in ["cameras.json", "transforms.json"].map(|name| room.join(name)) {
             if file.exists() {
                 assert_same(&file, &cameras, 1e-9);
@@ -403,7 +403,7 @@ fn photos_that_would_tell_their_size_and_are_gone_are_asked_for() {
     succeed(&render(&splat, &out, &["--path", arg(&room), "--size", "40x40"]));
 }
 
-/// What nerfstudio's viewer writes.
+/// Returns a camera path as nerfstudio's viewer writes it.
 fn of_viewer(cameras: &[Camera]) -> Value {
     let frames = cameras.iter().map(|camera| {
         let opengl = camera.c2w * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.));
@@ -421,7 +421,7 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
     let (folder, room) = room();
     let mut cameras = open_capture(&room).unwrap().cameras();
     for camera in &mut cameras {
-        // Square pixels, and a principal point in the middle, are all that such a path knows.
+        // Such a path stores only square pixels and a principal point in the middle.
         camera.width = 60;
         camera.intrinsics.fx = camera.intrinsics.fy;
         (camera.intrinsics.cx, camera.intrinsics.cy) = (30., 20.);
@@ -471,7 +471,7 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         }
     }
     assert!(!out.exists());
-    // Files that are no path at all.
+    // Files that are no camera paths.
     for (text, part) in [
         ("{", "not a description of cameras"),
         ("{\"frames\": 3}", "frames is 3"),

@@ -1,4 +1,4 @@
-//! What the program did not make is there afterwards, and what it can't tell apart it refuses.
+//! Files that the program did not write are kept, and ambiguous ones are refused.
 #![cfg(unix)]
 
 mod common;
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 const NOTES: &str = "what somebody wrote";
 
-/// A file of somebody's.
+/// Writes a file that stands for a user's own.
 fn put(file: PathBuf) -> PathBuf {
     std::fs::create_dir_all(file.parent().unwrap()).unwrap();
     std::fs::write(&file, NOTES).unwrap();
@@ -22,7 +22,7 @@ fn assert_kept(file: &Path) {
     assert_eq!(std::fs::read_to_string(file).unwrap(), NOTES, "{}", file.display());
 }
 
-/// The contents of every file in `folder`.
+/// Returns the contents of every file in `folder`.
 fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut files = BTreeMap::new();
     for entry in std::fs::read_dir(folder).unwrap() {
@@ -71,7 +71,7 @@ fn folders_of_other_names_than_ours_are_no_business_of_a_run() {
         "checkpoints/step-1/notes.txt",
         "checkpoints/step-00000001-kept/notes.txt",
         "checkpoints/.step-00000001.old/notes.txt",
-        // These are replaced and dropped in time.
+        // Folders that the run replaces and removes later.
         "best/notes.txt",
     ];
     let mut files: Vec<PathBuf> = files.iter().map(|name| put(run.join(name))).collect();
@@ -94,7 +94,7 @@ fn a_broken_checkpoint_takes_no_good_ones_place() {
     let train = |settings: &[&str]| succeed(&text(&train(&config, &run, settings)));
     train(&["train.steps=4", "train.keep_checkpoints=3"]);
     let at = |step: u64| run.join(format!("checkpoints/step-{step:08}"));
-    // One with the latest number that no run has reached again yet, and one on the way.
+    // A checkpoint with a number that the run hasn't reached again, and an incomplete one.
     std::fs::create_dir(at(90)).unwrap();
     std::fs::write(at(90).join("state.json"), "{").unwrap();
     std::fs::write(at(2).join("model.safetensors"), "").unwrap();
@@ -113,7 +113,7 @@ fn pack_replaces_no_chunk_but_one_that_it_would_write() {
     assert_kept(&chunk);
     std::fs::remove_file(&chunk).unwrap();
     succeed(&["pack", arg(&room), "--out", arg(&out)]);
-    // As if it had been stopped before the index.
+    // Simulates a process that was stopped before it wrote the index.
     let before = std::fs::read(&chunk).unwrap();
     std::fs::remove_file(out.join("index.json")).unwrap();
     succeed(&["pack", arg(&room), "--out", arg(&out)]);
@@ -160,7 +160,7 @@ fn a_run_takes_no_configuration_for_its_own() {
     assert_eq!(error, again);
     assert!(error.contains("the run's folder is one with a config.toml that no run wrote"), "{error}");
     assert_eq!(std::fs::read(&config).unwrap(), before);
-    // What a run wrote is written anew.
+    // Files that a run wrote are overwritten.
     let other = folder.path().join("other");
     let train = |config: &Path| {
         succeed(&["train", "--config", arg(config), "--out", arg(&other), "--set", "train.steps=1"])

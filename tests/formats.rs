@@ -1,4 +1,4 @@
-//! The formats captures come in: the same cameras and pixels from each.
+//! Capture formats: each gives the same cameras and pixels.
 
 mod common;
 
@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use tempfile::TempDir;
 
-/// Pixels that differ from view to view.
+/// Writes photos whose pixels differ from view to view.
 fn write_photos(folder: &Path) {
     std::fs::create_dir_all(folder).unwrap();
     for (i, name) in names().iter().enumerate() {
@@ -25,7 +25,7 @@ fn write_photos(folder: &Path) {
     }
 }
 
-/// A `cameras.json` capture of [`cameras`].
+/// Returns a `cameras.json` capture of [`cameras`].
 fn original() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     write_photos(&folder.path().join("images"));
@@ -39,7 +39,7 @@ fn every_format_opens_to_the_same_capture() {
         let folder = original();
         let expected = open_capture(folder.path()).unwrap().load_all(None).unwrap();
         rewrite(folder.path(), format);
-        // What other tools leave there.
+        // A file that other tools leave there.
         std::fs::write(folder.path().join("point_cloud.ply"), b"ply").unwrap();
         let capture = open_capture(folder.path()).unwrap();
         assert_same_cameras(&capture, &cameras());
@@ -132,7 +132,7 @@ fn views_and_captures_come_in_the_order_of_their_numbers() {
         let found: Vec<String> =
             open_capture(&folder).unwrap().names().map(|name| name.replace("images/", "")).collect();
         match format {
-            // The author's own order.
+            // The order of the file.
             None => assert!(found.iter().eq(shuffled.iter().copied()), "{found:?}"),
             Some(format) => assert_eq!(found, names, "{format:?}"),
         }
@@ -142,7 +142,7 @@ fn views_and_captures_come_in_the_order_of_their_numbers() {
     assert_eq!(captures, ["scene_8", "scene_9", "scene_10", "scene_11"]);
 }
 
-/// Opens `transforms.json` with [`cameras`] and `change`s, beside the photos.
+/// Opens a `transforms.json` with [`cameras`] and `change`s, beside the photos.
 fn changed_transforms(change: impl FnOnce(&mut Value)) -> Capture {
     let folder = original();
     let mut contents = transforms(&in_images(&names()), &cameras());
@@ -165,14 +165,14 @@ fn lenses_of_transforms_may_be_told_in_many_ways() {
         all.iter_mut().for_each(|camera| change(&mut camera.intrinsics));
         all
     };
-    // By angles of view.
+    // Focal lengths from the angles of view.
     let capture = changed_transforms(|t| {
         remove(t, &["fl_x", "fl_y"]);
         t["camera_angle_x"] = json!(2. * (12f64 / 21.5).atan());
         t["camera_angle_y"] = json!(2. * (8f64 / 20.25).atan());
     });
     assert_same_cameras(&capture, &cameras());
-    // By one of them, without a principal point or a size, and with the names of NeRF's synthetic scenes.
+    // One angle of view, no principal point or size, and the names of NeRF's synthetic scenes.
     let capture = changed_transforms(|t| {
         remove(t, &["fl_x", "fl_y", "cx", "cy", "w", "h"]);
         t["camera_angle_x"] = json!(2. * (12f64 / 30.).atan());
@@ -181,7 +181,7 @@ fn lenses_of_transforms_may_be_told_in_many_ways() {
         }
     });
     assert_same_cameras(&capture, &with(|k| *k = Intrinsics { fx: 30., fy: 30., cx: 12., cy: 8. }));
-    // A frame's own fields come before the shared ones, focal lengths before angles.
+    // A frame's own fields override the shared ones, focal lengths override angles.
     let capture = changed_transforms(|t| {
         t["camera_angle_x"] = json!(1.);
         remove(t, &["fl_y"]);
@@ -266,7 +266,8 @@ fn a_real_capture_with_a_lens_opens() {
         let rotation = DMat3::from_mat4(camera.c2w);
         assert!((rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, 1e-12));
     }
-    // All look at the fox: the point nearest to all optical axes, Σ(I − zzᵀ)(p − c) = 0, is in the middle of every photo.
+    // All cameras look at the fox: the point nearest to all optical axes, Σ(I − zzᵀ)(p − c) = 0, is in the middle of every
+    // photo.
     let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
     for camera in &cameras {
         let (z, c) = (camera.c2w.z_axis.truncate(), camera.c2w.w_axis.truncate());
@@ -277,7 +278,7 @@ fn a_real_capture_with_a_lens_opens() {
     for camera in &cameras {
         let p = camera.c2w.inverse().transform_point3(middle);
         assert!(p.z > 1. && (p.x / p.z).abs() < 0.4 && (p.y / p.z).abs() < 0.7, "{p}");
-        // Held upright: the world's up, z, is up in the photo.
+        // The photos are upright: the world's up, z, is up in the photo.
         assert!(camera.c2w.y_axis.z < -0.5, "{}", camera.c2w);
     }
     let stored = tensor_from_rgb(&read_image(&fox.join("images/0001.jpg")).unwrap());
@@ -287,7 +288,7 @@ fn a_real_capture_with_a_lens_opens() {
     assert!(moved > 0.002 && moved < 0.1, "the lens moves pixels a little: {moved}");
 }
 
-/// A folder with the photos of [`names`] in `images` and nothing that describes them.
+/// Returns a folder with the photos of [`names`] in `images` and no description of them.
 fn photos_alone() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     write_photos(&folder.path().join("images"));
@@ -300,7 +301,7 @@ fn write_transforms(folder: &Path, change: impl FnOnce(&mut Value)) {
     std::fs::write(folder.join("transforms.json"), contents.to_string()).unwrap();
 }
 
-/// That exactly one line is said of `capture`, and that it has all of `parts`.
+/// Asserts that `capture` has exactly one warning, of one line, and that it contains all of `parts`.
 #[track_caller]
 fn assert_warns(capture: &Capture, parts: &[&str]) {
     let [line] = capture.warnings() else { panic!("{:?}", capture.warnings()) };
@@ -333,7 +334,7 @@ fn photos_that_are_not_there_are_left_out_and_named() {
 #[test]
 fn the_first_format_that_can_be_read_is_taken() {
     let folder = photos_alone();
-    // What 3DGS puts beside its splats.
+    // File that 3DGS writes beside its splats.
     let foreign = r#"[{"id": 0, "img_name": "000", "width": 24, "height": 16, "position": [0, 0, 0]}]"#;
     std::fs::write(folder.path().join("cameras.json"), foreign).unwrap();
     let error = open_capture(folder.path()).unwrap_err().to_string();
@@ -385,7 +386,7 @@ fn what_a_frame_says_of_its_lens_comes_before_what_all_share() {
         camera.intrinsics = Intrinsics { fx, fy, ..camera.intrinsics };
     }
     assert_same_cameras(&capture, &expected);
-    // The second frame has coefficients of its own, which are all 0.
+    // The second frame has its own coefficients, all 0.
     let views = capture.load(&[0, 1], None).unwrap();
     assert!(!views[0].image.equal(&undistorted[0].image) && views[1].image.equal(&undistorted[1].image));
 }
@@ -408,7 +409,7 @@ fn of_several_models_the_largest_is_taken() {
             &["the largest of 2 models is taken, with 5 photos", &format!("{small} (2 photos)")],
         );
     }
-    // `sparse` itself names the same capture.
+    // The path `sparse` itself opens the same capture.
     let folder = photos_alone();
     for (model, count) in [("sparse/0", 2), ("sparse/1", 5), ("sparse/2", 5)] {
         write_colmap_binary(&folder.path().join(model), &names()[..count], &cameras()[..count]);
@@ -430,7 +431,7 @@ fn a_model_and_its_photos_may_lie_in_one_folder() {
         assert_same_cameras(&capture, &cameras());
         assert!(capture.warnings().is_empty() && capture.load_all(None).unwrap().len() == 5);
     }
-    // Numbered captures beside each other are captures, not models of one.
+    // Numbered captures beside each other are captures, not models of one capture.
     let above = tempfile::tempdir().unwrap();
     for i in 0..2 {
         let folder = above.path().join(i.to_string());
@@ -466,7 +467,7 @@ fn cameras_are_scaled_to_smaller_and_larger_photos() {
             assert_eq!(capture.load(&[3], None).unwrap()[0].image.size(), [3, 4, 6]);
         }
     }
-    // Of another aspect: refused as before, by the photo's name.
+    // A photo of another aspect ratio is refused, by its name.
     let folder = original();
     rewrite(folder.path(), Format::ColmapText);
     photo(12, 12).save(folder.path().join("images/001.png")).unwrap();
@@ -496,7 +497,7 @@ fn names_are_found_however_they_are_written() {
     write(&|_, name| format!("/home/me/room/images/{name}"));
     write(&|_, name| format!("../{}/images/{name}", folder.path().file_name().unwrap().to_str().unwrap()));
     std::fs::remove_file(folder.path().join("transforms.json")).unwrap();
-    // In COLMAP: subfolders, spaces, parentheses and backslashes.
+    // Names in COLMAP with subfolders, spaces, parentheses and backslashes.
     for name in ["left\\0 (1).png", "a plan (2)\\b.png"] {
         let all: Vec<String> = (0..5).map(|i| name.replace('.', &format!(" {i}."))).collect();
         for (from, to) in names().iter().zip(&all) {
@@ -530,13 +531,13 @@ fn the_synthetic_layout_has_views_to_learn_from_and_views_to_hold_out() {
     assert_eq!(capture.split("every:3+1".parse().unwrap()), (vec![0, 2], vec![1]));
     assert_eq!(capture.scored_views(), [3, 4]);
     assert_eq!(capture.names().nth(3), Some("./test/000"));
-    // Either file alone is a capture without parts.
+    // Each file alone is a capture without splits.
     let alone = open_capture(&path.join("transforms_train.json")).unwrap();
     assert_eq!((alone.len(), alone.has_test_part()), (3, false));
     assert_eq!(find_captures(path).unwrap().captures.len(), 1);
-    // As a data set, whose part isn't the folder of photos of that name.
+    // As a dataset, its test split is not the folder of photos with that name.
     assert_eq!(Dataset::open(path, Split::Train).unwrap().scenes(), 1);
-    // Without the photos of the test part there is none.
+    // Without its photos, the test split is missing.
     std::fs::remove_dir_all(path.join("test")).unwrap();
     let capture = open_capture(path).unwrap();
     assert!(!capture.has_test_part());
@@ -677,7 +678,7 @@ fn the_rational_lens_is_the_same_in_both_formats() {
     assert!(pixels(&format!("FULL_OPENCV {k} 0 0 0 0 0 0 0 0")).equal(&plain));
     let polynomial = pixels(&format!("OPENCV {k} 0.2 0.3 0.01 -0.02"));
     assert!(pixels(&format!("FULL_OPENCV {k} 0.2 0.3 0.01 -0.02 0 0 0 0")).equal(&polynomial));
-    // (1 + 2r²)/(1 + 2r²) is 1.
+    // The ratio (1 + 2r²)/(1 + 2r²) is 1.
     assert!(pixels(&format!("FULL_OPENCV {k} 2 0 0 0 0 2 0 0")).equal(&plain));
     let rational = pixels(&format!("FULL_OPENCV {k} 0.2 0.3 0.01 -0.02 0.1 0.4 0.05 0.02"));
     assert!(!rational.equal(&polynomial));
@@ -707,7 +708,7 @@ fn the_search_goes_past_what_it_can_not_read_and_what_work_has_left() {
     let found = find_captures(above.path()).unwrap();
     let names: Vec<&str> = found.captures.iter().map(|capture| capture.name.as_str()).collect();
     assert_eq!(names, ["room"]);
-    // Who may read everything is refused nothing.
+    // A user who may read everything, such as root, gets no warning.
     match std::fs::read_dir(&closed) {
         Ok(_) => assert!(found.warnings.is_empty()),
         Err(_) => assert!(found.warnings.len() == 1 && found.warnings[0].contains("closed can't be read")),

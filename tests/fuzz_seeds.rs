@@ -1,4 +1,4 @@
-//! What fuzzing found, and what it began with, goes through the readers once more: see `scripts/fuzz.sh`.
+//! Fuzzing seeds and former failures are read again by every reader: see `scripts/fuzz.sh`.
 
 #[path = "common/readers/mod.rs"]
 mod readers;
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 #[test]
 fn seeds_crash_no_reader() {
     let seeds = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
-    // What else to read, as `scripts/fuzz_coverage.sh` has it.
+    // Further inputs, as `scripts/fuzz_coverage.sh` passes them.
     let corpora = std::env::var_os("FUZZ_CORPORA").map(PathBuf::from);
     for (name, read) in readers::READERS {
         let files_in = |folder: PathBuf| {
@@ -36,8 +36,8 @@ fn every_reader_has_a_fuzz_target() {
     }
 }
 
-/// fuzz/Cargo.lock locks exactly the dependencies that the two manifests name; if one is missing, `cargo fuzz build` picks an untested
-/// version, or fails without a network.
+/// fuzz/Cargo.lock locks exactly the dependencies that the two manifests name; if one is missing, `cargo fuzz build` picks an
+/// untested version, or fails without a network.
 #[test]
 fn lock_file_of_the_fuzz_targets_is_up_to_date() {
     let read = |path: &str| {
@@ -48,7 +48,7 @@ fn lock_file_of_the_fuzz_targets_is_up_to_date() {
     for (manifest, name) in [("Cargo.toml", "globalsplat"), ("csrc/Cargo.toml", "globalsplat-csrc")] {
         let mut packages = lock["package"].as_array().unwrap().iter();
         let package = packages.find(|package| package["name"].as_str() == Some(name)).unwrap();
-        // A name, followed by its version where several are locked.
+        // A name, followed by its version if several are locked.
         let locked: Vec<&str> = package["dependencies"]
             .as_array()
             .unwrap()

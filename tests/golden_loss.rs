@@ -8,7 +8,7 @@ use globalsplat::io::read_weights;
 use globalsplat::loss::{frustum, sh_soft_cap};
 use tch::{Device, Kind, Tensor};
 
-/// The golden's cameras are those of images of this size: the file doesn't tell, its principal points do.
+/// Returns the size of the images of the golden cameras: the file doesn't contain it, but the principal points determine it.
 fn image_size(intrinsics: &Tensor) -> i64 {
     (intrinsics.double_value(&[0, 0, 0, 2]) * 2.).round() as i64
 }

@@ -1,4 +1,4 @@
-//! The model against tensors that an independent implementation computed: outputs within 1e-5 and gradients within 1e-4
+//! The model matches tensors that an independent implementation computed: outputs within 1e-5 and gradients within 1e-4
 //! relative L2, for every case in the golden folder.
 
 mod common;
@@ -12,12 +12,12 @@ use tch::{Device, Kind, Tensor, nn};
 
 const OUTPUT_TOLERANCE: f64 = 1e-5;
 const GRADIENT_TOLERANCE: f64 = 1e-4;
-/// The gradient of a key bias is zero in exact arithmetic: softmax ignores a constant. What is there is rounding, which
-/// goes with the gradients around it: it is held as a share of the case's largest.
+/// Name of key biases, whose gradient is zero in exact arithmetic: softmax ignores a constant. The computed values are rounding
+/// errors that scale with the gradients around them, so they are compared with the case's largest gradient.
 const ZERO_GRADIENT: &str = "mem_k.bias";
 const ZERO_TOLERANCE: f64 = 1e-5;
 
-/// None where there is no golden folder; a folder has one at least.
+/// Returns the cases, at least one; none without a golden folder.
 fn cases() -> Vec<PathBuf> {
     let Some(root) = golden() else { return vec![] };
     let mut cases: Vec<PathBuf> = std::fs::read_dir(&root)
@@ -30,7 +30,7 @@ fn cases() -> Vec<PathBuf> {
     cases
 }
 
-/// A case's model with its weights, and its configuration as JSON.
+/// Returns a case's model with its weights, and its configuration as JSON.
 fn load(case: &Path) -> (nn::VarStore, GlobalSplat, serde_json::Value) {
     let json: serde_json::Value =
         serde_json::from_slice(&std::fs::read(case.join("config.json")).expect("config.json")).expect("JSON");

@@ -1,4 +1,4 @@
-//! Photos of more pixels than a model was trained with: `--views-at`, `--views-as` and `--pictures-at`.
+//! Photos of higher resolution than a model was trained with: `--views-at`, `--views-as` and `--pictures-at`.
 
 mod common;
 
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use tch::Device;
 use tempfile::TempDir;
 
-/// A room of nine 64×64 photos, six of which a model of 32×32 sees where every third one is held out.
+/// Room of nine 64×64 photos, with a model of 32×32 images that gets six of them, as every third one is held out.
 struct Set {
     folder: TempDir,
     weights: PathBuf,
@@ -41,7 +41,7 @@ impl Set {
         open_capture(&self.room()).unwrap()
     }
 
-    /// What the program prints and tells, without LPIPS.
+    /// Returns the exit code, standard output and standard error of the program, run without LPIPS.
     fn run(&self, arguments: &[&str], options: &[&str]) -> (Option<i32>, String, String) {
         let output = command(&[arguments, options].concat())
             .env("GLOBALSPLAT_WEIGHTS", self.folder.path())
@@ -51,7 +51,7 @@ impl Set {
         (output.status.code(), text(&output.stdout), text(&output.stderr))
     }
 
-    /// The JSON of `reconstruct`, what it told, and its splat's bytes.
+    /// Returns the JSON of `reconstruct`, its messages, and its splat's bytes.
     fn reconstruct(&self, options: &[&str]) -> (Value, String, Vec<u8>) {
         let (room, splat) = (self.room(), self.path("room.ply"));
         let (weights, scene, out) = (arg(&self.weights), arg(&room), arg(&splat));
@@ -61,7 +61,7 @@ impl Set {
         (serde_json::from_str(&told).unwrap(), err, std::fs::read(splat).unwrap())
     }
 
-    /// The JSON of `eval --scene`, and what it told.
+    /// Returns the JSON of `eval --scene`, and its messages.
     fn score(&self, options: &[&str]) -> (Value, String) {
         let room = self.room();
         let arguments = ["eval", "--weights", arg(&self.weights), "--scene", arg(&room), "--json"];
@@ -70,7 +70,7 @@ impl Set {
         (serde_json::from_str(&told).unwrap(), err)
     }
 
-    /// What `eval --data` does in the folder `out`.
+    /// Runs `eval --data` in the folder `out`.
     fn sweep(&self, out: &str, options: &[&str]) -> (Option<i32>, String, String) {
         let (captures, index, out) = (self.path("captures"), self.path("index.json"), self.path(out));
         let (weights, data) = (arg(&self.weights), arg(&captures));
@@ -107,7 +107,7 @@ fn photos_become_as_many_views_as_they_have_phases() {
         "{err}"
     );
 
-    // At the model's own size nothing is another way.
+    // At the model's own size, `--views-at` changes nothing.
     let (same, said, bytes) = set.reconstruct(&["--views-at", "32"]);
     assert_eq!((without_times(same), said), (without_times(told), err));
     assert!(bytes == plain, "another splat");
@@ -123,7 +123,7 @@ fn photos_become_as_many_views_as_they_have_phases() {
     assert!(err.trim().ends_with(expected), "{err}");
     assert!(sharp.len() == plain.len() && sharp != plain);
 
-    // More than the photos have.
+    // A higher resolution than that of the photos.
     let (told, err, _) = set.reconstruct(&["--views-at", "96", "--views", "2"]);
     assert_eq!((&told["photos"], &told["views"]), (&json!(2), &json!(18)));
     assert!(err.contains("64×64 pixels are cut and resized to 96×96 pixels, 9 views of"), "{err}");
@@ -143,18 +143,18 @@ fn one_capture_is_scored_in_every_setting() {
         assert_eq!((&told["input"], &told["image_size"]), (&expected, &json!([32, 32])));
         assert!(told["forward_seconds"].as_f64().unwrap() > 0.);
         assert!(err.starts_with("photos are cut and resized to "), "{err}");
-        // Photos in the model's place know of no setting.
+        // The baselines don't depend on the setting.
         assert_eq!(told["baselines"], plain["baselines"], "{views_as}");
-        // Pictures of another size are of other photos; the splat is the same.
+        // Scored images of another size are compared with other photos; the splat is the same.
         let (large, _) = set.score(&["--views-at", "64", "--views-as", views_as, "--pictures-at", "64"]);
         assert_eq!((&large["input"], &large["image_size"]), (&expected, &json!([64, 64])));
         assert_ne!((&large["psnr"], &large["baselines"]), (&told["psnr"], &told["baselines"]));
     }
-    // Small photos in, large pictures out.
+    // Small input photos, large scored images.
     let (told, err) = set.score(&["--pictures-at", "128"]);
     assert_eq!((&told["input"]["views"], &told["image_size"]), (&json!(6), &json!([128, 128])));
     assert!(err.starts_with("room_000: smaller photos are enlarged"), "{err}");
-    // A splat's too.
+    // The size applies to a splat, too.
     let (room, splat) = (set.room(), set.path("captures/room_000/truth.ply"));
     let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"];
     let [own, half] = [&["--pictures-at", "64"], &["--pictures-at", "32"]].map(|options| {
@@ -185,7 +185,7 @@ fn a_data_set_is_scored_in_every_setting_and_none_goes_on_with_another() {
         let report = std::fs::read_to_string(set.path(views_as).join("report.html")).unwrap();
         assert!(report.contains(&found.method) && report.contains("64×64 pixels"), "{views_as}");
 
-        // The same goes on; another size, of what is shown or of pictures, doesn't.
+        // The same command resumes; another size, of the input or of scored images, is refused.
         assert_eq!(set.sweep(views_as, &options).0, Some(0));
         for other in [
             ["--views-at", "96", "--views-as", views_as, "--pictures-at", "64"],
@@ -199,7 +199,7 @@ fn a_data_set_is_scored_in_every_setting_and_none_goes_on_with_another() {
     assert_eq!(set.sweep("whole", &["--views-at", "64", "--pictures-at", "64"]).0, Some(2));
     assert_ne!(scores("polyphase"), scores("whole"));
     assert_ne!(scores("polyphase"), scores("repeated"));
-    // The model's own size is no setting.
+    // The model's own size counts as no setting.
     assert_eq!(
         set.sweep("plain", &["--views-at", "32", "--views-as", "whole", "--pictures-at", "32"]).0,
         Some(0)
@@ -210,7 +210,7 @@ fn a_data_set_is_scored_in_every_setting_and_none_goes_on_with_another() {
     assert!(read_evaluation(&set.path("large")).unwrap().scenes.iter().all(|scene| scene.enlarged));
 }
 
-/// A photo counts once in where the normalized world is, whatever it becomes.
+/// A photo counts once for the normalization of the scene, however many views it becomes.
 #[test]
 fn settings_share_one_normalized_world() {
     let set = Set::new();

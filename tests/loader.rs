@@ -1,4 +1,4 @@
-//! What training is fed with: the same samples whatever the number of threads, from anywhere, past everything broken.
+//! The loader gives the same samples with any number of threads, from any start position, and skips broken data.
 
 use glam::{DMat4, DVec3};
 use globalsplat::data::DataConfig;
@@ -13,11 +13,11 @@ use std::path::Path;
 use std::sync::Arc;
 use tch::{Device, Tensor};
 
-/// Of the photos.
+/// Size of the photos in pixels.
 const WIDTH: u32 = 48;
 const HEIGHT: u32 = 36;
 
-/// A capture of `views` JPEGs whose blue tells the scene.
+/// Writes a capture of `views` JPEGs whose blue channel identifies the scene.
 fn write_capture(folder: &Path, scene: u8, views: usize) -> Capture {
     std::fs::create_dir_all(folder).unwrap();
     let names: Vec<String> = (0..views).map(|view| format!("{view:03}.jpg")).collect();
@@ -48,7 +48,7 @@ fn config() -> DataConfig {
     }
 }
 
-/// Captures in groups; a group that holds none is broken, and so is a capture that isn't there.
+/// Captures in groups; an empty group stands for a broken file, `None` for a broken capture.
 #[derive(Debug)]
 struct Groups(Vec<Vec<Option<Capture>>>);
 
@@ -109,7 +109,7 @@ fn samples_depend_on_seed_and_number_alone() {
     assert_same(&load(3, 3, 0, 17), &all);
     assert_same(&load(3, 2, 5, 12), &all[5..]);
     assert_ne!(load(4, 2, 0, 17)[0].images, all[0].images);
-    // The same scene looks different in another epoch.
+    // The same scene is augmented differently in another epoch.
     assert!(
         all.iter().enumerate().all(|(i, scene)| all[..i].iter().all(|other| other.images != scene.images))
     );
@@ -140,7 +140,7 @@ fn the_scenes_of_a_step_show_equally_many_views() {
     };
     let all = counts(0);
     assert_eq!(all.iter().copied().collect::<BTreeSet<_>>(), BTreeSet::from([2, 3, 4]));
-    // A run that goes on draws on.
+    // A resumed run continues the random sequence.
     assert_eq!(counts(6)[..10], all[2..]);
 }
 
@@ -169,7 +169,8 @@ fn tensors(sample: &Sample) -> [&Tensor; 9] {
     [&a.images, &a.c2w, &a.w2c, &a.intrinsics, &b.images, &b.c2w, &b.w2c, &b.intrinsics, far]
 }
 
-/// On the CPU, where the same is done as for a GPU but for the copies.
+/// Batches that are prefetched to the device are the same. Tested on the CPU, which does the same as for a GPU except for the
+/// copies.
 #[test]
 fn batches_that_are_sent_ahead_are_the_same() {
     let folder = tempfile::tempdir().unwrap();
@@ -178,7 +179,7 @@ fn batches_that_are_sent_ahead_are_the_same() {
     let (mut plain, mut ahead) = (loader(4), loader(4));
     for step in 0..4 {
         if step != 2 {
-            // Twice is once.
+            // A second call is a no-op.
             ahead.send_ahead(2, Device::Cpu);
             ahead.send_ahead(2, Device::Cpu);
         }
@@ -193,7 +194,7 @@ fn batches_that_are_sent_ahead_are_the_same() {
     }
 }
 
-/// What is wrong with samples that were sent ahead is told at their turn, as it is without.
+/// Errors in prefetched samples are reported when the samples are due, as without prefetching.
 #[test]
 fn errors_come_when_their_samples_would() {
     let folder = tempfile::tempdir().unwrap();
@@ -229,7 +230,7 @@ fn without_augmentation_every_view_is_the_same_in_every_sample() {
     assert!(shown.iter().all(|scene| scene.images == shown[0].images && scene.context == [0, 1, 2, 3, 4, 5]));
 }
 
-/// Seven good scenes, a broken group, a scene with broken cameras, a short one, and one with a broken photo.
+/// Returns seven good scenes, a broken group, a scene with broken cameras, a short one, and one with broken photos.
 fn with_bad_data(folder: &Path) -> Groups {
     let mut data = groups(folder, &[3, 2, 2]);
     data.0[0].push(None);
@@ -264,11 +265,11 @@ fn bad_data_are_counted_and_skipped() {
         "{line}"
     );
     assert_eq!(line.lines().count(), 1);
-    // Those that stand in for bad ones follow from the number, too.
+    // The samples that replace broken ones are determined by the sample number, too.
     assert_same(&load(3, 7, 17).0, &all[7..]);
 }
 
-/// Groups that break the program's own rules.
+/// Groups that panic when they are opened.
 #[derive(Debug)]
 struct Panics;
 

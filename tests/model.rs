@@ -26,7 +26,7 @@ fn small() -> ModelConfig {
     }
 }
 
-/// `views` images of noise from cameras in a row.
+/// Returns `views` images of noise from cameras in a row.
 fn inputs(views: i64, height: i64, width: i64) -> [Tensor; 3] {
     let options = (Kind::Float, Device::Cpu);
     let images = Tensor::rand([1, views, 3, height, width], options);
@@ -123,7 +123,7 @@ fn the_number_of_gaussians_does_not_depend_on_the_number_of_views() {
 
 #[test]
 fn a_transition_starts_where_the_stage_before_ended() {
-    // At λ = 0 every parent is there twice, its optical depth split between the two.
+    // At λ = 0 every parent occurs twice, its optical depth split between the two.
     let (_vs, model) = build(&small());
     let [images, c2w, intrinsics] = inputs(2, 16, 16);
     let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics));
@@ -141,9 +141,9 @@ fn bf16_is_float32_but_for_its_rounding() {
     for streams in [Streams::Dual, Streams::Single] {
         let (vs, mut model) = build(&ModelConfig { streams, ..small() });
         let mut random = common::Random::new(3);
-        // By their names: a map's own order is another one in every process, and with it every weight.
+        // In the order of names: the map's own order differs between processes, and so would every weight.
         for (name, variable) in &mut vs.variables().into_iter().collect::<BTreeMap<_, _>>() {
-            // So that every layer matters: LayerScale begins at a thousandth.
+            // Large values, so that every layer matters: LayerScale is initialized to a thousandth.
             let is_norm = name.ends_with(".weight") && variable.dim() == 1;
             let value = random.symmetric(&variable.size()) * 0.3 + if is_norm { 1. } else { 0. };
             tch::no_grad(|| variable.copy_(&value));
@@ -207,7 +207,7 @@ fn weights_of_a_file_in_bf16_are_kept_in_it() {
     assert!(cast.quaternions.equal(&kept.quaternions) && cast.opacities.equal(&kept.opacities));
 }
 
-/// Bytes of the process' memory that lie in `file`, as Linux counts them.
+/// Returns the resident bytes of the process that are mapped from `file`, as Linux counts them.
 #[cfg(target_os = "linux")]
 fn resident(file: &std::path::Path) -> u64 {
     let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
@@ -216,7 +216,7 @@ fn resident(file: &std::path::Path) -> u64 {
     for line in maps.lines() {
         let first = line.split_whitespace().next().unwrap_or_default();
         if first.contains('-') {
-            // A range of addresses, and at the line's end what lies there.
+            // A line with a range of addresses, and the mapped file at its end.
             is_of_file = line.ends_with(&name);
         } else if first == "Rss:" && is_of_file {
             kilobytes += line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap();
@@ -246,7 +246,7 @@ fn weights_that_lie_in_their_file_are_those_that_are_copied() {
                 tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians)
             };
             let (a, b) = (of(&copied), of(loaded));
-            // Where a tensor lies in memory may decide in which order sums are added up.
+            // The memory alignment of a tensor may affect the order of summation.
             let pairs = [(&a.means, &b.means), (&a.opacities, &b.opacities), (&a.sh, &b.sh)];
             pairs.iter().all(|(a, b)| common::relative_error(b, a) < 1e-5)
         };
@@ -260,7 +260,7 @@ fn weights_that_lie_in_their_file_are_those_that_are_copied() {
             assert!(2 * used > bytes && 8 * left < bytes, "{dtype:?}: {used} of {bytes} bytes, then {left}");
         }
         assert!(same(&lies), "{dtype:?}: read again");
-        // A page that is written to is the process' own.
+        // Pages that are written to become private copies.
         let before = std::fs::read(&path).unwrap();
         tch::no_grad(|| lies.vs.variables().values().for_each(|t| drop(t.shallow_clone().fill_(1.))));
         assert!(!same(&lies) && std::fs::read(&path).unwrap() == before);
@@ -320,8 +320,8 @@ fn a_memory_that_nobody_follows_is_kept_as_products_take_it() {
     assert_eq!(of(&followed), [(true, Kind::Float), (false, Kind::Float)]);
     let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics));
     assert_eq!(of(&kept), [(false, Kind::BFloat16), (false, Kind::Float)]);
-    // What all have in common is of some views there, and looked at one by one: products of other shapes differ in float32's last
-    // digits. What is left is that bfloat16 takes the nearest of its numbers.
+    // Without gradients, the common part is estimated from some of the views, one view at a time: products of other shapes
+    // differ in float32's last digits. The remaining difference is rounding to bfloat16.
     let whole = |memory: &Memory| memory.tokens.to_kind(Kind::Double) + &memory.common;
     let off = (whole(&kept) - whole(&followed)).abs();
     let rounding =

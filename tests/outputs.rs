@@ -1,4 +1,4 @@
-//! What outputs may replace: nothing that the command reads, and nothing but regular files.
+//! Outputs replace neither inputs of the command nor anything but regular files.
 #![cfg(unix)]
 
 mod common;
@@ -13,7 +13,7 @@ use std::fs;
 use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
-/// Every file below `folder`, and what it holds.
+/// Returns every file below `folder`, with its contents.
 fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut files = BTreeMap::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -35,7 +35,7 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A capture, a splat of it and weights in a folder.
+/// Folder with a capture, a splat of it, and weights.
 struct Captured {
     folder: tempfile::TempDir,
     room: PathBuf,
@@ -57,7 +57,8 @@ impl Captured {
     }
 }
 
-/// Runs every command of `requests` and holds that it is refused because of what it reads, and that nothing changed in `folder`.
+/// Runs every command of `requests` and asserts that it is refused because its output is an input, and that nothing changed in
+/// `folder`.
 #[track_caller]
 fn refuse_all(folder: &Path, requests: &[&[&str]]) {
     let before = contents(folder);
@@ -85,7 +86,7 @@ fn pictures_replace_nothing_that_is_read() {
     symlink(&photo, &link).unwrap();
     fs::hard_link(&photo, &hard).unwrap();
     symlink(&images, &linked).unwrap();
-    // Photos as its files would be called, in a folder below the output.
+    // Links to photos, named like the output files, in a folder below the output.
     let below = files.at("below");
     fs::create_dir(&below).unwrap();
     symlink(&photo, below.join("000.png")).unwrap();
@@ -167,14 +168,14 @@ fn splats_and_weights_replace_nothing_that_is_read() {
         let page = ["render", "--splat", splat, "--scene", room, "--html", arg(&as_page)];
         refuse_all(files.folder.path(), &[&page]);
     }
-    // What is begun with may be replaced: it is read before.
+    // The input splat may be replaced: it is read before.
     succeed(&["convert", splat, splat, "--sh-degree", "0"]);
     assert_eq!(read_splat(&files.splat).unwrap().sh_degree(), 0);
     let id = |path: &Path| fs::metadata(path).unwrap().ino();
     let before = id(&files.splat);
     succeed(&["refine", "--splat", splat, "--scene", room, "--steps", "2", "--out", splat]);
     assert!(id(&files.splat) != before);
-    // Beside the photos, and beside what a run wrote, is room.
+    // New files beside the photos, and beside a run's files, are allowed.
     succeed(&["convert", splat, arg(&files.room.join("mine.ply"))]);
     succeed(&["export", "--run", arg(&run), "--out", arg(&run.join("model.safetensors"))]);
     succeed(&["export", "--run", arg(&run), "--out", arg(&run.join("model.safetensors"))]);
@@ -200,7 +201,7 @@ fn folders_of_outputs_replace_nothing_that_is_read() {
         let all = ["eval", "--data", arg(&data), "--index", arg(index)];
         all.iter().chain(more).map(|word| word.to_string()).collect()
     };
-    // Indices, splats and pictures where the scores would go.
+    // Indices, splats and images at the paths of the outputs.
     let (scored, splats, renders) =
         ("scored/scores.json", folder.path().join("splats"), folder.path().join("renders"));
     let scored = put(scored);
@@ -230,22 +231,22 @@ fn folders_of_outputs_replace_nothing_that_is_read() {
     ];
     let requests: Vec<Vec<&str>> = requests.iter().map(|request| text(request)).collect();
     let requests: Vec<&[&str]> = requests.iter().map(Vec::as_slice).collect();
-    // What they make before they look is no file.
+    // Folders that the commands create before the check are not files.
     refuse_all(folder.path(), &requests);
 
-    // A report may stand beside the scores that it shows, not in their place.
+    // A report may be written beside the scores that it shows, but must not replace them.
     let out = folder.path().join("out");
     succeed(&text(&sweep(&index, &["--splat", arg(&splats), "--out", arg(&out)])));
     for name in ["scores.json", "evaluation.json", "scenes/room_000.jpg"] {
         refuse_all(folder.path(), &[&["report", arg(&out), "--out", arg(&out.join(name))]]);
     }
     succeed(&["report", arg(&out), "--out", arg(&out.join("report.html"))]);
-    // The same sweep goes on where its files are, also in a folder of the data set.
+    // The same evaluation resumes on its own files, also in a folder of the dataset.
     let within = room.join("scores");
     for _ in 0..2 {
         succeed(&text(&sweep(&index, &["--splat", arg(&splats), "--out", arg(&within)])));
     }
-    // A run's own configuration trains it.
+    // A run may be trained with its own configuration.
     let run = folder.path().join("run");
     succeed(&text(&train(&config, &run, &["train.steps=2"])));
     succeed(&text(&train(&run.join("config.toml"), &run, &["train.steps=3"])));
@@ -286,7 +287,7 @@ fn links_are_followed_and_what_is_no_file_is_refused() {
     assert!(fs::metadata(&fifo).unwrap().file_type().is_fifo());
     assert!(refuse(&["report", room, "--out", "/dev/stdout"]).contains("/dev/stdout: the output is a"));
 
-    // A link's target is replaced, or made.
+    // The target of a symbolic link is replaced, or created.
     fs::create_dir(files.at("below")).unwrap();
     for target in ["below/there.spz", "below/new.spz"] {
         let link = files.at("link.spz");
@@ -300,7 +301,7 @@ fn links_are_followed_and_what_is_no_file_is_refused() {
         fs::remove_file(link).unwrap();
     }
     assert_eq!(names(&files.at("below")), ["new.spz", "there.spz"]);
-    // Within a folder of pictures, before the first is rendered.
+    // In a folder of images, this is checked before the first is rendered.
     let views = files.at("views");
     fs::create_dir(&views).unwrap();
     symlink(&fifo, views.join("008.png")).unwrap();
@@ -385,7 +386,7 @@ fn endings_are_the_same_in_capitals() {
         arg(&files.at("f.GIF")),
     ]);
     assert!(String::from_utf8_lossy(&error.stderr).contains("expected 1 to 50 in a .gif"));
-    // With an encoder or without one, no folder of that name is made.
+    // With or without an encoder, no folder of that name is created.
     let _ = globalsplat(&["render", "--splat", splat, "--scene", room, "--out", arg(&files.at("film.MP4"))]);
     assert!(!files.at("film.MP4").is_dir());
     succeed(&["convert", splat, arg(&files.at("room.SPZ"))]);
@@ -398,7 +399,7 @@ fn endings_are_the_same_in_capitals() {
 #[test]
 fn parts_of_pictures_have_names_of_their_own() {
     let (folder, room) = room();
-    // One photo is called as the depth of another.
+    // One photo has the name of another's depth image.
     fs::rename(room.join("images/001.png"), room.join("images/000_depth.png")).unwrap();
     let cameras = fs::read_to_string(room.join("cameras.json")).unwrap();
     fs::write(room.join("cameras.json"), cameras.replace("images/001.png", "images/000_depth.png")).unwrap();
@@ -423,7 +424,7 @@ fn shards_are_replaced_together_or_not_at_all() {
     succeed(&text(&export));
     let shards: Vec<_> = names(&out).into_iter().filter(|name| name.ends_with(".safetensors")).collect();
     assert!(shards.len() > 2, "{shards:?}");
-    // The last one can't be written.
+    // Make the last shard unwritable.
     fs::remove_file(out.join(&shards[shards.len() - 1])).unwrap();
     fs::create_dir(out.join(&shards[shards.len() - 1])).unwrap();
     let before = contents(&out);
@@ -438,7 +439,7 @@ fn synth_finishes_what_was_interrupted_before_its_indices() {
     let out = folder.path().join("worlds");
     let synth =
         ["synth", "--out", arg(&out), "--scenes", "2", "--frames", "3", "--size", "16"].map(String::from);
-    // A folder where a file has to be stops it, as a full disk would.
+    // A folder at the path of a file stops the program, as a full disk would.
     let index = out.join("evaluation_index.json");
     fs::create_dir_all(index.join("below")).unwrap();
     let error = globalsplat(&text(&synth));
@@ -475,7 +476,7 @@ fn checkpoints_that_list_no_files_or_others_are_broken() {
         let weights = folder.path().join("weights.safetensors");
         let error = fail(&["export", "--run", arg(&run), "--out", arg(&weights)], 2);
         assert!(error.contains("state.json: the names in files is"), "{error}");
-        // The checkpoint before is taken.
+        // The previous checkpoint is loaded.
         let output = globalsplat(&text(&train(&config, &run, &["train.steps=4"])));
         let told = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && told.contains("the checkpoint before it is taken"), "{told}");

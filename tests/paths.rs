@@ -1,4 +1,4 @@
-//! Every command in a folder whose name isn't UTF-8: it works, and its JSON holds the name as text.
+//! Every command works in a folder whose name isn't UTF-8, and its JSON contains the name as text.
 #![cfg(target_os = "linux")]
 
 mod common;
@@ -12,7 +12,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-/// A folder's name in Latin-1, and how text shows it.
+/// Name of a folder in Latin-1, and its lossy conversion to text.
 const NAME: &[u8] = b"caf\xe9";
 const SHOWN: &str = "caf\u{fffd}";
 
@@ -23,14 +23,14 @@ impl Folder {
         self.0.join(name).into()
     }
 
-    /// The program with arguments in this folder: those that begin with @ are files there.
+    /// Returns the program's command with this as current folder; arguments that begin with @ are files there.
     fn command(&self, arguments: &[&str]) -> Command {
         let mut command = command(&[]);
         command.args(arguments.iter().map(|argument| match argument.strip_prefix('@') {
             Some(name) => self.path(name),
             None => argument.into(),
         }));
-        // No networks for LPIPS, no browser, and temporary files here as well.
+        // Without networks for LPIPS, without a browser, and with temporary files here as well.
         command
             .current_dir(&self.0)
             .env("ROOMS", self.path("rooms"))
@@ -40,14 +40,14 @@ impl Folder {
         command
     }
 
-    /// What the command says on standard output.
+    /// Returns the standard output of a command that must succeed.
     fn succeed(&self, arguments: &[&str]) -> String {
         let done = self.command(arguments).output().expect("a program");
         assert!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
         String::from_utf8(done.stdout).expect("text")
     }
 
-    /// The object that the command prints, in which `keys` are paths.
+    /// Returns the JSON object that the command prints, and asserts that the values of `keys` are paths.
     fn json(&self, arguments: &[&str], keys: &[&str]) -> Value {
         let told: Value =
             serde_json::from_str(&self.succeed(&[arguments, &["--json"]].concat())).expect("JSON");
@@ -127,7 +127,7 @@ fn names_that_are_not_utf_8() {
     folder.json(&[&["view", "@rooms/room_000/truth.ply"], &room[..]].concat(), &["/page"]);
 }
 
-/// What `watch` says of the run, and serves.
+/// Checks what `watch` prints about the run, and what it serves.
 fn watch(folder: &Folder) {
     let mut watch =
         folder.command(&["watch", "@run", "--json"]).stdout(Stdio::piped()).spawn().expect("a program");
@@ -140,7 +140,7 @@ fn watch(folder: &Folder) {
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains(SHOWN), "{answer}");
 }
 
-/// The answer to a request for `/state` of the server that `line` tells of.
+/// Returns the response to a request for `/state` to the server whose URL is in `line`.
 fn served_state(line: &str) -> Option<String> {
     let told: Value = serde_json::from_str(line).ok()?;
     let host = told["url"].as_str()?.strip_prefix("http://")?.trim_end_matches('/');

@@ -1,4 +1,4 @@
-//! L_perc in bf16, as training has it on request.
+//! L_perc in bf16, which training offers as an option.
 
 mod common;
 
@@ -12,10 +12,10 @@ use std::path::Path;
 use tch::{Device, Kind, Tensor};
 
 const SIDE: u32 = 96;
-/// Of noise on pictures, about 14, 20, 26 and 34 dB.
+/// Amplitudes of noise on images, for a PSNR of about 14, 20, 26 and 34 dB.
 const NOISES: [f64; 4] = [0.4, 0.2, 0.1, 0.04];
 
-/// VGG-19's convolutions: their numbers in torchvision's file, and channels.
+/// VGG-19's convolutions: their indices in torchvision's file, and output channels.
 const LAYERS: [(i64, i64); 14] = [
     (0, 64),
     (2, 64),
@@ -33,7 +33,7 @@ const LAYERS: [(i64, i64); 14] = [
     (30, 512),
 ];
 
-/// The network in both precisions.
+/// Loads the network in both precisions.
 fn both(perceptual: PerceptualKind, weights: &Path) -> [PerceptualLoss; 2] {
     let perceptual_weights = weights.display().to_string();
     let config = LossConfig { perceptual, perceptual_weights, ..Default::default() };
@@ -43,7 +43,7 @@ fn both(perceptual: PerceptualKind, weights: &Path) -> [PerceptualLoss; 2] {
     })
 }
 
-/// A picture of random noise in blocks of several sizes, [1, 1, 3, SIDE, SIDE].
+/// Returns an image of random noise in blocks of several sizes, [1, 1, 3, SIDE, SIDE].
 fn made_up(random: &mut Random) -> Tensor {
     let side = i64::from(SIDE);
     let blocks = [4, 12, 32, side].map(|count| {
@@ -53,8 +53,8 @@ fn made_up(random: &mut Random) -> Tensor {
     (blocks.into_iter().reduce(|sum, block| sum + block).expect("four") / 4.).unsqueeze(0)
 }
 
-/// Holds loss and gradient in bf16 against float32, of pictures near and far from `truth`: what differs little loses most to
-/// rounding.
+/// Asserts that loss and gradient in bf16 are near those in float32, for images at several distances from `truth`: the smaller
+/// the difference, the larger the relative rounding error.
 fn assert_near(networks: &[PerceptualLoss; 2], truth: &Tensor, name: &str, random: &mut Random) {
     for noise in NOISES {
         let noise = random.symmetric(&truth.size()).to_kind(Kind::Float) * noise;

@@ -1,4 +1,4 @@
-//! The photos of a capture: lenses undone, EXIF orientation, and pixels of every kind.
+//! Photos of a capture: undistortion, EXIF orientation, and pixel formats.
 
 mod common;
 
@@ -14,7 +14,7 @@ use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage};
 use serde_json::json;
 use std::io::Cursor;
 
-/// Where the ray (x, y, 1) is seen, in the words of OpenCV's documentation.
+/// Returns the point at which the ray (x, y, 1) is seen, in the notation of OpenCV's documentation.
 fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, f64) {
     let r2 = x.powi(2) + y.powi(2);
     let radial = (1. + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
@@ -25,7 +25,7 @@ fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, 
     )
 }
 
-/// The ray that is seen at (u, v), by going back what it was moved.
+/// Returns the ray that is seen at (u, v), by fixed-point iteration.
 fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
     let (mut x, mut y) = (u, v);
     for _ in 0..200 {
@@ -37,7 +37,7 @@ fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
     (x, y)
 }
 
-/// What is seen along the ray (x, y, 1).
+/// Returns the colour of the scene along the ray (x, y, 1).
 fn scene(x: f64, y: f64) -> [f64; 3] {
     let wave = |t: f64| 127.5 + 120. * t.sin();
     [wave(6. * x + 2. * y), wave(7. * y - x), wave(4. * x - 5. * y)]
@@ -84,7 +84,7 @@ fn check_lens(lens: [f64; 8]) {
     for capture in [open_capture(path).unwrap(), open_capture(&path.join("colmap")).unwrap()] {
         assert_same_cameras(&capture, &cameras);
         let found = &capture.load(&[1], None).unwrap()[0].image;
-        // Where the photo shows what the pinhole camera sees.
+        // Pixels where the photo shows what the pinhole camera sees.
         let mut checked = 0;
         for y in 0..height {
             for x in 0..width {
@@ -97,7 +97,7 @@ fn check_lens(lens: [f64; 8]) {
                 checked += 1;
                 for c in 0..3 {
                     let at = |t: &tch::Tensor| t.double_value(&[c, i64::from(y), i64::from(x)]) * 255.;
-                    // Rounded twice, and interpolated linearly over a pixel.
+                    // The values are rounded twice, and interpolated linearly over a pixel.
                     assert!(
                         (at(found) - at(&pinhole)).abs() <= 2.,
                         "({x}, {y}): {} {}",
@@ -111,7 +111,7 @@ fn check_lens(lens: [f64; 8]) {
     }
 }
 
-/// A JPEG whose EXIF says that it is stored in `orientation`.
+/// Returns a JPEG whose EXIF data has `orientation`.
 fn jpeg_with_orientation(photo: &RgbImage, orientation: u8) -> Vec<u8> {
     let mut jpeg = Cursor::new(vec![]);
     photo.write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
@@ -125,7 +125,7 @@ fn jpeg_with_orientation(photo: &RgbImage, orientation: u8) -> Vec<u8> {
     bytes
 }
 
-/// The first view of a capture whose photos are all `bytes`, declared to be `width` × `height`.
+/// Loads the first view of a capture whose photos are all `bytes`, declared to be `width` × `height`.
 fn load_photo(
     bytes: &[u8],
     extension: &str,
@@ -151,11 +151,11 @@ fn photos_on_their_side_are_turned_where_the_capture_means_them_so() {
     let load = |orientation: u8, width, height| {
         load_photo(&jpeg_with_orientation(&photo, orientation), "jpg", width, height)
     };
-    // 6: the stored top row is the right column; 8: the left one; 5 mirrors across the diagonal.
+    // Orientation 6: the stored top row is the right column; 8: the left one; 5 mirrors across the diagonal.
     assert!(load(6, 16, 24).unwrap().equal(&stored.transpose(1, 2).flip([2])));
     assert!(load(8, 16, 24).unwrap().equal(&stored.transpose(1, 2).flip([1])));
     assert!(load(5, 16, 24).unwrap().equal(&stored.transpose(1, 2)));
-    // Declared as stored: whoever made the capture didn't turn it, nor upside down.
+    // If the size is declared as stored, the capture's cameras fit the unrotated photo.
     for orientation in [1, 3, 6, 8] {
         assert!(load(orientation, 24, 16).unwrap().equal(&stored), "{orientation}");
     }
@@ -201,7 +201,7 @@ fn photos_of_every_kind_load() {
     assert!(largest_error(&found, &repeated) < 0.05 && found.select(0, 0).equal(&found.select(0, 2)));
 }
 
-/// Levels that compress badly, so that the data of every block are of many bytes.
+/// Returns an image of levels that compress badly, so that the data of every block take many bytes.
 fn noise(width: u32, height: u32) -> RgbImage {
     RgbImage::from_fn(width, height, |x, y| {
         Rgb([1, 2, 3]
@@ -209,8 +209,8 @@ fn noise(width: u32, height: u32) -> RgbImage {
     })
 }
 
-/// JPEGs of every kind that is known: sequential and progressive, of one, three and four components, of smaller planes of colour,
-/// with restart markers and without.
+/// Returns JPEGs of every supported kind: sequential and progressive, with one, three and four components, with and without
+/// chroma subsampling, with and without restart markers.
 fn jpegs() -> Vec<(String, Vec<u8>)> {
     use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
     let pixels = noise(45, 37).into_raw();
@@ -221,7 +221,7 @@ fn jpegs() -> Vec<(String, Vec<u8>)> {
         for sampling in
             [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2, SamplingFactor::F_4_1]
         {
-            // The decoder knows no smaller planes of four, and refuses them.
+            // The decoder refuses subsampling with four components.
             if colours == 4 && !matches!(sampling, SamplingFactor::F_1_1) {
                 continue;
             }
@@ -254,7 +254,7 @@ fn jpegs_cut_short_are_refused_by_name() {
         let whole = decode(&jpeg).unwrap_or_else(|e| panic!("{kind}: {e}"));
         let (data, end) = jpeg.split_at(jpeg.len() - 2);
         assert_eq!(end, [0xff, 0xd9]);
-        // The end marker tells nothing that isn't known.
+        // The end marker carries no image data.
         for end in [&[][..], &[0xff], &[0xff, 0xd9, 1, 2, 3]] {
             assert_eq!(
                 decode(&[data, end].concat()).unwrap_or_else(|e| panic!("{kind}: {e}")),
@@ -263,7 +263,7 @@ fn jpegs_cut_short_are_refused_by_name() {
             );
         }
         for cut in (jpeg.len() / 16..data.len() - 1).step_by(41).chain([data.len() - 2]) {
-            // A progressive file may end after any of its scans if it says so.
+            // A progressive file may end after any of its scans if a marker follows.
             if (cut - 1..=cut).any(|at| matches!(data[at..], [0xff, 0xc4 | 0xda, ..])) {
                 continue;
             }
@@ -286,14 +286,14 @@ fn pngs_cut_short_are_refused_by_name() {
     let png = png.into_inner();
     let decode = |bytes: &[u8]| decode_photo(bytes, "cut.png".as_ref(), (45, 37));
     decode(&png).unwrap();
-    // The last chunk, of 12 bytes, and two checksums of 4 tell nothing that isn't known.
+    // The last chunk, of 12 bytes, and two checksums of 4 carry no image data.
     for cut in (0..png.len() - 20).step_by(37) {
         let error = decode(&png[..cut]).expect_err("a part of it").to_string();
         assert!(error.starts_with("cut.png: the image is "), "{error}");
     }
 }
 
-/// 24×16 pixels of 16 colours in a palette.
+/// PNG with 24×16 pixels of 16 colours in a palette, as hexadecimal.
 const PALETTE_PNG: &str = "89504e470d0a1a0a0000000d4948445200000018000000100403000000fe0aa2a600000030504c5445b4d20078d2003cd200\
     b48c00788c003c8c0000d200008c00b446007846003c4600004600b400007800003c0000000000c5d2909e0000002349444154789c63fccfc0f01e8698\
     1890006e0ecb1ef2f4dc2355cf7b0686b324ea010020e70e8d4441c80f0000000049454e44ae426082";

@@ -1,4 +1,4 @@
-//! A scene is shown in several sizes and places, and the splat that shows the photos best is kept (spec 9.9).
+//! A scene is normalized to several scales and positions, and the splat that matches the photos best is kept (spec 9.9).
 
 mod common;
 
@@ -12,21 +12,21 @@ use serde_json::Value;
 use std::path::Path;
 use tch::Device;
 
-/// Of a small room, at the size that the model knows.
+/// Returns photos of a small room, at the model's image size.
 fn photos_of(room: &Path, model: &LoadedModel) -> Vec<View> {
     write_room(room, 3, 8, [96, 96].into()).unwrap();
     let capture = open_capture(room).unwrap();
     load_context(&capture, Holdout::None, None, model.config.data.image_size).unwrap()
 }
 
-/// What the model makes of `photos`, which are targets, too, shown in `extents`.
+/// Reconstructs `photos` normalized to `extents`; the photos are also the targets.
 fn made_of(photos: &[View], model: &mut LoadedModel, extents: &[f64]) -> Reconstruction {
     model.config.data.extents = extents.to_vec();
     let targets: Vec<_> = photos.iter().map(|photo| photo.camera.c2w).collect();
     reconstruct(&*model, photos, &targets).unwrap()
 }
 
-/// PSNR of the splat in the capture's world, where its own cameras see it.
+/// Returns the PSNR of the splat in world coordinates, rendered from the capture's own cameras.
 fn psnr(made: &Reconstruction, photos: &[View]) -> f64 {
     let cameras: Vec<_> = photos.iter().map(|photo| photo.camera).collect();
     let pictures = render_views(&made.in_world(), &cameras).unwrap();
@@ -54,7 +54,7 @@ fn the_splat_that_shows_the_photos_best_is_kept() {
         let nudged = (placement.extent / extents[best]).ln().abs();
         assert!(nudged < 0.151 && placement.forward.abs() < 0.226, "{placement:?}, {alone:?}");
         assert!(psnr > alone[best] + 0.01, "nudges help: {placement:?} has {psnr}, {alone:?}");
-        // Cameras that are normalized along are where the splat is.
+        // The target poses are normalized like the splat.
         assert_eq!(kept.target_poses.len(), photos.len());
         for (pose, view) in kept.target_poses.iter().zip(&photos) {
             let Similarity { rotation, translation, scale } = kept.world_from_normalized;
@@ -72,7 +72,7 @@ fn reconstruct_tells_where_the_scene_was_shown() {
     let photos = photos_of(&room, &model);
     let arguments = ["reconstruct", "--scene", arg(&room), "--out", arg(&out)];
     let told: Value = serde_json::from_str(&succeed(&[&arguments[..], &["--json"]].concat())).unwrap();
-    // Another process rounds otherwise, and may nudge otherwise; it begins with the same.
+    // Rounding differs between processes, so the search may end at another offset; it starts from the same scale.
     let Placement { extent, .. } = reconstruct(&model, &photos, &[]).unwrap().placement;
     assert!((told["extent"].as_f64().unwrap() / extent).ln().abs() < 0.302, "{told}");
     assert!(told["forward"].as_f64().unwrap().abs() < 0.226, "{told}");

@@ -1,4 +1,4 @@
-//! The paper's tables as `eval::published` has them, against the paper's source.
+//! The paper's tables in `eval::published`, compared with the paper's source.
 
 mod common;
 
@@ -8,7 +8,7 @@ use std::path::Path;
 
 type Row = (String, Vec<Option<f64>>);
 
-/// The paper's source; where it isn't there, says so.
+/// Returns the paper's source, or skips the test if it isn't available.
 fn paper() -> Option<String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/paper/globalsplat.tex");
     let text = std::fs::read_to_string(&path).ok();
@@ -18,7 +18,7 @@ fn paper() -> Option<String> {
     text
 }
 
-/// Rows of the table that carries `label`, whose first cell is a name.
+/// Returns the rows of the table with `label`, each with a name in its first cell.
 fn table(paper: &str, label: &str) -> Vec<Vec<String>> {
     let end = paper.find(&format!(r"\label{{{label}}}")).expect("the label");
     let start = paper[..end].rfind(r"\begin{tabular}").expect("a table before it");
@@ -26,7 +26,7 @@ fn table(paper: &str, label: &str) -> Vec<Vec<String>> {
     rows.map(|row| row.split('&').map(plain).collect()).filter(|row: &Vec<String>| row.len() > 1).collect()
 }
 
-/// A cell without its typography.
+/// Returns a cell's text without typography.
 fn plain(cell: &str) -> String {
     let mut text = cell.trim().rsplit(r"\midrule").next().expect("a part").to_string();
     if let Some(at) = text.find(r"~\cite") {
@@ -47,7 +47,7 @@ fn number(cell: &str) -> Option<f64> {
     }
 }
 
-/// Name and numbers of the rows that have numbers.
+/// Returns name and values of the rows that have values.
 fn rows(table: Vec<Vec<String>>) -> Vec<Row> {
     let filled =
         table.into_iter().filter(|row| row[1] == "--" || row[1].starts_with(|c: char| c.is_ascii_digit()));

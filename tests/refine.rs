@@ -1,5 +1,5 @@
-//! Splats that are optimized on photos: better on views never shown, the same bytes whatever the threads, and one sentence where it
-//! can't be done.
+//! Refinement of splats on photos improves held-out views, is bit-identical with any number of threads, and reports impossible
+//! requests in one sentence.
 
 mod common;
 
@@ -17,7 +17,7 @@ use serde_json::Value;
 use std::path::Path;
 use tch::Kind;
 
-/// A video of a made-up world as chunks, and the name of its scene.
+/// Writes a video of a synthetic scene as chunks, and returns the path of its scene.
 fn world(folder: &Path, size: &str) -> String {
     let out = folder.join("world");
     succeed(&["synth", "--out", arg(&out), "--seed", "7", "--frames", "12", "--size", size]);
@@ -32,7 +32,7 @@ fn number(value: &Value, path: &str) -> f64 {
     value.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} in {value}"))
 }
 
-/// From nothing but photos: what was never shown is seen better than by what was begun with, and the splat is written.
+/// Refinement from photos alone shows held-out views better than the initial Gaussians do, and writes the splat.
 #[test]
 fn photos_alone_become_a_splat() {
     let folder = tempfile::tempdir().unwrap();
@@ -60,19 +60,19 @@ fn photos_alone_become_a_splat() {
     assert_eq!(done["steps"], 120);
     let curve = done["held_out"]["curve"].as_array().unwrap();
     assert!(curve.last().unwrap()["psnr"] == done["held_out"]["after"]["psnr"]);
-    // What was told is what was written.
+    // The reported scores are those of the written splat.
     let scored = told(&["eval", "--splat", arg(&out), "--scene", &scene, "--json"]);
     let held_out: Vec<f64> = [1, 5, 9].map(|i| number(&scored, &format!("/views/{i}/psnr"))).into();
     assert!((held_out.iter().sum::<f64>() / 3. - after).abs() < 0.01, "{held_out:?}, told {after}");
     assert!(sheet.is_file());
 }
 
-/// The same steps and seed give the same bytes for any number of threads, in either space; another seed gives others.
+/// The number of threads does not change the bytes with the same steps and seed, in either space; another seed gives others.
 #[test]
 fn threads_do_not_change_the_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let scene = world(folder.path(), "48");
-    // Of steps so many that what there was becomes better: it would be kept, else.
+    // Enough steps to improve on the initial splat, which would be kept otherwise.
     for (space, steps) in [
         (&["--gaussians", "500"][..], "30"),
         (&["--from", "weights", "--gaussians", "6000"], "30"),
@@ -103,7 +103,7 @@ fn rewrite_views(room: &Path, change: impl FnOnce(Vec<Value>) -> Vec<Value>) {
     std::fs::write(&file, cameras.to_string()).unwrap();
 }
 
-/// The places of the cameras, [V][3].
+/// Returns the positions of the cameras, [V][3].
 fn centres(views: &[Value]) -> Vec<[f64; 3]> {
     let number = |view: &Value, axis: usize| view["c2w"][axis][3].as_f64().unwrap();
     views.iter().map(|view| [0, 1, 2].map(|axis| number(view, axis))).collect()
@@ -113,8 +113,8 @@ fn put_centre(view: &mut Value, centre: [f64; 3]) {
     (0..3).for_each(|axis| view["c2w"][axis][3] = centre[axis].into());
 }
 
-/// Photos that are there several times, from exactly one place or from places near each other, as of a camera at rest, change nothing
-/// but by chance.
+/// Repeated photos, from exactly the same position or from nearby positions, as of a camera at rest, change the result only by
+/// chance.
 #[test]
 fn photos_of_one_place_count_once() {
     let reached = |copies: usize, jitter: f64| {
@@ -129,7 +129,7 @@ fn photos_of_one_place_count_once() {
                 centres.iter().map(|c| DVec3::from(*c).distance(centres[0].into())).fold(0., f64::max);
             let copy = |(index, view): (usize, &Value), copy: usize| {
                 let mut view = view.clone();
-                // Anywhere in a ball, and the first where the photo was taken.
+                // Offsets are within a ball; the first copy is at the original position.
                 let phase = (7 * index + 13 * copy) as f64;
                 let off = DVec3::new(phase.sin(), (1.7 * phase).cos(), (2.3 * phase).sin()) * jitter * extent;
                 let off = if copy == 0 { DVec3::ZERO } else { off };
@@ -153,7 +153,7 @@ fn photos_of_one_place_count_once() {
     }
 }
 
-/// Cameras that don't move tell no depth. That is said, and what they show is shown.
+/// Cameras that don't move give no depth: a warning says so, and the photos are placed at one distance.
 #[test]
 fn photos_from_one_place_are_shown_at_one_distance() {
     let (folder, room) = room();
@@ -161,7 +161,7 @@ fn photos_from_one_place_are_shown_at_one_distance() {
     rewrite_views(&room, |mut views| {
         let first = centres(&views)[0];
         views.iter_mut().for_each(|view| put_centre(view, first));
-        // All of them would be near duplicates, and nothing would be wrong with that.
+        // Otherwise all of them would be near duplicates, which is fine.
         (0..3).for_each(|row| views[1]["c2w"][row] = views[0]["c2w"][row].clone());
         views
     });
@@ -174,7 +174,7 @@ fn photos_from_one_place_are_shown_at_one_distance() {
     assert_eq!(means.isfinite().all().int64_value(&[]), 1);
 }
 
-/// Whenever it is ended, there is a splat, if there can be one.
+/// An interrupted refinement returns a splat at any time, once there is one.
 #[test]
 fn work_that_is_ended_early_keeps_what_there_is() {
     let (_folder, room) = room();
@@ -191,7 +191,7 @@ fn work_that_is_ended_early_keeps_what_there_is() {
         device: tch::Device::Cpu,
     };
     let all: Vec<usize> = (0..capture.len()).collect();
-    // The number of steps that are done, where the work ends at the first event of a kind.
+    // Returns the number of steps done if the work stops at the first event of a kind.
     let steps = |ends: fn(&RefineEvent) -> bool| {
         let now = std::time::Instant::now();
         let mut session =
@@ -214,8 +214,8 @@ fn work_that_is_ended_early_keeps_what_there_is() {
     assert_eq!(steps(tenth).unwrap(), 10);
 }
 
-/// A capture scaled by a power of two gives the same bits but for the scale; one in any other unit, or far from the origin, is shown
-/// as well.
+/// A capture scaled by a power of two gives bit-identical results up to the scale; one in any other unit, or far from the
+/// origin, is reconstructed as well.
 #[test]
 fn units_and_origin_change_nothing() {
     let refined = |factor: f64, offset: DVec3| {
@@ -249,7 +249,7 @@ fn units_and_origin_change_nothing() {
     }
 }
 
-/// A splat becomes better, and one that can't is kept as it is.
+/// A splat is improved, or kept unchanged if it can't be.
 #[test]
 fn a_splat_becomes_better_or_stays() {
     let (folder, room) = room();
@@ -270,13 +270,13 @@ fn a_splat_becomes_better_or_stays() {
     assert!(after > before + 5., "{before} → {after}");
     assert_eq!(done["held_out"], Value::Null);
     assert_eq!(read_splat(&out).unwrap().gaussians.count(), splat.gaussians.count());
-    // Its photos are its own renders: nothing is better than it.
+    // Its photos are its own renders: no splat is better.
     let done = refined(&truth);
     assert_eq!(done["shown"]["before"], done["shown"]["after"]);
     assert!(number(&done, "/shown/after/psnr") > 55.);
 }
 
-/// Real photos, with held-out views far above what any of the photos shown would score.
+/// On real photos, held-out views score far above the baseline that uses the input photos.
 #[test]
 fn real_photos_become_a_splat() {
     for capture in captures().unwrap_or_default() {
@@ -303,7 +303,7 @@ fn real_photos_become_a_splat() {
     }
 }
 
-/// Photos of several sizes, a lens that distorts, more views than are used.
+/// Photos of several sizes, with lens distortion, and more of them than are used, are accepted.
 #[test]
 fn many_photos_are_used_as_they_are() {
     let Some(fox) = fox() else { return };
@@ -326,7 +326,7 @@ fn many_photos_are_used_as_they_are() {
     assert_eq!(done["photos"], 12);
 }
 
-/// Where a model of COLMAP has points, text or binary, Gaussians begin at them.
+/// Points of a COLMAP model, text or binary, initialize Gaussians.
 #[test]
 fn points_are_begun_with() {
     for format in [Format::ColmapText, Format::ColmapBinary] {
@@ -345,7 +345,7 @@ fn points_are_begun_with() {
             assert_eq!(point.position.to_array(), expected);
             assert_eq!(point.colour, [1., 0., 0.2]);
         }
-        // Half of them at points, the others where pixels are.
+        // Half of the Gaussians are at points, the others on pixels.
         let views = capture.load_all(None).unwrap();
         let raw = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
             .expect("depths");
@@ -357,7 +357,7 @@ fn points_are_begun_with() {
     }
 }
 
-/// Poses that are a little off, and photos brighter than others, are found out: of a room whose splat is known.
+/// Small pose errors and exposure differences are estimated, for a room whose splat is known.
 #[test]
 fn what_photos_hide_is_found_out() {
     let (folder, room) = room();
@@ -365,7 +365,7 @@ fn what_photos_hide_is_found_out() {
     let file = room.join("cameras.json");
     let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let views = cameras["views"].as_array_mut().unwrap();
-    // Shifted to and fro, so that the mean stays where it is.
+    // Alternating shifts, so that the mean doesn't change.
     let shift = 0.03;
     let last = views.len() - views.len() % 2;
     for (index, view) in views[..last].iter_mut().enumerate() {
@@ -416,7 +416,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     assert!(with(&["--from", "nothing", "--space", "tokens"]).contains("nor tokens"));
     assert!(with(&["--space", "tokens", "--correct-poses"]).contains("corrects no photos"));
     assert!(with(&["--views", "1"]).contains("--views is 1, expected 2 or more"));
-    // A splat of another world.
+    // A splat elsewhere.
     let away = folder.path().join("away.ply");
     let mut splat = read_splat(&room.join("truth.ply")).unwrap();
     splat.gaussians.means = &splat.gaussians.means - 1000.;
@@ -425,7 +425,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     assert!(!out.exists());
 }
 
-/// Pictures are as narrow as SSIM allows; what is narrower is refused before it is read.
+/// Images as narrow as SSIM allows are accepted; narrower ones are refused before they are read.
 #[test]
 fn narrow_photos_are_taken_or_refused() {
     let (folder, room) = room();

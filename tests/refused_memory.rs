@@ -1,4 +1,4 @@
-//! Memory that the system refuses, at any moment: one sentence, exit code 1, and nothing lost.
+//! Out of memory at any moment gives one sentence and exit code 1, and loses nothing.
 #![cfg(target_os = "linux")]
 
 mod common;
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-/// The program, allowed so much address space in KiB.
+/// Runs the program with a limit on its address space, in KiB.
 fn limited(kibibytes: u64, arguments: &[&str]) -> Output {
     Command::new("bash")
         .args(["-c", "ulimit -v $0; exec \"$@\"", &kibibytes.to_string(), env!("CARGO_BIN_EXE_globalsplat")])
@@ -18,12 +18,12 @@ fn limited(kibibytes: u64, arguments: &[&str]) -> Output {
         .expect("a shell")
 }
 
-/// In KiB. Where not even the stack can grow, the system ends the process, and nobody can say anything. The program has all that
-/// it uses of it grow before anything else.
+/// Stack size in KiB. If not even the stack can grow, the system ends the process without a message. The program grows the part
+/// of its stack that it uses before anything else.
 const STACK: u64 = 2048;
 
-/// The least address space in KiB that the program starts with, its stack included, and what it does `arguments` with, to a MiB
-/// or two.
+/// Returns the smallest address space in KiB with which the program starts, stack included, and the smallest with which it
+/// completes `arguments`, both to a MiB or two.
 fn range(arguments: &[&str]) -> (u64, u64) {
     let search = |works: &dyn Fn(u64) -> bool| {
         let (mut fails, mut enough) = (0, 1 << 25);
@@ -39,8 +39,8 @@ fn range(arguments: &[&str]) -> (u64, u64) {
     (starts, search(&|limit| limit >= starts && limited(limit, arguments).status.success()))
 }
 
-/// At so many `limits` between starting and having enough, `arguments` end with a sentence and leave `file` as it was or as it is to
-/// be.
+/// Asserts that at `limits` values between starting and completing, `arguments` end with one sentence and leave `file` either
+/// unchanged or complete.
 fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
     let before = b"what was there before".to_vec();
     std::fs::write(file, &before).unwrap();
@@ -60,19 +60,19 @@ fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
         }
         refusals += 1;
         assert_eq!(code, Some(1), "{:?}: {err}", output.status);
-        // What was told of the photos before may stand there, too, and nothing else.
+        // The earlier message about the photos may be printed, too, and nothing else.
         let lines: Vec<&str> = err.lines().filter(|line| !line.contains(" photos are shown, ")).collect();
         assert!(matches!(lines[..], [error] if error.starts_with("globalsplat: ")), "{limit} KiB: {err}");
         assert!(!err.contains("panicked"), "{err}");
         assert_eq!(left, before);
     }
     assert!(refusals > 0, "none of {limits} limits was too low");
-    // What was left lying around is in nobody's way.
+    // Leftover temporary files don't disturb the next run.
     succeed(arguments);
     assert_eq!(std::fs::read(file).unwrap(), whole);
 }
 
-/// Of a model that needs some tens of megabytes.
+/// Writes the configuration of a model that needs some tens of megabytes.
 fn config(folder: &Path, room: &Path) -> PathBuf {
     let file = tiny_config(folder, room);
     let text = std::fs::read_to_string(&file).unwrap();
@@ -92,7 +92,7 @@ fn a_splat_is_made_or_not() {
     let (folder, room) = room();
     let (weights, out) = (folder.path().join("weights.safetensors"), folder.path().join("out.ply"));
     succeed(&["export", "--config", arg(&config(folder.path(), &room)), "--out", arg(&weights)]);
-    // Some libraries' code goes wrong within a few MiB only.
+    // Some libraries fail only within a range of a few MiB.
     refused_politely(
         &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&out)],
         &out,
@@ -123,7 +123,7 @@ fn a_run_goes_on_where_memory_ended_it() {
     goes_on_as(&config, &run, &whole);
 }
 
-/// The run ends, when nothing hinders it, as `whole` did.
+/// Asserts that the resumed run ends as `whole` did.
 fn goes_on_as(config: &Path, run: &Path, whole: &Path) {
     succeed(&text(&train(config, run, &[])));
     let weights = |run: &Path| {
@@ -134,7 +134,7 @@ fn goes_on_as(config: &Path, run: &Path, whole: &Path) {
     assert!(!a.is_empty() && a.iter().zip(&b).all(|((_, x), (_, y))| x.equal(y)));
 }
 
-/// There, the system doesn't refuse memory but kills who uses more: a run loses no more than by any other end.
+/// A memory cgroup kills the process instead of refusing memory: a run loses no more than by any other end.
 #[test]
 #[ignore = "needs a memory cgroup that it may write to; run it as root, by `-- --ignored`"]
 fn a_run_goes_on_where_a_cgroup_killed_it() {

@@ -1,4 +1,4 @@
-//! The report: what is in the file, and what a browser shows of it.
+//! The report: contents of the file, and its appearance in a browser.
 
 mod common;
 
@@ -12,13 +12,13 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-/// What a page must show as text, whoever writes it into a name.
+/// Names that a page must show as text instead of executing them.
 const SCRIPT: &str = "<script>window.injected = true</script>";
 const PICTURE: &str = "<img src=x onerror='window.injected = true'>";
 
 fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
     let (lpips_vgg, lpips_alex) = (lpips.then_some(psnr / 128.), lpips.then_some(psnr / 256.));
-    let ssim = psnr / 64.; // like all numbers here, exact in binary and so in JSON
+    let ssim = psnr / 64.; // exact in binary, like all values here, and so exact in JSON
     let view = |i: i32| {
         let psnr = psnr + f64::from(i - 1);
         ViewScore { image: format!("{i:06}.png"), psnr, ssim, lpips_vgg, lpips_alex }
@@ -65,8 +65,8 @@ fn evaluation(method: &str, dataset: &str, context_views: usize, scenes: Vec<Sce
     }
 }
 
-/// A method on RealEstate10K with 24 views, 64 scenes, all but one with a picture; and another on ACID with 12 views that
-/// scored two scenes of many, without LPIPS, and failed at one. Odd names everywhere.
+/// Returns a method on RealEstate10K with 24 views, 64 scenes, all but one with an image; and another on ACID with 12 views
+/// that scored two scenes of many, without LPIPS, and failed on one. All names contain special characters.
 fn made_up(folder: &Path) -> Vec<(PathBuf, Evaluation)> {
     let names = |i: usize| if i == 0 { SCRIPT.to_string() } else { format!("scene {i} & more") };
     let scenes = (0..64).map(|i| scene(&names(i), 20. + 0.125 * i as f64, true)).collect();
@@ -189,7 +189,7 @@ fn the_command_writes_the_page_and_refuses_in_a_sentence() {
     assert!(error.contains(arg(&picture)) && error.contains("undecodable"), "{error}");
 }
 
-/// Texts whose contrast with what is behind them is below 4.5, the threshold of WCAG's level AA.
+/// Script that finds texts with a contrast to their background below 4.5, the threshold of WCAG's level AA.
 const FAINT: &str = r#"(() => {
     const channels = (colour) => colour.match(/[\d.]+/g).map(Number);
     const luminance = (colour) => {
@@ -221,13 +221,13 @@ const FAINT: &str = r#"(() => {
     return { faint, texts };
 })()"#;
 
-/// Rows that can be seen, by the caption of their table.
+/// Script that counts the visible rows, by the caption of their table.
 const ROWS: &str = r#"Object.fromEntries([...document.querySelectorAll("table")].map((table) => [
     table.caption.textContent,
     [...table.tBodies[0].rows].filter((row) => row.checkVisibility() && row.getBoundingClientRect().height > 0).length,
 ]))"#;
 
-/// What plots lack: a size, or room for a text, or a text clear of the others.
+/// Script that finds defects of plots: an empty plot, or texts that are cut or overlap.
 const BAD_PLOTS: &str = r#"[...document.querySelectorAll("svg")].flatMap((svg) => {
     const area = svg.getBoundingClientRect();
     const bad = area.width > 100 && area.height > 100 ? [] : ["empty"];
@@ -268,7 +268,7 @@ fn a_browser_shows_it_in_light_and_dark_wide_and_narrow() {
             assert_eq!(strings(&browser.evaluate(BAD_PLOTS)), [""; 0], "at {width}");
             grounds.push(browser.evaluate("getComputedStyle(document.body).backgroundColor"));
 
-            // They are decoded when they are needed; ask for all.
+            // Images are decoded lazily; decode all.
             let pictures = "Promise.all([...document.images].map((image) => image.decode().then(
                 () => image.naturalWidth === 1036 && image.width > 300 && image.alt.length > 20, () => false)))";
             let pictures = browser.evaluate(pictures);
@@ -309,7 +309,7 @@ fn tables_are_whole_without_scripts_and_sort_with_them() {
         assert_eq!(browser.evaluate(headings), true);
         let buttons = browser.evaluate("document.querySelectorAll('thead button').length");
         assert_eq!(buttons == 0, scripts_off, "no button that does nothing");
-        // On paper, everything is unfolded and the ground is white, whatever the screen is like.
+        // In print, everything is unfolded and the background is white, whatever the screen's scheme.
         browser.look(1280, "dark", "print");
         let printed = browser.evaluate(ROWS);
         let counts: Vec<u64> =

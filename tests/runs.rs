@@ -1,4 +1,4 @@
-//! Training runs and what can befall them: being killed, damaged checkpoints, a full disk, a second run in the same place.
+//! Training runs survive being killed, damaged checkpoints, a full disk, and a second run in the same folder.
 #![cfg(unix)]
 
 mod common;
@@ -18,7 +18,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tch::Device;
 
-/// The last checkpoint's tensors, by file and name.
+/// Returns the last checkpoint's tensors, by file and name.
 fn tensors(run: &Path) -> Vec<(String, tch::Tensor)> {
     let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
     let mut all = vec![];
@@ -44,7 +44,7 @@ fn metrics(run: &Path) -> Vec<Value> {
     text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// The steps that metrics.jsonl tells of, and those after which it tells of a validation.
+/// Returns the steps that metrics.jsonl records, and those after which it records a validation.
 fn steps(run: &Path) -> (Vec<u64>, Vec<u64>) {
     let (validations, steps): (Vec<_>, Vec<_>) =
         metrics(run).into_iter().partition(|line| line["validation"].is_object());
@@ -63,7 +63,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
-    // Some weights are updated by one rule, and some by the other.
+    // Muon updates some weights, and AdamW the others.
     let settings = ["train.checkpoint_every=1", "train.validate_every=5", "train.optimizer=muon"];
     let steps_key = format!("train.steps={STEPS}");
     let settings = [&settings[..], &[&steps_key]].concat();
@@ -71,7 +71,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     let begun = std::time::Instant::now();
     assert!(run(&whole).output().unwrap().status.success());
     let step_time = begun.elapsed().as_secs_f64() / STEPS as f64;
-    // A checkpoint after every step: about as much time goes into saves as into steps.
+    // A checkpoint after every step: saves take about as much time as steps.
     let mut random = ChaCha8Rng::seed_from_u64(7);
     for _ in 0..10 {
         let lines = told(&killed) + random.random_range(0..=2);
@@ -100,7 +100,7 @@ fn a_broken_checkpoint_is_stepped_over() {
     let train =
         |out: &Path| command(&["train", "--config", arg(&config), "--out", arg(out)]).output().unwrap();
     assert!(train(&whole).status.success() && train(&run).status.success());
-    // One bit of a weight, which no format would notice.
+    // Flip one bit of a weight, which leaves the file format valid.
     let file = run.join("checkpoints/step-00000006/model.safetensors");
     let mut bytes = std::fs::read(&file).unwrap();
     let last = bytes.len() - 5;
@@ -122,12 +122,12 @@ fn a_broken_checkpoint_is_stepped_over() {
     assert!(output.status.code() == Some(2) && err.contains("broken, all 2 of them"), "{err}");
 }
 
-/// Training without end.
+/// Returns the command of a training with so many steps that it doesn't end.
 fn endless(config: &Path, run: &Path) -> Command {
     command(&["train", "--config", arg(config), "--out", arg(run), "--set", "train.steps=1000000"])
 }
 
-/// Lines of metrics.jsonl.
+/// Returns the number of lines of metrics.jsonl.
 fn told(run: &Path) -> usize {
     std::fs::read(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count())
 }
@@ -149,21 +149,21 @@ fn a_second_run_in_the_same_folder_is_refused() {
     assert!(error.contains(&format!("the run is in use by process {}", child.id())), "{error}");
     child.kill().unwrap();
     child.wait().unwrap();
-    // The lock goes with the process.
+    // The lock is released when the process ends.
     succeed(&["train", "--config", arg(&config), "--out", arg(&run)]);
 }
 
 fn set_file_size_limit(child: &Child, bytes: libc::rlim_t) {
     let limit = libc::rlimit { rlim_cur: bytes, rlim_max: libc::RLIM_INFINITY };
-    // SAFETY: the limit of a child that has not been waited for; the old one isn't asked for.
+    // SAFETY: sets a limit of a child process that has not been waited for; the old limit is not returned.
     let result =
         unsafe { libc::prlimit(child.id() as i32, libc::RLIMIT_FSIZE, &limit, std::ptr::null_mut()) };
     assert_eq!(result, 0);
 }
 
-/// Training in a place where no file can grow beyond 8 kB: to it, the disk is full.
+/// Starts training with a file size limit of 8 kB, which acts like a full disk.
 fn on_a_full_disk(config: &Path, run: &Path) -> (Child, BufReader<std::process::ChildStderr>, PathBuf) {
-    // Ignoring SIGXFSZ makes the system refuse the write instead of ending the program.
+    // If SIGXFSZ is ignored, the system refuses the write instead of ending the program.
     let mut child = Command::new("bash")
         .args(["-c", "trap '' XFSZ; ulimit -S -f 8; exec \"$@\"", "bash", env!("CARGO_BIN_EXE_globalsplat")])
         .args(["train", "--config", arg(config), "--out", arg(run)])
@@ -200,7 +200,7 @@ fn a_run_that_waits_for_room_can_be_stopped() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let (mut child, mut said, _) = on_a_full_disk(&config, &run);
-    // SAFETY: sends a signal to a child that has not been waited for.
+    // SAFETY: sends a signal to a child process that has not been waited for.
     unsafe { libc::kill(child.id() as i32, libc::SIGTERM) };
     assert_eq!(child.wait().unwrap().code(), Some(1));
     let mut line = String::new();
@@ -214,7 +214,8 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     succeed(&text(&train(&config, &run, &["train.steps=4"])));
     let good = tensors(&run);
-    // One step is enough to ruin all weights. Every step would be saved, and wouldn't be the last to be kept.
+    // One step is enough to ruin all weights. Without a check, every second step would be saved and would replace good
+    // checkpoints.
     let ruin =
         ["train.steps=40", "train.learning_rate=1e30", "train.checkpoint_every=2", "train.max_skipped=5"];
     let output = command(&text(&train(&config, &run, &ruin))).output().unwrap();
@@ -231,7 +232,7 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
     assert_eq!(skipped, [[false; 5], [true; 5]].concat());
     assert_eq!(told.last().unwrap()["scenes"], serde_json::json!(["room_000"]));
 
-    // With a learning rate that makes sense it goes on from there.
+    // With a reasonable learning rate, the run resumes from there.
     succeed(&text(&train(&config, &run, &["train.steps=8"])));
     assert_eq!(steps(&run), ((0..8).collect(), vec![3, 7]));
 }
@@ -244,7 +245,7 @@ fn a_run_that_ends_in_trouble_is_saved_as_it_was_before() {
     let output = command(&text(&train(&config, &run, &ruin))).output().unwrap();
     let err = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && err.contains("5 steps were skipped"), "{err}");
-    // Five of six steps changed nothing.
+    // Five of the six steps were skipped.
     assert_eq!(checkpoints(&run), ["step-00000001"]);
     let is_finite = |t: &tch::Tensor| t.isfinite().all().int64_value(&[]) == 1;
     assert!(tensors(&run).iter().all(|(_, t)| is_finite(t)));
@@ -268,7 +269,7 @@ fn a_run_that_goes_on_otherwise_says_so_and_keeps_its_place_in_the_data() {
     let state = std::fs::read(run.join("checkpoints/step-00000005/state.json")).unwrap();
     let state: Value = serde_json::from_slice(&state).unwrap();
     assert_eq!((state["step"].as_u64(), state["samples"].as_u64()), (Some(5), Some(3 + 2 * 2)));
-    // Muon needs less than AdamW has kept; the other way round something is missing.
+    // Muon needs less state than AdamW has saved; in the other direction, some is missing.
     stderr(&["train.steps=6", "train.optimizer=muon"]);
     let refused = refuse(&text(&train(&config, &run, &["train.steps=7", "train.optimizer=adamw"])));
     assert!(refused.contains("optimizer.safetensors: second.slot_encoder."), "{refused}");
@@ -279,7 +280,7 @@ fn a_run_that_goes_on_otherwise_says_so_and_keeps_its_place_in_the_data() {
 fn the_best_checkpoint_is_kept_and_exported() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    // Learning that goes well at first, and then not at all: the best is not the last.
+    // Training that improves at first and then diverges: the best checkpoint is not the last.
     let all = ["train.validate_every=2", "train.keep_checkpoints=1", "data.holdout=none"];
     let scenes = format!("data.validation=[{:?}]", arg(&room));
     let settings = [&all[..], &[&scenes]].concat();
@@ -369,7 +370,7 @@ fn what_kills_left_is_put_right() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     succeed(&text(&train(&config, &run, &["train.steps=3"])));
-    // Between the two renames of a save, and within an earlier one.
+    // Interrupted between the two renames of a save, and within an earlier save.
     let folder = run.join("checkpoints");
     for (from, to) in [
         ("step-00000003", ".step-00000003.globalsplat-old"),
@@ -398,7 +399,7 @@ fn a_damaged_checkpoint_is_not_exported() {
         let mut bytes = std::fs::read(&file).unwrap();
         let last = bytes.len() - 5;
         bytes[last] ^= 1;
-        // Both may be one file.
+        // Both paths may be hard links to one file.
         std::fs::remove_file(&file).unwrap();
         std::fs::write(&file, &bytes).unwrap();
         let mut arguments = vec!["export", "--run", arg(&run), "--out", arg(&weights)];
@@ -409,7 +410,7 @@ fn a_damaged_checkpoint_is_not_exported() {
     assert!(!weights.exists());
 }
 
-/// Is stopped before it knows anything.
+/// Validator that is always interrupted before it has a score.
 struct Stopped;
 
 impl Validator for Stopped {
@@ -441,7 +442,7 @@ fn held_out_scenes_are_checked_before_training() {
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let error = fail(&text(&train(&config, &run, &["data.validation=[\"nowhere\"]"])), 2);
     assert!(error.contains("nowhere"), "{error}");
-    // The views that are held out of what is learned, and a scene that is held out as a whole.
+    // The held-out views of the training scene, and a scene that is held out as a whole.
     let scenes = format!("data.validation=[{:?}]", arg(folder.path()));
     let out = succeed(&text(&train(&config, &run, &[&scenes, "train.steps=1"])));
     assert_eq!(out.lines().filter(|line| line.starts_with("room_000")).count(), 2, "{out}");
@@ -452,7 +453,7 @@ fn held_out_scenes_are_checked_before_training() {
 fn weights_are_used_at_the_stage_that_they_were_trained_to() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    // Stages 1 and 2 begin at steps 2 and 4, and take two steps each to come.
+    // Stages 1 and 2 start at steps 2 and 4, with transitions of two steps each.
     let settings = ["train.checkpoint_every=1", "train.keep_checkpoints=6", "train.validate_every=1"];
     let out = command(&text(&train(&config, &run, &settings))).output().unwrap();
     assert!(out.status.success());
@@ -489,7 +490,7 @@ fn weights_are_used_at_the_stage_that_they_were_trained_to() {
         let err = String::from_utf8(output.stderr).unwrap();
         let of_stage = err.lines().find(|line| line.contains(" stage "));
         assert_eq!(said.map(|said| err.contains(said)), of_stage.map(|_| true), "{err}");
-        // Weights go from file to file with their stage, and are the same bytes each time.
+        // Weights keep their stage from file to file, with the same bytes each time.
         let file = globalsplat::io::read_weights(&weights).unwrap();
         let bytes: Vec<Vec<u8>> = (0..4)
             .map(|_| {
@@ -541,7 +542,7 @@ fn a_run_begins_with_the_weights_that_are_named() {
         arguments.extend(["--from".into(), arg(&weights).into()]);
         arguments
     };
-    // At a learning rate that moves nothing.
+    // The learning rate is too small to change any weight.
     succeed(&text(&from(&second, &["train.steps=1", "train.learning_rate=1e-30"])));
     let of_model = |run: &Path| -> Vec<_> {
         tensors(run).into_iter().filter(|(name, _)| name.starts_with("model")).collect()
@@ -552,7 +553,7 @@ fn a_run_begins_with_the_weights_that_are_named() {
     let stage = metrics(&second)[0]["stage"].as_u64();
     assert_eq!(stage, Some(2), "all Gaussians are shown from the first step on");
 
-    // Patches of half the edge are looked at by weights that are sums of those they come from.
+    // Weights for patches with half the edge sum up to those they come from.
     let finer = folder.path().join("finer");
     let still = ["train.steps=1", "train.learning_rate=1e-30", "model.patch_size=4"];
     succeed(&text(&from(&finer, &still)));
@@ -566,7 +567,7 @@ fn a_run_begins_with_the_weights_that_are_named() {
         }
     }
 
-    // Scene tokens become several, which cover together what one did.
+    // Each scene token is split into several, which together cover what one did.
     let larger = folder.path().join("larger");
     succeed(&text(&from(&larger, &["train.steps=1", "train.learning_rate=1e-30", "model.latents=32"])));
     for ((name, of_few), (_, of_many)) in of_model(&first).iter().zip(of_model(&larger)) {
@@ -592,7 +593,7 @@ fn a_run_begins_with_the_weights_that_are_named() {
     );
     assert!(!other.join("checkpoints").exists(), "nothing was begun");
 
-    // A run that has begun needs them no more.
+    // A run that has a checkpoint doesn't need the initial weights any more.
     std::fs::remove_file(&weights).unwrap();
     succeed(&text(&from(&second, &["train.steps=2", "train.learning_rate=1e-30"])));
 }

@@ -1,4 +1,4 @@
-//! The splat op against finite differences and against brute force.
+//! The splat op, compared with finite differences and with a brute-force renderer.
 
 mod common;
 
@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
 use tch::{Device, Kind, Tensor};
 
-/// Gaussians in front of the cameras of [`cameras`], of sizes and opacities as a trained scene has them, every one a
-/// full random rotation and SH of `degree`.
+/// Returns Gaussians in front of the cameras of [`cameras`], with sizes and opacities typical of a trained scene, uniformly
+/// random rotations and SH of `degree`.
 fn gaussians(scenes: i64, count: i64, degree: i64, kind: Kind, seed: u64) -> Gaussians {
     let mut random = Random::new(seed);
     let means = random.uniform(&[scenes, count, 3]) * 2. - 1.;
@@ -24,7 +24,7 @@ fn gaussians(scenes: i64, count: i64, degree: i64, kind: Kind, seed: u64) -> Gau
     .map(|t| t.to_kind(kind))
 }
 
-/// Cameras side by side, the last ones turned inwards.
+/// Returns cameras side by side, the last ones turned inwards.
 fn cameras(scenes: i64, count: i64, width: i64, height: i64, kind: Kind) -> Cameras {
     let (mut w2c, mut intrinsics) = (vec![], vec![]);
     for i in 0..scenes * count {
@@ -55,7 +55,7 @@ fn draw(g: &Gaussians, c: &Cameras) -> Pictures {
     render(g, c, DEFAULT_EPS2D).expect("shapes that fit")
 }
 
-/// A number that weighs every pixel of every picture differently, the same on every call.
+/// Returns a scalar that weighs every pixel of every image differently, the same on every call.
 fn objective(p: &Pictures) -> Tensor {
     let weigh = |t: &Tensor, phase: f64| {
         let n = t.numel() as i64;
@@ -65,7 +65,7 @@ fn objective(p: &Pictures) -> Tensor {
     weigh(&p.rgb, 0.1) + weigh(&p.alpha, 0.9) + weigh(&p.depth, 1.7)
 }
 
-/// [`Gaussians`] that record gradients.
+/// Returns copies of [`Gaussians`] that require gradients.
 fn leaves(g: &Gaussians) -> Gaussians {
     g.map(|t| t.detach().copy().set_requires_grad(true))
 }
@@ -80,7 +80,7 @@ fn fields(g: &Gaussians) -> [(&'static str, &Tensor); 5] {
     ]
 }
 
-/// `g` with quaternions of lengths from 1e-30 to 1e30, by powers of two: the rotations are the same to the bit.
+/// Returns `g` with quaternions of lengths from 1e-30 to 1e30, by powers of two: the rotations are bit-identical.
 fn of_any_length(g: &Gaussians) -> Gaussians {
     let count = g.count();
     let exponents =
@@ -89,7 +89,7 @@ fn of_any_length(g: &Gaussians) -> Gaussians {
     Gaussians { quaternions: &g.quaternions * powers, ..g.map(Tensor::shallow_clone) }
 }
 
-/// Pictures and gradients of what [`objective`] tells of them.
+/// Returns the rendered images, and the gradients of [`objective`].
 fn differentiated(g: &Gaussians, c: &Cameras) -> (Pictures, [(&'static str, Tensor); 5]) {
     let g = leaves(g);
     let p = draw(&g, c);
@@ -113,7 +113,7 @@ fn quaternions_of_any_length_turn_the_same() {
                 [(&p.rgb, &expected.rgb), (&p.alpha, &expected.alpha), (&p.depth, &expected.depth)];
             assert!(pictures.iter().all(|(a, b)| a.equal(b)), "{kind:?}, length {length:e}");
             for ((name, found), (_, expected)) in found.iter().zip(&gradients) {
-                // ∂L/∂(s q) = ∂L/∂q / s.
+                // The gradient scales inversely: ∂L/∂(s q) = ∂L/∂q / s.
                 let found = if *name == "quaternions" { found * length } else { found.shallow_clone() };
                 let error = common::relative_error(&found, expected);
                 assert!(error < 1e-6, "{kind:?}, length {length:e}: {name} is off by {error:.1e}");
@@ -152,9 +152,9 @@ fn gaussians_without_a_rotation_are_dropped() {
 
 #[test]
 fn gradients_are_those_of_finite_differences() {
-    // Central differences in float64 along random directions, one input at a time and all of its entries at once. The
-    // picture jumps where some α crosses 1/255: a direction whose difference quotient changes with the step met such a
-    // jump and is drawn again.
+    // Central differences in float64 along random directions, one input at a time and all of its elements at once. The image is
+    // discontinuous where some α crosses 1/255: a direction whose difference quotient changes with the step met such a
+    // discontinuity and is drawn again.
     const DIRECTIONS: u64 = 4;
     for (degree, seed) in [(0, 1), (1, 2), (2, 3), (3, 4)] {
         let (scenes, views) = (2, 3);
@@ -204,7 +204,7 @@ fn gradients_are_those_of_finite_differences() {
     }
 }
 
-/// Spec 6.2 to 6.4, pixel by pixel over every Gaussian, in float64 and without any culling.
+/// Renders by spec 6.2 to 6.4, pixel by pixel over every Gaussian, in float64 and without any culling.
 fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
     let values = |t: &Tensor| Vec::<f64>::try_from(t.to_kind(Kind::Double).flatten(0, -1)).expect("numbers");
     let [means, scales, quaternions, opacities, sh] = fields(g).map(|(_, t)| values(t));
@@ -309,8 +309,8 @@ fn pictures_are_those_of_brute_force() {
     }
 }
 
-/// Gaussians that culling is likely to lose, one per scene: needles at any angle, large and tiny ones, faint ones, centres
-/// on the borders of tiles and blocks, and outside the picture. The camera is that of [`straight_camera`].
+/// Returns Gaussians that culling is likely to lose, one per scene: needles at any angle, large and tiny ones, faint ones,
+/// centres on the borders of tiles and blocks, and outside the image. The camera is that of [`straight_camera`].
 fn lone_gaussians(width: f64, height: f64, seed: u64) -> Gaussians {
     const COUNT: usize = 600;
     let mut random = Random::new(seed);
@@ -341,7 +341,7 @@ fn lone_gaussians(width: f64, height: f64, seed: u64) -> Gaussians {
     }
 }
 
-/// At the origin, looking along z, focal length 100 pixels; one for each of `scenes`.
+/// Returns a camera at the origin, looking along z, focal length 100 pixels; one for each of `scenes`.
 fn straight_camera(scenes: i64, width: i64, height: i64) -> Cameras {
     let intrinsics = [100., 0., width as f64 / 2., 0., 100., height as f64 / 2., 0., 0., 1.];
     Cameras {
@@ -357,7 +357,7 @@ fn straight_camera(scenes: i64, width: i64, height: i64) -> Cameras {
 
 #[test]
 fn a_gaussian_is_seen_wherever_it_reaches() {
-    // float32 against brute force in float64. They may disagree about a pixel only where α is 1/255 but for rounding.
+    // float32 is compared with brute force in float64. They may disagree about a pixel only where α is 1/255 up to rounding.
     let threshold = 1. / 255.;
     for (width, height, seed) in [(96, 80, 14), (33, 50, 15), (16, 16, 16)] {
         let g = lone_gaussians(width as f64, height as f64, seed);
@@ -376,7 +376,7 @@ fn a_gaussian_is_seen_wherever_it_reaches() {
 
 #[test]
 fn instruction_sets_agree() {
-    // The choice is made once per process: this test runs itself again for every set, to draw and save.
+    // The instruction set is selected once per process: this test runs itself again for every set, to render and save.
     const OUT: &str = "GLOBALSPLAT_TEST_OUT";
     const UNSUPPORTED: i32 = 77;
     if let Some(out) = std::env::var_os(OUT) {
@@ -411,7 +411,7 @@ fn instruction_sets_agree() {
         }
     }
     println!("compared: {:?}", answers.iter().map(|(level, _)| level).collect::<Vec<_>>());
-    // For other processors there is one alone.
+    // Other processors have only one instruction set.
     if answers.len() < 2 && cfg!(target_arch = "x86_64") {
         common::skip("a second instruction set", "the processor has none but the portable one");
     }
@@ -425,15 +425,15 @@ fn instruction_sets_agree() {
     }
 }
 
-/// Compares the CUDA kernels, emulated on the CPU, with the CPU's own: pictures bit by bit, gradients within rounding.
+/// Compares the CUDA kernels, emulated on the CPU, with the CPU's own: images bit by bit, gradients within rounding.
 ///
-/// Where the CPU has fused multiply-add, gradients differ by the order of sums alone. `portable` rounds a product and a sum
-/// separately (`add_product` in csrc/raster/simd.h). Both kernels compute the loss behind a splat as the loss of the whole pixel less
-/// what has been passed, a difference that magnifies rounding. The two float32 gradients then differ by about as much as each
-/// differs from the float64 gradient, and this distance is the bound.
+/// If the CPU has fused multiply-add, gradients differ only by the order of summation. `portable` rounds a product and a sum
+/// separately (`add_product` in csrc/raster/simd.h). Both kernels compute the loss behind a splat as the loss of the whole
+/// pixel less the part in front of it, a difference that magnifies rounding. The two float32 gradients then differ by about as
+/// much as each differs from the float64 gradient, and this distance is the bound.
 #[test]
 fn kernels_for_gpus_draw_the_cpus_bits() {
-    // A variable of the process decides: this test runs itself again, to draw and save.
+    // An environment variable selects the kernels: this test runs itself again, to render and save.
     const OUT: &str = "GLOBALSPLAT_TEST_OUT";
     let answer = |kind: Kind| {
         let g = of_any_length(&gaussians(2, 700, 3, Kind::Float, 21)).map(|t| t.to_kind(kind));
@@ -479,7 +479,7 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
         let is_picture = place < 3;
         if is_picture {
             assert!(found.equal(expected), "{name}");
-            // A pixel that blends other Gaussians in float64 would make the gradients' distance large.
+            // If a pixel blended other Gaussians in float64, the distance of the gradients would be large.
             assert!(rounding < 1e-6, "{name}: float64 differs by {rounding:.1e}");
             continue;
         }

@@ -1,4 +1,4 @@
-//! Splats in every format: what comes back of what was written, what each makes of the numbers, and what is refused.
+//! Splat formats: round trips, the values that each format stores, and invalid files.
 
 mod common;
 
@@ -14,7 +14,7 @@ use tch::{Kind, Tensor};
 
 const ENDINGS: [&str; 4] = ["ply", "compressed.ply", "spz", "splat"];
 
-/// Splats whose numbers every format can hold: coefficients within ±0.9, colours within what a screen shows.
+/// Returns a splat whose values are within the range of every format: coefficients within ±0.9, displayable colours.
 fn random_splat(count: i64, degree: i64, seed: u64) -> Splat {
     let mut random = Random::new(seed);
     let bases = (degree + 1) * (degree + 1);
@@ -34,7 +34,7 @@ fn written(folder: &Path, name: &str, splat: &Splat) -> PathBuf {
     path
 }
 
-/// How far apart quaternions are, of whatever length; q and −q are the same rotation.
+/// Returns the difference between rotations, from quaternions of any length; q and −q are the same rotation.
 fn rotation_error(a: &Tensor, b: &Tensor) -> f64 {
     let unit = |q: &Tensor| q / q.norm_scalaropt_dim(2, [-1i64].as_slice(), true);
     let (a, b) = (unit(a), unit(b));
@@ -42,7 +42,7 @@ fn rotation_error(a: &Tensor, b: &Tensor) -> f64 {
     largest_error(&a, &(b * same_side))
 }
 
-/// What brings the Gaussians of `to` into the order of `from`: each to the one nearest to it.
+/// Reorders the Gaussians of `to` to match `from`, each to its nearest.
 fn matched(from: &Gaussians, to: &Gaussians) -> Gaussians {
     let distances = (from.means.squeeze_dim(0).unsqueeze(1) - to.means.squeeze_dim(0).unsqueeze(0))
         .square()
@@ -52,8 +52,8 @@ fn matched(from: &Gaussians, to: &Gaussians) -> Gaussians {
     to.map(|tensor| tensor.index_select(1, &nearest))
 }
 
-/// Largest errors that quantization leaves: of positions, logarithms of scales, quaternions, opacities, SH of degree 0, of
-/// degree 1 and of more.
+/// Maximum quantization errors: of positions, logarithms of scales, quaternions, opacities, SH of degree 0, of degree 1 and of
+/// higher degrees.
 struct Steps([f64; 7]);
 
 fn assert_within(what: &str, original: &Splat, copy: &Splat, steps: &Steps) {
@@ -79,12 +79,13 @@ fn assert_within(what: &str, original: &Splat, copy: &Splat, steps: &Steps) {
     }
 }
 
-/// What each format's own steps leave, half of one at most, and a little for float32.
+/// Returns the quantization errors of each format, at most half a step, with a margin for float32.
 fn steps(ending: &str, count: i64) -> Steps {
     const C0: f64 = 0.2820947918;
     match ending {
         "ply" => Steps([0., 1e-6, 1e-6, 2e-6, 0., 0., 0.]),
-        // Within the bounds of the Gaussians, which are 6 wide, in logarithms 2, in colours 1.8·C0 and more.
+        // Steps are fractions of the Gaussians' bounds, which are 6 wide in positions, 2 in logarithms, 1.8·C0 and more in
+        // colours.
         "compressed.ply" => {
             assert!(count > 0);
             Steps([
@@ -97,7 +98,7 @@ fn steps(ending: &str, count: i64) -> Steps {
                 0.5 / 32. + 1e-6,
             ])
         }
-        // 9 is within 2^23 / 2^19; rotations have nine bits of 1/√2.
+        // The largest position, 9, is below 2^23 / 2^19; rotations have nine bits of 1/√2.
         "spz" => Steps([
             0.5 / f64::from(1 << 19) + 1e-6,
             0.5 / 16. + 1e-6,
@@ -129,7 +130,7 @@ fn what_is_written_comes_back_to_half_a_step() {
     }
 }
 
-/// A camera at the origin that looks along z, 64×64.
+/// Returns a camera at the origin that looks along z, 64×64.
 fn camera() -> Camera {
     let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 32. };
     Camera { intrinsics, c2w: glam::DMat4::IDENTITY, width: 64, height: 64 }
@@ -140,7 +141,7 @@ fn psnr_of_pictures(a: &Splat, b: &Splat, camera: Camera) -> f64 {
     globalsplat::eval::psnr(&seen(a), &seen(b))
 }
 
-/// Signs, orders and axes are those of the pictures: one that is wrong shows from other sides.
+/// Renders from all sides are the same after a round trip: a wrong sign, order or axis would show from some side.
 #[test]
 fn pictures_are_the_same_from_other_sides() {
     let folder = tempfile::tempdir().unwrap();
@@ -160,7 +161,7 @@ fn pictures_are_the_same_from_other_sides() {
     }
 }
 
-/// The first Gaussian's numbers where SPZ's documentation puts them.
+/// An SPZ file has the values of the first Gaussian at the offsets of SPZ's documentation.
 #[test]
 fn an_spz_is_as_documented() {
     let folder = tempfile::tempdir().unwrap();
@@ -178,9 +179,10 @@ fn an_spz_is_as_documented() {
     flate2::bufread::GzDecoder::new(&bytes[..]).read_to_end(&mut unfolded).unwrap();
     assert_eq!(unfolded[..4], *b"NGSP");
     assert_eq!(unfolded[4..16], [3, 0, 0, 0, 1, 0, 0, 0, 1, 21, 0, 0], "version, Gaussians, degree, bits");
-    // Niantic's library gives these bytes for these numbers, but for positions, to which it leaves 12 bits, and coefficients.
+    // Niantic's library gives these bytes for these values, except for positions, which it stores with 12 fractional bits, and
+    // coefficients.
     assert_eq!(unfolded[25..36], hex("9f83878b908070de52aac4")[..]);
-    // −0.1·128 + 128 and so on: y and z change their sign.
+    // Bytes of the coefficients: −0.1·128 + 128 and so on; y and z change their sign.
     assert_eq!(unfolded[36..], hex("73665a4d4033dae6f3"));
     let fixed = |at: usize| i32::from_le_bytes([0, unfolded[at], unfolded[at + 1], unfolded[at + 2]]) >> 8;
     assert_eq!([16, 19, 22].map(fixed), [1 << 21, -(2 << 21), -(3 << 21)]);
@@ -191,19 +193,19 @@ fn hex(text: &str) -> Vec<u8> {
     digits.map(|two| u8::from_str_radix(std::str::from_utf8(two).unwrap(), 16).unwrap()).collect()
 }
 
-/// Four parts of one Gaussian, in the words of the format.
+/// Each of the four versions of SPZ gives the same Gaussian, from bytes written by the format's documentation.
 #[test]
 fn older_versions_of_spz_are_read() {
     let folder = tempfile::tempdir().unwrap();
     let head = |version: u8| [b"NGSP", &[version, 0, 0, 0, 1, 0, 0, 0, 1, 12, 0, 0][..]].concat();
     let shape = hex("9f83878b908070");
     let harmonics = hex("706858504030d8e8f0");
-    // 1, 2 and 3 as halves, and with 12 bits after the point; the rotation's x, y and z in a byte each.
+    // Positions 1, 2 and 3 as half-precision floats, and with 12 fractional bits; x, y and z of the rotation in a byte each.
     let halves = [0x3c00u16, 0xc000, 0xc200].map(u16::to_le_bytes).concat();
     let one = [head(1), halves, shape.clone(), hex("8d6558"), harmonics.clone()].concat();
     let two = [head(2), hex("00100000e0ff00d0ff"), shape.clone(), hex("8d6558"), harmonics.clone()].concat();
     let three = [head(3), hex("00100000e0ff00d0ff"), shape, hex("de52aac4"), harmonics].concat();
-    // As Niantic's library writes it.
+    // File written by Niantic's library.
     let four = hex(
         "4e4753500400000001000000010c000620000000000000000000000000000000120000000000000009000000000000000a0000000000000\
          001000000000000000c0000000000000003000000000000000c0000000000000003000000000000000d000000000000000400000000000\
@@ -234,7 +236,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// The axes that an extension names are heeded: here those of PLYs, in which nothing changes its sign.
+/// The axes that an extension of an SPZ names are applied: here those of PLYs, for which no sign changes.
 #[test]
 fn the_axes_of_an_spz_are_heeded() {
     let folder = tempfile::tempdir().unwrap();
@@ -250,14 +252,14 @@ fn the_axes_of_an_spz_are_heeded() {
     let [rub, rdf] = [4, 6].map(|number| read_splat(&with_axes(number)).unwrap().gaussians);
     let turned = Tensor::from_slice(&[1f32, -1., -1.]);
     assert!((&rub.means * &turned).equal(&rdf.means));
-    // Of degree 1 the order is y, z, x.
+    // The order of degree 1 is y, z, x.
     let signs = Tensor::from_slice(&[1f32, -1., -1., 1.]).view([1, 1, 4, 1]);
     assert!((&rub.sh * signs).equal(&rdf.sh));
     assert!((&rub.quaternions * Tensor::from_slice(&[1f32, 1., -1., -1.])).equal(&rdf.quaternions));
     assert_says(&refuse(&["inspect", arg(&with_axes(9))]), &["the coordinate system is 9", "1 to 8"]);
 }
 
-/// The same PLY in text, in both byte orders, with everything that may stand in it besides.
+/// A PLY is read identically as text, in both byte orders, and with all other elements that it may contain.
 #[test]
 fn a_ply_is_read_however_it_is_written() {
     let folder = tempfile::tempdir().unwrap();
@@ -321,7 +323,8 @@ fn a_ply_is_read_however_it_is_written() {
     }
 }
 
-/// Logits of 1 and 0 and the logarithm of 0 stand in files of programs that keep bytes.
+/// Opacities of exactly 1 and 0 have infinite logits, and scales of 0 an infinite logarithm, in files of programs that store
+/// bytes.
 #[test]
 fn infinite_logits_are_opacities_of_0_and_1() {
     let folder = tempfile::tempdir().unwrap();
@@ -366,7 +369,7 @@ fn endings_that_are_unknown() {
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing was written");
 }
 
-/// What a file holds counts, not what it is called, where it says so itself.
+/// The contents of a file determine its format, not its name, for formats that can be recognized.
 #[test]
 fn files_are_recognized() {
     let folder = tempfile::tempdir().unwrap();
@@ -383,7 +386,7 @@ fn files_are_recognized() {
     assert_eq!(find_splat(folder.path(), "b"), folder.path().join("b.ply"));
 }
 
-/// What is said of a file of `ending` whose bytes are changed.
+/// Returns the error message for a file of `ending` whose bytes are changed.
 fn refused(ending: &str, change: impl FnOnce(&mut Vec<u8>)) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = written(folder.path(), &format!("broken.{ending}"), &random_splat(300, 1, 9));
@@ -469,7 +472,7 @@ fn bad_compressed_plys() {
     assert_says(&bound, &["min_x of chunk 0 is NaN", "a finite number"]);
 }
 
-/// Without bounds of colours, as in older files, bytes are the colours.
+/// Bytes are the colours themselves in older files, without bounds of colours.
 #[test]
 fn older_compressed_plys_are_read() {
     let folder = tempfile::tempdir().unwrap();
@@ -521,7 +524,7 @@ fn bad_spzs() {
     assert_says(&refused("spz", |bytes| *bytes = b"no gzip".to_vec()), &["the file is no SPZ"]);
 }
 
-/// A table of contents that doesn't fit what follows.
+/// A table of contents that doesn't match the data is refused.
 #[test]
 fn bad_spzs_of_version_4() {
     let plain = |change: &dyn Fn(&mut Vec<u8>)| {
@@ -559,7 +562,7 @@ fn bad_splats() {
     assert_says(&number(20, -1.), &["the scale of Gaussian 2 is -1", "0 or more"]);
 }
 
-/// What a format can't hold is refused, and nothing is written.
+/// Values that a format can't store are refused, and nothing is written.
 #[test]
 fn numbers_that_do_not_fit() {
     let folder = tempfile::tempdir().unwrap();
@@ -574,13 +577,13 @@ fn numbers_that_do_not_fit() {
     let error = write_splat(&folder.path().join("a.spz"), &far).unwrap_err().to_string();
     assert_says(&error, &["a coordinate is 10000000, expected at most 8388607"]);
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
-    // What fits nearly is as exact as 24 bits are.
+    // Values that nearly exceed the range are as exact as 24 bits allow.
     let _ = far.gaussians.means.narrow(1, 1, 1).fill_(-8_388_000.);
     let near = read_splat(&written(folder.path(), "a.spz", &far)).unwrap();
     assert!(largest_error(&near.gaussians.means, &far.gaussians.means) <= 0.5);
 }
 
-/// `convert` tells both files and what was lost, by an orbit or by a capture's cameras.
+/// `convert` reports both files and the loss, measured on an orbit or from a capture's cameras.
 #[test]
 fn convert_tells_what_is_lost() {
     let (folder, room) = room();
@@ -610,7 +613,7 @@ fn convert_tells_what_is_lost() {
     assert_eq!(higher.status.code(), Some(2));
 }
 
-/// Coefficients beyond SPZ's bounds are cut off where nobody looks, and changed for others where a capture says who does.
+/// Coefficients beyond SPZ's range are clamped without a capture; with a capture the others are fitted to its cameras.
 #[test]
 fn convert_keeps_what_a_capture_sees() {
     let (folder, room) = room();
@@ -633,7 +636,7 @@ fn convert_keeps_what_a_capture_sees() {
             if !always.is_empty() {
                 let colour = copy.gaussians.sh.narrow(2, 0, 1) * 0.28209479177387814;
                 let others = copy.gaussians.sh.narrow(2, 1, 15);
-                // A byte of SPZ's is 0.03 apart.
+                // SPZ's quantization step is 0.03.
                 let beyond =
                     [colour.abs().max().double_value(&[]) - 0.5, others.abs().max().double_value(&[]) - 1.];
                 assert!(
@@ -646,7 +649,7 @@ fn convert_keeps_what_a_capture_sees() {
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
         assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
     }
-    // Who has the capture at hand needs no telling; who hasn't is told.
+    // A message appears only without a capture.
     let (out, own) = (folder.path().join("b.spz"), folder.path().join("b.ply"));
     let said = |more: &[&str]| {
         let done = common::program::globalsplat(&[&["convert", arg(&strong), arg(&out)], more].concat());
@@ -666,10 +669,10 @@ fn convert_keeps_what_a_capture_sees() {
     assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
 }
 
-/// The properties of three Gaussians in a PLY, by name.
+/// Properties of three Gaussians in a PLY, by name.
 type Columns = Vec<(&'static str, [f64; 3])>;
 
-/// Properties of a PLY that is one Gaussian's, with the values of three Gaussians in a row.
+/// Returns the properties of a PLY, with the values of three Gaussians in a row.
 fn small_gaussians() -> Columns {
     vec![
         ("x", [-0.5, 0., 0.5]),
@@ -689,7 +692,7 @@ fn small_gaussians() -> Columns {
     ]
 }
 
-/// Writes a binary PLY of `columns`, whose numbers are float but where `types` says otherwise.
+/// Writes a binary PLY of `columns`, whose values are float unless `types` says otherwise.
 fn write_ply(path: &Path, columns: &[(&str, [f64; 3])], types: &[(&str, &str)]) {
     let type_of = |name: &str| types.iter().find(|(own, _)| *own == name).map_or("float", |(_, of)| of);
     let mut bytes = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n".to_vec();
@@ -710,7 +713,7 @@ fn write_ply(path: &Path, columns: &[(&str, [f64; 3])], types: &[(&str, &str)]) 
     std::fs::write(path, bytes).unwrap();
 }
 
-/// What a command that succeeds says on standard error, and on standard output.
+/// Returns standard error and standard output of a command that succeeds.
 fn said(arguments: &[&str]) -> (String, String) {
     let done = common::program::globalsplat(arguments);
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
@@ -719,7 +722,7 @@ fn said(arguments: &[&str]) -> (String, String) {
     (stderr, stdout)
 }
 
-/// Rotations of length 0 are dropped by what reads and what writes, and counted, as the rasterizer doesn't draw them.
+/// Rotations of length 0 are dropped by readers and writers, and counted, since the rasterizer doesn't draw such Gaussians.
 #[test]
 fn gaussians_without_a_rotation_are_left_out() {
     let folder = tempfile::tempdir().unwrap();
@@ -732,7 +735,7 @@ fn gaussians_without_a_rotation_are_left_out() {
         let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
         assert_eq!((copy.gaussians.count(), copy.warnings.len()), (250, 0), "{ending}");
     }
-    // Files of other programs: zeros, and numbers that are as good as zero, in a PLY; the middle of a byte in a .splat.
+    // Files of other programs: zeros, and values that underflow, in a PLY; the middle of the byte range in a .splat.
     let mut columns = small_gaussians();
     columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
     let ply = folder.path().join("zero.ply");
@@ -755,7 +758,7 @@ fn gaussians_without_a_rotation_are_left_out() {
     }
 }
 
-/// `convert` leaves out Gaussians with numbers that no Gaussian has, and counts them; other commands refuse them and name it.
+/// `convert` removes Gaussians with invalid values, and counts them; other commands refuse the file and name it.
 #[test]
 fn convert_repairs_what_others_refuse() {
     let (folder, room) = room();
@@ -795,7 +798,7 @@ fn convert_repairs_what_others_refuse() {
     .into_iter()
     .map(|(name, value)| (write(&format!("{name}.ply"), &|columns| set(columns, name, 1, value)), name, name))
     .collect();
-    // .splat files have no names for what they hold, and SPZ's oldest version has halves.
+    // .splat files have no property names, and SPZ's oldest version has half-precision floats.
     let antimatter = |name: &str, at: usize, value: f32| {
         let path = written(folder.path(), name, &random_splat(3, 0, 1));
         let mut bytes = std::fs::read(&path).unwrap();
@@ -832,7 +835,7 @@ fn convert_repairs_what_others_refuse() {
             assert_eq!(read_splat(&to).unwrap().gaussians.count(), 2, "{ending}");
         }
     }
-    // Several properties are named once each, and no more than a few; a Gaussian counts once.
+    // Each property is named once, up to a maximum number; a Gaussian counts once.
     let many = write("many.ply", &|columns| {
         columns.iter_mut().for_each(|(_, values)| values[0] = f64::NAN);
         set(columns, "y", 2, f64::NAN);
@@ -851,7 +854,7 @@ fn convert_repairs_what_others_refuse() {
     );
 }
 
-/// What bounds a compressed PLY's Gaussians makes all of them invalid.
+/// An invalid bound of a chunk of a compressed PLY makes all of the chunk's Gaussians invalid.
 #[test]
 fn compressed_gaussians_without_bounds_are_left_out() {
     let folder = tempfile::tempdir().unwrap();
@@ -865,7 +868,7 @@ fn compressed_gaussians_without_bounds_are_left_out() {
     assert_says(&repaired.warnings[0], &["256 of 300 Gaussians are left out", ": min_y"]);
 }
 
-/// 2DGS has no third scale: its Gaussians are flat, in every format, to each format's smallest scale.
+/// 2DGS has no third scale: its Gaussians are flat, in every format, down to each format's smallest scale.
 #[test]
 fn surfels_are_flat() {
     let folder = tempfile::tempdir().unwrap();
@@ -877,7 +880,7 @@ fn surfels_are_flat() {
     assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
     let third = |splat: &Splat| splat.gaussians.scales.select(2, 2).max().double_value(&[]);
     assert!(third(&splat) > 0. && third(&splat) <= 1.1e-30, "{}", third(&splat));
-    // From the side there is only what the rasterizer's blur leaves: nothing is thinner.
+    // From the side only the rasterizer's blur is visible: a smaller scale makes no difference.
     let mut thinnest = Splat::of(&splat.gaussians).unwrap();
     thinnest.gaussians.scales = splat.gaussians.scales.copy();
     let _ = thinnest.gaussians.scales.select(2, 2).zero_();
@@ -894,7 +897,7 @@ fn surfels_are_flat() {
     }
 }
 
-/// Colours in place of spherical harmonics, in whatever type and by whatever name.
+/// Colours instead of spherical harmonics are read, whatever their type and their names.
 #[test]
 fn colours_are_harmonics_of_degree_0() {
     let folder = tempfile::tempdir().unwrap();
@@ -924,7 +927,7 @@ fn colours_are_harmonics_of_degree_0() {
             let step = if largest(of) == 65535. { 1e-4 } else { 1e-6 };
             let error = largest_error(&splat.gaussians.sh, &expected);
             assert!(error < step, "{of} {names:?} of {whole}: {error}");
-            // Beside coefficients, colours are another program's picture of them.
+            // If there are coefficients as well, another program derived the colours from them, and they are ignored.
             columns.extend(small_gaussians().into_iter().filter(|(name, _)| name.starts_with("f_dc")));
             write_ply(&path, &columns, &names.map(|name| (name, of)));
             let splat = read_splat(&path).unwrap();
@@ -933,7 +936,7 @@ fn colours_are_harmonics_of_degree_0() {
     }
 }
 
-/// What lacks all that makes Gaussians of points is called what it is.
+/// A PLY without the properties that make Gaussians of points is reported as a point cloud.
 #[test]
 fn point_clouds_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -952,7 +955,7 @@ fn point_clouds_are_refused() {
     }
 }
 
-/// Lengths of quaternions say nothing, in any format: rotations come back as of length 1.
+/// Lengths of quaternions are ignored, in every format: rotations are read back with length 1.
 #[test]
 fn quaternions_of_any_length_are_kept() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Made-up videos: the same for everyone, true to their cameras, and data like any other.
+//! Videos of synthetic scenes are reproducible, consistent with their cameras, and usable like any other data.
 
 mod common;
 
@@ -15,7 +15,7 @@ fn settings(frames: usize, side: u32) -> VideoSettings {
     VideoSettings { frames, size: ImageSize { height: side, width: side }, pictures: vec![] }
 }
 
-/// The same seed, the same bytes, whatever the threads, and other ones for another seed.
+/// A seed determines the bytes, whatever the number of threads; another seed gives others.
 #[test]
 fn a_seed_makes_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
@@ -62,7 +62,7 @@ fn where_it_was_stopped_the_same_command_goes_on() {
     let (before, depth) = (read(), out.join("depth/0_000001.npy"));
     let (bytes, depths) = (std::fs::read(&chunk).unwrap(), std::fs::read(&depth).unwrap());
 
-    // Stopped before the index was written, and a file lost.
+    // Simulates a process that was stopped before it wrote the index, and a lost file.
     for lost in indices.iter().chain([&depth]) {
         std::fs::remove_file(lost).unwrap();
     }
@@ -72,7 +72,7 @@ fn where_it_was_stopped_the_same_command_goes_on() {
     assert_eq!(read(), before);
     assert!(std::fs::read(&chunk).unwrap() == bytes && std::fs::read(&depth).unwrap() == depths);
     assert_eq!(written(), when, "made anew");
-    // What is there is of other worlds, or of other photos of them.
+    // The existing files are of other scenes, or of other photos of them.
     std::fs::remove_file(&indices[0]).unwrap();
     for other in [["1", "3", "24", "0"], ["2", "4", "24", "0"], ["2", "3", "25", "0"], ["2", "3", "24", "1"]]
     {
@@ -82,7 +82,7 @@ fn where_it_was_stopped_the_same_command_goes_on() {
     assert!(std::fs::read(&chunk).unwrap() == bytes, "lost");
 }
 
-/// Where a pixel of `from` that is `depth` metres away is seen by `to`, in pixels, and how far it is from there.
+/// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.
 fn seen(from: &Camera, to: &Camera, x: f64, y: f64, depth: f64) -> (f64, f64, f64) {
     let k = from.intrinsics;
     let point = from.c2w.transform_point3(depth * DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.));
@@ -91,14 +91,14 @@ fn seen(from: &Camera, to: &Camera, x: f64, y: f64, depth: f64) -> (f64, f64, f6
     (k.fx * there.x / there.z + k.cx, k.fy * there.y / there.z + k.cy, there.z)
 }
 
-/// A view that is carried into the next one by its depths and both poses agrees with it, where both see the same.
+/// A view warped into another by its depths and both poses agrees with it, where both see the same.
 #[test]
 fn depths_and_poses_carry_one_view_into_the_next() {
     const SIDE: u32 = 96;
     let mut compared = 0;
     for index in 0..6 {
         let video = Video::new(11, index, &settings(24, SIDE));
-        // Not so far apart that much of what one sees is hidden from the other.
+        // Near enough that little of what one view sees is occluded in the other.
         let frames = [6, 12];
         let [from, to] = frames.map(|i| &video.cameras()[i]);
         let (photos, depths) = (frames.map(|i| video.photo(i)), frames.map(|i| video.depth(i)));
@@ -111,7 +111,7 @@ fn depths_and_poses_carry_one_view_into_the_next() {
             }
             let there = (y as u32 * SIDE + x as u32) as usize;
             apart.push((f64::from(depths[1][there]) / far - 1.).abs());
-            // Another depth there: something is in front.
+            // A different depth: the point is occluded.
             if *apart.last().unwrap() > 0.05 {
                 continue;
             }
@@ -151,8 +151,8 @@ fn cameras_are_in_free_space_and_move() {
     }
 }
 
-/// Some videos go around a thing, as people photograph things: all cameras look at nearly the same point, by more than 45 degrees
-/// from one another.
+/// Some videos go around an object, as people photograph objects: all cameras look at nearly the same point, by more than 45
+/// degrees from one another.
 #[test]
 fn things_are_looked_at_from_around() {
     let is_around = |index| {
@@ -160,7 +160,7 @@ fn things_are_looked_at_from_around() {
         let rays: Vec<(DVec3, DVec3)> =
             cameras.iter().map(|c| (c.c2w.w_axis.truncate(), c.c2w.z_axis.truncate())).collect();
         let turn = rays.iter().map(|ray| ray.1.angle_between(rays[0].1)).fold(0., f64::max);
-        // Σ (I − d dᵀ) p = Σ (I − d dᵀ) c is the point that rays from c along d pass nearest.
+        // The point that is nearest to all rays from c along d solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) c.
         let across = |d: DVec3| DMat3::IDENTITY - DMat3::from_cols(d.x * d, d.y * d, d.z * d);
         let sum = rays.iter().fold(DMat3::ZERO, |sum, &(_, d)| sum + across(d));
         let point = sum.inverse() * rays.iter().map(|&(c, d)| across(d) * c).sum::<DVec3>();
@@ -174,7 +174,7 @@ fn things_are_looked_at_from_around() {
     assert!((6..=20).contains(&around), "{around} of 40 videos");
 }
 
-/// What is written is a data set, with an index to judge by; and one that isn't written has the same scenes.
+/// Written videos are a dataset, with an evaluation index; videos generated on the fly have the same scenes.
 #[test]
 fn videos_are_data_like_any_other() {
     let folder = tempfile::tempdir().unwrap();
@@ -241,13 +241,13 @@ fn videos_are_data_like_any_other() {
     };
     for (a, b) in views(&written).iter().zip(&views(&named)) {
         assert!((a.camera.c2w - b.camera.c2w).abs_diff_eq(glam::DMat4::ZERO, 1e-5));
-        // A JPEG of high quality on one side.
+        // The written photos are JPEGs of high quality.
         let apart = (&a.image - &b.image).abs().mean(tch::Kind::Double).double_value(&[]);
         assert!(apart < 0.02, "{apart}");
     }
 }
 
-/// Pictures of a folder are seen in some of the worlds, whether these are written or named.
+/// A user's images are visible in some of the scenes, both in written videos and in those generated on the fly.
 #[test]
 fn pictures_that_a_user_names_are_seen() {
     let folder = tempfile::tempdir().unwrap();
@@ -257,7 +257,7 @@ fn pictures_that_a_user_names_are_seen() {
     let size = ["--scenes", "8", "--frames", "3", "--size", "24"];
     succeed(&[&["synth", "--out", arg(&out), "--pictures", arg(&pictures)][..], &size].concat());
     let named = |more: &str| format!("synth:scenes=8,frames=3,size=24{more}");
-    // How many pixels of the first view of each scene are pink.
+    // Returns the number of pink pixels in the first view of each scene.
     let pink = |data: &Path| -> Vec<f64> {
         let data = Dataset::open(data, Split::Test).unwrap();
         let first = |capture: Capture| {

@@ -1,5 +1,5 @@
-//! Captures in any unit, anywhere: the same pictures of millimetres as of kilometres, at the origin as in UTM coordinates, and the
-//! same bits where the unit is another power of two (spec 2.5).
+//! Units and origins of captures don't matter: renders are the same in millimetres and kilometres, at the origin and in UTM
+//! coordinates, and bit-identical if the unit changes by a power of two (spec 2.5).
 
 mod common;
 
@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Units and origins, among them kilometres, UTM and ECEF coordinates.
+/// Scales and origins, among them kilometres, UTM and ECEF coordinates.
 const PLACES: [(f64, [f64; 3]); 7] = [
     (1e-6, [0.; 3]),
     (1e-3, [0.; 3]),
@@ -28,12 +28,12 @@ const PLACES: [(f64, [f64; 3]); 7] = [
     (1., [-1e8, 3e7, 7e6]),
 ];
 
-/// The similarity to such a place.
+/// Returns the similarity transform of such a scale and origin.
 fn to_place((scale, offset): (f64, [f64; 3])) -> Similarity {
     Similarity { rotation: DMat3::IDENTITY, translation: DVec3::from_array(offset), scale }
 }
 
-/// Writes the capture at `from`, moved by `to`, in `folder`.
+/// Writes the capture at `from`, transformed by `to`, to `folder`.
 fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
     let capture = open_capture(from).unwrap();
     let names: Vec<String> = capture.names().map(String::from).collect();
@@ -50,7 +50,7 @@ fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
     write_cameras_json(&folder.join("cameras.json"), &names, &cameras).unwrap();
 }
 
-/// `splat`, of which a capture that was moved by `to` sees the same. Its origin is the translation.
+/// Returns `splat` transformed by `to`, to match a capture transformed by `to`. Its origin is the translation.
 fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
     let gaussians = transform(&splat.gaussians, &Similarity { translation: DVec3::ZERO, ..*to });
     Splat { origin: to.translation, ..Splat::of(&gaussians).unwrap() }
@@ -60,7 +60,7 @@ fn told(arguments: &[&str]) -> Value {
     serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
-/// The PNGs of `folder`, by name.
+/// Returns the PNGs of `folder`, sorted by name.
 fn pictures(folder: &Path) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     files.sort();
@@ -68,7 +68,7 @@ fn pictures(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The least PSNR of a picture of the folder `a` beside that of `b`.
+/// Returns the minimum PSNR of the images of folder `a` compared with those of `b`.
 fn least_psnr(a: &Path, b: &Path) -> f64 {
     let image = |path: &Path| tensor_from_rgb(&read_image(path).unwrap());
     let both = pictures(a).into_iter().zip(pictures(b));
@@ -80,7 +80,8 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
     let (folder, room) = room();
     let truth = room.join("truth.ply");
     let of = |name: &str| folder.path().join(name);
-    // Pictures of the capture's cameras, of a smooth path through them and of orbits, and what is scored and lost.
+    // Renders from the capture's cameras, along a smooth path through them and on orbits, with the scores and the loss of
+    // `convert`.
     let looked_at = |splat: &Path, scene: &Path, name: &str| -> (PathBuf, f64, f64) {
         let (pictures, copy) = (of(name), of("copy.compressed.ply"));
         let (splat, scene) = (arg(splat), arg(scene));
@@ -116,14 +117,14 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
     }
 }
 
-/// What a model makes of photos, and its file, are the same bits but for the exponent.
+/// A reconstruction and its file are bit-identical up to the exponent.
 #[test]
 fn powers_of_two_change_no_bit() {
     let (folder, room) = room();
     let truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
     let made = |scene: &Path, name: &str| {
-        // Scales are linear in this format.
+        // This format stores linear scales.
         let (out, pictures) = (of(&format!("{name}.splat")), of(&format!("{name}.png")));
         succeed(&["reconstruct", "--scene", arg(scene), "--views", "3", "--out", arg(&out)]);
         succeed(&[
@@ -161,7 +162,7 @@ fn powers_of_two_change_no_bit() {
     }
 }
 
-/// A page is about a local origin, in a unit that a browser's numbers and the page's steps are for.
+/// A page has a local origin, and a unit that suits a browser's precision and the page's step sizes.
 #[test]
 fn a_page_is_the_same_in_any_unit_and_place() {
     if told(&["doctor", "--json"])["viewer"] != true {
@@ -198,7 +199,7 @@ fn a_page_is_the_same_in_any_unit_and_place() {
     }
 }
 
-/// Far from the origin it is said what float32 loses, and a local origin keeps it, for whatever takes up the splat.
+/// Far from the origin, the loss in float32 is reported, and a local origin avoids it in all commands that read the splat.
 #[test]
 fn a_local_origin_keeps_the_detail() {
     let (folder, room) = room();
@@ -222,7 +223,7 @@ fn a_local_origin_keeps_the_detail() {
     assert!(!origin_file(&world).exists());
     assert!(psnr(&local) > psnr(&world) + 10., "{} {}", psnr(&local), psnr(&world));
 
-    // About the capture's centre, in every format; an origin of an older splat goes.
+    // Relative to the capture's centre, in every format; an older splat's origin is replaced.
     for ending in ["ply", "compressed.ply", "spz", "splat"] {
         let copy = of(&format!("copy.{ending}"));
         let convert = ["convert", arg(&local), arg(&copy), "--scene", arg(&scene)];
@@ -239,23 +240,23 @@ fn a_local_origin_keeps_the_detail() {
         assert!(!origin_file(&copy).exists(), "{ending}");
     }
 
-    // Without a capture a splat keeps its origin, and one that has none is moved to its own middle.
+    // Without a capture, a splat keeps its origin, and one without an origin gets its own centre.
     let copy = of("kept.ply");
     succeed(&["convert", arg(&local), arg(&copy), "--local-origin"]);
     assert_eq!(read_splat(&copy).unwrap().origin, offset);
     succeed(&["convert", arg(&world), arg(&copy), "--local-origin"]);
     assert!(read_splat(&copy).unwrap().origin.distance(offset) < 10.);
 
-    // A name that is too long for the origin's is refused before the work.
+    // A file name that is too long for the origin's file is refused before the work.
     let long = of(&format!("{}.ply", "x".repeat(240)));
     let said = refuse(&["convert", arg(&local), arg(&long), "--local-origin"]);
     assert!(said.contains(".origin.json can't be written"), "{said}");
 
-    // Moved without its origin, it still opens, elsewhere.
+    // A copy without its origin file still opens, at another position.
     let lone = of("lone.ply");
     fs::copy(&local, &lone).unwrap();
     assert_eq!(read_splat(&lone).unwrap().origin, DVec3::ZERO);
-    // What writes by the library in world coordinates takes the origin away.
+    // Writing by the library in world coordinates removes the origin file.
     write_splat(&local, &read_splat(&local).unwrap()).unwrap();
     assert!(!origin_file(&local).exists() && read_splat(&local).unwrap().origin == DVec3::ZERO);
 }
@@ -293,7 +294,7 @@ fn origins_that_are_none_are_refused() {
     }
 }
 
-/// A real capture in kilometres and in UTM coordinates scores what it scores where it is.
+/// A real capture gets the same scores in kilometres and in UTM coordinates.
 #[test]
 fn real_captures_score_the_same_anywhere() {
     let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
@@ -307,7 +308,8 @@ fn real_captures_score_the_same_anywhere() {
         pictures
     };
     let plain = score(&capture, "plain.ply");
-    // Made-up rooms have walls whose Gaussians are equally far from a camera, in an order that rotations change; photos have none.
+    // Synthetic rooms have walls whose Gaussians are equally far from a camera, in an order that rotations change; photos have
+    // none.
     let turned = Similarity { rotation: DMat3::from_rotation_y(0.9), ..to_place(PLACES[2]) };
     for place in [to_place(PLACES[0]), to_place(PLACES[5]), turned] {
         let scene = of("scene");

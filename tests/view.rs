@@ -1,4 +1,4 @@
-//! The page to walk in: that it shows what it should, in a browser without a network, and heeds hands and keys.
+//! The interactive page shows the scene in a browser without network access, and reacts to touch and keys.
 #![cfg(unix)]
 
 mod common;
@@ -20,10 +20,10 @@ use std::time::{Duration, Instant};
 use tch::{Kind, Tensor};
 
 const SIDE: u32 = 512;
-/// Between the page's picture and ours, in dB.
+/// Minimum PSNR between the page's image and our own render, in dB.
 const LEAST: f64 = 25.;
 
-/// Whether the program has the viewer in it.
+/// Returns `true` if the program contains the viewer; otherwise, skips the test.
 fn has_viewer() -> bool {
     let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
     if !found {
@@ -35,7 +35,7 @@ fn has_viewer() -> bool {
     found
 }
 
-/// The page in a browser as large as the photos are square, where nothing moves by itself.
+/// Page in a browser whose window is as large as the square photos, without animations.
 struct Shown {
     browser: Browser,
     folder: tempfile::TempDir,
@@ -73,10 +73,10 @@ impl Shown {
         }
     }
 
-    /// What is to be seen, once nothing changes any more, without the controls.
+    /// Returns the image of the page, without controls, after all changes have finished.
     fn picture(&mut self) -> Tensor {
         self.wait_for("(({ stage, walk }) => !walk.jump && !stage.isDirty && !stage.spark.sorting && !stage.spark.sortDirty)(page)");
-        // What was drawn last is to be on the screen.
+        // The last frame must have reached the screen.
         self.value("new Promise((done) => setTimeout(done, 500))");
         self.key("KeyH");
         let picture = self.screen();
@@ -91,7 +91,7 @@ impl Shown {
         tensor_from_rgb(&read_image(&file).unwrap())
     }
 
-    /// Presses a key for a moment.
+    /// Presses a key briefly.
     fn key(&mut self, code: &str) {
         self.key_for(code, Duration::ZERO);
     }
@@ -107,7 +107,7 @@ impl Shown {
         }
     }
 
-    /// Touches with one finger and draws it along.
+    /// Drags one finger across the touch screen.
     fn draw(&mut self, from: (f64, f64), to: (f64, f64)) {
         self.browser.call("Emulation.setTouchEmulationEnabled", json!({"enabled": true}));
         for step in 0..=8 {
@@ -125,7 +125,7 @@ impl Shown {
         self.value(&format!("document.querySelector({selector:?}).click()"));
     }
 
-    /// Where who looks is, and whither: position and quaternion.
+    /// Returns the position and the quaternion of the page's camera.
     fn place(&mut self) -> Vec<f64> {
         let place = "[...page.stage.camera.position.toArray(), ...page.stage.camera.quaternion.toArray()]";
         serde_json::from_value(self.value(place)).unwrap()
@@ -136,7 +136,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Our own picture from a capture's camera, and the photo, as large as the page.
+/// Returns our own render from a capture's camera, and the photo, as large as the page.
 fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let size = ImageSize { width: SIDE, height: SIDE };
     let view = open_capture(capture).unwrap().load(&[index], Some(size)).unwrap().remove(0);
@@ -144,7 +144,7 @@ fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     (own.rgb.clamp(0., 1.), view.image)
 }
 
-/// How far a picture's pixels are from the nearest colour of depth, in the mean.
+/// Returns the mean distance of an image's pixels from the nearest depth colour.
 fn from_depth_colours(picture: &Tensor) -> f64 {
     let pixels = picture.flatten(1, 2).transpose(0, 1).contiguous();
     let distances = Tensor::cdist(&pixels, &Tensor::from_slice2(&depth_colours()), 2., None::<i64>);
@@ -164,7 +164,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     let Some(mut shown) = Shown::open(&page) else { return };
     let screenshots = Screenshots::create();
 
-    // From the first camera, as the files say.
+    // The view from the first camera matches our own render.
     let (own, photo) = expected(&capture, &splat, 0);
     let picture = shown.picture();
     screenshots.save("page-first", &picture);
@@ -174,7 +174,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     let count = open_capture(&capture).unwrap().len();
     assert_eq!(shown.value("document.querySelectorAll('#strip img').length"), count);
 
-    // The slider draws the photo over it.
+    // The slider overlays the photo.
     shown.value("share.value = 1, share.dispatchEvent(new Event('input'))");
     shown.value("document.getElementById('photo').decode()");
     let hide = |how: &str| {
@@ -190,7 +190,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     assert!(psnr(&over, &photo) > 28., "{:.2} dB", psnr(&over, &photo));
     shown.value("share.value = 0, share.dispatchEvent(new Event('input'))");
 
-    // Jumping: by the strip, and by keys.
+    // Jump by the photo strip, and by keys.
     shown.click("#strip button:nth-child(4)");
     let jumped = shown.picture();
     let (own, _) = expected(&capture, &splat, 3);
@@ -203,11 +203,11 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.key("Comma");
     shown.wait_for("page.walk.at === 2");
     assert_eq!(shown.value("[...strip.children].findIndex((of) => of.hasAttribute('aria-current'))"), 2);
-    // Held for many frames, it goes there and nowhere else.
+    // Holding the key for many frames jumps to the first photo and nowhere else.
     shown.key_for("Home", Duration::from_millis(500));
     shown.wait_for("page.walk.at === 0");
 
-    // Depth has the colours of depth, centres are points.
+    // Depth is shown in the depth colours, centres as points.
     shown.key("Digit2");
     let depth = shown.picture();
     screenshots.save("page-depth", &depth);
@@ -224,14 +224,14 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.key("Home");
     shown.wait_for("page.walk.at === 0");
 
-    // Walking by keys, turning by touch: the photo is left.
+    // Walking by keys and turning by touch leave the photo.
     let at_photo = shown.place();
     shown.key_for("KeyS", Duration::from_millis(700));
     shown.wait_for("page.walk.at === null");
     let walked = shown.place();
     assert!(distance(&at_photo[..3], &walked[..3]) > 0.01 && distance(&at_photo[3..], &walked[3..]) < 1e-3);
     assert_eq!(shown.value("compare.hidden"), true);
-    // From behind, the camera is to be seen.
+    // From behind, the camera is visible.
     let before = shown.picture();
     shown.key("KeyC");
     let cameras = shown.picture();
@@ -242,7 +242,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     let turned = shown.place();
     assert!(distance(&walked[3..], &turned[3..]) > 0.01, "{walked:?} {turned:?}");
 
-    // The path plays until it is stopped, or over.
+    // The path plays until it is stopped, or at its end.
     shown.key("Space");
     shown.wait_for("page.walk.along > 0.05");
     assert_eq!(shown.value("page.walk.isPlaying && document.getElementById('play').textContent"), "Pause");
@@ -260,7 +260,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     assert_eq!(pages, 1, "{asked:?}");
 }
 
-/// A program called `xdg-open` that notes what it is asked to open, and its folder.
+/// Writes a program `xdg-open` that records the path it is asked to open, and returns its folder.
 fn opener(folder: &Path) -> PathBuf {
     let bin = folder.join("bin");
     std::fs::create_dir_all(&bin).unwrap();
@@ -277,7 +277,7 @@ fn view_opens_a_page_of_a_splat_alone() {
         return;
     }
     let (folder, room) = room();
-    // Names are text, whatever is in them.
+    // Names are escaped as text.
     let splat = folder.path().join("a <b>room&.ply");
     std::fs::copy(room.join("truth.ply"), &splat).unwrap();
     let path = format!("{}:/usr/bin:/bin", opener(folder.path()).display());
@@ -371,7 +371,7 @@ fn bad_requests_are_refused() {
     let refusal = refuse(&["view", arg(&nowhere)]);
     assert!(refusal.contains("nowhere.ply"), "{refusal}");
     let splat = room.join("truth.ply");
-    // A folder is no page.
+    // The page's path is a folder.
     let page = folder.path().join("page.html");
     std::fs::create_dir(&page).unwrap();
     let refusal = refuse(&["render", "--splat", arg(&splat), "--scene", arg(&room), "--html", arg(&page)]);

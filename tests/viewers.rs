@@ -1,5 +1,5 @@
-//! Our splats in other people's viewers: what Spark and Babylon.js, which are public and know nothing of each other, show of
-//! them in a browser. A test that fails keeps the pictures.
+//! Our splats in third-party viewers: renders by Spark and Babylon.js, two independent public viewers, in a browser. A test
+//! that fails keeps the images.
 
 mod common;
 
@@ -19,10 +19,10 @@ use std::process::Command;
 use tch::{Kind, Tensor};
 
 const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
-/// Between a viewer's picture and ours, in dB.
+/// Minimum PSNR between a viewer's image and our own render, in dB.
 const LEAST: f64 = 25.;
 
-/// Pages with the viewers, by their names.
+/// Returns the pages with the viewers, by their names.
 fn viewers(folder: &Path) -> Option<Vec<(&'static str, PathBuf)>> {
     let npm = Path::new(env!("CARGO_MANIFEST_DIR")).join("parity/npm");
     let bundler = npm.join("node_modules/.bin/esbuild");
@@ -48,7 +48,7 @@ fn viewers(folder: &Path) -> Option<Vec<(&'static str, PathBuf)>> {
     Some(["spark", "babylon"].map(page).into())
 }
 
-/// The first camera of a capture, for a picture of [`SIZE`].
+/// Returns the first camera of a capture, for an image of [`SIZE`].
 fn first_camera(capture: &Path) -> Camera {
     let camera = open_capture(capture).unwrap().cameras()[0];
     let factor = f64::from(SIZE.width) / f64::from(camera.width);
@@ -58,7 +58,7 @@ fn first_camera(capture: &Path) -> Camera {
     Camera { intrinsics, width: SIZE.width, height: SIZE.height, ..camera }
 }
 
-/// What a viewer tells of a splat, and its picture [3, H, W].
+/// Shows a splat in a viewer; returns the viewer's report, and its image [3, H, W].
 fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Value, Tensor) {
     browser.open(page);
     let c2w: Vec<f64> = (0..12).map(|i| camera.c2w.col(i % 4)[i / 4]).collect();
@@ -81,7 +81,7 @@ fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Va
     (told, tensor_from_rgb(&read_image(&picture).unwrap()))
 }
 
-/// The corners of the means' box.
+/// Returns the corners of the bounding box of the means.
 fn bounds(splat: &Splat) -> [Vec<f64>; 2] {
     let means = splat.gaussians.means.view([-1, 3]).to_kind(Kind::Double);
     [means.amin([0i64].as_slice(), false), means.amax([0i64].as_slice(), false)]
@@ -100,8 +100,8 @@ fn public_viewers_show_our_splats_as_we_do() {
     let Some(mut browser) = Browser::start() else { return };
     let of = |name: &str| folder.path().join(name);
     let published = capture.join("reference.ply");
-    // What the shipped model makes of the photos, as it comes; the published splat, whose colours are far beyond a byte's, as
-    // `convert --for-viewers` makes it.
+    // The embedded model's reconstruction, unchanged; and the published splat, whose colours are far beyond the range of a
+    // byte, converted by `convert --for-viewers`.
     succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.ply"))]);
     succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.spz"))]);
     for ending in ["ply", "spz"] {
@@ -115,7 +115,7 @@ fn public_viewers_show_our_splats_as_we_do() {
         ("made", of("made.ply"), of("made.spz"), LEAST),
         ("published", published.clone(), of("published.ply"), LEAST),
         ("published", published.clone(), of("published.spz"), LEAST),
-        // What they cut off of its colours is theirs to know; it is told below.
+        // The viewers clamp its colours, each in its own way, so its PSNR is only printed.
         ("as it is", published.clone(), published, 0.),
     ];
     for (name, original, file, least) in files {
@@ -129,7 +129,7 @@ fn public_viewers_show_our_splats_as_we_do() {
             screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);
             assert_eq!(told["count"].as_i64(), Some(splat.gaussians.count()), "{what}");
             for (corner, own) in ["low", "high"].iter().zip(bounds(&splat)) {
-                // Spark keeps means in half precision.
+                // Spark stores means in half precision.
                 for (a, b) in numbers(&told[*corner]).iter().zip(own) {
                     assert!((a - b).abs() <= 1e-3 * b.abs(), "{what}: {corner} {a}, {b}");
                 }

@@ -1,4 +1,4 @@
-//! `globalsplat watch`: what it tells of a run, whom it tells it, and that the run's folder stays as it is.
+//! `globalsplat watch`: its view of a run, its access control, and that it leaves the run's folder unchanged.
 
 mod common;
 
@@ -15,10 +15,10 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime};
 use tempfile::TempDir;
 
-/// Of the run that is watched.
+/// Number of steps of the watched run.
 const STEPS: usize = 6;
 
-/// A run that is over, with pictures; made once. Whoever changes it takes a [`copy`].
+/// Returns a finished run, with images; created once. Tests that change it use a [`copy`].
 fn run() -> &'static Path {
     static RUN: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, run) = RUN.get_or_init(|| {
@@ -31,7 +31,7 @@ fn run() -> &'static Path {
     run
 }
 
-/// The run in another folder, where it may be changed.
+/// Copies the run to another folder, where it may be changed.
 fn copy() -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().expect("a folder");
     let copy = folder.path().join("run");
@@ -43,7 +43,7 @@ fn copy() -> (TempDir, PathBuf) {
     (folder, copy)
 }
 
-/// All files below a folder: their bytes, and when they were written.
+/// Returns all files below a folder: their bytes, and their modification times.
 fn files(folder: &Path) -> BTreeMap<PathBuf, (Vec<u8>, SystemTime)> {
     let mut found = BTreeMap::new();
     for entry in std::fs::read_dir(folder).expect("a folder") {
@@ -59,7 +59,7 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, (Vec<u8>, SystemTime)> {
     found
 }
 
-/// The command while it runs.
+/// Running `watch` command.
 struct Watch {
     process: Child,
     port: u16,
@@ -77,7 +77,7 @@ impl Watch {
         Watch { process, port: port.and_then(|port| port.parse().ok()).unwrap_or_else(|| panic!("{url}")) }
     }
 
-    /// The head and the body of what is answered to a request of these first words, told to this host.
+    /// Sends a request with this first line and this Host header; returns the head and the body of the response.
     fn ask_as(&self, first: &str, host: &str) -> (String, Vec<u8>) {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("a server");
         stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a time limit");
@@ -92,7 +92,7 @@ impl Watch {
         self.ask_as(first, &format!("127.0.0.1:{}", self.port))
     }
 
-    /// The number by which a request is answered.
+    /// Returns the status code of the response to a request.
     fn status(&self, first: &str, host: &str) -> u16 {
         let (head, _) = self.ask_as(first, host);
         head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap_or_else(|| panic!("{head}"))
@@ -105,7 +105,7 @@ impl Watch {
         serde_json::from_slice(&body).expect("JSON")
     }
 
-    /// Ends it as Ctrl-C does, and returns the exit code.
+    /// Ends the command as Ctrl-C does, and returns the exit code.
     #[cfg(unix)]
     fn interrupt(mut self) -> Option<i32> {
         let killed =
@@ -129,7 +129,7 @@ impl Drop for Watch {
     }
 }
 
-/// The points of a curve, by what the run wrote down.
+/// Returns the points of a curve, as the run recorded them.
 fn written(run: &Path, value: impl Fn(&Value) -> &Value) -> Value {
     let lines = std::fs::read_to_string(run.join("metrics.jsonl")).expect("metrics");
     let lines = lines.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
@@ -180,7 +180,7 @@ fn what_is_added_or_begun_anew_is_seen() {
         let mut file = OpenOptions::new().append(true).open(&metrics).unwrap();
         file.write_all(text.as_bytes()).unwrap();
     };
-    // Half a line tells nothing until the other half is there.
+    // An incomplete line is ignored until the rest is written.
     add(r#"{"step": 6, "loss": 0.5, "psnr": 3"#);
     assert_eq!(watch.state()["step"], STEPS);
     add(
@@ -194,7 +194,7 @@ fn what_is_added_or_begun_anew_is_seen() {
         "{told}"
     );
 
-    // A run that stands still.
+    // A stalled run.
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     std::fs::write(run.join("config.toml"), config.replace("\nsteps = 6", "\nsteps = 60")).unwrap();
     let file = OpenOptions::new().append(true).open(&metrics).unwrap();
@@ -203,7 +203,7 @@ fn what_is_added_or_begun_anew_is_seen() {
     assert!(notices(&state).starts_with("nothing was written down for 10 min"), "{}", notices(&state));
     assert_eq!(state["steps"], 60);
 
-    // Resumed, it is written anew and grows past what was read before.
+    // A resumed run rewrites the file, which then grows past its previous length.
     let text = std::fs::read_to_string(&metrics).unwrap();
     let first = text.lines().next().unwrap().to_string() + "\n";
     std::fs::write(&metrics, &first).unwrap();
@@ -213,7 +213,7 @@ fn what_is_added_or_begun_anew_is_seen() {
     let state = watch.state();
     assert_eq!([&state["step"], &state["curves"]["psnr"][99]], [&json!(100), &json!([99, 99.5])]);
 
-    // Gone, and there again.
+    // The file is removed, and written again.
     std::fs::remove_file(&metrics).unwrap();
     let state = watch.state();
     assert_eq!([&state["step"], &state["curves"]["psnr"]], [&json!(0), &json!([])]);
@@ -231,7 +231,7 @@ fn a_resumed_run_goes_on_and_its_later_pictures_are_void() {
     succeed(&text(&train(&config, &run, &settings("train.steps=3"))));
     let watch = Watch::start(&run);
     assert_eq!(watch.state()["pictures"], json!([2, 1, 0]));
-    // As if it had been killed after the checkpoint of step 2.
+    // Simulates a run that was killed after the checkpoint of step 2.
     std::fs::remove_dir_all(run.join("checkpoints/step-00000003")).unwrap();
     succeed(&text(&train(&config, &run, &settings("train.steps=5"))));
     let state = watch.state();
@@ -297,7 +297,7 @@ fn only_this_machine_is_answered_and_only_what_there_is() {
     ] {
         assert_eq!(watch.status(&format!("GET {path}"), &own), 404, "{path}");
     }
-    // Five pictures and the gaps between them; what stands behind a question mark asks for nothing.
+    // Five images and the gaps between them; the query string is ignored.
     for path in ["/picture/4.png", "/picture/4.png?step=2"] {
         let (head, png) = watch.ask(&format!("GET {path}"));
         let picture = image::load_from_memory(&png).expect("a picture");
@@ -311,7 +311,7 @@ fn only_this_machine_is_answered_and_only_what_there_is() {
     assert!(head.contains("content-security-policy: default-src 'none'; script-src 'nonce-"), "{head}");
     assert!(!head.contains("unsafe"), "{head}");
 
-    // Other addresses of this machine have no such port. Linux has all of 127.0.0.0/8.
+    // The port is closed on other addresses of this machine. Linux has all of 127.0.0.0/8.
     #[cfg(target_os = "linux")]
     for address in ["127.0.0.2", "::1"] {
         assert!(TcpStream::connect((address, port)).is_err(), "{address}");
@@ -320,7 +320,7 @@ fn only_this_machine_is_answered_and_only_what_there_is() {
     assert_eq!(listening(port), ["0100007F"], "127.0.0.1 alone");
 }
 
-/// The addresses on which a port is listened on, as the kernel writes them.
+/// Returns the addresses on which a port is listened on, as the kernel formats them.
 #[cfg(target_os = "linux")]
 fn listening(port: u16) -> Vec<String> {
     let tables =
@@ -344,7 +344,7 @@ fn the_run_stays_as_it_is() {
     assert_eq!(watch.interrupt(), Some(0), "Ctrl-C is how it ends");
     assert!(before == files(&run), "something was written");
 
-    // Nor does it need to be allowed to, or keep anybody from training.
+    // It neither needs the lock nor keeps anybody from training.
     let watch = Watch::start(&run);
     let lock = OpenOptions::new().read(true).write(true).open(run.join(".lock")).unwrap();
     lock.try_lock().expect("a lock that nobody holds");
@@ -368,7 +368,7 @@ fn what_is_no_run_is_refused_in_a_sentence() {
     assert!(error.contains(&format!("--port is {port}, which can't be listened on")), "{error}");
 }
 
-/// Whether curves, numbers, pictures and checkpoints are there.
+/// Script that reports the curves, values, images and checkpoints on the page.
 const SHOWN: &str = r#"(() => {
     const images = [...document.images];
     return {
@@ -385,7 +385,7 @@ const SHOWN: &str = r#"(() => {
     };
 })()"#;
 
-/// What the page says when it has said what `is_right` waits for.
+/// Returns the value of the expression in the page once `is_right` accepts it.
 fn wait_for(browser: &mut Browser, expression: &str, is_right: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + Duration::from_secs(60);
     loop {
@@ -422,7 +422,7 @@ fn a_browser_shows_it_and_follows_the_run() {
     assert_ne!(grounds[0].0, grounds[2].0, "light and dark differ");
     assert_ne!(grounds[0].0, grounds[0].1, "cards stand out");
 
-    // The pointer tells numbers.
+    // Hovering shows values.
     let hover = r#"(() => {
         const svg = document.querySelector("svg"), area = svg.getBoundingClientRect();
         svg.dispatchEvent(new PointerEvent("pointermove", { clientX: area.left + 1, clientY: area.top + 20 }));
@@ -437,7 +437,7 @@ fn a_browser_shows_it_and_follows_the_run() {
     let strangers: Vec<_> = browser.requests().into_iter().filter(|asked| !asked.starts_with(&url)).collect();
     assert!(strangers.is_empty(), "{strangers:?}");
 
-    // The page goes on with the run, without being opened again.
+    // The page follows the run without being reloaded.
     let (_folder, run) = copy();
     let watch = Watch::start(&run);
     browser.open_served(&format!("http://127.0.0.1:{}/", watch.port));

@@ -1,10 +1,10 @@
-// What a render may never do, whatever is asked of it and whatever the machine refuses: race, read what isn't its own, wait
-// for ever, lose memory, or depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
+// Robustness checks of the rasterizer, for all inputs and failures of the system: no data race, no out-of-bounds access, no deadlock, no
+// memory leak, and results that don't depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
 //
-//   checks CHECK short|long     tells how many renders, forward and backward, or calls were checked
-//   checks orders short N       the same without the N-th barrier of the kernels for GPUs, which must be noticed
-//   checks simd                 tells the instruction set
-//   checks barriers             tells how many barriers these kernels have
+//   checks CHECK short|long     prints how many renders, forward and backward, or calls were checked
+//   checks orders short N       runs without the N-th barrier of the GPU kernels, which must be detected
+//   checks simd                 prints the instruction set
+//   checks barriers             prints the number of barriers in these kernels
 #include <signal.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -39,9 +39,9 @@ namespace {
 
 using raster::parallel_for;
 
-constexpr unsigned kPatience = 120;  // seconds that nothing takes, unless it waits for ever
+constexpr unsigned kPatience = 120;  // timeout in seconds, much longer than any check takes
 
-std::string now;  // what is being checked
+std::string now;  // name of the running check
 
 [[noreturn]] void fail(const std::string& what) {
   std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what.c_str());
@@ -68,12 +68,12 @@ bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
   return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
 }
 
-// A frame of a scene, with all that it reads and writes.
+// Render of a scene, with all of its inputs and outputs.
 template <class T>
 class Render {
  public:
   Render(const Scene<T>& scene, int threads) : settings_{scene.width, scene.height, 0.05, threads}, views_(scene.views) {
-    // What isn't written differs from what another number of threads doesn't write.
+    // Unwritten outputs differ from those of a render with another number of threads.
     const T unwritten = T(threads);
     const size_t pixels = size_t(scene.width) * size_t(scene.height);
     for (const Arrays<T>& g : scene.gaussians) {
@@ -140,7 +140,7 @@ class Render {
   raster::Settings settings_;
   std::vector<raster::Gaussians<T>> scenes_;
   std::vector<raster::View<T>> views_;
-  std::vector<Planes> pictures_, asked_;  // asked_: the loss's gradients
+  std::vector<Planes> pictures_, asked_;  // asked_: gradients of the loss
   std::vector<raster::CameraGradient<T>> cameras_;
   std::vector<Arrays<T>> gradients_;
   std::unique_ptr<raster::Frame<T>> frame_;
@@ -158,7 +158,7 @@ void for_both(const Scene<double>& scene, const Check& check) {
   check(as<double>(scene));
 }
 
-// On one thread, which nothing is refused.
+// Renders on one thread, without simulated failures.
 template <class T>
 Render<T> expected(const Scene<T>& scene) {
   Render<T> render(scene, 1);
@@ -182,7 +182,7 @@ int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) 
   return 1 + int64_t(thread_counts.size());
 }
 
-// What pictures are off by, its gradient, and a step of Adam. Arrays end where they end: reading beyond is noticed.
+// Losses and their gradients, and a step of Adam. Arrays have their exact sizes, so that out-of-bounds reads are detected.
 template <class T>
 int64_t fits(const std::vector<int>& thread_counts) {
   Random random(11);
@@ -192,7 +192,7 @@ int64_t fits(const std::vector<int>& thread_counts) {
     return values;
   };
   int64_t count = 0;
-  // evaluate(gradient, threads) gives a loss, and the gradient's `all` numbers unless that is null.
+  // evaluate(gradient, threads) returns a loss, and writes the gradient's `all` values unless it is null.
   const auto expect_the_same = [&](const std::string& what, size_t all, const auto& evaluate) {
     std::vector<T> one(all);
     begin(what + ", " + type_name<T>());
@@ -240,7 +240,7 @@ int64_t fits(const std::vector<int>& thread_counts) {
   return count;
 }
 
-// What a step of Muon should make of a matrix (muon.h): X as it lies, whichever way, one number after the other.
+// Reference for a step of Muon (muon.h), which doesn't transpose X, in scalar float64 code.
 std::vector<double> after_muon(const raster::MuonStep& step, const raster::MuonMatrix& of) {
   const auto [rows, columns] = std::array<int64_t, 2>{of.rows, of.columns};
   std::vector<double> x(size_t(rows * columns));
@@ -272,7 +272,7 @@ std::vector<double> after_muon(const raster::MuonStep& step, const raster::MuonM
   return x;
 }
 
-// Steps of Muon on matrices of all shapes, in no more room than they ask for.
+// Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request.
 int64_t matrices(const std::vector<int>& thread_counts) {
   const raster::MuonStep step{0.1, 0.01, 0.95};
   std::vector<std::vector<float>> numbers;
@@ -320,7 +320,7 @@ std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
   return cut;
 }
 
-// As raster::Bf16Products say, one number after the other.
+// Reference for raster::Bf16Products in scalar code.
 void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const raster::Bf16* a,
                    const raster::Bf16* b, float* c) {
   for (int64_t i = 0; i < m; ++i)
@@ -331,7 +331,7 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
     }
 }
 
-// Attention, forward and backward. Arrays end where they end here, too.
+// Attention, forward and backward. Here, too, arrays have their exact sizes.
 int64_t attentions(const std::vector<int>& thread_counts) {
   Random random(12);
   const auto numbers = [&](int64_t count) {
@@ -388,13 +388,13 @@ int64_t attentions(const std::vector<int>& thread_counts) {
   return count;
 }
 
-// Every scene's pictures and gradients on any number of threads.
+// Every scene's images and gradients are the same for any number of threads.
 int64_t bits(bool is_short) {
   std::vector<int> thread_counts = {2, 3, 16};
   if (!is_short)
     for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
   int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts) + matrices(thread_counts) + attentions(thread_counts);
-  size_t turn = 0;  // the short form has one degree for each scene, and all degrees for all of them
+  size_t turn = 0;  // the short form covers all degrees, but one per scene
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);
     for (size_t i = 0; i < scenes.size(); ++i)
@@ -408,8 +408,8 @@ int64_t bits(bool is_short) {
 
 void in_another_thread(const std::function<void()>& what) { std::thread(what).join(); }
 
-// Several threads render at once, each on several threads, if it can have them; frames go backward in any order, from other
-// threads than drew them, or never.
+// Several threads render at the same time, each on several threads if available. The backward passes run in any order, on other threads
+// than the forward passes, or not at all.
 template <class T>
 int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
   std::vector<Scene<T>> scenes;
@@ -461,7 +461,7 @@ int64_t callers(bool is_short) {
   return callers_of<float>(scenes, rounds) + callers_of<double>(scenes, rounds);
 }
 
-// Returns once so many threads work at the same time.
+// Returns once `threads` threads are working at the same time.
 void meet(int threads) {
   std::atomic<int> arrived{0};
   parallel_for(threads, threads, [&](int64_t) {
@@ -475,7 +475,7 @@ Scene<double> small_scene() {
   return scattered(random, "small", 20, 20, 2, 2, 40, 4);
 }
 
-// Threads refused, all of them or some, and what else a call of parallel_for() has to bear.
+// Failures to create all threads or some of them, and other uses of parallel_for().
 int64_t threads(bool is_short) {
   const Scene<float> scene = as<float>(small_scene());
   Render<float> one = expected(scene);
@@ -534,7 +534,7 @@ int64_t threads(bool is_short) {
   return count;
 }
 
-// Every single allocation of a render refused, and all from one on.
+// Failures of every single allocation of a render, and of all allocations from one on.
 template <class T>
 int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
   begin("memory refused, " + type_name<T>() + ", " + std::to_string(threads) + " threads");
@@ -576,7 +576,7 @@ int64_t memory(bool is_short) {
   return count;
 }
 
-// The kernels for GPUs, in other orders of blocks and threads.
+// The GPU kernels give the same results in other orders of blocks and threads.
 int64_t orders(bool is_short) {
   const std::vector<uint64_t> seeds = is_short ? std::vector<uint64_t>{1, 2} : std::vector<uint64_t>{1, 2, 3, 4, 5};
   const auto expect_none = [](const std::string& difference) {
@@ -603,7 +603,7 @@ int64_t orders(bool is_short) {
   return count;
 }
 
-// A child process, which has a copy of everything but the threads.
+// A child process renders correctly; it has a copy of everything but the threads.
 int64_t children(bool is_short) {
   const Scene<float> scene = as<float>(small_scene());
   Render<float> one = expected(scene);
@@ -649,7 +649,7 @@ int main(int count, char** arguments) {
       std::puts(raster::kernels().name);
       return 0;
     } catch (const std::invalid_argument&) {
-      return 1;  // named by GLOBALSPLAT_SIMD, and not to be had
+      return 1;  // GLOBALSPLAT_SIMD names a set that isn't available
     }
   }
   if (check == "barriers") {

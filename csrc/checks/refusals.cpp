@@ -11,11 +11,11 @@ namespace globalsplat::checks {
 namespace {
 
 constexpr int64_t kNever = std::numeric_limits<int64_t>::max();
-std::atomic<int64_t> calls_left{kNever};  // before the first that is refused
+std::atomic<int64_t> calls_left{kNever};  // before the first one that fails
 std::atomic<int64_t> refused{0}, given{0};
 std::atomic<bool> refuses_all_after{false};
 
-// Sanitizers see what malloc() gives.
+// Uses malloc(), so that sanitizers track the blocks.
 void* allocate(size_t size, size_t alignment) {
   if (calls_left.load() != kNever) {
     const int64_t left = calls_left.fetch_sub(1);
@@ -60,7 +60,7 @@ int64_t allow_memory() {
 
 int64_t blocks() { return given; }
 
-// No address space has room for such a stack.
+// No address space can hold such a stack.
 void refuse_threads() { set_stack_size(size_t(1) << 60); }
 void allow_threads() { set_stack_size(size_t(8) << 20); }
 
@@ -70,7 +70,7 @@ using globalsplat::checks::allocate;
 using globalsplat::checks::give_back;
 constexpr size_t kUsual = __STDCPP_DEFAULT_NEW_ALIGNMENT__;
 
-// All forms that throw: a sanitizer's library has forms of its own, which don't call each other.
+// All forms that throw: a sanitizer's library has its own implementations, which don't call each other.
 void* operator new(size_t n) { return allocate(n, kUsual); }
 void* operator new[](size_t n) { return allocate(n, kUsual); }
 void* operator new(size_t n, std::align_val_t a) { return allocate(n, size_t(a)); }

@@ -1,15 +1,15 @@
-// What a machine may refuse: memory and threads.
+// Simulated failures of allocations and of the creation of threads.
 #pragma once
 
 #include <cstdint>
 
 namespace globalsplat::checks {
 
-// From now on `operator new` refuses its n-th call, counted from 0, or that and all after it. Any thread's calls count.
+// Makes the n-th call of `operator new` from now on fail, counted from 0 over all threads, or that and all later ones.
 void refuse_memory(int64_t n, bool all_after);
-// Gives memory again, and tells how many calls were refused.
+// Ends the failures and returns the number of calls that failed.
 int64_t allow_memory();
-// Blocks that `operator new` gave and nobody has given back.
+// Returns the number of blocks of `operator new` that are not freed.
 int64_t blocks();
 
 void refuse_threads();

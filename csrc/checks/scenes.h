@@ -1,5 +1,5 @@
-// Gaussians and cameras, drawn with a fixed seed: the kinds of parity/harness/scenes.py, numbers for which nobody has an
-// answer, and as many as it takes to share out every stage's work.
+// Gaussians and cameras drawn with a fixed seed: the kinds of parity/harness/scenes.py, values without a defined result, and scenes large
+// enough to split every stage's work.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +13,7 @@
 
 namespace globalsplat::checks {
 
-// Every array is a vector of its own, so that reading beyond it is noticed.
+// Arrays of Gaussians. Each is a separate vector, so that out-of-bounds reads are detected.
 template <class T>
 struct Arrays {
   std::vector<T> means, scales, quaternions, opacities, sh;
@@ -23,7 +23,7 @@ template <class T>
 struct Scene {
   std::string name;
   int width, height, bases;
-  std::vector<Arrays<T>> gaussians;  // of every scene
+  std::vector<Arrays<T>> gaussians;  // one item per scene
   std::vector<raster::View<T>> views;
 };
 
@@ -47,7 +47,7 @@ class Random {
   std::mt19937_64 bits_;
 };
 
-// Of the quaternion (1, x, y, z).
+// Returns a camera with the rotation of the quaternion (1, x, y, z).
 inline raster::Camera<double> turned(double x, double y, double z) {
   const double s = 2 / (1 + x * x + y * y + z * z);
   return {{1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y),      //
@@ -56,7 +56,7 @@ inline raster::Camera<double> turned(double x, double y, double z) {
           {0, 0, 0}, 1, 1, 0, 0};
 }
 
-// From under a pixel to a third of the picture, some outside of it, at all opacities.
+// Creates a scene whose splats range from less than a pixel to a third of the image, some of them outside of it, at all opacities.
 inline Scene<double> scattered(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
                                int bases) {
   Scene<double> scene{name, width, height, bases, {}, {}};
@@ -87,7 +87,7 @@ inline Scene<double> scattered(Random& random, std::string name, int width, int 
   return scene;
 }
 
-// Before a camera that isn't turned, and maybe a second one beside it.
+// Creates a scene in front of a camera without rotation, and optionally a second one beside it.
 inline Scene<double> before(Random& random, std::string name, int bases, std::vector<double> means,
                             std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
                             int height = 33) {
@@ -100,7 +100,7 @@ inline Scene<double> before(Random& random, std::string name, int bases, std::ve
   return scene;
 }
 
-// Means at the given depths, within the view of `before` and a little beyond.
+// Returns means at the given depths, within the view of `before` and a little beyond.
 inline std::vector<double> around(Random& random, const std::vector<double>& depths, double spread = 0.6) {
   std::vector<double> means;
   for (const double depth : depths)
@@ -108,7 +108,7 @@ inline std::vector<double> around(Random& random, const std::vector<double>& dep
   return means;
 }
 
-// `values` again and again, `count` numbers in all.
+// Repeats `values` cyclically, `count` values in all.
 inline std::vector<double> repeated(const std::vector<double>& values, size_t count) {
   std::vector<double> out(count);
   for (size_t i = 0; i < count; ++i) out[i] = values[i % values.size()];
@@ -159,7 +159,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   scales = random.uniform(24, 0.5, 1.5);
   for (double& scale : scales) scale *= std::pow(10, random.uniform(1, 3));
   add("huge", around(random, depths(8)), scales, repeated({0.3}, 8));
-  // More pairs than there is room for at first.
+  // More pairs than the initial allocation holds.
   add("huge in many tiles", around(random, depths(150)), random.uniform(450, 5, 50), random.uniform(150, 0, 0.05), 1, 128, 96);
   add("opacities", around(random, depths(24)), random.uniform(72, 0.02, 0.3),
       repeated({0, 1e-12, 0.0039, 0.0040, 0.5, 1}, 24));  // 1/255 is 0.00392
@@ -183,7 +183,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   std::vector<double>& quaternions = scenes.back().gaussians[0].quaternions;
   for (size_t k = 0; k < quaternions.size(); ++k) quaternions[k] *= std::exp2(25. * double(k / 4 % 9) - 100);
 
-  // Every strange number in every place, each in a Gaussian of its own.
+  // Every special value in every position, each in its own Gaussian.
   const double infinity = std::numeric_limits<double>::infinity();
   const std::vector<double> strange = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,
                                        1e-30,        1e30,     3e38,      -3e38, 1e18, 1e5};
@@ -197,9 +197,9 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
     for (size_t k = 0; k < 4; ++k) g.sh[size_t(bases) * 3 * i++ + k % size_t(3 * bases)] = strange[n];
     g.opacities[i] = strange[n];
   }
-  for (size_t k = 0; k < 4; ++k) g.quaternions[60 * strange.size() + k] = 0;  // no rotation at all
+  for (size_t k = 0; k < 4; ++k) g.quaternions[60 * strange.size() + k] = 0;  // no rotation
 
-  // And in every camera.
+  // Cameras with the same special values.
   add_scattered("strange cameras", 17, 9, 1, int(4 * strange.size()), 6);
   for (size_t n = 0; n < 4 * strange.size(); ++n) {
     raster::Camera<double>& camera = scenes.back().views[n].camera;
@@ -207,12 +207,12 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
     *places[n % 4] = strange[n / 4];
   }
 
-  // More pairs of a tile than a GPU sorts in one go.
+  // More pairs in a tile than a GPU sorts at once.
   add_scattered("a long list", 8, 8, 1, 1, 10000);
   return scenes;
 }
 
-// More Gaussians than are sorted and binned in one go.
+// Creates a scene with more Gaussians than are sorted and binned in one chunk.
 inline Scene<double> crowd(int bases) {
   Random random(8);
   return scattered(random, "crowd", 20, 20, 1, 1, 66000, bases);

@@ -15,16 +15,16 @@ namespace {
 
 using Numbers = std::vector<float>;
 
-// What a render leaves, of all scenes and views one after the other.
+// Outputs of a render, for all scenes and views consecutively.
 struct Left {
   Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c;
   std::vector<Numbers*> all() { return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c}; }
-  static constexpr size_t kPictures = 3;  // the first of them
+  static constexpr size_t kPictures = 3;  // number of images, which come first
 };
 
 void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
 
-// What the pictures' gradients are.
+// Returns gradients with respect to the images.
 Numbers asked(Random& random, size_t count) {
   Numbers numbers;
   for (const double value : random.uniform(count, -1, 1)) numbers.push_back(float(value));
@@ -135,13 +135,13 @@ std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64
   const char* const names[] = {"colours", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
                                "spherical harmonics", "cameras"};
   Left cpu = by_cpu(scene), first = by_kernels(scene, seeds[0]);
-  // What is infinite, or no number, makes pixels nearby so, too: on the CPU those of a block, here those of two.
+  // Infinite values and NaN spread to pixels nearby: on the CPU within a block, here within two.
   const bool is_strange = scene.name.rfind("strange", 0) == 0;
   double slope = 0;
   for (size_t k = Left::kPictures; k < cpu.all().size(); ++k) slope = std::max(slope, largest(*cpu.all()[k]));
   for (size_t k = 0; k < first.all().size() && !is_strange; ++k) {
     const Numbers &ours = *first.all()[k], &theirs = *cpu.all()[k];
-    // Where nothing changes, as when a ball is turned, gradients are differences of larger ones.
+    // Some gradients, such as that of a sphere's rotation, are differences of larger values that cancel.
     const double off = distance(ours, theirs), most = k < Left::kPictures ? 0 : 1e-3 * largest(theirs) + 1e-5 * slope;
     if (!(off <= most)) return std::string(names[k]) + " differ from the CPU's by " + std::to_string(off);
   }
@@ -185,9 +185,9 @@ std::string fits_differ(const std::vector<uint64_t>& seeds) {
     for (int64_t k = 0; k < parts.count; ++k) sum += static_cast<const double*>(parts.numbers.get())[k];
     return sum;
   };
-  // Instructions without fused multiply-add round products before adding them.
+  // Instruction sets without fused multiply-add round products before adding them.
   const bool is_fused = std::strcmp(raster::kernels().name, "portable") != 0;
-  // by_cpu(gradient) and by_kernels(device, gradient) give a loss, and the gradient's `all` numbers unless that is null.
+  // by_cpu(gradient) and by_kernels(device, gradient) return a loss, and write the gradient's `all` values unless it is null.
   const auto difference = [&](size_t all, const auto& by_cpu, const auto& by_kernels) -> std::string {
     Numbers cpu(all), first;
     const double expected = by_cpu(cpu.data());

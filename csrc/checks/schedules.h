@@ -1,4 +1,4 @@
-// The kernels for GPUs, run on a CPU in a GPU's place.
+// Tests of the GPU kernels in the emulation on a CPU.
 #pragma once
 
 #include <string>
@@ -8,14 +8,17 @@
 
 namespace globalsplat::checks {
 
-// What differs when the kernels render `scene`, forward and backward, with blocks and threads in the orders of these seeds, or when
-// the CPU's backend does; empty if pictures have the CPU's bits, gradients are near to its, and no order changes a bit.
+// Renders `scene` with the kernels, forward and backward, with blocks and threads in the orders of these seeds, and with the CPU backend.
+// Returns a description of the first difference; empty if images have the CPU's bits, gradients are close to the CPU's, and no order
+// changes a bit.
 std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds);
 
-// The same of the sums that sorting needs, of more counts than a block takes in one go.
+// Tests the prefix sums that sorting needs, with more counts than one block processes. Returns a description of the difference; empty if
+// there is none.
 std::string sums_differ(uint64_t seed);
 
-// The same of how far pictures are from photos, with their gradients.
+// Tests the losses that compare images with photos, and their gradients. Returns a description of the first difference; empty if there is
+// none.
 std::string fits_differ(const std::vector<uint64_t>& seeds);
 
 }  // namespace globalsplat::checks

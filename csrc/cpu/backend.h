@@ -1,4 +1,4 @@
-// The CPU's backend: raster/ on tensors' memory.
+// The CPU backend: it runs the rasterizer of raster/ on tensors' memory.
 #pragma once
 
 #include "../backend.h"

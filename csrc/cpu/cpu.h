@@ -1,4 +1,4 @@
-// What only a CPU has, as Rust calls it through cxx: measurements of the rasterizer, and its instruction set.
+// CPU-only functions that Rust calls through cxx: measurements of the rasterizer, and its instruction set.
 #pragma once
 
 #include "rust/cxx.h"
@@ -10,16 +10,16 @@ struct SplatArguments;
 struct StageTimes;
 struct PairCounts;
 
-// Wall-clock seconds that the stages of this thread's last call of splat() on the CPU, and of its backward pass, took.
+// Returns the wall-clock seconds of the stages of this thread's last call of splat() on the CPU, and of its backward pass.
 StageTimes stage_times();
 
-// What a call of splat() with float32 Gaussians has to blend. Same arguments.
+// Counts the pairs that splat() has to blend with these arguments and float32 Gaussians.
 PairCounts count_pairs(const SplatArguments& of);
 
-// Floating-point operations per second that multiply-adds alone reach on libtorch's number of threads, in `seconds`.
+// Measures for `seconds` how many floating-point operations per second multiply-adds alone reach on libtorch's number of threads.
 double multiply_add_peak(double seconds);
 
-// The instruction set of the kernels in use. Throws when GLOBALSPLAT_SIMD names an unknown one.
+// Returns the instruction set of the kernels in use. Throws if GLOBALSPLAT_SIMD names an unknown one.
 rust::String simd_level();
 
 }  // namespace globalsplat

@@ -1,4 +1,4 @@
-// Tensors on the CPU as the rasterizer takes them: plain memory.
+// Access of the rasterizer to CPU tensors as plain memory.
 #pragma once
 
 #include <ATen/ops/empty_like.h>
@@ -12,13 +12,13 @@
 
 namespace globalsplat::cpu {
 
-// Calls body(0.) or body(0.f), as the type of the inputs is.
+// Calls body(0.) or body(0.f), depending on the type of the inputs.
 template <class Body>
 auto by_type(const Inputs& in, Body body) {
   return in.gaussians.means.scalar_type() == at::kDouble ? body(0.) : body(0.f);
 }
 
-// One item per scene.
+// Returns the Gaussians, one item per scene.
 template <class T>
 std::vector<raster::Gaussians<T>> scenes_of(const Inputs& in) {
   std::vector<raster::Gaussians<T>> scenes;
@@ -31,7 +31,7 @@ std::vector<raster::Gaussians<T>> scenes_of(const Inputs& in) {
   return scenes;
 }
 
-// The same for gradients.
+// Returns the gradients of Gaussians, one item per scene.
 template <class T>
 std::vector<raster::GaussianGradients<T>> gradients_of(const Gaussians& g) {
   std::vector<raster::GaussianGradients<T>> scenes;
@@ -43,7 +43,7 @@ std::vector<raster::GaussianGradients<T>> gradients_of(const Gaussians& g) {
   return scenes;
 }
 
-// One item per camera of each scene.
+// Returns the views, one item per camera of each scene.
 template <class T>
 std::vector<raster::View<T>> views_of(const Inputs& in) {
   std::vector<raster::View<T>> views;
@@ -55,7 +55,7 @@ std::vector<raster::View<T>> views_of(const Inputs& in) {
   return views;
 }
 
-// The views' gradients as the op gives them.
+// Converts the gradients of views to the gradient of the op's w2c.
 template <class T>
 Tensor w2c_gradient(const Inputs& in, const std::vector<raster::CameraGradient<T>>& of_views) {
   const Tensor out = at::zeros_like(in.w2c);
@@ -69,7 +69,7 @@ Tensor w2c_gradient(const Inputs& in, const std::vector<raster::CameraGradient<T
   return out;
 }
 
-// Not yet written.
+// Returns uninitialized tensors of the same shapes.
 inline Gaussians empty_like(const Gaussians& g) {
   const auto empty = [](const Tensor& t) { return at::empty_like(t); };
   return {empty(g.means), empty(g.scales), empty(g.quaternions), empty(g.opacities), empty(g.sh)};

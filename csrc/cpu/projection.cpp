@@ -11,7 +11,7 @@
 namespace globalsplat::cpu {
 namespace {
 
-// Each scene's cameras, and every Gaussian's splat as each sees it.
+// Cameras of each scene, and the splat of every Gaussian in each of them.
 template <class T>
 struct Seen {
   std::vector<raster::Gaussians<T>> scenes;
@@ -31,7 +31,7 @@ struct Seen {
                                         places.data() + int64_t(b) * cameras);
   }
 
-  // Calls visit(view, place in [B, C, N], splat) for every visible pair.
+  // Calls visit(view, index in [B, C, N], splat) for every visible pair.
   template <class Visit>
   void for_each_visible(Visit visit) const {
     int64_t place = 0;
@@ -69,15 +69,15 @@ Projected project_as(const Inputs& in) {
 template <class T>
 Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool of_cameras) {
   const Seen<T> seen(in);
-  // A record per visible Gaussian: the sums over pixels that project_backward() turns into just these gradients.
+  // One record per visible Gaussian: the sums over pixels that project_backward() converts to exactly these gradients.
   const size_t views = seen.splats.size(), count = size_t(in.count());
   std::vector<std::vector<raster::SplatGradient<T>>> records(views);
   std::vector<std::vector<uint32_t>> first(views, std::vector<uint32_t>(count + 1, 0));
   seen.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
     const T *d_mean = gradients.mean2d.data_ptr<T>() + 2 * at, *d_conic = gradients.conic.data_ptr<T>() + 3 * at;
     const T* d_colour = gradients.colour.data_ptr<T>() + 3 * at;
-    // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the one number xy stands
-    // for two entries.
+    // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two
+    // entries.
     const T two_ln2 = T(2 / raster::kLog2E);
     raster::SplatGradient<T> d{};
     d.power_p = d_mean[0] / (two_ln2 * s.a);

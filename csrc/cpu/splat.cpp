@@ -16,7 +16,7 @@ namespace globalsplat {
 namespace cpu {
 namespace {
 
-// Of this thread's last call and of its backward pass, which autograd runs on the thread that asked for it.
+// Times of this thread's last call and of its backward pass, which autograd runs on the thread that requested it.
 thread_local raster::StageTimes last_times;
 
 template <class T>
@@ -25,7 +25,7 @@ struct KeptFrame : Kept {
   std::unique_ptr<raster::Frame<T>> frame;
 };
 
-// One item per view. `Pixel` is T or const T.
+// Returns the images, one item per view. `Pixel` is T or const T.
 template <class Pixel>
 std::vector<raster::Pictures<Pixel>> pictures_of(const Pictures& p) {
   using T = std::remove_const_t<Pixel>;

@@ -1,15 +1,15 @@
-// The backend of GPUs, and the same on a CPU in a GPU's place.
+// The GPU backend, and its emulation on a CPU.
 #pragma once
 
 #include "../backend.h"
 
 namespace globalsplat::cuda {
 
-// Tensors of CUDA devices.
+// Backend for tensors on CUDA devices.
 extern const Backend backend;
 
-// Tensors of the CPU, where the variable GLOBALSPLAT_CUDA_ON_CPU is set: to a number, from which the order of blocks and threads is
-// drawn. Null where it isn't.
+// Returns the backend that emulates a GPU for tensors on the CPU if the variable GLOBALSPLAT_CUDA_ON_CPU is set, and null otherwise. Its
+// value is a number that seeds the order of blocks and threads.
 const Backend* emulated_backend();
 
 }  // namespace globalsplat::cuda

@@ -1,9 +1,9 @@
-// What host and kernels share: a call's numbers, and every kernel's name and arguments.
+// Declarations that host and kernels share: the parameters of a call, and every kernel's name and arguments.
 #pragma once
 
 #include "types.h"
 
-// In C++ that only launches them, kernels are functions like others.
+// Kernels are ordinary functions in C++ code that only launches them.
 #if !defined(__CUDACC__) && !defined(GS_EMULATED)
 #define __global__
 #endif
@@ -21,31 +21,31 @@ using raster::Splat;
 using raster::SplatGradient;
 using raster::TileEntry;
 
-// Gaussians, splats, pictures and their gradients of all scenes and views follow each other, as in the op's tensors.
+// Parameters of a call. Gaussians, splats, images and their gradients of all scenes and views are consecutive, as in the op's tensors.
 struct Call {
   int views;    // scenes · cameras
-  int cameras;  // of a scene
-  int count;    // Gaussians of a scene
-  int bases;    // of spherical harmonics
+  int cameras;  // per scene
+  int count;    // Gaussians per scene
+  int bases;    // spherical harmonics per channel
   Grid grid;
 };
 
 inline constexpr int kWarp = 32;
-inline constexpr int kGaussianThreads = 128;  // of a block that takes a Gaussian a thread
-inline constexpr int kTileThreads = 256;      // of a block that takes a tile, a pixel a thread
-inline constexpr int kSortThreads = 256;      // of a block that sorts a tile's list
-inline constexpr int kListKeys = 2048;        // of a list that is sorted in shared memory
-inline constexpr int kScanThreads = 512;      // of a block that adds up counts
-inline constexpr int kScanItems = 4;          // counts of a thread
-inline constexpr int kFitThreads = 256;       // of a block that compares pictures with photos
-inline constexpr int kFitColumns = 32;        // of the windows or pixels that such a block takes
+inline constexpr int kGaussianThreads = 128;  // per block with one Gaussian per thread
+inline constexpr int kTileThreads = 256;      // per block with one tile, one pixel per thread
+inline constexpr int kSortThreads = 256;      // per block that sorts a tile's list
+inline constexpr int kListKeys = 2048;        // maximum length of a list that is sorted in shared memory
+inline constexpr int kScanThreads = 512;      // per block that sums counts
+inline constexpr int kScanItems = 4;          // counts per thread
+inline constexpr int kFitThreads = 256;       // per block that compares images with photos
+inline constexpr int kFitColumns = 32;        // windows or pixels per such block
 inline constexpr int kFitRows = 16;
 
-// What pairs of a tile are sorted by: depth, a positive float's bits, then their place among all pairs, Gaussian by Gaussian.
+// Sort key of a tile's pairs: the bits of the depth, a positive float, then the index among all pairs, which are ordered by Gaussian.
 inline constexpr uint64_t key_of(uint32_t depth, uint32_t pair) { return uint64_t(depth) << 32 | pair; }
 inline constexpr uint32_t pair_of(uint64_t key) { return uint32_t(key); }
 
-// Planes [H, W] of pictures, and those of the photos, and the weights of SSIM's window in each direction.
+// Planes [H, W] of images and of photos, and the weights of SSIM's window in each direction.
 struct FitPlanes {
   const float* pictures;
   const float* photos;
@@ -53,17 +53,17 @@ struct FitPlanes {
   float window[raster::kWindow];
 };
 
-// Counts, and where the sums of those before go.
+// Counts, and the output for their exclusive prefix sums.
 struct Counts {
   int64_t length;
   const uint32_t* counts;
   uint32_t* sums;
 };
 
-// Warps that a view's Gaussians, or blocks that so many items, are dealt to.
+// Returns the number of warps or blocks for `items` items, with `of` items each.
 inline constexpr int parts(int64_t items, int of) { return int((items + of - 1) / of); }
 
-// Described where they are written: gaussians.h, lists.h, losses.h, sort.h, tiles.h.
+// Kernels, documented where they are defined: gaussians.h, lists.h, losses.h, sort.h, tiles.h.
 extern "C" {
 __global__ void gs_lenses(Call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
                           uint32_t* tile_counts);

@@ -1,4 +1,4 @@
-// What runs the kernels: a GPU, or a CPU in its place.
+// Interface of a device that runs the kernels: a GPU, or its emulation on a CPU.
 #pragma once
 
 #include <cstddef>
@@ -9,10 +9,10 @@
 
 namespace globalsplat::cuda {
 
-// Memory of a device, not filled. Kernels that were launched before it is given up may still use it.
+// Uninitialized memory of a device. Kernels that were launched before it is released may still use it.
 using Memory = std::shared_ptr<void>;
 
-// Blocks of a launch.
+// Number of blocks of a launch in each dimension.
 struct Blocks {
   int64_t x, y = 1;
 };
@@ -21,13 +21,13 @@ class Device {
  public:
   virtual ~Device() = default;
   virtual Memory allocate(size_t bytes) const = 0;
-  // Has a kernel run after all that were launched before. `arguments` are addresses of its arguments, which are copied.
+  // Enqueues a kernel after all previous ones. `arguments` are addresses of its arguments, which are copied.
   virtual void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const = 0;
-  // Waits for all kernels.
+  // Waits for all kernels and reads a number.
   virtual uint64_t read(const uint64_t* number) const = 0;
 };
 
-// A kernel's arguments have to be those of its declaration.
+// Launches a kernel with arguments of the types in its declaration.
 template <class... Parameters>
 struct Launch;
 template <class... Parameters>

@@ -1,17 +1,17 @@
-// A CPU in a GPU's place: see emulator.h.
+// Emulation of a GPU on a CPU: see emulator.h.
 #pragma once
 
 #include "device.h"
 
 namespace globalsplat::cuda::emulated {
 
-// Memory is the CPU's own, aligned as a GPU's, and begins as anything. Blocks, and the threads of a block, take turns in an
-// order drawn from `seed`, another one in every launch.
+// Device that runs kernels on the CPU. Memory is the CPU's own, aligned as on a GPU, and initially undefined. Blocks, and the threads of a
+// block, run in an order drawn from `seed`, which differs in every launch.
 class Emulator : public Device {
  public:
   explicit Emulator(uint64_t seed) : seed_(seed) {}
   Memory allocate(size_t bytes) const override;
-  // Throws std::logic_error where threads wait for others that don't come.
+  // Throws std::logic_error on a deadlock: if threads wait for others that don't arrive.
   void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override;
   uint64_t read(const uint64_t* number) const override { return *number; }
 
@@ -19,14 +19,14 @@ class Emulator : public Device {
   mutable uint64_t seed_;
 };
 
-// A kernel by its name, to be called on a thread's stack.
+// Kernel with its name, to be called on the stack of an emulated thread.
 struct Kernel {
   const char* name;
   void (*run)(void** arguments);
 };
-const Kernel* kernel_named(const char* name);  // null: there is none
+const Kernel* kernel_named(const char* name);  // null if there is none
 
-// How many barriers the text has, and to have threads pass by one of them from now on, to see whether that is noticed.
+// Number of barriers in the source, and a function that makes threads skip one of them from now on, to test that this is detected.
 int barriers();
 void leave_out_barrier(int place);
 

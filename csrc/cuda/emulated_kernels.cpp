@@ -1,4 +1,4 @@
-// The kernels' text as C++, and how an emulated launch finds them by name.
+// The kernels' source compiled as C++, and their lookup by name for emulated launches.
 #include "emulator.h"
 
 #include "kernels.cu"

@@ -14,7 +14,8 @@
 
 #include "emulated.h"
 
-// Sanitizers have to hear of stacks that change. ThreadSanitizer must not look at this file, but has to be told who met.
+// Sanitizers must be notified when stacks are switched. ThreadSanitizer must not instrument this file, but must be told which threads
+// synchronized.
 #if defined(__SANITIZE_ADDRESS__)
 #include <sanitizer/common_interface_defs.h>
 #define GS_ASAN(call) call
@@ -31,18 +32,18 @@
 namespace globalsplat::cuda::emulated {
 namespace {
 
-constexpr int kMostThreads = 1024;          // of a block
+constexpr int kMostThreads = 1024;          // per block
 constexpr size_t kStack = 256 << 10;        // bytes
-constexpr size_t kSharedMemory = 48 << 10;  // bytes of a block, as GPUs have at least
-constexpr size_t kLine = 64;                // between two arrays of it
-// ThreadSanitizer takes memory that two blocks use, one after the other, for shared.
+constexpr size_t kSharedMemory = 48 << 10;  // bytes per block: the minimum that GPUs have
+constexpr size_t kLine = 64;                // alignment of its arrays
+// ThreadSanitizer reports memory that two blocks use one after the other as shared.
 #if defined(GS_UNDER_TSAN)
 constexpr bool kReuse = false;
 #else
 constexpr bool kReuse = true;
 #endif
 
-// A stack, and what is needed to go on with it.
+// Stack, and the context that is needed to resume it.
 struct Stack {
   ucontext_t context;
   void* bottom = nullptr;
@@ -58,8 +59,8 @@ void go_on(Stack& from, Stack& to) {
   GS_ASAN(__sanitizer_finish_switch_fiber(from.fake, nullptr, nullptr));
 }
 
-// Threads, by their number in the block. What stacks share is plain memory: templates that a file compiled with sanitizers has,
-// too, might be linked from there.
+// List of threads, by their index in the block. The data that stacks share consists of plain arrays: a template that a file compiled with
+// sanitizers also instantiates might be linked from there.
 struct Threads {
   int numbers[kMostThreads];
   int count = 0;
@@ -67,31 +68,31 @@ struct Threads {
 };
 
 struct Warp {
-  Threads waiting;  // for the rest of them
-  int place = -1;   // in the text, where they meet
+  Threads waiting;  // for the other threads
+  int place = -1;   // in the source, of the barrier that they wait at
   uint64_t given[2][32];
 };
 
 struct Thread {
   Stack stack;
   std::unique_ptr<char[]> memory;
-  // So far; two in turn have a place each, so that nobody overwrites what is still to be read.
+  // Number of calls so far. Consecutive calls alternate between two buffers, so that values are not overwritten before they are read.
   unsigned exchanges = 0, votes = 0;
   size_t shared_used = 0;
 };
 
-// The block that this thread of the CPU runs.
+// Block that this thread of the CPU runs.
 struct Block {
-  std::unique_ptr<Thread> threads[kMostThreads];  // as many as any block had yet
+  std::unique_ptr<Thread> threads[kMostThreads];  // as many as the largest block so far
   Stack scheduler;
   const Kernel* kernel = nullptr;
   void** arguments = nullptr;
   Index index{}, size{}, grid{};
   int current = 0, done = 0;
-  bool votes[2] = {};  // of this meeting and the next
+  bool votes[2] = {};  // of this barrier and the next one
   Threads ready, waiting;
   Warp warps[kMostThreads / 32];
-  std::vector<std::unique_ptr<char[]>> shared;  // the last is this block's
+  std::vector<std::unique_ptr<char[]>> shared;  // the last one belongs to this block
 };
 Block& block() {
   thread_local std::unique_ptr<Block> own;
@@ -99,9 +100,9 @@ Block& block() {
   return *own;
 }
 
-int left_out = -1;  // the barrier that no thread heeds
+int left_out = -1;  // the barrier that all threads skip
 
-// What is in memory that nobody has filled: other numbers every time, of which many are no numbers.
+// Fills uninitialized memory with values that differ every time and are often NaN.
 void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
   for (size_t k = 0; k < bytes; k += 8) {
     uint64_t word = random();
@@ -112,7 +113,7 @@ void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
 
 Thread& current() { return *block().threads[block().current]; }
 
-// Of one thread of the GPU after the other.
+// Runs one thread of the GPU after the other on this stack.
 void run_threads() {
   GS_ASAN(__sanitizer_finish_switch_fiber(nullptr, const_cast<const void**>(&block().scheduler.bottom), &block().scheduler.size));
   for (;;) {
@@ -138,7 +139,7 @@ std::unique_ptr<Thread> new_thread() {
   return thread;
 }
 
-// Waits until as many threads as `all` are here.
+// Waits until `all` threads have arrived.
 void meet(Threads& waiting, int all) {
   GS_TSAN(__tsan_release(&waiting));
   if (waiting.count + 1 == all) {
@@ -155,7 +156,7 @@ Warp& own_warp() { return block().warps[block().current / 32]; }
 void run_block(std::mt19937_64& order) {
   const int threads = int(block().size.x);
   if (block().shared.empty() || !kReuse) block().shared.emplace_back(new char[kSharedMemory]);
-  // What the block before left must be of no use.
+  // Values that the previous block left must not be usable.
   fill_with_anything(block().shared.back().get(), kSharedMemory, order);
   GS_TSAN(__tsan_release(&block().kernel));
   block().done = block().ready.count = block().waiting.count = 0;
@@ -202,7 +203,7 @@ void meet_in_warp(int place) {
 bool vote_in_block(int place, bool given) {
   const unsigned turn = current().votes++ % 2;
   block().votes[turn] |= given;
-  if (block().waiting.count + 1 == int(block().size.x)) block().votes[1 - turn] = false;  // which all have read
+  if (block().waiting.count + 1 == int(block().size.x)) block().votes[1 - turn] = false;  // all threads have read it
   meet_in_block(place);
   return block().votes[turn];
 }
@@ -231,7 +232,7 @@ void* shared_memory(size_t bytes) {
 void leave_out_barrier(int place) { left_out = place; }
 
 Memory Emulator::allocate(size_t bytes) const {
-  if (bytes == 0) return Memory();  // as an empty tensor's
+  if (bytes == 0) return Memory();  // as for an empty tensor
   constexpr std::align_val_t alignment{256};
   void* const memory = ::operator new(bytes, alignment);
   std::mt19937_64 random(seed_++);

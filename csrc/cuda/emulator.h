@@ -1,7 +1,7 @@
-// CUDA's words for a C++ compiler: a CPU in a GPU's place. Every thread of a block has a stack of its own, blocks and threads take
-// turns in an order drawn from a seed, and a thread goes on until it waits for others. So each word means what CUDA says and no
-// more: threads of a warp are not in step unless they meet. Compiled under ThreadSanitizer, memory that two threads use without
-// having met by __syncthreads() or __syncwarp() is a race.
+// Emulation of CUDA's built-ins for a C++ compiler, which runs kernels on a CPU. Every thread of a block has its own stack, blocks and
+// threads run in an order drawn from a seed, and a thread runs until it waits for others. So each built-in guarantees what CUDA guarantees
+// and no more: threads of a warp run in lockstep only if they synchronize. Under ThreadSanitizer, an access of two threads to the same
+// memory without __syncthreads() or __syncwarp() between them is a race.
 #pragma once
 
 #include <cstddef>
@@ -30,14 +30,15 @@ Index block_index();
 Index block_size();
 Index grid_size();
 
-// Those of a block's, or of a warp's, threads that come here first wait for the last. `place` tells one word of the text from another.
+// Barriers of a block's, or of a warp's, threads. `place` identifies the call in the source.
 void meet_in_block(int place);
 void meet_in_warp(int place);
-// And whether any of a block's gave true.
+// Barrier that also returns true if any of the block's threads passed true.
 bool vote_in_block(int place, bool given);
-// The threads of a warp give their numbers, and `out` receives all 32; says nothing about other memory. All come from one line.
+// Exchanges values among the threads of a warp: `out` receives all 32. It doesn't order other memory accesses. All threads must call it
+// from the same line.
 void exchange(int line, uint64_t given, uint64_t (&out)[32]);
-// The same memory for all threads of a block, the n-th time that they ask.
+// Returns shared memory: the n-th call of every thread of a block returns the same address.
 void* shared_memory(size_t bytes);
 
 template <class T>

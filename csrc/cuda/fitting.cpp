@@ -13,7 +13,7 @@ FitPlanes planes_of(const raster::FitJob<float>& job) {
   return planes;
 }
 
-// Throws where there are more blocks than a launch may have.
+// Throws if there are more blocks than a launch may have.
 Blocks blocks_of(int64_t count) {
   if (count > std::numeric_limits<int32_t>::max()) throw std::length_error("a GPU compares at most 2 billion tiles of pictures in one go");
   return {count};

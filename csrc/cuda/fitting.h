@@ -1,4 +1,4 @@
-// What fitting pictures to photos needs on a device: what ../raster/fit.h is on the CPU, in float32, kernel after kernel.
+// Losses that fit rendered images to photos on a GPU: the counterpart of ../raster/fit.h, in float32, as a sequence of kernels.
 #pragma once
 
 #include "../raster/fit.h"
@@ -6,13 +6,13 @@
 
 namespace globalsplat::cuda {
 
-// Numbers on the device whose sum is a result.
+// Partial sums on the device, whose total is a result.
 struct Parts {
   Memory numbers;  // double[count]
   int64_t count;
 };
 
-// As raster::photometric(), and raster::depth_smoothness(); addresses are of the device's memory.
+// Compute raster::photometric() and raster::depth_smoothness(); addresses are in the device's memory.
 Parts photometric(const Device&, const raster::FitJob<float>&, double absolute, double similar, float* gradient);
 Parts depth_smoothness(const Device&, const raster::DepthJob<float>&, double factor, float* gradient);
 

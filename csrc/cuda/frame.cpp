@@ -19,7 +19,7 @@ Memory room_for(const Device& device, int64_t count) {
 
 Blocks for_each(int64_t items, int threads, int64_t rows = 1) { return {parts(items, threads), rows}; }
 
-// A view's Gaussians, or pixels, are counted by 32 bits, and a launch has so many rows of blocks at the most.
+// Maximum number of rows of blocks in a launch. A view's Gaussians, or pixels, are counted by 32 bits.
 constexpr int64_t kMostRows = 65535;
 
 Call call_of(const Arguments& of) {
@@ -31,7 +31,7 @@ Call call_of(const Arguments& of) {
   return {int(views), int(of.cameras), int(of.gaussians.count), of.gaussians.bases, {of.width, of.height, columns, rows}};
 }
 
-// Where tiles' lists begin, and where the last ends.
+// Returns the number of starts of the tiles' lists, including the end of the last one.
 int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.grid.tiles() + 1; }
 
 }  // namespace
@@ -52,7 +52,7 @@ void Seen::backward(const Device& device, const Arguments& of, const SplatGradie
                     const GaussianGradients<float>& out, float* w2c) const {
   const int warps = parts(call.count, kWarp);
   const Memory asked = w2c == nullptr ? Memory() : room_for<CameraGradient<float>>(device, int64_t(call.views) * warps);
-  // Where there are several cameras, all warps of a block have the same Gaussians.
+  // With several cameras, all warps of a block process the same Gaussians.
   const int gaussians = call.cameras > 1 ? kWarp : kGaussianThreads;
   GS_LAUNCH(device, gs_project_backward, for_each(call.count, gaussians, of.scenes), kGaussianThreads, call, of.gaussians,
             as<Lens<float>>(lenses), as<Splat<float>>(splats), records, first, out, as<CameraGradient<float>>(asked));
@@ -73,13 +73,13 @@ Frame::Frame(const Device& device, const Arguments& of, const Pictures<float>& o
   tile_start_ = room_for<uint32_t>(device, places);
   GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(group_pairs),
             tile_counts + 1, nullptr, nullptr, nullptr);
-  // Sums of what is before a tile go to the place behind the tile's own, where they grow to what is before the next one.
+  // The prefix sum for a tile is stored one index after the tile's own, where it grows to that of the next tile.
   GS_LAUNCH(device, gs_scan, for_each(std::max(groups, places), kScanThreads * kScanItems, 2), kScanThreads,
             (Counts{groups, as<uint32_t>(group_pairs), as<uint32_t>(pairs_before)}),
             (Counts{places, tile_counts, as<uint32_t>(tile_start_)}), as<uint64_t>(total));
-  // The one number that has to be known here: how much memory pairs take.
+  // The only value that the host has to wait for: the number of pairs, which determines their memory.
   const uint64_t count = device.read(as<uint64_t>(total));
-  // Behind the last there is room to count on, a few batches.
+  // The margin lets indices run past the last pair by a few batches.
   if (count > std::numeric_limits<uint32_t>::max() - 1024)
     throw std::length_error("more than 4 billion (Gaussian, tile) pairs in one go");
   count_ = uint32_t(count);

@@ -1,4 +1,4 @@
-// Gaussians to splats, and back: the maths of raster/project.h, a Gaussian a thread.
+// Projection of Gaussians to splats, forward and backward: the maths of raster/project.h with one Gaussian per thread.
 #pragma once
 
 #include "lens.h"
@@ -7,7 +7,7 @@
 
 namespace globalsplat::cuda {
 
-// Those of one scene.
+// Returns the Gaussians of one scene.
 inline Gaussians<float> scene_of(const Gaussians<float>& all, int64_t scene) {
   const int64_t first = scene * all.count;
   return {all.means + 3 * first,
@@ -25,7 +25,7 @@ inline GaussianGradients<float> scene_of(const GaussianGradients<float>& all, co
           all.sh + 3 * of.bases * first};
 }
 
-// Calls body(g) where the compiler knows how many spherical harmonics there are: then their loops need no memory.
+// Calls body(g) with a number of spherical harmonics that is a compile-time constant, so that loops over them keep values in registers.
 template <class Body>
 inline void with_bases(Gaussians<float> g, const Body& body) {
   switch (g.bases) {
@@ -38,7 +38,7 @@ inline void with_bases(Gaussians<float> g, const Body& body) {
 
 extern "C" {
 
-// A view a thread. Where `tile_counts` isn't null, it is set to 0, for every tile of every view and once more.
+// Computes the lenses, one view per thread. If `tile_counts` isn't null, sets it to 0 for every tile of every view, plus one element.
 __global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
                           uint32_t* tile_counts) {
   const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
@@ -48,12 +48,12 @@ __global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float*
   if (tile_counts != nullptr && k <= int64_t(call.views) * call.grid.tiles()) tile_counts[k] = 0;
 }
 
-// A row of blocks a view.
+// Projects Gaussians, with one row of blocks per view.
 __global__ void __launch_bounds__(kGaussianThreads)
     gs_project(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, Splat<float>* splats) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x, view = blockIdx.y;
   if (i >= call.count) return;
-  // Written in one piece, four numbers at a time.
+  // Stored as a whole, four values at a time.
   Splat<float> own;
   with_bases(scene_of(gaussians, view / call.cameras), [&](const Gaussians<float>& g) {
     Splat<float>* const place = &own;
@@ -64,32 +64,33 @@ __global__ void __launch_bounds__(kGaussianThreads)
   splats[view * call.count + i] = own;
 }
 
-// A row of blocks a scene. The records of Gaussian i in a view are first[view·N + i] … first[view·N + i + 1] − 1. Where `asked`
-// isn't null, it receives what the Gaussians of every warp ask of the views' cameras: [views, warps of a view].
+// Computes the gradients of Gaussians, with one row of blocks per scene. The records of Gaussian i in a view are first[view·N + i] …
+// first[view·N + i + 1] − 1. If `asked` isn't null, it receives the gradients of the views' cameras from the Gaussians of every warp:
+// [views, warps of a view].
 //
-// Where there are several cameras, the warps of a block have the same Gaussians and deal the cameras among them; their sums are
-// added up in the warps' order. Spherical harmonics, three quarters of all numbers, go through shared memory, to be read and written
-// as they follow each other.
+// With several cameras, the warps of a block process the same Gaussians and divide the cameras among themselves; their sums are added in
+// the warps' order. Spherical harmonics, three quarters of all values, go through shared memory, which makes their global memory accesses
+// contiguous.
 __global__ void __launch_bounds__(kGaussianThreads, 4)
     gs_project_backward(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, const Splat<float>* splats,
                         const SplatGradient<float>* records, const uint32_t* first, GaussianGradients<float> out,
                         CameraGradient<float>* asked) {
-  constexpr int kWarps = kGaussianThreads / kWarp, kRow = 3 * raster::kMaxBases + 1;  // an odd number of words: in other banks
+  constexpr int kWarps = kGaussianThreads / kWarp, kRow = 3 * raster::kMaxBases + 1;  // odd, which avoids bank conflicts
   constexpr int kSums = 14;
   struct Shared {
     float sh[kWarps][kWarp][kRow];  // sums of gradients
     union {
-      float of_all[kWarp][kRow];    // what the warps have in common: coefficients
+      float of_all[kWarp][kRow];    // coefficients, shared by the warps
       float sums[kWarps][kSums][kWarp];
     };
   };
   GS_SHARED(Shared, shared, [1]);
   auto& memory = shared[0];
   const bool is_dealt = call.cameras > 1;
-  const int sharing = is_dealt ? kWarps : 1, member = warp() % sharing;  // warps with the same Gaussians, and which is this
+  const int sharing = is_dealt ? kWarps : 1, member = warp() % sharing;  // number of warps with the same Gaussians, and index among them
   const int64_t begin = (int64_t(blockIdx.x) * kWarps + warp() - member) / sharing * kWarp;
   const int64_t view = int64_t(blockIdx.y) * call.cameras, i = begin + lane(), groups = parts(call.count, kWarp);
-  // Threads that are left over have no Gaussian, but take part in sums.
+  // Excess threads have no Gaussian, but take part in sums.
   const bool is_there = i < call.count;
   const int there = int(begin >= call.count ? 0 : call.count - begin < kWarp ? call.count - begin : kWarp);
   float(&sums_of_sh)[kRow] = memory.sh[warp()][lane()];
@@ -112,9 +113,9 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
         for (int n = 0; n < raster::kSplatGradientNumbers; ++n) d[n] += numbers[n / 2].numbers[n % 2];
       }
       if (from < to) {
-        // What is read, and computed, twice takes no registers in between.
+        // Recomputing and rereading values frees registers in between.
         raster::lane::Group<float> group;
-        raster::lane::Projection<float> projection{};  // which is visible, as all are that have records
+        raster::lane::Projection<float> projection{};  // only visible Gaussians have records
         raster::lane::Shading<float> shading;
         const Lens<float>& lens = lenses[view + k];
         float d_r[3];
@@ -140,8 +141,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
       for (int n = 0; n < width; ++n) sums_of_sh[n] = 0;
     __syncthreads();
 
-    // Both kinds of sums over warps, and back to where they belong.
-    // What keep() returns nobody can have computed, and kept in registers, before.
+    // Writes the sums over warps to global memory. The result of keep() can't have been computed earlier, so it has occupied no registers.
     const auto at = scene_of(out, scene, keep(int(blockIdx.y)));
     for (int k = own; k < there * width; k += sharing * kWarp) {
       float number = 0;
@@ -180,7 +180,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
   });
 }
 
-// A number of w2c a warp: what all warps ask.
+// Computes the gradient of one element of w2c per warp, summed over the gradients from all warps.
 __global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* asked, float* w2c) {
   const int64_t number = (int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / kWarp;
   if (number >= int64_t(views) * 16) return;

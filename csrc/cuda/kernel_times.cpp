@@ -17,7 +17,7 @@ struct Launched {
   c10::Event begin, end;
 };
 
-// The backward pass launches from a thread of autograd's, so this belongs to no thread.
+// Not thread-local, because the backward pass launches from one of autograd's threads.
 std::atomic<bool> measuring{false};
 std::mutex guard;
 std::vector<Launched> launched;

@@ -1,9 +1,9 @@
-// The splat op on a GPU: one text, which NVRTC compiles for the device at hand when it is first needed, and which any C++ compiler
-// compiles against emulator.h, where it is proven. The maths are raster/'s own, with one number in the place of a vector.
+// All kernels for a GPU as one source, which NVRTC compiles for the current device when it is first needed. Any C++ compiler compiles it
+// against emulator.h for tests. The maths is that of raster/, with single values instead of vectors.
 #define GS_LANE
 #define GS_ISA lane
 #ifdef __CUDACC__
-// Memory that the threads of a block share; `extents` are an array's.
+// Declares shared memory of a block; `extents` are those of an array.
 #define GS_SHARED(type, name, extents) __shared__ type name extents
 #endif
 

@@ -1,4 +1,4 @@
-// Lists the tiles, and the 4×4 blocks of their pixels, that splats reach (raster/reach.h).
+// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch (raster/reach.h).
 #pragma once
 
 #include "reach.h"
@@ -7,12 +7,12 @@
 namespace globalsplat::cuda {
 extern "C" {
 
-// A warp takes 32 splats of a view, a group, and deals the tiles in their boxes to its lanes: most have a few tiles, and some
-// hundreds. In the first pass, where `first` is null, it tells in group_pairs [views, groups] how many tiles its splats reach, and
-// counts in of_tiles [views, tiles] the splats that reach each. In the second, group_pairs tells how many pairs are before the
-// group's, and every (splat, tile) pair gets its place in `pairs`: those of a splat are neighbours. first[view·N + i] is where those
-// of Gaussian i begin, first[views·N] where all end. of_tiles tells where the next key of a tile goes in `keys`, whose order, within
-// a tile, is that in which warps came.
+// Lists tiles in two passes. A warp takes a group of 32 splats of a view and distributes the tiles in their bounding boxes to its lanes,
+// because most splats have a few tiles and some have hundreds. The first pass, in which `first` is null, writes the number of tiles that
+// the group's splats touch to group_pairs [views, groups], and counts the splats that touch each tile in of_tiles [views, tiles]. In the
+// second pass, group_pairs holds the number of pairs before the group's, and every (splat, tile) pair is stored in `pairs`, with those of a
+// splat adjacent. first[view·N + i] is the index of the first pair of Gaussian i, and first[views·N] the end of the last. of_tiles holds
+// the index of a tile's next key in `keys`; within a tile, keys are in the order in which warps arrived.
 __global__ void __launch_bounds__(kGaussianThreads)
     gs_cover(Call call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first, uint64_t* keys,
              TileEntry* pairs) {
@@ -31,7 +31,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
   uint32_t reached = 0, own_first = 0;
   for (uint32_t base = 0; base < total; base += kWarp) {
     const uint32_t candidate = base + uint32_t(lane());
-    int owner = 0;  // as many lanes have all of their candidates before this one
+    int owner = 0;  // number of lanes whose candidates all precede this one
     for (int step = kWarp / 2; step > 0; step /= 2)
       if (__shfl_sync(kAll, end, owner + step - 1) <= candidate) owner += step;
     const uint32_t within = candidate - __shfl_sync(kAll, begin, owner);
@@ -46,7 +46,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
 
     const unsigned reaching = __ballot_sync(kAll, blocks != 0);
     if (begin >= base) {
-      const uint32_t earlier = begin - base;  // of these candidates
+      const uint32_t earlier = begin - base;  // among these candidates
       own_first = reached + uint32_t(__popc(earlier < kWarp ? reaching & ((1u << earlier) - 1) : reaching));
     }
     if (blocks != 0) {

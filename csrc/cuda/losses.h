@@ -1,5 +1,5 @@
-// How far pictures are from photos, and gradients: what ../raster/ssim.h and smooth.h do on the CPU, with the same bits but for the sums
-// over blocks, each of which leaves one number in `parts`, times what it counts.
+// Losses that compare images with photos, and their gradients: the kernels of ../raster/ssim.h and smooth.h for GPUs. Results have the same
+// bits as on the CPU except for sums over blocks. Each block writes one weighted partial sum to `parts`.
 #pragma once
 
 #include "call.h"
@@ -9,10 +9,10 @@
 
 namespace globalsplat::cuda {
 
-// Columns that a tile's windows read, or whose windows its pixels are in.
+// Number of columns that a tile's windows read, or whose windows contain its pixels.
 inline constexpr int kFitReach = kFitColumns + raster::kWindow - 1;
 
-// The sum over a block's threads in an order that is always the same, known to the first of them.
+// Sums over a block's threads in a fixed order; the result is valid in the first thread.
 inline double block_sum(double value) {
   GS_SHARED(double, sums, [kFitThreads / kWarp]);
   for (int step = kWarp / 2; step > 0; step /= 2) value += __shfl_xor_sync(kAll, value, step);
@@ -24,7 +24,7 @@ inline double block_sum(double value) {
   return total;
 }
 
-// The tile of a plane of `columns` × `rows` windows or pixels that a block takes.
+// Tile of a block: a part of a plane of `columns` × `rows` windows or pixels.
 struct FitTile {
   FitTile(int columns, int rows) {
     const int across = parts(columns, kFitColumns), tiles = across * parts(rows, kFitRows), tile = int(blockIdx.x) % tiles;
@@ -38,8 +38,8 @@ struct FitTile {
 
 extern "C" {
 
-// Σ SSIM of a tile of windows times `each`; their slopes go to `slopes`, [planes, 3, H − 10, W − 10], if it isn't null. First the
-// columns of windows are summed up, then the rows of these sums.
+// Computes Σ SSIM of a tile of windows times `each`; writes the slopes to `slopes`, [planes, 3, H − 10, W − 10], if it isn't null. Windows
+// are summed first along columns, then along rows.
 __global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each, float* slopes, double* parts) {
   const int columns = of.width - raster::kWindow + 1, rows = of.height - raster::kWindow + 1;
   const FitTile tile(columns, rows);
@@ -73,8 +73,8 @@ __global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each
   if (threadIdx.x == 0) parts[blockIdx.x] = each * total;
 }
 
-// Σ |x − y| of a tile of pixels times `absolute`, and its gradient, plus `similar` times that of Σ SSIM, from all windows' slopes where
-// these aren't null. `gradient`, [planes, H, W], may be null.
+// Computes Σ |x − y| of a tile of pixels times `absolute`, and its gradient plus `similar` times that of Σ SSIM, from all windows' slopes
+// if they aren't null. `gradient`, [planes, H, W], may be null.
 __global__ void __launch_bounds__(kFitThreads)
     gs_fit_gradient(FitPlanes of, const float* slopes, double absolute, float similar, float* gradient, double* parts) {
   const int columns = of.width - raster::kWindow + 1, last = of.height - raster::kWindow;
@@ -115,8 +115,8 @@ __global__ void __launch_bounds__(kFitThreads)
   if (threadIdx.x == 0) parts[blockIdx.x] = absolute * total;
 }
 
-// Of a pixel a thread, the pairs with the pixels to the right and below, times `each`; and the gradient of all four pairs, [views, H, W],
-// where it isn't null.
+// Computes the unevenness of the pairs of one pixel per thread with the pixels to the right and below, times `each`; and the gradient from
+// all four pairs, [views, H, W], if it isn't null.
 __global__ void __launch_bounds__(kFitThreads) gs_unevenness(DepthJob<float> of, double each, float* gradient, double* parts) {
   const int64_t k = int64_t(blockIdx.x) * kFitThreads + threadIdx.x, pixels = int64_t(of.width) * of.height;
   double sum = 0;
@@ -129,7 +129,7 @@ __global__ void __launch_bounds__(kFitThreads) gs_unevenness(DepthJob<float> of,
     };
     const float a = of.depths[k], g = grey(k);
     float slope = 0;
-    // What is beyond the border shows nothing.
+    // Pixels beyond the border are empty.
     const auto pair = [&](bool is_there, int64_t other) {
       return raster::lane::unevenness_of<float>(a, g, is_there ? of.depths[other] : 0, is_there ? grey(other) : 0, slope);
     };

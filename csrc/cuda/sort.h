@@ -1,12 +1,12 @@
-// Prefix sums, and the order of tiles' lists: by depth, and where depths are equal by Gaussian.
+// Prefix sums, and sorting of tiles' lists by depth, and by Gaussian for equal depths.
 #pragma once
 
 #include "warp.h"
 
 namespace globalsplat::cuda {
 
-// Of a thread's number and those of the threads before it in the block, and of all of them. `of_warps` is shared memory that
-// no other sum uses until the block has met once more.
+// Inclusive prefix sum over the threads of a block, and the sum over all of them. `of_warps` is shared memory that no other sum may use
+// before the block's next barrier.
 template <class T>
 struct Sum {
   T inclusive, all;
@@ -23,11 +23,12 @@ inline Sum<T> block_sum(T value, T (&of_warps)[warps]) {
   return sum;
 }
 
-// A step of a bitonic network: the lower of two keys, `distance` apart, comes first where `sorted` isn't in the lower one's place.
+// Comparison of a bitonic network: returns true if two keys must be swapped. `low` is the key at the lower index, `place`. The order is
+// ascending if bit `sorted` of that index is 0, and descending otherwise.
 inline bool changes_places(uint64_t low, uint64_t high, int place, int sorted) { return (low > high) == ((place & sorted) == 0); }
 
-// The steps of distances up to 32, from the stage that has runs of `sorted` keys in their order on until that of `last`, by a warp in
-// registers, for 64 keys from `place` on: a lane has two of them.
+// Runs the steps with distances up to 32 in registers, for the stages that produce sorted runs of `sorted` to `last` keys. A warp processes
+// 64 keys from index `place` on, two per lane.
 inline void sort_in_warp(uint64_t* keys, int place, int sorted, int last) {
   uint64_t own[2] = {keys[place + lane()], keys[place + kWarp + lane()]};
   for (; sorted <= last; sorted *= 2) {
@@ -47,7 +48,7 @@ inline void sort_in_warp(uint64_t* keys, int place, int sorted, int last) {
   keys[place + kWarp + lane()] = own[1];
 }
 
-// Sorts keys, `size` of them, a power of two from 64 on, by a bitonic network. Other warps may use them once the block has met.
+// Sorts `size` keys, a power of two that is at least 64, with a bitonic network. Other warps may read them after the block's next barrier.
 inline void sort_keys(uint64_t* keys, int size) {
   constexpr int kPart = 2 * kWarp, kSortWarps = kSortThreads / kWarp;
   for (int place = warp() * kPart; place < size; place += kSortWarps * kPart) sort_in_warp(keys, place, 2, kPart);
@@ -70,8 +71,8 @@ inline void sort_keys(uint64_t* keys, int size) {
 
 extern "C" {
 
-// A row of blocks a row of counts: each becomes, in `sums`, the sum of those before it; `total` receives that of all of the first
-// row. A block has kScanThreads·kScanItems of them, and adds up by itself all that are before: nobody waits for others.
+// Computes exclusive prefix sums of two rows of counts, one row of blocks for each, in `sums`; `total` receives the sum of the first row. A
+// block has kScanThreads·kScanItems counts, and sums all preceding ones by itself, so that no block waits for another.
 __global__ void __launch_bounds__(kScanThreads) gs_scan(Counts first, Counts second, uint64_t* total) {
   GS_SHARED(uint64_t, before_of_warps, [kScanThreads / kWarp]);
   GS_SHARED(uint64_t, of_warps, [kScanThreads / kWarp]);
@@ -90,7 +91,7 @@ __global__ void __launch_bounds__(kScanThreads) gs_scan(Counts first, Counts sec
     sum += items[k];
   }
   const Sum<uint64_t> sums = block_sum(sum, of_warps);
-  // Where 32 bits are too few, the total tells.
+  // If 32 bits overflow, the host notices by the total.
   uint32_t next = uint32_t(before_these + sums.inclusive - sum);
   for (int k = 0; k < kScanItems && own + k < row.length; ++k) {
     row.sums[own + k] = next;
@@ -100,8 +101,8 @@ __global__ void __launch_bounds__(kScanThreads) gs_scan(Counts first, Counts sec
     *total = before_these + sums.all;
 }
 
-// A tile a block: its pairs in their order, entries tile_start[tile] … tile_start[tile + 1] − 1. There, `keys` has those of the
-// pairs in any order, and is used up; `spare` is as long.
+// Sorts the pairs of one tile per block into entries tile_start[tile] … tile_start[tile + 1] − 1. The same range of `keys` holds the pairs'
+// keys in any order, and is overwritten; `spare` is scratch memory of the same size.
 __global__ void __launch_bounds__(kSortThreads)
     gs_sort_lists(Call call, const uint32_t* tile_start, uint64_t* keys, uint64_t* spare, const TileEntry* pairs,
                   TileEntry* entries) {
@@ -124,11 +125,12 @@ __global__ void __launch_bounds__(kSortThreads)
         entries[k] = pairs[pair_of(list[k])];
       else
         keys[done + uint32_t(k)] = list[k];
-    // The next round begins with each thread's own places in `list`.
+    // The next round starts with each thread's own elements of `list`, so it needs no barrier.
   }
   if (length <= kListKeys) return;
 
-  // A longer list is made of several: each key goes behind as many as are before it in its own list and in the neighbour.
+  // Longer lists are merged from several: the new position of a key is the number of smaller keys in its own run and in the neighbouring
+  // one.
   for (uint64_t run = kListKeys;; run *= 2) {
     __syncthreads();
     if (run >= length) break;

@@ -35,7 +35,7 @@ Pictures<Number> places_of(const globalsplat::Pictures& p) {
   return {data<Number>(p.rgb), data<Number>(p.alpha), data<Number>(p.depth)};
 }
 
-// Not yet written.
+// Returns uninitialized gradients.
 Gradients empty_gradients(const Inputs& in, bool of_cameras) {
   const auto empty = [](const Tensor& t) { return at::empty_like(t); };
   const globalsplat::Gaussians& g = in.gaussians;
@@ -77,11 +77,11 @@ Gradients splat_backward(const Inputs& in, const globalsplat::Pictures& drawn, c
   return out;
 }
 
-// The splats' numbers in Splat's order, each [B, C, N], as long as `seen` lives.
+// Returns the fields of the splats in Splat's order, each [B, C, N]. They are valid as long as `seen`.
 std::vector<Tensor> numbers_of(const Seen& seen, const Inputs& in) {
   return tensor_of(seen.splats.get(), {in.scenes(), in.cameras(), in.count(), 16}, in.gaussians.means.options()).unbind(-1);
 }
-constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // places in it
+constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // indices of fields
 constexpr double kTwoLn2 = 2 / raster::kLog2E;
 
 // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
@@ -97,8 +97,8 @@ Projected project(const Inputs& in) {
           shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1))};
 }
 
-// A record per visible Gaussian, the sums over pixels that turn into just these gradients: ∂L/∂(u, v) = 2 ln 2·UᵀM, and
-// W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the one number xy stands for two entries.
+// Creates one record per visible Gaussian, with the sums over pixels that are converted to exactly these gradients: ∂L/∂(u, v) = 2 ln
+// 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two entries.
 template <class On>
 Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
   const On device(in.gaussians.means);

@@ -1,6 +1,6 @@
-// Blends tiles, forward and backward: the maths of raster/pixel.h, a pixel a thread and a tile a block (spec 6.4 and 6.5).
+// Blends tiles, forward and backward: the maths of raster/pixel.h with one pixel per thread and one tile per block (spec 6.4 and 6.5).
 //
-// Each half of a warp has one of the tile's 4×4 blocks of pixels, and goes through the splats that reach this block.
+// Each half-warp has one of the tile's 4×4 blocks of pixels, and processes the splats that touch this block.
 #pragma once
 
 #include "pixel.h"
@@ -9,14 +9,14 @@
 namespace globalsplat::cuda {
 
 inline constexpr int kTileWarps = kTileThreads / kWarp;
-inline constexpr int kHalf = kWarp / 2;       // lanes of a block of pixels
-inline constexpr int kBatch = kWarp;          // entries that are taken at a time
-inline constexpr int kNothing = kBatch;       // the place behind a batch, where a splat without effect is
+inline constexpr int kHalf = kWarp / 2;       // lanes per block of pixels
+inline constexpr int kBatch = kWarp;          // entries per batch
+inline constexpr int kNothing = kBatch;       // index after a batch, at which a splat without effect is stored
 static_assert(sizeof(Splat<float>) == 64 && kTileThreads * 2 == kBatch * 16, "a batch's splats are two numbers a thread");
 static_assert(raster::kBlocks == 2 * kTileWarps && raster::kBlock * raster::kBlock == kHalf, "two blocks a warp");
 
-// Blocks that fit a multiprocessor at least: as many as leave enough registers for a thread. Forward, other architectures' compilers do
-// better without being told.
+// Minimum number of blocks per multiprocessor, chosen so that threads have enough registers. In the forward pass, compilers for other
+// architectures do better without a bound.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 900
 #define GS_FORWARD_BOUNDS __launch_bounds__(kTileThreads, 8)
 inline constexpr int kBackwardBlocks = 5;
@@ -27,15 +27,16 @@ inline constexpr int kBackwardBlocks = 4;
 
 using Evaluated = raster::lane::Evaluated<float>;
 
-// In which half of its warp a thread is, and which of the tile's blocks is that half's: warps go by rows, two in each.
+// Return the index of a thread's half-warp, and the block of the tile that this half has: warps are in row-major order, with two blocks
+// each.
 inline int half() { return lane() / kHalf; }
 inline int own_block() { return 2 * warp() + half(); }
 
-// This thread's pixel.
+// Pixel of this thread.
 struct Pixel {
   int x, y;
-  bool inside;    // the picture
-  int64_t place;  // in a plane
+  bool inside;    // of the image
+  int64_t place;  // index in a plane
   uint32_t eighth;
 
   explicit Pixel(const Grid& grid) : eighth(raster::kExp2Eighths[lane() % 8]) {
@@ -45,7 +46,8 @@ struct Pixel {
     inside = x < grid.width && y < grid.height;
     place = int64_t(y) * grid.width + x;
   }
-  // All of a warp together, whose lanes have the table of 2^(i/8): asking another lane is faster than asking memory.
+  // Evaluates a splat; all threads of a warp must call it together. The lanes hold the table of 2^(i/8), because a shuffle is faster than a
+  // memory access.
   Evaluated evaluate(const Splat<float>& splat) const {
     Evaluated e;
     raster::lane::evaluate(splat, float(x) + 0.5f, float(y) + 0.5f, e,
@@ -54,25 +56,25 @@ struct Pixel {
   }
 };
 
-// Of one view.
+// Returns the images of one view.
 template <class Number>
 inline Pictures<Number> pictures_of(const Pictures<Number>& all, const Grid& grid, int64_t view) {
   const int64_t plane = int64_t(grid.width) * grid.height;
   return {all.rgb + 3 * plane * view, all.alpha + plane * view, all.depth + plane * view};
 }
 
-// Has no α, and all of its numbers are finite.
+// Returns a splat whose α is 0 and whose values are all finite.
 inline Splat<float> nothing() {
   Splat<float> splat{};
   splat.log2_opacity = -1e30f;
   return splat;
 }
 
-// Which items of a batch the halves of a warp go through: those that reach their blocks, in their order.
+// For each half-warp, the indices of a batch's items that touch its block, in order.
 using Order = uint8_t[2][kBatch];
 
-// Each lane tells by two bits which of the warp's blocks its item reaches. `order` receives both halves' items, and kNothing behind
-// the last; returns how many the longer list has. The warp has to meet before it reads them.
+// Builds the lists of both half-warps. In each lane, two bits of `blocks` tell which of the warp's blocks its item touches. Entries of
+// `order` after the last item are kNothing; returns the length of the longer list. The warp must synchronize before it reads them.
 inline int list_items(uint32_t blocks, Order& order) {
   int longest = 0;
   for (int k = 0; k < 2; ++k) {
@@ -87,7 +89,7 @@ inline int list_items(uint32_t blocks, Order& order) {
 
 extern "C" {
 
-// Warps go on by themselves: each fetches those of a batch that reach its pixels.
+// Blends tiles. Warps are independent: each loads the items of a batch that touch its pixels.
 __global__ void GS_FORWARD_BOUNDS
     gs_blend(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
              Pictures<float> pictures) {
@@ -126,15 +128,15 @@ __global__ void GS_FORWARD_BOUNDS
   out.depth[pixel.place] = raster::lane::expected_depth(sums);
 }
 
-// `pictures` are the forward pass's own, `gradients` the loss's with respect to them; one record per entry is written. A splat's
-// sums are added up over each block's pixels, then over blocks, always in the same order.
+// Computes gradients of splats and writes one record per entry. `pictures` are outputs of the forward pass, and `gradients` the loss's
+// gradients with respect to them. A splat's sums are added over each block's pixels, then over blocks, always in the same order.
 __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
     gs_blend_backward(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
                       Pictures<const float> pictures, Pictures<const float> gradients, SplatGradient<float>* records) {
   constexpr int kNumbers = raster::kSplatGradientNumbers;
-  // Two numbers of a splat, and of a sum, a thread.
+  // Each thread handles two values of a splat, and of a sum.
   constexpr int kParts = int(sizeof(Splat<float>) / sizeof(Two)), kSums = kNumbers / 2;
-  // One address is kept, instead of one for each.
+  // A single struct, so that one address is kept instead of one per array.
   struct Shared {
     Splat<float> batch[kBatch + 1];
     Two sums[raster::kBlocks][kBatch][kSums];
@@ -158,7 +160,7 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   }
 
   const uint32_t end = tile_start[tile + 1];
-  // Every warp knows a batch's entries, one a lane, and fetches as many of its splats as there are others' to fetch.
+  // Every warp holds a batch's entries, one per lane; all warps share the loading of its splats.
   const auto fetch_entry = [&](uint32_t begin) {
     const uint32_t at = begin + uint32_t(lane());
     return at < end ? entries[at] : TileEntry{0, 0, 0};
@@ -169,7 +171,7 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
     return begin + uint32_t(item) < end ? reinterpret_cast<const Two*>(splats + splat)[part] : Two{};
   };
   const Fold<kNumbers, kHalf> fold;
-  // Which sums of a batch this thread adds up over blocks.
+  // Indices of the sums of a batch that this thread adds over blocks.
   const int sum_item = int(threadIdx.x) / kSums, sum_part = int(threadIdx.x) % kSums;
 
   uint32_t begin = tile_start[tile];
@@ -177,16 +179,16 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   if (threadIdx.x == 0) batch[kNothing] = nothing();
   TileEntry entry = fetch_entry(begin), next = fetch_entry(begin + kBatch);
   Two own = fetch_part(entry, begin);
-  // A batch is put into its place while some still add up the last one's sums, which nobody changes before all have put theirs.
+  // The next batch is stored while some threads still add the previous sums, which no thread overwrites before all have stored theirs.
   for (; begin < end; begin += kBatch) {
     reinterpret_cast<Two*>(batch + item)[part] = own;
-    // Behind what ended all pixels nothing is asked.
+    // Once all pixels have ended, the remaining splats get zero gradients.
     if (!__syncthreads_or(state.transmittance > 0)) {
       for (uint64_t k = uint64_t(begin) * kNumbers + threadIdx.x; k < uint64_t(end) * kNumbers; k += kTileThreads)
         (&records[entries[k / kNumbers].record].power)[k % kNumbers] = 0;
       return;
     }
-    // What comes next is on its way meanwhile.
+    // The next batch is loaded in the meantime.
     own = fetch_part(next, begin + kBatch);
     const TileEntry later = fetch_entry(begin + 2 * kBatch);
 
@@ -199,9 +201,9 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
       const int at = order[k];
       const Splat<float>& splat = batch[at];
       const Evaluated e = pixel.evaluate(splat);
-      // What reaches a block may miss all of its pixels that go on.
+      // A splat that touches a block may miss all of its active pixels.
       if (!__any_sync(kAll, e.raw > 0 && state.transmittance > 0)) continue;
-      // Adding to −0 costs nothing.
+      // Sums start at −0, so that the first addition is exact and can be optimized away.
       float sums[kNumbers];
       for (float& sum : sums) sum = -0.0f;
       raster::lane::pass(splat, e, state, sums);

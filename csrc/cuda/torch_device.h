@@ -1,4 +1,4 @@
-// Devices that hold torch's tensors: a GPU, or a CPU in its place.
+// Devices that hold torch tensors: a GPU, or its emulation on a CPU.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -17,12 +17,12 @@
 
 namespace globalsplat::cuda {
 
-// A view of a device's memory as a tensor of `options`, as long as the memory lives.
+// Returns a view of a device's memory as a tensor with `options`. It is valid as long as the memory.
 inline at::Tensor tensor_of(const void* memory, at::IntArrayRef size, const at::TensorOptions& options) {
   return at::for_blob(const_cast<void*>(memory), size).options(options).target_device(options.device()).make_tensor();
 }
 
-// The GPU that holds a tensor: memory from torch's allocator, kernels in torch's current stream.
+// GPU of a tensor: memory from torch's allocator, kernels in torch's current stream.
 class Gpu : public Device {
  public:
   explicit Gpu(const at::Tensor& on) : guard_(on.device()), options_(on.options()) {}
@@ -50,7 +50,7 @@ class Gpu : public Device {
   at::TensorOptions options_;
 };
 
-// The variable that asks for a CPU in a GPU's place, a number from which the order of blocks and threads is drawn.
+// Returns the variable that enables emulation, a number that seeds the order of blocks and threads; null if it isn't set.
 inline const char* emulation() { return std::getenv("GLOBALSPLAT_CUDA_ON_CPU"); }
 
 class Emulated : public emulated::Emulator {
@@ -58,7 +58,7 @@ class Emulated : public emulated::Emulator {
   explicit Emulated(const at::Tensor&) : Emulator(std::strtoull(emulation(), nullptr, 10)) {}
 };
 
-// The device whose kernels serve a tensor; null where the CPU's own do. These also serve float64, which exists to prove gradients.
+// Returns the device whose kernels process a tensor; null if the CPU's kernels do, which also process float64, used to verify gradients.
 inline std::unique_ptr<Device> device_of(const at::Tensor& t) {
   if (t.scalar_type() != at::kFloat) return nullptr;
   if (emulation() != nullptr) return std::make_unique<Emulated>(t);

@@ -1,4 +1,4 @@
-// What the 32 threads of a warp do together. All of them call these at the same time.
+// Operations of the 32 threads of a warp, which all must call them together.
 #pragma once
 
 #include "call.h"
@@ -8,17 +8,17 @@ namespace globalsplat::cuda {
 inline constexpr unsigned kAll = 0xFFFFFFFFu;
 
 inline int lane() { return int(threadIdx.x) % kWarp; }
-inline int warp() { return int(threadIdx.x) / kWarp; }  // of the block
+inline int warp() { return int(threadIdx.x) / kWarp; }  // index within the block
 
-// Two numbers in one access of memory.
+// Two values that are read or written in one memory access.
 struct alignas(8) Two {
   float numbers[2];
 };
 
-// Bits of the lanes before this one.
+// Returns the bits of the lanes before this one.
 inline unsigned before() { return (1u << lane()) - 1; }
 
-// Of this lane's and those of the lanes before it.
+// Returns the inclusive prefix sum of the lanes' values.
 template <class T>
 inline T prefix_sum(T value) {
   for (int step = 1; step < kWarp; step *= 2) {
@@ -28,12 +28,12 @@ inline T prefix_sum(T value) {
   return value;
 }
 
-// The same number, which the compiler keeps from now on instead of computing it again and again in a loop.
+// Returns the same value, but makes the compiler keep it instead of recomputing it repeatedly in a loop.
 inline int keep(int number) { return __shfl_sync(kAll, number, lane()); }
 
-// Adds up each of `count` ≤ 16 numbers over `lanes` neighbours, always in the same order. In every step one half of the lanes that
-// still share their numbers keeps the first half of them, the other one the rest, so that there is little left to exchange: ten
-// numbers of 16 lanes take 11 shuffles instead of 40. Lane by lane the sum of number `which` is left, of none where it is −1.
+// Sums each of `count` ≤ 16 values over `lanes` adjacent lanes, always in the same order. In every step one half of the lanes that still
+// share their values keeps the first half of the values, and the other half the rest, which reduces the exchange: ten values of 16 lanes
+// take 11 shuffles instead of 40. Each lane is left with the sum of value number `which`, or with none if that is −1.
 template <int count, int lanes>
 class Fold {
  public:
@@ -48,7 +48,7 @@ class Fold {
   static constexpr int kSteps = lanes == 32 ? 5 : 4;
   static_assert(lanes == 1 << kSteps && count <= 16, "a power of two");
 
-  // Which of the numbers from `first` on, of which only `left` are there, a lane is left with.
+  // Returns which of the values from `first` on, of which only `left` exist, a lane is left with.
   template <int shared, int distance>
   static int number(int first, int left) {
     const bool upper = (lane() & distance) != 0;
@@ -81,7 +81,7 @@ class Fold {
     }
   }
 
-  int is_upper_[kSteps];  // whether this lane is in the upper half of 2, 4, 8, …
+  int is_upper_[kSteps];  // 1 if this lane is in the upper half of 2, 4, 8, … lanes
 };
 
 }  // namespace globalsplat::cuda

@@ -2,7 +2,7 @@
 //
 //   m ← m + (1 − β₁)(g − m),  v ← β₂ v + (1 − β₂) g²,  x ← (1 − decay) x − rate · m / (√v / root + ε)
 //
-// where rate is the learning rate over 1 − β₁ᵗ, root is √(1 − β₂ᵗ), and decay is times the learning rate (spec 8.5).
+// where rate is the learning rate over 1 − β₁ᵗ, root is √(1 − β₂ᵗ), and decay is the weight decay times the learning rate (spec 8.5).
 #pragma once
 
 #include "simd.h"

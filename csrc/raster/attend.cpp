@@ -10,12 +10,12 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int64_t kFewestQueries = 96;  // that make packing keys worth while
-constexpr int64_t kPiece = 66;  // rows that are one task where a pass over them is all
+constexpr int64_t kFewestQueries = 96;  // minimum number that makes packing the keys worthwhile
+constexpr int64_t kPiece = 66;  // rows per task in a single pass over rows
 
 int64_t rounded_up(int64_t number, int64_t step) { return (number + step - 1) / step * step; }
 
-// How many of every head's `count` rows are one task, that there are about `tasks`: at least `fewest`, in whole `step`s.
+// Returns the number of each head's `count` rows per task, so that there are about `tasks` tasks: at least `fewest`, in whole `step`s.
 int64_t part(int64_t heads, int64_t count, int64_t tasks, int64_t fewest, int64_t step) {
   return rounded_up(std::max(fewest, (count * heads + tasks - 1) / tasks), step);
 }
@@ -25,12 +25,12 @@ Rows<Number> head_of(const Heads<Number>& all, const AttentionShape& shape, int6
   return {all.data + head / shape.heads * all.scene + head % shape.heads * shape.width, all.row};
 }
 
-// Calls task(some of a head's queries with all of its keys and values, head, where these queries begin) on up to `threads` threads.
-// Queries come in whole `step`s.
+// Calls task(some of a head's queries with all of its keys and values, head, index of the first of these queries) on up to `threads`
+// threads. Numbers of queries are multiples of `step`.
 template <class Number, class Task>
 void for_some_queries(const AttentionShape& shape, const AttentionInputs<Number>& in, int64_t step, int threads, const Task& task) {
   const int64_t heads = shape.scenes * shape.heads;
-  // A query's bits are the same in any company, so this may hang on the number of threads.
+  // A query's bits don't depend on the other queries of its task, so the task size may depend on the number of threads.
   const int64_t most = std::min(part(heads, shape.queries, 8 * threads, kFewestQueries, step), kAttentionQueries / step * step);
   const int64_t blocks = (shape.queries + most - 1) / most;
   const int64_t size = rounded_up((shape.queries + blocks - 1) / std::max<int64_t>(blocks, 1), step);
@@ -62,7 +62,8 @@ void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, H
 void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
                      Heads<const float> slope, const AttentionGradients<float>& gradients, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
-  // Every task has a part of a head's keys, cut by shapes alone, and a gradient of all its queries; these are added up in order.
+  // Every task processes a part of a head's keys, split by shapes alone, and computes a gradient for all of its queries; these are summed
+  // in order.
   const int64_t size = part(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t whole = whole_product_rows(shape.queries), columns = attention_columns(shape.width), all = whole * columns;
   const std::unique_ptr<float[]> q(new float[size_t(heads * all)]), slopes(new float[size_t(heads * all)]);
@@ -109,7 +110,7 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& 
 void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out, const float* log_sums,
                           Heads<const Bf16> slope, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
                           int threads) {
-  // Shared out as float32 numbers are.
+  // Work is split as in attend_backward().
   const int64_t heads = shape.scenes * shape.heads, width = shape.width;
   const int64_t size = part(heads, shape.keys, 64, kBf16BackwardKeys, kBf16BackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t whole = whole_bf16_columns(shape.queries), all = whole * width, rows_all = whole * attention_columns(shape.width);

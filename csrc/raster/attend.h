@@ -1,5 +1,5 @@
-// Attention, softmax(q kᵀ / √w) v, of many heads at once, and its gradients: attention.h, shared among threads. The bits don't depend
-// on their number.
+// Attention, softmax(q kᵀ / √w) v, of many heads at once, and its gradients: attention.h, parallel over threads. Results are bit-identical
+// for any number of threads.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace globalsplat::raster {
 
-// The numbers of all heads, side by side: row i of head h of scene b begins at data + b · scene + i · row + h · width.
+// Rows of all heads, side by side: row i of head h of scene b begins at data + b · scene + i · row + h · width.
 template <class Number>
 struct Heads {
   Number* data;
@@ -17,7 +17,7 @@ struct Heads {
 
 struct AttentionShape {
   int64_t scenes, heads, queries, keys;
-  int width;  // of a head, at most kAttentionWidth
+  int width;  // per head, at most kAttentionWidth
 };
 
 template <class Number>
@@ -25,15 +25,15 @@ struct AttentionInputs {
   Heads<const Number> q, k, v;
 };
 
-// Writes `out`, and log_sums[scene, head, query], which the backward pass asks for. There are keys.
+// Computes `out` and log_sums[scene, head, query], which the backward pass needs. There must be at least one key.
 void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums, int threads);
 
-// The same of bfloat16 numbers, whose `width` is a multiple of 8 and whose rows are an even number of them apart, by `products`
-// (attention_bf16.h).
+// Computes attend() for bfloat16 inputs with the given `products` (attention_bf16.h). `width` must be a multiple of 8 and the rows' stride
+// even.
 void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
                  const Bf16Products& products, int threads);
 
-// Of the gradient `slope` of what came out.
+// Gradients of queries, keys and values, computed from the gradient `slope` of the output.
 template <class Number>
 struct AttentionGradients {
   Heads<Number> q, k, v;

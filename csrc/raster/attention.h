@@ -1,10 +1,10 @@
-// Attention of one head: out = softmax(q kᵀ / √w) v over rows of w numbers (spec 4.2), forward beside backward. Scores never leave
-// the caches (FlashAttention, Dao et al. 2022): keys come in blocks, and a query's sums so far are scaled down whenever a larger
-// score turns up (Milakov & Gimelshein 2018). With s = q kᵀ · log₂e / √w, so that softmax's exponentials are to base 2:
+// Attention of one head: out = softmax(q kᵀ / √w) v over rows of w elements (spec 4.2), forward and backward. Scores never leave the caches
+// (FlashAttention, Dao et al. 2022): keys come in blocks, and a query's previous sums are scaled down whenever a larger score is found
+// (Milakov & Gimelshein 2018). With s = q kᵀ · log₂e / √w, so that softmax's exponentials have base 2:
 //
 //   m = maxⱼ sⱼ,  l = Σⱼ 2^(sⱼ − m),  out = Σⱼ 2^(sⱼ − m) vⱼ / l,  L = m + log₂ l
 //
-// Backward, scores are computed again. For a gradient g of `out`, and p = 2^(s − L):
+// The backward pass recomputes the scores. For a gradient g of `out`, and p = 2^(s − L):
 //
 //   dv = pᵀ g,  ds = p ⊙ (g vᵀ − Σ g ⊙ out),  dq = ds k / √w,  dk = dsᵀ q / √w
 #pragma once
@@ -13,7 +13,7 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// 2^x; what is below the least number is 0, and NaN is NaN.
+// Computes 2^x; results below the smallest normal number are 0, and NaN gives NaN.
 GS_INLINE Vector<float> power_of_two(Vector<float> x) {
   return exp2_where(Mask<float>(~less(x, broadcast<float>(-126))), x);
 }
@@ -21,7 +21,7 @@ GS_INLINE Vector<float> power_of_two(Vector<float> x) {
 static_assert(kForwardKeys % kProductColumns == 0 && kBackwardKeys % kProductColumns == 0 && kBackwardKeys % kProductRows == 0 &&
               kBackwardQueries % kProductRows == 0 && kAttentionQueries % kProductRows == 0);
 
-// The largest of `count` scores, and of `largest`. Scores past them become −∞ up to `columns`.
+// Returns the maximum of `count` scores and of `largest`. Sets the scores after them, up to `columns`, to −∞.
 GS_INLINE float largest_score(float* scores, int64_t count, int64_t columns, float largest) {
   constexpr int lanes = Simd<float>::lanes;
   for (int64_t j = count; j < columns; ++j) scores[j] = -__builtin_inff();
@@ -40,7 +40,7 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
   Room room(memory);
   float* const q = room.take(queries * columns);
   float* const sums = room.take(queries * columns);     // of values
-  float* const weights = room.take(queries * lanes);    // l, in parts
+  float* const weights = room.take(queries * lanes);    // l, in partial sums
   float* const most = room.take(queries);               // m
   float* const k = room.take(kForwardKeys * width);
   float* const v = room.take(kForwardKeys * columns);
@@ -86,7 +86,7 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
   }
 }
 
-// Some of a head's queries, and what is known of them, for attend_backward().
+// Packs some of a head's queries, and the results of the forward pass for them, for attend_backward().
 inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<float>& past, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
@@ -100,8 +100,8 @@ inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<f
   }
 }
 
-// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
-// of q · √w, [whole_product_rows(queries), attention_columns(width)].
+// Backward pass for the keys and values in `head`, which may be a part of those that softmax is over. Computes their gradients, and their
+// contribution to the gradient of q · √w, [whole_product_rows(queries), attention_columns(width)].
 inline void attend_backward(const AttentionHead<float>& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
                             Rows<float> dv, float* memory) {
   using V = Vector<float>;
@@ -151,7 +151,7 @@ inline void attend_backward(const AttentionHead<float>& head, const PackedQuerie
     }
     for (int64_t j = 0; j < count; ++j)
       for (int c = 0; c < width; ++c) {
-        // What q was multiplied by more than it should be.
+        // Undoes the factor log₂e of the packed q.
         dk.data[(first + j) * dk.stride + c] = float(1 / kLog2E) * dk_sums[j * columns + c];
         dv.data[(first + j) * dv.stride + c] = dv_sums[j * columns + c];
       }

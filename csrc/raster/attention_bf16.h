@@ -1,13 +1,13 @@
-// Attention of one head as in attention.h, forward beside backward, of bfloat16 numbers. Products are somebody else's, who has the
-// instructions for them. Scores, the largest of them and all sums are float32; the weights p and their scores' gradients ds are rounded
-// before anything is multiplied by them, as libtorch does.
+// Attention of one head as in attention.h, forward and backward, for bfloat16 inputs. Products are provided by the caller, who has
+// instructions for them. Scores, their maxima and all sums are float32. The weights p and the gradients ds of the scores are rounded to
+// bfloat16 before they are multiplied, as in libtorch.
 #pragma once
 
 #include "attention.h"
 
 namespace globalsplat::raster::GS_ISA {
 
-// The nearest bfloat16 number, ties to even, in the upper half; anything in the lower one.
+// Rounds to the nearest bfloat16 value, ties to even. The result is in the upper half; the lower half is undefined.
 GS_INLINE Bits rounded(Vector<float> v) {
   const Bits bits = (Bits)v;
   return bits + 0x7fff + ((bits >> 16) & 1);
@@ -19,14 +19,14 @@ GS_INLINE void store_bf16(Bf16* to, Bits rounded) {
   __builtin_memcpy(to, &halves, sizeof halves);
 }
 
-// Two rows side by side.
+// Interleaves two rows.
 GS_INLINE void store_pair(Bf16* to, Bits even, Bits odd) {
   const Bits both = (even >> 16) | (odd & 0xffff0000);
   __builtin_memcpy(to, &both, sizeof both);
 }
 
-// Copies `count` rows of `width` numbers, a multiple of 8, an even number of them apart, to panels of kBf16Columns columns, rows
-// there: what products take for their second matrix, two numbers of a row side by side. Zeros fill up the last panel.
+// Transposes `count` rows of `width` elements into panels of kBf16Columns columns, one per row: the layout of a product's second matrix,
+// with pairs of a row's elements adjacent. `width` is a multiple of 8 and the rows' stride even. The last panel is padded with zeros.
 GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, Bf16* out) {
   for (int64_t first = 0; first < count; first += kBf16Columns, out += int64_t(width) * kBf16Columns)
     for (int64_t j = 0; j < kBf16Columns; j += 4) {
@@ -48,13 +48,13 @@ GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, 
     }
 }
 
-// Copies `count` rows of `width` numbers, a multiple of 8, to columns: number (row, c) goes to out[c · stride + row]. Zeros fill up
-// rows up to `whole`, a multiple of 8.
+// Transposes `count` rows of `width` elements, a multiple of 8: element (row, c) goes to out[c · stride + row]. Rows are padded with zeros
+// up to `whole`, a multiple of 8.
 GS_INLINE void pack_columns(Rows<const Bf16> from, int64_t count, int width, int64_t whole, int64_t stride, Bf16* out) {
   const Bf16 zeros[kAttentionWidth] = {};
   for (int64_t j = 0; j < whole; j += 8)
     for (int c = 0; c < width; c += 8) {
-      Bf16 pairs[4][16];  // of rows, which a transposition of words puts in a line
+      Bf16 pairs[4][16];  // of rows, which a transposition of 32-bit words makes contiguous
       for (int n = 0; n < 4; ++n) {
         const auto row = [&](int64_t j) { return (j < count ? from.data + j * from.stride : zeros) + c; };
         const Bf16 *const even = row(j + 2 * n), *const odd = row(j + 2 * n + 1);
@@ -67,7 +67,7 @@ GS_INLINE void pack_columns(Rows<const Bf16> from, int64_t count, int width, int
     }
 }
 
-// Copies `count` rows of `width` numbers, two of them side by side, to kBf16Columns rows of `columns` numbers. Zeros fill up.
+// Copies `count` rows of `width` elements to kBf16Columns rows of `columns` elements, with pairs of rows interleaved, and pads with zeros.
 GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int columns, Bf16* out) {
   const Bf16 zeros[kBf16Columns] = {};
   const int present = width < columns ? width : columns;
@@ -82,8 +82,8 @@ GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int c
   }
 }
 
-// Scores are transposed, a key's side by side, here and backward: what is done to them goes by queries, and whoever multiplies them
-// takes them as they lie, outᵀ = vᵀ pᵀ.
+// Forward pass of a head. Scores are transposed, with those of a key contiguous, here and in the backward pass: they are processed by
+// queries, and products take them in this layout, outᵀ = vᵀ pᵀ.
 inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, Rows<Bf16> out, float* log_sums,
                         float* memory) {
   using V = Vector<float>;
@@ -97,7 +97,7 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
   const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(room.take(count / 2)); };
   float* const sums = room.take(queries * width);  // of values, in panels of queries, [width, kBf16Columns]
   float* const weights = room.take(queries);       // l
-  float* const most = room.take(queries);          // m, but for the factor
+  float* const most = room.take(queries);          // m without the factor
   float* const scores = room.take(kBf16Keys * kBf16Columns);
   Bf16* const p = take_bf16(kBf16Keys * kBf16Columns);
   Bf16* const v = take_bf16(kBf16Keys * width);
@@ -150,8 +150,8 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
   }
 }
 
-// One panel of a head's queries, which begins at query `first`, and what is known of them, for attend_backward_bf16(). There are
-// `whole` queries when zeros have filled up the last panel.
+// Packs one panel of a head's queries, which begins at query `first`, and the results of the forward pass for them, for
+// attend_backward_bf16(). `whole` is the number of queries with the last panel padded by zeros.
 inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPast<Bf16>& past, const float* log_sums, int64_t first,
                               int64_t whole, const PackedBf16Queries& to) {
   const int width = head.width, columns = attention_columns(width);
@@ -175,8 +175,8 @@ inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPa
   }
 }
 
-// Of `head`'s keys and values alone, which may be some of those that softmax is over: their gradients, and what they give to that
-// of q · √w, in panels of kBf16Columns queries, [width, kBf16Columns]: dv = pᵀ g, dk = dsᵀ q, dqᵀ = kᵀ dsᵀ.
+// Backward pass for the keys and values in `head`, which may be a part of those that softmax is over. Computes their gradients, and their
+// contribution to the gradient of q · √w in panels of kBf16Columns queries, [width, kBf16Columns]: dv = pᵀ g, dk = dsᵀ q, dqᵀ = kᵀ dsᵀ.
 inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, const PackedBf16Queries& of, float* dq,
                                  Rows<Bf16> dk, Rows<Bf16> dv, float* memory) {
   using V = Vector<float>;

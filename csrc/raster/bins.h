@@ -1,4 +1,4 @@
-// Stable sorting by counting, in parallel: of splats by depth, and of (splat, tile) pairs into the tiles' lists.
+// Stable parallel counting sort: of splats by depth, and of (splat, tile) pairs into the tiles' lists.
 #pragma once
 
 #include <cstring>
@@ -11,7 +11,7 @@
 
 namespace globalsplat::raster {
 
-// Memory that isn't filled before it is written.
+// Uninitialized array.
 template <class T>
 struct Buffer {
   std::unique_ptr<T[]> data;
@@ -23,12 +23,12 @@ struct Buffer {
   const T& operator[](size_t i) const { return data[i]; }
 };
 
-// Distributes the items of several lists among buckets, each list by itself, keeping the order within a bucket. A list is
-// taken in `chunks` consecutive parts, which are counted and placed side by side.
+// Distributes the items of several lists among buckets, each list by itself, keeping the order within a bucket. Each list is split into
+// `chunks` consecutive chunks, which are counted and placed in parallel.
 //   count(list, chunk, visit)  calls visit(bucket) for the chunk's items, in any order
 //   each(list, chunk, visit)   calls visit(bucket, item) for them in order
-//   place(list, at, item)      puts the item at its place in the sorted list
-// Returns for every list where its buckets start, one more than there are buckets.
+//   place(list, at, item)      stores the item at its position in the sorted list
+// Returns the start of every bucket for every list, followed by the end of the last one.
 template <class Count, class Each, class Place>
 std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chunks, int64_t buckets, const Count& count,
                                          const Each& each, const Place& place) {
@@ -64,14 +64,14 @@ std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chu
   return starts;
 }
 
-// A splat in the order of depths.
+// Item of a list that is sorted by depth.
 template <class T>
 struct DepthItem {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> key;  // bits of z, whose order is that of the positive numbers
   uint32_t splat;
 };
 
-// Sorts every list of items by key; equal ones keep their order. Radix sort, 11 bits at a time.
+// Sorts every list of items by key with a stable radix sort, 11 bits at a time.
 template <class T>
 void sort_by_depth(int threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_t chunks) {
   constexpr int kBits = 11;

@@ -1,7 +1,7 @@
-// Alpha blending of one 16×16 tile, forward and backward: which pixels meet which splats, and when; pixel.h has the maths.
+// Alpha blending of one 16×16 tile, forward and backward: the order in which splats and pixels are combined; pixel.h has the maths.
 //
-// The unit of work is a block of 4×4 pixels, which is one vector on AVX-512 and several elsewhere: splats are small and round
-// rather than long, so a square is filled better than a row.
+// The unit of work is a block of 4×4 pixels, which is one vector on AVX-512 and several elsewhere: splats are small and round rather than
+// elongated, so they fill a square better than a row.
 #pragma once
 
 #include "pixel.h"
@@ -10,11 +10,11 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Vectors that make up a block: vector k holds its pixels k·lanes … (k + 1)·lanes − 1, counted row by row.
+// Number of vectors per block: vector k holds its pixels k·lanes … (k + 1)·lanes − 1, in row-major order.
 template <class T>
 inline constexpr int kVectors = kBlock * kBlock / Simd<T>::lanes;
 
-// Centres of the pixels of every vector of a block whose first pixel is (0, 0).
+// Centres of the pixels in every vector of a block whose first pixel is (0, 0).
 template <class T>
 struct Centres {
   T x[16], y[16];
@@ -28,24 +28,24 @@ struct Centres {
 template <class T>
 inline constexpr Centres<T> kCentres{};
 
-// A tile's splats lie scattered in memory, as do their records, and waiting for each costs more than blending it: they are asked
-// for this many items ahead.
+// Number of items by which prefetching runs ahead. A tile's splats and records are scattered in memory, and waiting for each costs more
+// than blending it.
 inline constexpr int64_t kPrefetch = 12;
 
 template <class T>
 GS_INLINE void prefetch(const TileJob<T>& job, const SplatGradient<T>* records, int64_t item) {
   if (item >= job.count) return;
   __builtin_prefetch(job.splats + job.entries[item].splat);
-  const SplatGradient<T>* const record = records + job.entries[item].record;  // which may lie in two lines
+  const SplatGradient<T>* const record = records + job.entries[item].record;  // may span two cache lines
   __builtin_prefetch(&record->power, 1);
   __builtin_prefetch(&record->z, 1);
 }
 
-// A block's pixels in an image plane, and which of them lie inside the image.
+// Position of a block in an image plane, and the number of its columns and rows inside of the image.
 struct BlockPlace {
-  int64_t offset;     // of its first pixel
-  int64_t row;        // from one row to the next
-  int columns, rows;  // inside the image
+  int64_t offset;     // of the first pixel
+  int64_t row;        // stride between rows
+  int columns, rows;  // inside of the image
 
   BlockPlace(int x0, int y0, int width, int height)
       : offset(int64_t(y0) * width + x0), row(width), columns(width - x0), rows(height - y0) {}
@@ -53,7 +53,7 @@ struct BlockPlace {
   bool outside() const { return columns <= 0 || rows <= 0; }
 };
 
-// Pixels outside the image read 0.
+// Loads a block; pixels outside of the image are 0.
 template <class T>
 GS_INLINE void load_block(const T* plane, const BlockPlace& at, Vector<T>* out) {
   if (at.whole()) return load_rows(plane + at.offset, at.row, out);
@@ -72,7 +72,7 @@ GS_INLINE void store_block(const Vector<T>* in, const BlockPlace& at, T* plane) 
     for (int i = 0; i < kBlock && i < at.columns; ++i) plane[at.offset + at.row * j + i] = pixels[kBlock * j + i];
 }
 
-// T = 1 inside the image, 0 outside.
+// Sets T to 1 inside of the image and 0 outside.
 template <class T>
 GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
   T ones[kBlock * kBlock];
@@ -80,9 +80,9 @@ GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
   for (int k = 0; k < kVectors<T>; ++k) transmittance[k] = load<T>(ones + k * Simd<T>::lanes);
 }
 
-// Splats on their way to a vector of pixels, each a step behind the one before it. A splat's instructions wait for one another
-// several times as long as they take, and a processor looks only two or three splats ahead: here each step's operands have
-// been ready since the last splat.
+// Software pipeline that evaluates a sequence of splats at a vector of pixels, with each splat one step behind the previous one. The
+// instructions for a splat wait for one another several times as long as they take, and a processor looks ahead by only two or three
+// splats. Here the operands of each step have been ready since the previous splat.
 template <class T>
 class Approach {
  public:
@@ -92,7 +92,7 @@ class Approach {
     step(second, third);
   }
 
-  // What evaluate() calls `raw`, of the first, the second … splat; `near` and `far` are those two and three behind it.
+  // Returns `raw` as in evaluate() for the first, the second … splat; `near` and `far` are the splats two and three positions after it.
   GS_INLINE Vector<T> next(const Splat<T>& near, const Splat<T>& far) {
     const Vector<T> raw = end_exp2(reaches_, power_);
     step(near, far);
@@ -114,8 +114,8 @@ class Approach {
   Exp2<T> power_;
 };
 
-// The tile's list is taken in parts whose splats fit the first-level cache; each vector of pixels goes through those that
-// reach its block with all its sums in registers.
+// Blends a tile. The list is processed in parts whose splats fit into the first-level cache. Each vector of pixels goes through the splats
+// that touch its block with all sums in registers.
 template <class T>
 void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
   using V = Vector<T>;
@@ -143,7 +143,7 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
       const int block = __builtin_ctz(blocks);
       const int length = choose(splats, blocks_of, count, block, list);
       if (length == 0) continue;
-      for (int i = 0; i < 3; ++i) list[length + i] = splats[0];  // seen coming, but not blended
+      for (int i = 0; i < 3; ++i) list[length + i] = splats[0];  // evaluated in advance, but not blended
       const auto splat = [&](int i) -> const Splat<T>& { return job.splats[list[i]]; };
       bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
@@ -211,14 +211,14 @@ GS_INLINE void pass_blocks(const Splat<T>& s, uint32_t blocks, const Evaluated<T
   }
 }
 
-// `pictures` are the forward pass's own, `gradients` the loss's with respect to them; one record per entry is written.
-// Here splats are the outer loop, so that a splat's ten sums over the tile stay in registers.
+// Computes gradients of a tile's splats and writes one record per entry. `pictures` are outputs of the forward pass, and `gradients` the
+// loss's gradients with respect to them. Here the outer loop is over splats, so that a splat's ten sums over the tile stay in registers.
 template <class T>
 void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& pictures,
                          const Pictures<const T>& gradients, SplatGradient<T>* records) {
   using V = Vector<T>;
   PixelGradients<T> pixels[kBlocks][kVectors<T>];
-  V x[4][kVectors<T>], y[4][kVectors<T>];  // centres of a column's, a row's blocks
+  V x[4][kVectors<T>], y[4][kVectors<T>];  // pixel centres of the blocks of each column and row
   for (int i = 0; i < 4; ++i)
     for (int k = 0; k < kVectors<T>; ++k) {
       x[i][k] = T(job.x0 + i * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
@@ -229,7 +229,7 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
     load_gradients(at, int64_t(job.width) * job.height, pictures, gradients, pixels[block]);
   }
 
-  // Which blocks have pixels that go on is asked once in a while: an answer after every splat would make the next one wait.
+  // The blocks with active pixels are updated only once in a while: a check after every splat would delay the next one.
   constexpr int64_t while_items = 32;
   uint32_t alive = 0;
   Evaluated<T> evaluated[kBlocks][kVectors<T>];
@@ -257,7 +257,7 @@ void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& picture
   }
 }
 
-// What blending this tile takes, for benchmarks.
+// Counts the pairs that blending this tile processes, for benchmarks.
 template <class T>
 PairCounts count_tile(const TileJob<T>& job) {
   using V = Vector<T>;
@@ -286,8 +286,8 @@ PairCounts count_tile(const TileJob<T>& job) {
   return counts;
 }
 
-// Multiply-adds as fast as they go: `rounds` times 16 vectors of independent ones. Returns how many floating-point
-// operations that were, a multiplication and an addition each; `out` keeps the compiler from leaving them out.
+// Runs multiply-adds at peak rate: `rounds` times 16 independent vectors. Returns the number of floating-point operations, counting a
+// multiplication and an addition each; `out` keeps the compiler from removing the computation.
 inline int64_t multiply_adds(int64_t rounds, float* out) {
   constexpr int chains = 16;
   Vector<float> sums[chains];

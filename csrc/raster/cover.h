@@ -1,4 +1,4 @@
-// Lists the tiles, and the 4×4 blocks of their pixels, that splats reach; reach.h tells whether they do.
+// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch; reach.h has the test.
 #pragma once
 
 #include "reach.h"
@@ -7,17 +7,17 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// A tile that a splat may reach, before it is known whether it does. The numbers fit: a picture has at most 2^20 pixels a
-// side, a call covers at most kCoverTask splats.
+// Tile that a splat may touch, before the exact test. The values fit into 16 bits: an image has at most 2^20 pixels per side, and a call
+// covers at most kCoverTask splats.
 struct Candidate {
   uint16_t x, y;     // of the tile
   uint16_t unused;
-  uint16_t splat;    // counted from the first of the call
+  uint16_t splat;    // relative to the first one of the call
 };
 static_assert(sizeof(Candidate) == sizeof(TilePair));
 
-// Writes the tiles in reach of a splat's bounding box, or fewer, and returns how many; 0 if there may be more than
-// `capacity`, with `full` set.
+// Writes the tiles that overlap a splat's bounding box, or fewer, and returns their number. Returns 0 and sets `full` if there may be more
+// than `capacity`.
 template <class T>
 GS_INLINE int64_t candidates_of(const Splat<T>& s, uint16_t index, const Grid& grid, int64_t capacity, Candidate* out,
                                 bool& full) {
@@ -28,7 +28,7 @@ GS_INLINE int64_t candidates_of(const Splat<T>& s, uint16_t index, const Grid& g
   if ((full = capacity < (tiles < 4 ? 4 : tiles))) return 0;
   const auto candidate = [&](int x, int y) { return Candidate{uint16_t(x), uint16_t(y), 0, index}; };
   if (x1 - x0 < 2 && y1 - y0 < 2) {
-    // Nearly all of them. All four are written, whatever their number: no branch to guess wrongly.
+    // The most frequent case. All four are written, whatever their number, which avoids mispredicted branches.
     out[0] = candidate(x0, y0);
     out[1] = candidate(x1, y0 + (x1 == x0));
     out[2] = candidate(x0, y1);
@@ -49,14 +49,13 @@ GS_INLINE int64_t candidates_of(const Splat<T>& s, uint16_t index, const Grid& g
   return used;
 }
 
-// Lists the tiles that splats begin … end − 1, at most kCoverTask, reach, splat by splat: after the `used` pairs that are
-// there already, those of splat i start at pairs[first[i − begin]]. Stops before a splat for which `capacity` might not
-// suffice; any splat fits into as many pairs as there are tiles, or four. Returns the first splat that isn't listed, and in
-// `used` how many pairs there are.
+// Lists the tiles that splats begin … end − 1, at most kCoverTask of them, touch, splat by splat. The new pairs are appended to the `used`
+// existing ones; those of splat i start at pairs[first[i − begin]]. Stops before a splat for which `capacity` might not suffice; every
+// splat fits into as many pairs as there are tiles, or four. Returns the first splat that isn't listed, and the number of pairs in `used`.
 template <class T>
 int64_t cover(const Splat<T>* splats, int64_t begin, int64_t end, const Grid& grid, TilePair* pairs, int64_t capacity,
               int64_t& used, uint32_t* first) {
-  // What may be reached, and where it ends for each splat; then what is, in the same place.
+  // Ends of each splat's candidates, and then of its touched tiles, which are stored in the same memory.
   uint32_t candidates_end[kCoverTask], reached_end[kCoverTask];
   const auto at = [&](int64_t k) { return pairs + used + k; };
   int64_t count = 0, stop = begin;

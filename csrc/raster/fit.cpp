@@ -11,10 +11,10 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int kRows = 16;       // that are one task
-constexpr double kSigma = 1.5;  // of SSIM's window, pixels
+constexpr int kRows = 16;       // rows per task
+constexpr double kSigma = 1.5;  // standard deviation of SSIM's window, pixels
 
-// Σ of body(plane, begin, end, room) over planes and parts of their rows, added in order.
+// Returns Σ of body(plane, begin, end, room) over planes and blocks of their rows, summed in order.
 template <class T, class Body>
 double sum_over_rows(int threads, int64_t planes, int rows, int width, const Body& body) {
   const int64_t parts = (rows + kRows - 1) / kRows;

@@ -1,5 +1,5 @@
-// What fitting pictures to photos needs beside drawing them: how far they are apart, and how uneven depths are, with gradients.
-// Shared among threads; the bits don't depend on their number.
+// Losses that fit rendered images to photos, with gradients: photometric distance and depth smoothness. Parallel over threads; results are
+// bit-identical for any number of threads.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace globalsplat::raster {
 
-// Pictures and photos: planes [H, W], both sides at least 11.
+// Images and photos: planes [H, W], both sides at least 11.
 template <class T>
 struct FitJob {
   const T* pictures;
@@ -17,17 +17,17 @@ struct FitJob {
   int width, height;
 };
 
-// `absolute` · mean |x − y| + `similar` · mean SSIM, means over all planes and pixels, or windows that lie inside (spec 9.4).
-// Writes the gradient with respect to the pictures, [planes, H, W], if it isn't null.
+// Computes `absolute` · mean |x − y| + `similar` · mean SSIM. Means are over all planes and over pixels, or windows that lie inside (spec
+// 9.4). Writes the gradient with respect to the images, [planes, H, W], if it isn't null.
 template <class T>
 double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads);
 
-// The weights of SSIM's window in each direction, [11].
+// Returns the weights of SSIM's window in each direction, [11].
 template <class T>
 const T* ssim_window();
 
-// `factor` · the mean over all pairs of neighbouring pixels of how uneven depths are there; see smooth.h. Writes the gradient with
-// respect to the depths, [views, H, W], if it isn't null.
+// Computes `factor` · the mean unevenness of depths over all pairs of neighbouring pixels; see smooth.h. Writes the gradient with respect
+// to the depths, [views, H, W], if it isn't null.
 template <class T>
 double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads);
 

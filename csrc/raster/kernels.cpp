@@ -24,7 +24,7 @@ struct Candidate {
 };
 
 const Kernels& choose() {
-  // Best first.
+  // Sorted by preference, best first.
   const Candidate candidates[] = {
 #if defined(__x86_64__)
       {&avx512::table, __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&

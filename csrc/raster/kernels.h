@@ -1,4 +1,4 @@
-// The kernels that exist once per instruction set, and the choice among them.
+// Kernels that are compiled once per instruction set, and the choice among them.
 #pragma once
 
 #include "rows.h"
@@ -6,7 +6,7 @@
 
 namespace globalsplat::raster {
 
-// In the order of the work. Described where they are written: project.h, cover.h, blend.h.
+// Kernels in the order of their use, documented where they are defined: project.h, cover.h, blend.h.
 template <class T>
 struct KernelsOf {
   void (*project)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
@@ -20,7 +20,7 @@ struct KernelsOf {
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
-  // Beside the rasterizer: ssim.h, smooth.h, adam.h.
+  // Kernels outside of the rasterizer: ssim.h, smooth.h, adam.h.
   double (*ssim)(const FitPlane<T>&, int begin, int end, T* room);
   double (*fit_gradient)(const FitPlane<T>&, T absolute, T similar, int begin, int end, T* room);
   double (*unevenness)(const DepthPlane<T>&, T factor, int begin, int end, T* room);
@@ -54,8 +54,8 @@ struct Kernels {
   }
 };
 
-// The best that this machine runs, or the one GLOBALSPLAT_SIMD names. Throws std::invalid_argument when it names one
-// that this machine or build doesn't have.
+// Returns the kernels for the best instruction set that this machine supports, or for the one that GLOBALSPLAT_SIMD names. Throws
+// std::invalid_argument if it names one that this machine or build doesn't support.
 const Kernels& kernels();
 
 }  // namespace globalsplat::raster

@@ -1,4 +1,4 @@
-// Compiled once per instruction set: GS_ISA names it, the compiler's flags enable it.
+// Compiled once per instruction set: GS_ISA is its name, and compiler flags enable it.
 #include "adam.h"
 #include "attention_bf16.h"
 #include "blend.h"

@@ -1,5 +1,5 @@
-// One number in the place of a vector: what simd.h has, for a thread of a GPU. Each function gives the bits that a lane of any
-// instruction set gives, but for reciprocal().
+// Scalar replacement of simd.h for a thread of a GPU: each vector is one value. Except for reciprocal(), every function gives the same bits
+// as a lane of any instruction set.
 #pragma once
 
 #include <cmath>
@@ -49,7 +49,7 @@ GS_INLINE float value_of(float sum) { return sum; }
 GS_INLINE float add_product(float a, float b, float c) { return fma(a, b, c); }
 GS_INLINE float take_product(float a, float b, float c) { return fnma(a, b, c); }
 GS_INLINE float sqrt(float v) { return ::sqrtf(v); }
-// To the last bit but one, as vectors' is, in one instruction instead of ten.
+// Computes 1/v, accurate to the last bit but one like the vector version, in one instruction instead of ten.
 GS_INLINE float reciprocal(float v) {
 #ifdef __CUDACC__
   float result;
@@ -67,7 +67,7 @@ GS_INLINE bool both(bool a, bool b) { return a & b; }
 GS_INLINE bool any(bool m) { return m; }
 GS_INLINE int lane_bits(bool m) { return m; }
 
-// The second operand where either is NaN.
+// Both functions return the second operand if either is NaN.
 GS_INLINE float smaller(float a, float b) { return a < b ? a : b; }
 GS_INLINE float larger(float a, float b) { return a > b ? a : b; }
 GS_INLINE float magnitude(float v) { return larger(v, -v); }
@@ -86,7 +86,7 @@ GS_INLINE T inverse_power_of_two(T v) {
 struct Exp2Eighths {
   uint32_t operator()(uint32_t i) const { return kExp2Eighths[i % 8]; }
 };
-// `eighths(i)` returns kExp2Eighths[i % 8].
+// Computes 2^x if `m` is true, and 0 otherwise. `eighths(i)` returns kExp2Eighths[i % 8].
 template <class Eighths = Exp2Eighths>
 GS_INLINE float exp2_where(bool m, float x, const Eighths& eighths = {}) {
   const float shifted = x + kToEighths, f = x - (shifted - kToEighths);

@@ -1,11 +1,11 @@
-// What all Gaussians of a camera share.
+// Camera parameters that all Gaussians of a view share.
 #pragma once
 
 #include "types.h"
 
 namespace globalsplat::raster {
 
-// From rows of w2c, 4×4, and of the intrinsics, 3×3 in pixels.
+// Converts the rows of w2c, 4×4, and of the intrinsics, 3×3 in pixels, to a camera.
 template <class T>
 inline Camera<T> camera_of(const T* w2c, const T* intrinsics) {
   const T *m = w2c, *k = intrinsics;

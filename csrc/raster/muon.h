@@ -1,12 +1,12 @@
-// One step of Muon (Jordan et al. 2024) on a matrix θ of R × C numbers: along the nearest matrix whose singular values are alike, about,
-// found by five rounds of Newton and Schulz, each nothing but products:
+// One step of Muon (Jordan et al. 2024) on a matrix θ of R × C elements. It goes along the approximate nearest matrix with equal singular
+// values, found by five rounds of the Newton–Schulz iteration, which needs only products:
 //
 //   m ← m + (1 − β)(g − m),  u = g + β(m − g),  X = u / (‖u‖ + 1e-7)
 //   five times  X ← a X + (b S + c S²) X,  S = X Xᵀ
 //   θ ← (1 − decay) θ − rate · 0.2 · √max(R, C) · X
 //
-// which has numbers as large as AdamW's steps have (Liu et al. 2025); decay is times the learning rate (spec 8.5). Of a matrix with
-// more rows than columns X is the transpose.
+// The elements of the step are as large as those of AdamW's steps (Liu et al. 2025); decay is the weight decay times the learning rate
+// (spec 8.5). For a matrix with more rows than columns, X is transposed.
 #pragma once
 
 #include "product.h"
@@ -17,8 +17,8 @@ namespace globalsplat::raster::GS_ISA {
 inline constexpr int kMuonRounds = 5;
 inline constexpr float kMuonA = 3.4445f, kMuonB = -4.7750f, kMuonC = 2.0315f;
 
-// A symmetric matrix of `size` rows: make(i, first) makes kProductRows rows from row i on of the panel of columns that begins at `first`,
-// which is asked for down to the diagonal. What is below it is mirrored.
+// Computes a symmetric matrix of `size` rows. make(i, first) computes kProductRows rows from row i on of the panel of columns that begins
+// at `first`, and is called only down to the diagonal. The part below is mirrored.
 template <class Make>
 GS_INLINE void make_symmetric(int64_t size, float* matrix, int64_t stride, const Make& make) {
   for (int64_t first = 0; first < size; first += kProductColumns)
@@ -32,7 +32,7 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   constexpr int lanes = Simd<float>::lanes;
   const bool upright = of.rows > of.columns;
   const int64_t few = upright ? of.columns : of.rows, many = upright ? of.rows : of.columns;
-  // Padded with zeros, which stay zeros.
+  // Padded with zeros, which remain zero.
   const int64_t rows = whole_product_rows(few), row = muon_stride(many), square_row = muon_stride(few);
   const int wide = int((many + lanes - 1) / lanes * lanes);
   const int64_t panel_columns = (few + kProductColumns - 1) / kProductColumns * kProductColumns;
@@ -47,7 +47,7 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   float* const sum = room.take(rows * square_row);     // b S + c S²
 
   for (int64_t k = 0; k < rows * row; ++k) x[k] = 0;
-  // Only the last panel is made down to the rows of padding.
+  // Only the last panel is computed down to the padding rows.
   for (int64_t k = few * square_row; k < rows * square_row; ++k) square[k] = 0;
   const float beta = float(step.beta), fresh = float(1 - step.beta);
   for (int64_t i = 0; i < of.rows; ++i)

@@ -1,10 +1,10 @@
-// How uneven depths are between two neighbouring pixels of which the photo tells little; smooth.h goes through pictures with it, and
-// ../cuda/losses.h. With depths a and b and the photo's greys g and h there:
+// Unevenness of depths between two neighbouring pixels, weighted down at edges of the photo; used by smooth.h and ../cuda/losses.h. With
+// depths a and b and the photo's grey values g and h at the two pixels:
 //
 //   e^{−10 |g − h|} · 2 |a − b| / (a + b),    ∂/∂a = ± e^{−10 |g − h|} · 4b / (a + b)²
 //
-// which is |ln a − ln b| where depths are alike, and at most 2 where one thing ends before another (after Godard et al. 2017,
-// eq. 3). A pair of which one shows nothing, z = 0, counts for nothing.
+// Apart from the weight, this is approximately |ln a − ln b| for similar depths, and at most 2 at the border of an object (after Godard et
+// al. 2017, eq. 3). Pairs with an empty pixel, z = 0, contribute 0.
 #pragma once
 
 #include "simd.h"
@@ -12,13 +12,13 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// The mean of red, green and blue.
+// Computes the mean of red, green and blue.
 template <class T>
 GS_INLINE Vector<T> grey_of(Vector<T> red, Vector<T> green, Vector<T> blue) {
   return (red + green + blue) * T(1. / 3);
 }
 
-// The value of a pair; its gradient with respect to `a` is added to `gradient`.
+// Returns the unevenness of a pair, and adds its gradient with respect to `a` to `gradient`.
 template <class T>
 GS_INLINE Vector<T> unevenness_of(Vector<T> a, Vector<T> g, Vector<T> b, Vector<T> h, Vector<T>& gradient) {
   using V = Vector<T>;

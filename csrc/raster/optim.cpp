@@ -8,7 +8,7 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int64_t kNumbers = int64_t(1) << 14;  // of Adam that are one task
+constexpr int64_t kNumbers = int64_t(1) << 14;  // values per task of Adam
 
 }  // namespace
 

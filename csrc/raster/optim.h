@@ -1,4 +1,4 @@
-// Steps of optimizers, shared among threads. The bits don't depend on their number.
+// Optimizer steps, parallel over threads. Results are bit-identical for any number of threads.
 #pragma once
 
 #include <cstdint>
@@ -8,11 +8,11 @@
 
 namespace globalsplat::raster {
 
-// Updates `count` numbers and their moments: adam.h.
+// Updates `count` values and their moments: adam.h.
 template <class T>
 void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads);
 
-// Updates matrices that aren't empty, and their running means: muon.h. Each is one thread's.
+// Updates nonempty matrices and their running means: muon.h. Each matrix is processed by one thread.
 void muon(const MuonStep& step, const std::vector<MuonMatrix>& matrices, int threads);
 
 }  // namespace globalsplat::raster

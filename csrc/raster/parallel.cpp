@@ -16,11 +16,11 @@
 namespace globalsplat::raster {
 namespace {
 
-// Threads that sleep between calls. They live as long as the process: joining at exit could wait for ever on a
-// thread that the operating system has already ended.
+// Pool of threads that sleep between calls. They live as long as the process: joining at exit could wait forever for a thread that the
+// operating system has already ended.
 class Pool {
  public:
-  // False if another call is running.
+  // Returns false if another call is running.
   bool try_run(int threads, int64_t count, const std::function<void(int64_t)>& task) {
     std::unique_lock<std::mutex> lock(mutex_);
     if (task_ != nullptr) return false;
@@ -40,8 +40,8 @@ class Pool {
   }
 
  private:
-  // How many of `wanted` threads there are, once those that are missing were asked for. The machine may refuse some: the
-  // work is done without them, and the next call asks again.
+  // Starts missing threads and returns how many of `wanted` there are. The system may refuse some: the work is done without them, and the
+  // next call tries again.
   int start(int wanted) {
     try {
       for (; workers_ < wanted; ++workers_) std::thread([this, id = workers_] { work(id); }).detach();
@@ -55,7 +55,7 @@ class Pool {
     try {
       for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
     } catch (...) {
-      next_ = count;  // nobody starts another task
+      next_ = count;  // prevents further tasks from starting
       std::lock_guard<std::mutex> lock(mutex_);
       if (!failure_) failure_ = std::current_exception();
     }
@@ -79,16 +79,16 @@ class Pool {
 
   std::mutex mutex_;
   std::condition_variable wake_, done_;
-  const std::function<void(int64_t)>* task_ = nullptr;  // of the call that is running
+  const std::function<void(int64_t)>* task_ = nullptr;  // task of the running call
   int64_t count_ = 0;
   std::atomic<int64_t> next_{0};
   int workers_ = 0, active_ = 0, running_ = 0;
   uint64_t generation_ = 0;
-  std::exception_ptr failure_;  // the first one, rethrown to the caller
+  std::exception_ptr failure_;  // first exception, rethrown to the caller
 };
 
-// Never destroyed: its threads outlive main. A child of fork() inherits none of them, so its pool begins anew, in the same
-// place: what comes before exec() shouldn't ask for memory.
+// Never destroyed, because its threads outlive main. A child of fork() inherits none of them, so its pool is constructed again in place:
+// code between fork() and exec() shouldn't allocate memory.
 Pool& pool() {
   static Pool* shared = [] {
     pthread_atfork(nullptr, nullptr, [] { new (shared) Pool; });

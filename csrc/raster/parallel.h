@@ -1,4 +1,4 @@
-// Work shared among threads: tasks 0 … count − 1 are taken one by one, so uneven ones balance.
+// Parallel execution of tasks 0 … count − 1. Threads take them one by one, which balances tasks of different duration.
 #pragma once
 
 #include <cstdint>
@@ -6,13 +6,13 @@
 
 namespace globalsplat::raster {
 
-// Calls task(i) for every i on up to `threads` threads, this one included, and returns when all are done. Every task
-// must write only what is its own: results then don't depend on the number of threads. Threads that can't be had are done
-// without. A call made while another is running (from a task, or from a second thread) runs on the calling thread alone.
-// What a task throws reaches the caller, once no task is running; those that hadn't begun are left out.
+// Calls task(i) for every i on up to `threads` threads including this one, and returns when all are done. Each task must write only its own
+// data; results then don't depend on the number of threads. Works with fewer threads if the system refuses some. A call made while another
+// is running (from a task, or from a second thread) runs on the calling thread alone. An exception thrown by a task reaches the caller once
+// no task is running; tasks that have not begun are skipped.
 void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task);
 
-// `count` numbers that are this thread's until it asks again, on whole cache lines.
+// Returns scratch memory for `count` floats, aligned to cache lines. It belongs to this thread until the thread's next call.
 float* room(int64_t count);
 
 }  // namespace globalsplat::raster

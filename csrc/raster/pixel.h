@@ -2,18 +2,18 @@
 //
 // For a pixel and the splats in front-to-back order i = 1, 2, …
 //     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
-//     α_i = min(0.999, 2^e_i),            skipped when e_i < −log₂ 255
+//     α_i = min(0.999, 2^e_i),            skipped if e_i < −log₂ 255
 //     w_i = T_i α_i,  T_{i+1} = T_i − w_i,  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
 //     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.
 //
-// Backward. With the pictures' gradients g_C, g_A, g_D, ∂D/∂w_i = (z_i − D) / A, so that
+// Backward: with the images' gradients g_C, g_A, g_D, ∂D/∂w_i = (z_i − D) / A, so that
 //     q_i = ∂L/∂w_i = g_C·c_i + (g_D / A) z_i + (g_A − g_D D / A)
 //     α_i ∂L/∂α_i = w_i q_i − (Σ_{j>i} w_j q_j) α_i / (1 − α_i) = w_i (q_i − (Σ_{j>i} w_j q_j) / T_{i+1}).
-// The sum over what lies behind is the pixel's total, known from the pictures alone, Q = Σ w_j q_j = g_C·C + g_A A,
-// less what has been passed: the tile is replayed front to back and nothing per pixel has to be stored.
+// The sum over the splats behind is the pixel's total, which follows from the images alone, Q = Σ w_j q_j = g_C·C + g_A A, minus the terms
+// of the splats already processed. The tile is therefore replayed front to back, and nothing has to be stored per pixel.
 //
-// Pixels that ended, or lie outside the image, have T = 0: their weights vanish and T_{i+1} ≤ 1e-4 holds for ever, so no other
-// mask is carried.
+// Pixels that have ended, or lie outside of the image, have T = 0: their weights are 0 and T_{i+1} ≤ 1e-4 holds for all further splats, so
+// no other mask is needed.
 #pragma once
 
 #include "simd.h"
@@ -21,22 +21,22 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Where a vector of pixels lies, in the splat's own widths.
+// Offset of a vector of pixels from a splat's mean, in units of the splat's widths.
 template <class T>
 struct Offset {
   Vector<T> p, r;
 };
 
-// What a splat is there.
+// A splat evaluated at a vector of pixels.
 template <class T>
 struct Evaluated : Offset<T> {
-  Vector<T> raw;      // α before its cap; 0 where the splat doesn't reach
+  Vector<T> raw;      // α without its cap; 0 beyond the splat's reach
 };
 
-// And what it does.
+// Contribution of a splat to a vector of pixels.
 template <class T>
 struct Contribution {
-  Vector<T> weight;   // 0 also where the pixel ends, or ended before
+  Vector<T> weight;   // 0 also if the pixel ends here, or has ended before
   Vector<T> behind;   // T behind the splat
   Mask<T> goes_on;    // T behind the splat > 1e-4
 };
@@ -57,13 +57,13 @@ GS_INLINE Mask<T> reaches(Vector<T> exponent) {
   return at_most(broadcast<T>(T(-kLog2Of255)), exponent);
 }
 
-// Whether α may reach its cap: few splats' does.
+// Returns true if α may reach its cap, which is the case for few splats.
 template <class T>
 GS_INLINE bool may_be_capped(const Splat<T>& s) {
-  return s.log2_opacity > T(-0.0015);  // log₂ 0.99896, with room for rounding
+  return s.log2_opacity > T(-0.0015);  // log₂ 0.99896, with a margin for rounding
 }
 
-// `table` is what exp2_where() of the instruction set may be given in addition.
+// Evaluates a splat at a vector of pixels. `table` is an optional additional argument for the instruction set's exp2_where().
 template <class T, class... Table>
 GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Evaluated<T>& e, const Table&... table) {
   const Offset<T> at = offset_of(s, x, y);
@@ -73,7 +73,7 @@ GS_INLINE void evaluate(const Splat<T>& s, Vector<T> x, Vector<T> y, Evaluated<T
   e.raw = exp2_where(reaches<T>(exponent), exponent, table...);
 }
 
-// `capped` says whether any α may have to be.
+// Computes a splat's contribution. `capped` tells if any α may exceed the cap.
 template <class T, bool capped = true>
 GS_INLINE Contribution<T> blend(Vector<T> transmittance, Vector<T> raw) {
   const Vector<T> weight = transmittance * (capped ? smaller(raw, broadcast<T>(T(kMaxAlpha))) : raw);
@@ -82,13 +82,13 @@ GS_INLINE Contribution<T> blend(Vector<T> transmittance, Vector<T> raw) {
   return {select(goes_on, weight, Vector<T>{}), behind, goes_on};
 }
 
-// 0 where the pixel ends.
+// Returns T after a contribution; 0 if the pixel has ended.
 template <class T>
 GS_INLINE Vector<T> next_transmittance(const Contribution<T>& c) {
   return select(c.goes_on, c.behind, Vector<T>{});
 }
 
-// Sums of a vector of pixels.
+// Accumulated sums of a vector of pixels.
 template <class T>
 struct Pixels {
   Vector<T> transmittance, alpha{};
@@ -110,14 +110,14 @@ GS_INLINE Vector<T> expected_depth(const Pixels<T>& px) {
   return select(less(broadcast<T>(T(kMinDepthAlpha)), px.alpha), value_of(px.z) / px.alpha, Vector<T>{});
 }
 
-// What the backward pass knows of a vector of pixels: T, Q less what has been passed, and q_i = g_red·r + g_green·g +
-// g_blue·b + per_z·z + constant.
+// State of the backward pass for a vector of pixels: T, the rest of Q after the splats already processed, and the coefficients of q_i =
+// g_red·r + g_green·g + g_blue·b + per_z·z + constant.
 template <class T>
 struct PixelGradients {
   Vector<T> transmittance, remaining, g_red, g_green, g_blue, per_z, constant;
 };
 
-// Before the first splat, from what the forward pass drew and the gradients with respect to it.
+// Returns the state before the first splat, from the outputs of the forward pass and the gradients with respect to them.
 template <class T>
 GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vector<T> colour[3], Vector<T> alpha, Vector<T> depth,
                                             const Vector<T> g_colour[3], Vector<T> g_alpha, Vector<T> g_depth) {
@@ -127,7 +127,7 @@ GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vecto
   return {transmittance, total, g_colour[0], g_colour[1], g_colour[2], per_z, g_alpha - per_z * depth};
 }
 
-// Passes a splat, and adds what it asks of it to its sums, in SplatGradient's order.
+// Processes a splat: updates the state, and adds the splat's gradient to `sums`, in SplatGradient's order.
 template <class T, bool capped = true>
 GS_INLINE void pass(const Splat<T>& s, const Evaluated<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
   using V = Vector<T>;
@@ -138,7 +138,7 @@ GS_INLINE void pass(const Splat<T>& s, const Evaluated<T>& e, PixelGradients<T>&
   q = add_product(px.per_z, broadcast<T>(s.z), q);
   px.remaining = take_product(c.weight, q, px.remaining);
 
-  // ν = −α ∂L/∂α, nothing through the cap.
+  // ν = −α ∂L/∂α; no gradient passes the cap.
   const Mask<T> follows = capped ? both(c.goes_on, less(e.raw, broadcast<T>(T(kMaxAlpha)))) : c.goes_on;
   const V nu = select(follows, c.weight * (px.remaining * reciprocal(c.behind) - q), V{});
   const V nu_p = nu * e.p, nu_r = nu * e.r;

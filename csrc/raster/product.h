@@ -1,5 +1,5 @@
-// Products of small matrices, a few rows of the first with all columns of the second, whose sums stay in registers; and how
-// matrices are laid out for them.
+// Products of small matrices: a few rows of the first with all columns of the second, with sums in registers; and the memory layouts for
+// them.
 #pragma once
 
 #include "rows.h"
@@ -7,7 +7,7 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// What is left of a task's room.
+// Allocator within a task's scratch memory.
 class Room {
  public:
   explicit Room(float* from) : next_(from) {}
@@ -21,8 +21,8 @@ class Room {
   float* next_;
 };
 
-// Rows and vectors of columns whose sums are in registers at a time: as many as there are registers for, beside a row of the second
-// matrix and a number of the first.
+// Number of vectors of columns, for kProductRows rows, whose sums are in registers at a time: as many as fit, in addition to a row of the
+// second matrix and an element of the first.
 #if defined(__AVX512F__) || defined(__aarch64__)
 inline constexpr int kProductVectors = 4;
 #else
@@ -30,14 +30,14 @@ inline constexpr int kProductVectors = 2;
 #endif
 inline constexpr int kProductColumns = kProductVectors * Simd<float>::lanes;
 
-// How the first matrix lies in memory: number (row, k) is data[row · row + k · step].
+// Memory layout of the first matrix: element (row, k) is data[row · row + k · step].
 struct Factor {
   const float* data;
   int64_t row, step;
 };
 
-// sums[row][column] = start(sums[row][column]) + Σₖ a(row, k) · b[k][column], k from 0 to depth − 1 in order, for kProductRows
-// rows and `vectors` vectors of columns. With `fresh` sums start at zero, else where they were, times factors[row] if there are any.
+// Computes sums[row][column] = start(sums[row][column]) + Σₖ a(row, k) · b[k][column], k from 0 to depth − 1 in order, for kProductRows
+// rows and `vectors` vectors of columns. With `fresh`, start is zero, and otherwise the previous sum, times factors[row] if there are any.
 template <int vectors, bool fresh>
 GS_INLINE void multiply_panel(Factor a, const float* b, int64_t b_row, int64_t depth, float* sums, int64_t sums_row,
                               const float* factors) {
@@ -73,7 +73,7 @@ GS_INLINE void multiply_panel(Factor a, const float* b, int64_t b_row, int64_t d
     for (int c = 0; c < vectors; ++c) store<float>(sums + r * sums_row + c * lanes, sum[r][c]);
 }
 
-// The same for any number of columns, a whole number of vectors.
+// Computes multiply_panel() for any number of columns, a multiple of the vector length.
 template <bool fresh>
 GS_INLINE void multiply_rows(Factor a, const float* b, int64_t b_row, int64_t depth, float* sums, int64_t sums_row, int columns,
                              const float* factors = nullptr) {
@@ -84,8 +84,7 @@ GS_INLINE void multiply_rows(Factor a, const float* b, int64_t b_row, int64_t de
   for (; c < columns; c += lanes) multiply_panel<1, fresh>(a, b + c, b_row, depth, sums + c, sums_row, factors);
 }
 
-// Copies `count` rows of `width` numbers, times `factor`, to rows of `columns` numbers, which zeros fill up, as they do rows up to
-// `rows`.
+// Copies `count` rows of `width` elements, times `factor`, to `rows` rows of `columns` elements. Missing elements and rows are zero.
 GS_INLINE void pack_rows(Rows<const float> from, int64_t count, int width, float factor, int columns, int64_t rows, float* out) {
   constexpr int lanes = Simd<float>::lanes;
   for (int64_t i = 0; i < rows; ++i, out += columns) {
@@ -97,8 +96,8 @@ GS_INLINE void pack_rows(Rows<const float> from, int64_t count, int width, float
   }
 }
 
-// Copies `count` rows of `width` numbers, a multiple of 4, to panels of kProductColumns columns: number (row, k) goes to panel
-// row / kProductColumns, [k][row % kProductColumns]. Zeros fill up the last panel.
+// Transposes `count` rows of `width` elements, a multiple of 4, into panels of kProductColumns columns: element (row, k) goes to panel row
+// / kProductColumns, [k][row % kProductColumns]. The last panel is padded with zeros.
 GS_INLINE void pack_panels(Rows<const float> from, int64_t count, int width, float* out) {
   for (int64_t first = 0; first < count; first += kProductColumns, out += int64_t(width) * kProductColumns)
     for (int j = 0; j < kProductColumns; j += 4) {

@@ -1,4 +1,4 @@
-// Gaussians seen by cameras, forward and backward, a vector of Gaussians at a time (spec 6.2).
+// Projection of Gaussians into cameras, forward and backward, a vector of Gaussians at a time (spec 6.2).
 //
 //     t = W μ + p                          camera space; z ≤ 0.01 is dropped
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)
@@ -6,12 +6,12 @@
 //     Σ2D = (J W R S)(J W R S)ᵀ + eps2d·I;    det ≤ 0 is dropped
 //     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p.
 //
-// R is the rotation of the normalized quaternion, S = diag(scales). A quaternion whose largest part is 0, subnormal or not
-// finite has none: R is NaN, and the Gaussian is dropped. Only J sees the clamp: 15 % of the image's width
-// (height) beyond its borders. Writing Σ2D as a product of one factor keeps it positive semi-definite in float.
+// R is the rotation of the normalized quaternion, S = diag(scales). A quaternion whose largest component is 0, subnormal or not finite has
+// no rotation: R is NaN, and the Gaussian is dropped. The clamp, 15 % of the image's width (height) beyond its borders, affects only J.
+// Writing Σ2D as the product of a factor with its transpose keeps it positive semi-definite in floating point.
 //
-// All cameras of a scene are served while a vector of its Gaussians is at hand: what doesn't depend on the camera, above
-// all reading 59 numbers of each and turning them into lanes, is done once.
+// All cameras of a scene are processed while a vector of its Gaussians is loaded: work that doesn't depend on the camera, above all reading
+// 59 values of each Gaussian and transposing them into lanes, is done once.
 #pragma once
 
 #include "sh.h"
@@ -20,10 +20,10 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// As many Gaussians as a vector has lanes.
+// Group of as many Gaussians as a vector has lanes.
 template <class T>
 struct Group {
-  int count;             // lanes in use; the others repeat the last Gaussian
+  int count;             // number of lanes in use; the others repeat the last Gaussian
   Vector<T> mean[3], scale[3];
   Vector<T> power, inverse_norm, unit[4];  // a power of two near 1/‖q‖, 1/‖power q‖, q/‖q‖
   Vector<T> rotation[9], axes[9];        // R, R S
@@ -31,7 +31,7 @@ struct Group {
   Vector<T> sh[kMaxBases * 3];
 };
 
-// What one camera makes of a group, as far as the backward pass needs it.
+// Projection of a group into one camera, with the intermediate values that the backward pass needs.
 template <class T>
 struct Projection {
   Mask<T> visible;
@@ -43,18 +43,18 @@ struct Projection {
   Vector<T> factor_a, factor_b, factor_c;  // Splat's a, b, c
 };
 
-// A group's colours from one camera.
+// Colours of a group in one camera.
 template <class T>
 struct Shading {
   Vector<T> direction[3], inverse_distance, basis[kMaxBases];
-  Vector<T> colour[3];  // before the clamp at 0
+  Vector<T> colour[3];  // without the clamp at 0
 };
 
-// Whether transpose4() turns rows into lanes, and back, as far as they have four numbers and there are as many rows as lanes.
+// True if transpose4() can convert rows to lanes and back, for multiples of four elements and as many rows as lanes.
 template <class T>
 inline constexpr bool kByFours = sizeof(T) == 4 && Simd<T>::lanes % 4 == 0;
 
-// Lanes from rows of `width` numbers, `stride` apart: out[k] holds number k of each of the group's rows.
+// Loads rows of `width` elements, `stride` apart, into lanes: out[k] holds element k of each of the group's rows.
 template <class T>
 GS_INLINE void load_columns(const T* rows, int stride, int width, int count, Vector<T>* out) {
   constexpr int lanes = Simd<T>::lanes;
@@ -72,7 +72,7 @@ GS_INLINE void load_columns(const T* rows, int stride, int width, int count, Vec
   for (int k = 0; k < width; ++k) out[k] = load<T>(columns[k]);
 }
 
-// The way back, for the first `count` lanes and rows that follow each other.
+// Stores the first `count` lanes to consecutive rows: the inverse of load_columns().
 template <class T>
 GS_INLINE void store_columns(const Vector<T>* in, int width, int count, T* rows) {
   constexpr int lanes = Simd<T>::lanes;
@@ -88,7 +88,7 @@ GS_INLINE void store_columns(const Vector<T>* in, int width, int count, T* rows)
     for (int k = done; k < width; ++k) rows[int64_t(width) * lane + k] = columns[k][lane];
 }
 
-// All but spherical harmonics.
+// Loads everything except spherical harmonics.
 template <class T>
 GS_INLINE void load_shapes(const Gaussians<T>& g, int64_t begin, int64_t end, Group<T>& group) {
   using V = Vector<T>;
@@ -100,7 +100,7 @@ GS_INLINE void load_shapes(const Gaussians<T>& g, int64_t begin, int64_t end, Gr
   load_columns(g.opacities + begin, 1, 1, group.count, &group.opacity);
   group.log2_opacity = log2_of<T>(group.opacity);
 
-  // Times a power of two, which rounds nothing, squares neither overflow nor underflow.
+  // Scaling by a power of two is exact, and keeps squares from overflowing and underflowing.
   V* q = group.unit;
   group.power = inverse_power_of_two<T>(larger(larger(magnitude(q[0]), magnitude(q[1])), larger(magnitude(q[2]), magnitude(q[3]))));
   for (int k = 0; k < 4; ++k) q[k] *= group.power;
@@ -126,7 +126,7 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
   load_columns(g.sh + int64_t(3) * g.bases * begin, 3 * g.bases, 3 * g.bases, group.count, group.sh);
 }
 
-// NaN anywhere in a Gaussian's geometry makes it invisible.
+// Projects a group. A NaN anywhere in a Gaussian's geometry makes it invisible.
 template <class T>
 GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<T>& p) {
   using V = Vector<T>;
@@ -165,8 +165,8 @@ GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<
                   lens.eps2d * (p.cov_xx + p.cov_yy - lens.eps2d);
   p.visible = both(p.visible, both(less(zero, p.determinant), at_most(p.determinant, largest)));
 
-  // Half the inverse is [[a², ab], [ab, b² + c²]]: 2a² = Σ_yy/det, and as the Schur complement of an inverse is the inverse
-  // of an entry, 2c² = 1/Σ_yy. The factor log₂e makes exponents those of 2.
+  // Half the inverse is [[a², ab], [ab, b² + c²]]: 2a² = Σ_yy/det, and 2c² = 1/Σ_yy, because the Schur complement of an inverse is the
+  // inverse of an entry. The factor log₂e converts exponents to base 2.
   constexpr T scale = T(0.5 * kLog2E);
   p.factor_a = sqrt(scale * p.cov_yy / p.determinant);
   p.factor_b = -p.factor_a * p.cov_xy / p.cov_yy;
@@ -176,14 +176,14 @@ GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<
   p.visible = both(p.visible, both(at_most(u * u, largest), at_most(v * v, largest)));
 }
 
-// The numbers of Splat, in its order, lane by lane.
+// Computes the fields of Splat, in its order, for all lanes.
 template <class T>
 GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, const Shading<T>& s,
                          Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
-  // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The room on top covers the rounding of s, whose terms may be larger than s itself: on
-  // the rim of a splat by 1 + |b|/c.
+  // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
+  // |b|/c.
   const V exact = g.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
   constexpr T rounding = sizeof(T) == 4 ? T(1e-6) : T(1e-15);
   const V reach = exact + T(1e-3) * (T(1) + exact) + rounding * exact * (T(1) + skew);
@@ -207,7 +207,7 @@ GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projectio
   for (int k = 0; k < 16; ++k) out[k] = numbers[k];
 }
 
-// All but colours. Lanes where `visible` is false get a direction of zero.
+// Computes directions and basis functions, without colours. Lanes in which `visible` is false get a direction of zero.
 template <class T>
 GS_INLINE void look_at_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
   using V = Vector<T>;
@@ -230,7 +230,7 @@ GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Ma
   }
 }
 
-// Gaussians begin … end − 1 as each of `views` cameras sees them: splats[view][i].
+// Projects Gaussians begin … end − 1 into each of `views` cameras: splats[view][i].
 template <class T>
 void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
              Splat<T>* const* splats) {
@@ -252,22 +252,22 @@ void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* l
   }
 }
 
-// Gradients of a group's Gaussians, summed over cameras; of R S instead of scales and quaternions.
+// Gradients of a group's Gaussians, summed over cameras, with respect to R S instead of scales and quaternions.
 template <class T>
 struct GroupGradient {
   Vector<T> mean[3] = {}, axes[9] = {}, opacity = {}, sh[kMaxBases * 3] = {};
 };
 
-// What one camera's pixels, summed in `d`, ask of the Gaussians' spherical harmonics, coefficient(n) for number n, and of their means
-// through the direction, which d_r receives. `is_lit` tells where a channel isn't clamped at 0. add_product_to(n, x, y) hears that
-// x·y is to be added to the gradient of number n, after coefficients have been read.
+// Computes the gradients that one camera's pixel sums `d` give to the Gaussians' spherical harmonics, whose element n is coefficient(n),
+// and to their means through the direction, which are stored in d_r. `is_lit` is true for channels that aren't clamped at 0.
+// add_product_to(n, x, y) is called to add x·y to the gradient of element n, after all coefficients have been read.
 template <class T, class Coefficient, class AddProductTo>
 GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T> (&is_lit)[3],
                                     const Vector<T> d[kSplatGradientNumbers], const Coefficient& coefficient,
                                     const AddProductTo& add_product_to, Vector<T> d_r[3]) {
   using V = Vector<T>;
   const V zero{};
-  // The mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
+  // Gradient of the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
   V d_colour[3], d_basis[kMaxBases], d_direction[3];
   for (int channel = 0; channel < 3; ++channel) d_colour[channel] = select(is_lit[channel], d[6 + channel], zero);
   for (int k = 0; k < bases; ++k) {
@@ -282,8 +282,8 @@ GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T
   for (int k = 0; k < 3; ++k) d_r[k] = (d_direction[k] - along * s.direction[k]) * s.inverse_distance;
 }
 
-// Adds what one camera's pixels, summed in `d`, ask of the Gaussians in lanes where `touched` holds, but for spherical harmonics; in
-// others `d` and `d_r` are 0. Where `of_cameras` holds, `of_camera` receives what they ask of the camera through each lane, in
+// Adds the gradients that one camera's pixel sums `d` give to the Gaussians, except for spherical harmonics, in lanes in which `touched` is
+// true; in other lanes `d` and `d_r` are 0. If `of_cameras` is set, `of_camera` receives the gradient of the camera from each lane, in
 // CameraGradient's order.
 template <class T>
 GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, Mask<T> touched,
@@ -312,7 +312,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, co
   const Camera<T>& camera = lens.camera;
   const V fx = camera.fx * p.inverse_z, fy = camera.fy * p.inverse_z;
   V d_half[6], d_wrs[9];
-  V d_fx{}, d_fy{}, d_a{}, d_b{};  // of f_x/z, f_y/z, a, b
+  V d_fx{}, d_fy{}, d_a{}, d_b{};  // with respect to f_x/z, f_y/z, a, b
   for (int k = 0; k < 3; ++k) {
     d_half[k] = T(2) * (m_xx * p.half[k] + m_xy * p.half[3 + k]);
     d_half[3 + k] = T(2) * (m_xy * p.half[k] + m_yy * p.half[3 + k]);
@@ -327,7 +327,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, co
     d_b -= fy * d_half[3 + k] * p.wrs[6 + k];
   }
 
-  // t_x/z reaches u always and a where it isn't clamped.
+  // t_x/z affects u always, and a if it isn't clamped.
   const V d_x = camera.fx * d_u + select(p.a_free, d_a, zero);
   const V d_y = camera.fy * d_v + select(p.b_free, d_b, zero);
   const V inverse_z2 = p.inverse_z * p.inverse_z;
@@ -352,7 +352,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, co
   }
 }
 
-// From ∂L/∂(R S) to scales and quaternions, which no camera's pixels see in any other way.
+// Converts ∂L/∂(R S) to gradients of scales and quaternions, which affect pixels in no other way.
 template <class T>
 GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vector<T> d_scale[3],
                              Vector<T> d_quaternion[4]) {
@@ -363,7 +363,7 @@ GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vecto
     d_scale[k % 3] += d_axes[k] * g.rotation[k];
     r[k] = d_axes[k] * g.scale[k % 3];
   }
-  // R of the unit quaternion, then the normalization: ∂/∂q = (I − q̂ q̂ᵀ)/‖q‖.
+  // Gradient of R with respect to the unit quaternion, then of the normalization: ∂/∂q = (I − q̂ q̂ᵀ)/‖q‖.
   const V w = g.unit[0], x = g.unit[1], y = g.unit[2], z = g.unit[3];
   const V d_unit[4] = {T(2) * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1])),
                        T(2) * (w * (r[7] - r[5]) + y * (r[1] + r[3]) + z * (r[2] + r[6]) - T(2) * x * (r[4] + r[8])),
@@ -373,8 +373,7 @@ GS_INLINE void axes_backward(const Group<T>& g, const Vector<T> d_axes[9], Vecto
   for (int k = 0; k < 4; ++k) d_quaternion[k] = (d_unit[k] - inward * g.unit[k]) * g.inverse_norm * g.power;
 }
 
-// The records of Gaussian `first` and those after it, added up in their order, one Gaussian per lane. Tells which
-// lanes have any.
+// Sums the records of Gaussian `first` and those after it in order, one Gaussian per lane. Returns which lanes have any.
 template <class T>
 GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int count,
                               Vector<T> out[kSplatGradientNumbers]) {
@@ -393,9 +392,9 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
   return less(Vector<T>{}, load<T>(has_any));
 }
 
-// All gradients of the group from Gaussian `i` on, from what the pixels of each of `views` cameras ask of them:
-// records_of(view) are a camera's. Where `of_cameras` holds, asked(view, numbers) hears what the group asks of each camera, in
-// CameraGradient's order.
+// Computes all gradients of the group that begins at Gaussian `i` from the pixel sums of `views` cameras; records_of(view) returns a
+// camera's records. If `of_cameras` is set, asked(view, numbers) is called with the group's gradient of each camera, in CameraGradient's
+// order.
 template <class T, class RecordsOf, class Asked>
 GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const Lens<T>* lenses, int64_t views,
                                       const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,
@@ -413,7 +412,7 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
       Projection<T> projection;
       Shading<T> shading;
       project_group(group, lenses[view], projection);
-      if (any(projection.visible)) {  // as all are that have records
+      if (any(projection.visible)) {  // all Gaussians with records are visible
         shade_group(group, g.bases, lenses[view], touched, shading);
         const Mask<T> is_lit[3] = {less(V{}, shading.colour[0]), less(V{}, shading.colour[1]), less(V{}, shading.colour[2])};
         V d_r[3];
@@ -436,7 +435,7 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
   store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
 }
 
-// The same of Gaussians begin … end − 1. Where `cameras` isn't null, what these ask of each camera is added there.
+// Computes all gradients of Gaussians begin … end − 1. If `cameras` isn't null, their gradients of the cameras are added to it.
 template <class T>
 void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
                       const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {

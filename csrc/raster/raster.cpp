@@ -14,10 +14,10 @@ namespace globalsplat::raster {
 
 namespace {
 
-constexpr int64_t kTask = kCoverTask;  // Gaussians that a task projects or covers
-constexpr int64_t kChunk = 64 * 1024;  // Gaussians of a view that are sorted and binned side by side
+constexpr int64_t kTask = kCoverTask;  // Gaussians per task of projection and of listing tiles
+constexpr int64_t kChunk = 64 * 1024;  // Gaussians of a view per chunk of sorting and binning
 
-// Tells the seconds since it was last asked.
+// Returns the seconds since its previous lap.
 class Stopwatch {
  public:
   double lap() {
@@ -42,14 +42,14 @@ struct Frame<T>::PerView {
   Buffer<uint32_t> tile_start;    // [tiles + 1] into entries
 };
 
-// What a task leaves of its Gaussians in one view: the tiles that they reach, and the depths of those that reach any.
+// Result of a task for one view: the tiles that its Gaussians touch, and the depths of the Gaussians that touch any.
 template <class T>
 struct Frame<T>::Part {
   Buffer<TilePair> pairs;
   int64_t pair_count = 0;
   Buffer<DepthItem<T>> depths;
   int64_t depth_count = 0;
-  uint32_t pairs_before = 0, depths_before = 0;  // in the view's parts before this one
+  uint32_t pairs_before = 0, depths_before = 0;  // in the view's previous parts
 };
 
 template <class T>
@@ -82,7 +82,7 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
           settings_.height};
 }
 
-// Lists the tiles of one task's splats, while they are in the cache. first_record counts from the part's own first pair.
+// Lists the tiles of one task's splats, while they are in the cache. first_record is relative to the part's own first pair.
 template <class T>
 void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, Part& part) const {
   part.pairs = Buffer<TilePair>(size_t(4 * kTask));
@@ -105,7 +105,7 @@ void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, Part& part) cons
   }
 }
 
-// All Gaussians to splats, and to the tiles that these reach: a part for every task of every view.
+// Projects all Gaussians to splats, and lists the tiles that these touch: one part for every task of every view.
 template <class T>
 std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussians<T>>& scenes) {
   std::vector<Part> made(views_.size() * size_t(tasks_));
@@ -138,7 +138,7 @@ std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussia
   return made;
 }
 
-// Each view's splats that reach any tile, front to back. Also lets first_record count all of the view's pairs.
+// Sorts each view's splats that touch any tile front to back. Also makes first_record relative to all of the view's pairs.
 template <class T>
 std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) {
   std::vector<Buffer<DepthItem<T>>> order;
@@ -157,7 +157,7 @@ std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) 
   return order;
 }
 
-// The tiles' lists.
+// Builds the tiles' lists.
 template <class T>
 void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order) {
   for (PerView& view : views_) view.entries = Buffer<TileEntry>(view.first_record[size_t(count_)]);
@@ -171,7 +171,7 @@ void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<Depth
       return part.pairs.data.get() + (view.first_record[splat] - part.pairs_before);
     };
     for (size_t i = begin; i < end; ++i) {
-      // Splats in the order of depth lie anywhere.
+      // Splats in the order of depth are scattered in memory.
       if (i + 16 < end) __builtin_prefetch(&view.first_record[items[i + 16].splat]);
       if (i + 8 < end) __builtin_prefetch(first_pair(items[i + 8].splat));
       const uint32_t splat = items[i].splat;
@@ -184,7 +184,7 @@ void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<Depth
       settings_.threads, int64_t(views_.size()), chunks(), grid_.tiles(),
       [&](int64_t k, int64_t chunk, const auto& visit) {
         if (chunks() > 1) return each(k, chunk, [&](int64_t tile, const TileEntry&) { visit(tile); });
-        // All of a view's pairs are counted as they lie.
+        // With a single chunk, all of a view's pairs are counted in memory order.
         for (int64_t i = 0; i < tasks_; ++i) {
           const Part& part = made[size_t(k * tasks_ + i)];
           for (int64_t pair = 0; pair < part.pair_count; ++pair) visit(int64_t(part.pairs[size_t(pair)].tile));
@@ -242,7 +242,7 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   });
   times.blend_backward = watch.lap();
 
-  // What each task's Gaussians ask of the cameras of their scene: [tasks][views].
+  // Gradients of the cameras of a scene from each task's Gaussians: [tasks][views].
   std::vector<CameraGradient<T>> asked(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
   parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
     const size_t scene = size_t(task / tasks_), part = size_t(task % tasks_), first = first_view_[scene];

@@ -1,4 +1,5 @@
-// The rasterizer: many scenes, several cameras each, in one call; forward, and backward from what the forward kept.
+// The rasterizer: many scenes with several cameras each in one call; a forward pass, and a backward pass that uses state of the forward
+// pass.
 #pragma once
 
 #include <memory>
@@ -12,7 +13,7 @@ namespace globalsplat::raster {
 template <class T>
 struct View {
   Camera<T> camera;
-  int scene;  // which of the scenes it looks at
+  int scene;  // index of the scene
 };
 
 struct Settings {
@@ -21,30 +22,30 @@ struct Settings {
   int threads;
 };
 
-// Wall-clock seconds that the stages of one call took, all views together.
+// Wall-clock seconds of the stages of one call, summed over all views.
 struct StageTimes {
   double project = 0, sort = 0, bin = 0, blend = 0;
   double blend_backward = 0, project_backward = 0;
 };
 
-// What a forward pass leaves for its backward pass: per view the splats and the tile lists.
+// State of a forward pass for its backward pass: the splats and the tile lists of each view.
 template <class T>
 class Frame {
  public:
-  // Draws every view into its pictures: `out[k]` for `views[k]`. All scenes have the same number of Gaussians; a scene's
-  // views follow each other.
+  // Renders every view into its images: `out[k]` for `views[k]`. All scenes must have the same number of Gaussians, and a scene's views
+  // must be consecutive.
   static std::unique_ptr<Frame> draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
                                      const Settings& settings, const std::vector<Pictures<T>>& out,
                                      StageTimes& times);
 
-  // `scenes` and `pictures` are draw()'s inputs and outputs, unchanged. Writes every gradient of every Gaussian, and of every
-  // view's camera into `cameras`, which is null where nobody asks. Sums run over a scene's cameras, a camera's tiles and, in
-  // tasks, its Gaussians in order, so the bits don't depend on the number of threads.
+  // Computes every gradient of every Gaussian, and of every view's camera if `cameras` isn't null. `scenes` and `pictures` are the
+  // unchanged inputs and outputs of draw(). Sums run in order over a scene's cameras, a camera's tiles and, by tasks, its Gaussians, so
+  // results are bit-identical for any number of threads.
   void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
                 const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
                 CameraGradient<T>* cameras, StageTimes& times) const;
 
-  // What blending all views takes, for benchmarks.
+  // Counts the pairs that blending all views processes, for benchmarks.
   PairCounts count() const;
 
   ~Frame();
@@ -62,14 +63,14 @@ class Frame {
 
   Settings settings_;
   Grid grid_;
-  int64_t count_;  // Gaussians of a scene
-  int64_t tasks_;  // in which a scene's Gaussians are taken
+  int64_t count_;  // Gaussians per scene
+  int64_t tasks_;  // into which a scene's Gaussians are split
   std::vector<PerView> views_;
   std::vector<Lens<T>> lenses_;
-  std::vector<size_t> first_view_;  // [scenes + 1] of a scene
+  std::vector<size_t> first_view_;  // [scenes + 1] first view of each scene
 };
 
-// Floating-point operations per second that multiply-adds alone reach on so many threads, for benchmarks.
+// Measures the floating-point operations per second that multiply-adds alone reach on this number of threads, for benchmarks.
 double multiply_add_peak(int threads, double seconds);
 
 }  // namespace globalsplat::raster

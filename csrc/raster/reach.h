@@ -1,10 +1,9 @@
-// Which tiles, and which 4×4 blocks of their pixels, a splat reaches: exactly those where s = (aΔx + bΔy)² + (cΔy)² is at
-// most `reach` for some point between a block's outermost pixel centres.
+// Exact test of which tiles, and which 4×4 blocks of their pixels, a splat touches: those where s = (aΔx + bΔy)² + (cΔy)² is at most
+// `reach` for some point between a block's outermost pixel centres.
 //
-// s is convex with its minimum 0 at Δ = 0. Over a rectangle that doesn't hold Δ = 0, its minimum lies on a side that faces
-// it: on x = x*, the value nearest to 0 among the rectangle's, or on y = y*. On either side s is a parabola, least at
-// −slope_y·x* (or −slope_x·y*), clamped to the side. Sixteen rectangles, four by four, are tested at a time: first tiles,
-// then the blocks of each tile reached.
+// s is convex with its minimum 0 at Δ = 0. Over a rectangle that doesn't contain Δ = 0, its minimum lies on a side that faces it: on x =
+// x*, the value nearest to 0 within the rectangle, or on y = y*. On either side s is a parabola, minimal at −slope_y·x* (or −slope_x·y*),
+// clamped to the side. Sixteen rectangles, four by four, are tested at a time: first tiles, then the blocks of each touched tile.
 #pragma once
 
 #include "simd.h"
@@ -12,8 +11,8 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Bit 4·j + i tells whether the splat reaches cell (i, j) of a 4×4 array of cells of size × size pixels, whose first pixel
-// is (x0, y0).
+// Returns bits that tell which cells of a 4×4 array the splat touches, bit 4·j + i for cell (i, j). Cells have size × size pixels, and the
+// first pixel is (x0, y0).
 template <class T>
 GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
   using V = Vector<T>;
@@ -44,14 +43,14 @@ GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
   return bits;
 }
 
-// Columns x0 … x1 and rows y0 … y1 of tiles.
+// Range of tiles: columns x0 … x1 and rows y0 … y1.
 struct Box {
   int x0, x1, y0, y1;
   int width() const { return x1 - x0 + 1; }
   int64_t tiles() const { return int64_t(width()) * (y1 - y0 + 1); }
 };
 
-// The tiles in reach of a splat's bounding box; false if there are none.
+// Computes the range of tiles that overlap a splat's bounding box; returns false if there are none.
 template <class T>
 GS_INLINE bool box_of(const Splat<T>& s, const Grid& grid, Box& box) {
   const T left = s.u - s.half_width, right = s.u + s.half_width;

@@ -1,4 +1,4 @@
-// What attention reads and writes: plain memory and numbers, as in types.h.
+// Inputs and outputs of attention: plain memory and numbers, as in types.h.
 #pragma once
 
 #include <cstdint>
@@ -6,7 +6,7 @@
 
 namespace globalsplat::raster {
 
-// Rows of numbers, one after the other `stride` numbers on: of a head, the part that is its own of rows that all heads share.
+// Rows at a distance of `stride` elements: for a head, its own part of rows that all heads share.
 template <class Number>
 struct Rows {
   Number* data;
@@ -15,8 +15,8 @@ struct Rows {
   Rows from(int64_t first) const { return {data + first * stride, stride}; }
 };
 
-// A bfloat16 number: the upper half of a float's bits. What makes one of the other is compiled into its caller, whichever instruction
-// set that is for.
+// A bfloat16 value: the upper half of a float's bits. The conversions are inlined into their caller, whichever instruction set it is
+// compiled for.
 using Bf16 = uint16_t;
 
 [[gnu::always_inline]] inline float to_float(Bf16 number) {
@@ -26,14 +26,14 @@ using Bf16 = uint16_t;
   return exact;
 }
 
-// The nearest, ties to even.
+// Rounds to the nearest value, ties to even.
 [[gnu::always_inline]] inline Bf16 to_bf16(float number) {
   uint32_t bits;
   std::memcpy(&bits, &number, sizeof bits);
   return Bf16((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
 }
 
-// One head's queries, keys and values, all `width` numbers wide.
+// Queries, keys and values of one head, all with rows of `width` elements.
 template <class Number>
 struct AttentionHead {
   Rows<const Number> q, k, v;
@@ -41,58 +41,58 @@ struct AttentionHead {
   int width;
 };
 
-// Who multiplies matrices of bfloat16 numbers.
+// Implementation of products of bfloat16 matrices.
 struct Bf16Products {
-  // c [m, n] = a [m, k] · b [k, n], added to what is there where it `adds`; of b two rows lie side by side, [k / 2, n, 2], and k is
-  // even. c is float32. Numbers from one row to the next (of b to the next but one, halved): a_row, b_row, c_row.
+  // Computes c [m, n] = a [m, k] · b [k, n], added to c if `adds`. k is even, and pairs of b's rows are interleaved, [k / 2, n, 2]. c is
+  // float32. a_row, b_row and c_row are the strides between rows in elements (for b: between pairs of rows, halved).
   void (*multiply)(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const Bf16* a,
                    const Bf16* b, float* c);
-  // What a thread says when it was its last product for now.
+  // Called by a thread after its last product for now.
   void (*done)();
 };
 
-// What came out, and the gradient of that.
+// Output of the forward pass, and its gradient.
 template <class Number>
 struct AttentionPast {
   Rows<const Number> out, slope;
 };
 
-// Of all queries of a head, side by side, whole_product_rows() of attention_columns() with zeros where there is nothing: themselves
-// times log₂e / √w, and the gradients of what came out. And of every query the sum of this times that.
+// Packed rows of all queries of a head, whole_product_rows() of attention_columns() with zero padding: the queries times log₂e / √w, and
+// the gradients of the output. `means` holds for every query the dot product of the output and its gradient.
 struct PackedQueries {
   float *q, *slope, *means;
 };
 
-// The same of bfloat16 numbers, whole_bf16_columns() of queries: themselves (not multiplied by anything) and the gradients, each in
-// both of the ways that products take their second matrix. As columns: in panels of kBf16Columns queries, [width / 2, kBf16Columns, 2]. As
-// rows: in panels of kBf16Columns numbers, [queries / 2, panel, 2].
+// Packed bfloat16 rows of whole_bf16_columns() queries: the queries themselves (without a factor) and the gradients of the output, each in
+// both layouts in which products take their second matrix. As columns: in panels of kBf16Columns queries, [width / 2, kBf16Columns, 2]. As
+// rows: in panels of kBf16Columns elements, [queries / 2, panel, 2].
 struct PackedBf16Queries {
   Bf16 *q_columns, *slope_columns, *q_rows, *slope_rows;
   float *log_sums, *means;
 };
 
-// Rows of a product whose sums are in registers at a time (product.h).
+// Number of rows of a product whose sums are in registers at a time (product.h).
 inline constexpr int64_t kProductRows = 6;
 inline constexpr int64_t whole_product_rows(int64_t rows) { return (rows + kProductRows - 1) / kProductRows * kProductRows; }
 
-// The widest head.
+// Maximum width of a head.
 inline constexpr int kAttentionWidth = 128;
 
-// Columns of what is packed: whole vectors on every machine.
+// Returns the number of columns of packed rows: whole vectors on every machine.
 inline constexpr int attention_columns(int width) { return (width + 15) / 16 * 16; }
 
-// Queries that are one task forward, at most: so many share the work of packing all keys and values.
+// Maximum number of queries per forward task: that many share the cost of packing all keys and values.
 inline constexpr int64_t kAttentionQueries = 1032;
 
-// Of a block of keys, and backward of queries, too: what is packed of them, and summed up for them, stays in the second cache.
+// Block sizes of keys, and in the backward pass of queries, too, for which packed inputs and sums stay in the second-level cache.
 inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 384, kBackwardQueries = 48;
 
-// The same of bfloat16 numbers, and the columns of a panel of what is packed, be they queries or numbers of a row.
+// Block sizes for bfloat16, and the number of columns of a packed panel, which are queries or elements of a row.
 inline constexpr int64_t kBf16Keys = 256, kBf16Columns = 64;
 inline constexpr int64_t kBf16BackwardKeys = 128, kBf16BackwardQueries = 128;
 inline constexpr int64_t whole_bf16_columns(int64_t count) { return (count + kBf16Columns - 1) / kBf16Columns * kBf16Columns; }
 
-// Numbers that a task works with.
+// Return the number of elements of scratch memory that a task needs.
 inline constexpr int64_t attention_room(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
 }

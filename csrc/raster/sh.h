@@ -1,7 +1,7 @@
 // Real spherical harmonics up to degree 3, with the constants and signs of the original 3DGS release
 // (Kerbl et al. 2023; spec 6.3): Y_0 = 0.28209479, Y_1 = 0.48860251·(−y, z, −x), …
 //
-// T is a number, V what is computed with: T itself or a vector of them.
+// T is a scalar type; V is the type of the computation: T itself or a vector of T.
 #pragma once
 
 namespace globalsplat::raster {
@@ -17,7 +17,7 @@ inline constexpr double c3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570
                                  -0.4570457994644658, 1.445305721320277,  -0.5900435899266435};
 }  // namespace sh
 
-// Y_b(d) for the first `bases` functions; d = (x, y, z) is a unit vector.
+// Evaluates Y_b(d) for the first `bases` functions; d = (x, y, z) is a unit vector.
 template <class T, class V>
 inline __attribute__((always_inline)) void sh_basis(int bases, const V d[3], V out[kMaxBases]) {
   using namespace sh;
@@ -44,7 +44,7 @@ inline __attribute__((always_inline)) void sh_basis(int bases, const V d[3], V o
   out[15] = T(c3[6]) * x * (xx - T(3) * yy);
 }
 
-// Σ_b g_b ∂Y_b/∂d, the polynomials taken as functions of all of space.
+// Computes Σ_b g_b ∂Y_b/∂d, with the polynomials as functions on all of space.
 template <class T, class V>
 inline __attribute__((always_inline)) void sh_basis_backward(int bases, const V d[3], const V g[kMaxBases], V out[3]) {
   using namespace sh;

@@ -1,8 +1,8 @@
-// Vectors of numbers. GCC's and Clang's vector extensions give arithmetic and comparisons on every machine; what they
-// lack (fused multiply-add, masks in a form each machine likes, approximations) is here, once per instruction set. This
-// file is compiled several times with different instruction sets, so everything is inside the namespace that the
-// including kernel file names, and nothing of the standard library is instantiated here: the linker would keep one copy
-// for all. Where GS_LANE is defined, a vector is one number.
+// Portable SIMD vectors. The vector extensions of GCC and Clang provide arithmetic and comparisons on every machine. This file adds what
+// they lack (fused multiply-add, masks in each machine's preferred form, approximations), once per instruction set. It is compiled several
+// times with different instruction sets, so everything is in the namespace that the including kernel file names, and no templates of the
+// standard library are instantiated: the linker would keep one copy for all instruction sets. If GS_LANE is defined, a vector is a single
+// value.
 #pragma once
 
 #ifdef GS_LANE
@@ -32,9 +32,9 @@ inline constexpr int kVectorBytes = 32;
 inline constexpr int kVectorBytes = 16;
 #endif
 
-// `bits` is what a comparison of vectors gives: −1 or 0 in every lane. `mask` is the form that the machine computes
-// with: a bit per lane in a mask register on AVX-512, the same as `bits` elsewhere. `sum` is one of products that are added by
-// add_fused(): a vector, or where fused multiply-add is emulated the same numbers in float64.
+// `bits` is the result of a comparison of vectors: −1 or 0 in every lane. `mask` is the form that the machine computes with: one bit per
+// lane in a mask register on AVX-512, and `bits` elsewhere. `sum` is the type of a sum of products in add_fused(): a vector, or float64
+// values if fused multiply-add is emulated.
 template <class T>
 struct Simd;
 
@@ -94,7 +94,7 @@ GS_INLINE void store(T* to, Vector<T> v) {
   __builtin_memcpy(to, &v, sizeof v);
 }
 
-// A 4×4 block of numbers, rows `stride` apart: the vectors that it makes, row after row.
+// Loads a 4×4 block of values, with a stride of `stride` between rows, as vectors in row-major order.
 template <class T>
 GS_INLINE void load_rows(const T* first, int64_t stride, Vector<T>* out) {
   T rows[16];
@@ -110,7 +110,7 @@ GS_INLINE void store_rows(const Vector<T>* in, T* first, int64_t stride) {
 }
 
 #if defined(__AVX512F__)
-// In registers: the processor can't read in one piece what was just written in four.
+// Kept in registers: the processor can't load in one piece what was just stored in four.
 GS_INLINE void load_rows(const float* first, int64_t stride, Vector<float>* out) {
   const auto two = [&](const float* row) {
     return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row)), _mm_loadu_ps(row + stride), 1);
@@ -124,9 +124,9 @@ GS_INLINE void load_rows(const float* first, int64_t stride, Vector<float>* out)
 }
 #endif
 
-// fma(a, b, c) = a·b + c and fnma(a, b, c) = c − a·b, in one rounding on every machine: which splats reach which pixels
-// then is decided alike everywhere. Kernels are compiled without contraction, so nothing else is fused. float64 exists to
-// prove gradients and is rounded twice where the machine can't do better.
+// fma(a, b, c) = a·b + c and fnma(a, b, c) = c − a·b, with one rounding on every machine, so that all machines agree which splats reach
+// which pixels. Kernels are compiled without contraction, so nothing else is fused. float64 exists to verify gradients, and is rounded
+// twice on machines without fused instructions.
 #if defined(__AVX512F__)
 GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fmadd_ps(a, b, c); }
 GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fnmadd_ps(a, b, c); }
@@ -144,8 +144,8 @@ GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> 
 GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return vfmsq_f64(c, a, b); }
 #else
 #if defined(__SSE2__)
-// The product of two floats is exact in float64, and the sum rounded to float64 and then to float is all but always the
-// sum rounded once.
+// The product of two floats is exact in float64. The sum rounded to float64 and then to float is nearly always equal to the sum rounded
+// once.
 GS_INLINE FusedSum<float> widened(Vector<float> v) { return {_mm_cvtps_pd(v), _mm_cvtps_pd(_mm_movehl_ps(v, v))}; }
 GS_INLINE FusedSum<float> widened(float v) { return {_mm_set1_pd(v), _mm_set1_pd(v)}; }
 GS_INLINE Vector<float> value_of(const FusedSum<float>& sum) { return _mm_movelh_ps(_mm_cvtpd_ps(sum.low), _mm_cvtpd_ps(sum.high)); }
@@ -175,19 +175,20 @@ GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> 
 GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return c - a * b; }
 #endif
 
-// With the same number in every lane.
+// Overloads with the same value in every lane.
 template <class T>
 GS_INLINE Vector<T> fma(T a, Vector<T> b, Vector<T> c) { return fma(broadcast<T>(a), b, c); }
 template <class T>
 GS_INLINE Vector<T> fnma(Vector<T> a, Vector<T> b, T c) { return fnma(a, b, broadcast<T>(c)); }
 
-// sum + weight·number.
+// Returns sum + weight·number.
 template <class T>
 GS_INLINE Vector<T> add_fused(Vector<T> weight, T number, Vector<T> sum) { return fma(number, weight, sum); }
 template <class V>
 GS_INLINE V value_of(V sum) { return sum; }
 
-// fma() and fnma(), where no decision and no picture hangs on the last bit: rounded twice where fusing would have to be emulated.
+// fma() and fnma() for results whose last bit affects neither decisions nor images: rounded twice on machines that would have to emulate
+// fusing.
 #if defined(__AVX2__) || defined(__AVX512F__) || defined(__aarch64__)
 template <class V>
 GS_INLINE V add_product(V a, V b, V c) { return fma(a, b, c); }
@@ -200,7 +201,7 @@ template <class V>
 GS_INLINE V take_product(V a, V b, V c) { return c - a * b; }
 #endif
 
-// Comparisons are false where an operand is NaN.
+// Comparisons are false if an operand is NaN.
 #if defined(__AVX512F__)
 GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
 GS_INLINE Mask<float> at_most(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
@@ -247,7 +248,7 @@ GS_INLINE bool any(M m) {
   return lane_bits(m) != 0;
 }
 
-// The second operand where either is NaN.
+// Both functions return the second operand if either is NaN.
 #if defined(__AVX512F__)
 GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm512_min_ps(a, b); }
 GS_INLINE Vector<double> smaller(Vector<double> a, Vector<double> b) { return _mm512_min_pd(a, b); }
@@ -262,7 +263,7 @@ template <class V>
 GS_INLINE V larger(V a, V b) {
   return a > b ? a : b;
 }
-// One instruction, which compilers don't find.
+// Single instructions, which compilers don't generate for the code above.
 #if defined(__AVX2__)
 GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm256_min_ps(a, b); }
 GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm256_max_ps(a, b); }
@@ -272,13 +273,14 @@ GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm_ma
 #endif
 #endif
 
-// |v|
+// Returns |v|.
 template <class V>
 GS_INLINE V magnitude(V v) {
   return larger(v, -v);
 }
 
-// 2^(1−k) for v in [2^k, 2^(k+1)), so that their product is in [2, 4). Infinite where v is 0 or subnormal, 0 where v isn't finite.
+// Returns 2^(1−k) for v in [2^k, 2^(k+1)), so that their product is in [2, 4). The result is infinite if v is 0 or subnormal, and 0 if v
+// isn't finite.
 template <class T>
 GS_INLINE Vector<T> inverse_power_of_two(Vector<T> v) {
   typedef typename Simd<T>::bits Integers;
@@ -311,7 +313,7 @@ GS_INLINE Vector<double> sqrt(Vector<double> v) {
 }
 #endif
 
-// Four rows of four numbers of 32 bits, whatever they are, to four columns; rows are `stride` such numbers apart.
+// Transposes four rows of four 32-bit elements of any type. `stride` and `to_stride` are distances between rows in elements.
 GS_INLINE void transpose4(const void* from, int64_t stride, void* to, int64_t to_stride) {
   const char* const rows = static_cast<const char*>(from);
   char* const columns = static_cast<char*>(to);
@@ -326,7 +328,7 @@ GS_INLINE void transpose4(const void* from, int64_t stride, void* to, int64_t to
 #endif
 }
 
-// 1/v to 2e-7: an estimate of 12 or 14 bits and one step of Newton's method. No decision hangs on it.
+// Computes 1/v with an error of 2e-7: an estimate of 12 or 14 bits and one step of Newton's method. No decision depends on it.
 #if defined(__AVX512F__)
 GS_INLINE Vector<float> reciprocal(Vector<float> v) {
   const Vector<float> estimate = _mm512_rcp14_ps(v);
@@ -342,10 +344,10 @@ GS_INLINE Vector<float> reciprocal(Vector<float> v) { return 1.0f / v; }
 #endif
 GS_INLINE Vector<double> reciprocal(Vector<double> v) { return 1.0 / v; }
 
-// 32 bits a lane, which may overflow.
+// Unsigned 32-bit lanes, which may overflow.
 typedef uint32_t Bits __attribute__((vector_size(kVectorBytes)));
 
-// Number i mod 8 of kExp2Eighths for each lane i.
+// Returns element i mod 8 of kExp2Eighths for each lane i.
 #if defined(__AVX512F__)
 GS_INLINE Bits eighth(Bits i) {
   return (Bits)_mm512_permutexvar_epi32((__m512i)i, _mm512_broadcast_i64x4(_mm256_loadu_si256((const __m256i*)kExp2Eighths)));
@@ -367,10 +369,10 @@ GS_INLINE Bits eighth(Bits i) {
 }
 #endif
 
-// 2^x, begun and ended, with other work in between: x = i/8 + f with |f| ≤ 1/16, 2^f is a polynomial of degree 3, and 2^(i/8) a
-// table's number whose exponent i's whole part is added to. The relative error is below 1.7e-7 for x ≥ −126; below that there is
-// nothing to rely on. Nothing is fused, which costs little, as a sum in it is ready as soon as a product and goes elsewhere: so
-// all machines give the same bits, those that can't fuse without effort.
+// 2^x in two steps, so that other work can be done in between. x = i/8 + f with |f| ≤ 1/16; 2^f is a polynomial of degree 3, and 2^(i/8) is
+// a table entry to whose exponent the integer part of i/8 is added. The relative error is below 1.7e-7 for x ≥ −126; results for smaller x
+// are undefined. Nothing is fused, so that all machines give the same bits, including those without fused instructions. This costs little:
+// an addition takes no longer than a multiplication, and runs on another execution unit.
 template <class T>
 struct Exp2;
 template <>
@@ -383,19 +385,19 @@ struct Exp2<double> {
 };
 
 GS_INLINE Exp2<float> begin_exp2(Vector<float> x) {
-  const Vector<float> magic = broadcast<float>(kToEighths), shifted = x + magic;  // rounds to eighths, counted in the low bits
+  const Vector<float> magic = broadcast<float>(kToEighths), shifted = x + magic;  // rounds to eighths; the low bits hold their number
   const Bits i = (Bits)shifted;
   return {x - (shifted - magic), (Vector<float>)(eighth(i) + (i << 20))};
 }
 
-// Where `m` holds, and 0 elsewhere.
+// Returns the power for lanes in which `m` is true, and 0 for others.
 GS_INLINE Vector<float> end_exp2(Mask<float> m, const Exp2<float>& of) {
   const auto c = [](int k) { return broadcast<float>(kExp2[k]); };
   const Vector<float> p = ((c(3) * of.f + c(2)) * of.f + c(1)) * of.f + c(0);
   return select(m, p * of.power, Vector<float>{});
 }
 
-// float64 exists to prove gradients, so it takes the library's exponential.
+// float64 exists to verify gradients, so it uses the library's exponential.
 GS_INLINE Exp2<double> begin_exp2(Vector<double> x) { return {x}; }
 GS_INLINE Vector<double> end_exp2(Mask<double> m, const Exp2<double>& of) {
   Vector<double> power;
@@ -403,21 +405,21 @@ GS_INLINE Vector<double> end_exp2(Mask<double> m, const Exp2<double>& of) {
   return select(m, power, Vector<double>{});
 }
 
-// 2^x where `m` holds, and 0 elsewhere.
+// Computes 2^x for lanes in which `m` is true, and 0 for others.
 template <class M, class V>
 GS_INLINE V exp2_where(M m, V x) {
   return end_exp2(m, begin_exp2(x));
 }
 
-// The logarithm to base 2, rounded from float64's.
+// Computes the logarithm to base 2 in float64 and rounds it.
 template <class T>
 GS_INLINE Vector<T> log2_of(Vector<T> v) {
   for (int lane = 0; lane < Simd<T>::lanes; ++lane) v[lane] = T(__builtin_log2(double(v[lane])));
   return v;
 }
 
-// Copies those of `count` values whose flags have bit `bit` to `out`, in order, and returns how many they are. `out` has
-// room for kListRoom more.
+// Copies to `out`, in order, those of `count` values whose flags have bit `bit` set, and returns their number. `out` must have kListRoom
+// additional elements.
 inline constexpr int kListRoom = 16;
 #if defined(__AVX512F__)
 GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
@@ -442,7 +444,7 @@ GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, i
 }
 #endif
 
-// Those that there are, and zeros in the other lanes.
+// Loads `count` values and sets the other lanes to 0.
 template <class T>
 GS_INLINE Vector<T> load_some(const T* from, int count) {
   if (count >= Simd<T>::lanes) return load<T>(from);
@@ -492,7 +494,7 @@ GS_INLINE float largest_lane(Vector<float> v) {
 }
 #endif
 
-// out[k] = the sum of v[k]'s lanes, in an order that doesn't change from call to call.
+// Computes out[k] = the sum of v[k]'s lanes, in an order that is the same in every call.
 template <class T, int count>
 GS_INLINE void sum_each(const Vector<T> (&v)[count], T* out) {
   for (int k = 0; k < count; ++k) {
@@ -505,13 +507,13 @@ GS_INLINE void sum_each(const Vector<T> (&v)[count], T* out) {
 }
 
 #if defined(__AVX512F__)
-// Pairs of vectors are folded into one that holds both halves' sums: 16 vectors become one of 16 sums in four levels.
+// Folds pairs of vectors into one that holds the sums of both: 16 vectors become one vector of 16 sums in four levels.
 template <int count>
 GS_INLINE void sum_each(const Vector<float> (&v)[count], float* out) {
   static_assert(count <= 16);
   __m512 level[16];
   for (int k = 0; k < 16; ++k) level[k] = k < count ? (__m512)v[k] : _mm512_setzero_ps();
-  // Values k and k + 4, then those and k + 8, k + 12, share a vector; a quarter of it each.
+  // Vectors k and k + 4, and then the result and that of k + 8 and k + 12, share a vector, with a quarter of it each.
   __m512 quarter[4];
   for (int k = 0; k < 4; ++k) {
     const auto fold = [](__m512 a, __m512 b) {

@@ -1,4 +1,4 @@
-// How uneven a picture's depths are where the photo is even, and the gradient (neighbours.h), a few rows at a time.
+// Edge-aware smoothness of the depths of an image, and its gradient (neighbours.h), a few rows at a time.
 #pragma once
 
 #include "neighbours.h"
@@ -7,7 +7,7 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Depths and greys of one row in `room`, after one number of nothing and before a vector of it: what is beyond the border is 0.
+// Depths and grey values of one row in `room`, preceded by one zero and followed by a vector of zeros for pixels beyond the border.
 template <class T>
 struct SmoothRow {
   T *depth, *grey;
@@ -32,8 +32,8 @@ GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>&
   }
 }
 
-// The sum over pairs whose first pixel is in the rows [begin, end), and, where it is asked for, the gradient of all of them in
-// these rows, times `factor`. `room` has fit_room(width) numbers.
+// Returns the sum over pairs whose first pixel is in the rows [begin, end). If requested, writes `factor` times the gradient of the sum
+// over all pairs at the pixels of these rows. `room` has fit_room(width) elements.
 template <class T>
 double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* room) {
   using V = Vector<T>;
@@ -51,7 +51,7 @@ double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* r
     for (int i = 0; i < plane.width; i += lanes) {
       const V a = load<T>(own.depth + 1 + i), g = load<T>(own.grey + 1 + i);
       V gradient{};
-      // The value of the pairs with a neighbour; their gradient goes to `gradient`.
+      // Returns the value of the pairs with a neighbour, and adds their gradient to `gradient`.
       const auto pair = [&](const SmoothRow<T>& of, int column) {
         return unevenness_of<T>(a, g, load<T>(of.depth + column), load<T>(of.grey + column), gradient);
       };

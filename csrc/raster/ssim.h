@@ -1,5 +1,5 @@
-// How far a picture is from a photo, and the gradient: absolute differences and structural similarity (window.h), one channel, a few
-// rows at a time.
+// Photometric distance of an image from a photo, and its gradient: absolute differences and structural similarity (window.h), for one
+// channel, a few rows at a time.
 #pragma once
 
 #include "simd.h"
@@ -8,8 +8,8 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Σ SSIM over the windows whose first row is in [begin, end), and their slopes where these are asked for. `room` has
-// fit_room(width) numbers, and so below.
+// Returns Σ SSIM over the windows whose first row is in [begin, end), and writes their slopes if requested. `room` has fit_room(width)
+// elements, also in the functions below.
 template <class T>
 double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
   using V = Vector<T>;
@@ -18,7 +18,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
   const int64_t count = int64_t(windows) * (plane.height - kWindow + 1);
   V sum{};
   for (int row = begin; row < end; ++row) {
-    // Down the columns: five rows of means go to `room`.
+    // Sums along the columns: five rows of means are stored in `room`.
     for (int i = 0; i < width; i += lanes) {
       const T* x = plane.picture + int64_t(row) * width + i;
       const T* y = plane.photo + int64_t(row) * width + i;
@@ -27,7 +27,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
         add_pixels<T>(broadcast<T>(plane.weights[k]), load_some<T>(x, width - i), load_some<T>(y, width - i), means);
       for (int j = 0; j < 5; ++j) store<T>(room + j * stride + i, means[j]);
     }
-    // Along the row.
+    // Sums along the row.
     for (int i = 0; i < windows; i += lanes) {
       WindowMeans<T> means = {};
       for (int k = 0; k < kWindow; ++k)
@@ -45,8 +45,8 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* room) {
   return sum_of_lanes<T>(sum);
 }
 
-// Σ |x − y| over the rows [begin, end), and, where it is asked for, the gradient there: `absolute` times that of Σ |x − y| plus
-// `similar` times that of Σ SSIM, for which all slopes are known unless `similar` is 0.
+// Returns Σ |x − y| over the rows [begin, end). If requested, writes the gradient there: `absolute` times that of Σ |x − y| plus `similar`
+// times that of Σ SSIM. All slopes must be known unless `similar` is 0.
 template <class T>
 double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, int end, T* room) {
   using V = Vector<T>;
@@ -55,10 +55,10 @@ double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, 
   const int stride = width + kWindow + lanes;
   const int64_t count = int64_t(windows) * (last + 1);
   V sum{};
-  // Windows before the first and behind the last have no slope.
+  // Windows before the first and after the last have zero slopes.
   for (int j = 0; j < 3 * stride; ++j) room[j] = 0;
   for (int row = begin; row < end; ++row) {
-    // Down the columns of windows that the row is in; that of window i goes to place i + 10.
+    // Sums along the columns of the windows that contain the row; the sum for window i is stored at index i + 10.
     const int first = row < kWindow ? 0 : row - kWindow + 1, stop = row < last ? row : last;
     for (int i = 0; similar != 0 && i < windows; i += lanes) {
       WindowSlopes<T> slopes = {};
@@ -68,7 +68,7 @@ double fit_gradient(const FitPlane<T>& plane, T absolute, T similar, int begin, 
                           load_some<T>(plane.slopes + j * count + int64_t(at) * windows + i, windows - i), slopes[j]);
       for (int j = 0; j < 3; ++j) store<T>(room + j * stride + kWindow - 1 + i, slopes[j]);
     }
-    // Along the row.
+    // Sums along the row.
     for (int i = 0; i < width; i += lanes) {
       const int64_t at = int64_t(row) * width + i;
       const int left = width - i;

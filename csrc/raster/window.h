@@ -1,12 +1,11 @@
-// The arithmetic of structural similarity (spec 9.4), window by window and pixel by pixel; ssim.h goes through pictures with it, and
-// ../cuda/losses.h. Under a window w of 11×11 with x the picture, y the photo, m, n, p, q, r the means of x, y, x², y² and xy, and
-// s = 121/120:
+// Arithmetic of structural similarity (spec 9.4) for windows and pixels; used by ssim.h and ../cuda/losses.h. For a window w of 11×11, x is
+// the image, y the photo, m, n, p, q, r are the means of x, y, x², y² and xy, and s = 121/120:
 //
 //   SSIM = N C / (M V),   N = 2mn + C₁,  C = 2s(r − mn) + C₂,  M = m² + n² + C₁,  V = s(p − m² + q − n²) + C₂
 //
 //   ∂/∂p = −s SSIM / V,   ∂/∂r = 2s N / (M V),   ∂/∂m = 2n C/(M V) − 2m SSIM/M − 2m ∂/∂p − n ∂/∂r
 //
-// and a pixel's gradient gathers those of the windows that it is in:  w∗∂m + 2x (w∗∂p) + y (w∗∂r).
+// The gradient at a pixel sums over the windows that contain it:  w∗∂m + 2x (w∗∂p) + y (w∗∂r).
 #pragma once
 
 #include "simd.h"
@@ -14,14 +13,14 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// m, n, p, q and r, in this order.
+// Means m, n, p, q and r of a window, in this order.
 template <class T>
 using WindowMeans = Vector<T>[5];
-// ∂SSIM/∂m, ∂/∂p and ∂/∂r of a window, or their sums over the windows that a pixel is in.
+// Slopes ∂SSIM/∂m, ∂/∂p and ∂/∂r of a window, or their sums over the windows that contain a pixel.
 template <class T>
 using WindowSlopes = Vector<T>[3];
 
-// Adds pixels of the picture and of the photo, weighted.
+// Adds weighted pixels of the image and of the photo to the means.
 template <class T>
 GS_INLINE void add_pixels(Vector<T> weight, Vector<T> x, Vector<T> y, WindowMeans<T>& means) {
   const Vector<T> wx = weight * x, wy = weight * y;
@@ -32,7 +31,7 @@ GS_INLINE void add_pixels(Vector<T> weight, Vector<T> x, Vector<T> y, WindowMean
   means[4] = add_product(wx, y, means[4]);
 }
 
-// SSIM of a window, and its slopes where they are asked for.
+// Computes SSIM of a window, and its slopes if requested.
 template <class T>
 GS_INLINE Vector<T> similarity_of(const WindowMeans<T>& means, bool with_slopes, WindowSlopes<T>& slopes) {
   using V = Vector<T>;
@@ -52,7 +51,7 @@ GS_INLINE Vector<T> similarity_of(const WindowMeans<T>& means, bool with_slopes,
   return similarity;
 }
 
-// The gradient of `absolute` · |x − y| at a pixel, which is 0 where they are equal.
+// Computes the gradient of `absolute` · |x − y| at a pixel, which is 0 if they are equal.
 template <class T>
 GS_INLINE Vector<T> gradient_of_difference(Vector<T> x, Vector<T> y, T absolute) {
   using V = Vector<T>;
@@ -60,7 +59,7 @@ GS_INLINE Vector<T> gradient_of_difference(Vector<T> x, Vector<T> y, T absolute)
   return select(less(d, V{}), broadcast<T>(-absolute), up);
 }
 
-// Adds `similar` times the gradient of Σ SSIM at a pixel, from the weighted sums of slopes of the windows that it is in.
+// Adds `similar` times the gradient of Σ SSIM at a pixel, from the weighted sums of the slopes of the windows that contain it.
 template <class T>
 GS_INLINE Vector<T> add_gradient_of_similarity(Vector<T> x, Vector<T> y, T similar, const WindowSlopes<T>& slopes, Vector<T> gradient) {
   return add_product(broadcast<T>(similar), add_product(x + x, slopes[1], add_product(y, slopes[2], slopes[0])), gradient);

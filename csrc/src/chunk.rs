@@ -1,35 +1,36 @@
-//! Pickles of RealEstate10K-style chunks.
+//! Pickling of RealEstate10K-style chunks.
 
 pub use ffi::*;
 
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// The bytes of an image file.
+    /// Encoded contents of an image file.
     #[derive(Debug, Clone)]
     struct EncodedImage {
-        /// As they are in the file.
+        /// Bytes of the file.
         bytes: Vec<u8>,
     }
 
-    /// A posed video: as many timestamps, cameras and images as it has views.
+    /// Posed video with equally many timestamps, cameras and images: one for each view.
     #[derive(Debug, Clone)]
     struct SceneToPickle {
-        /// By which an index names the scene.
+        /// Key of the scene in an index.
         key: String,
-        /// Where the video came from; may be empty.
+        /// Source of the video; may be empty.
         url: String,
-        /// Microseconds.
+        /// Timestamps in microseconds.
         timestamps: Vec<i64>,
-        /// 18 numbers of each view: f_x, f_y, c_x, c_y of the width and height, 0, 0, and w2c's first three rows.
+        /// Camera parameters, 18 values per view: f_x, f_y, c_x, c_y relative to the width and height, 0, 0, and the first three rows of
+        /// w2c.
         cameras: Vec<f32>,
-        /// As many as cameras.
+        /// Images, one for each camera.
         images: Vec<EncodedImage>,
     }
 
     unsafe extern "C++" {
         include!("chunk.h");
 
-        /// See `csrc/chunk.h`.
+        /// Serializes scenes in the format of torch.save; see `csrc/chunk.h`.
         fn pickle_scenes(scenes: &Vec<SceneToPickle>) -> Result<UniquePtr<CxxVector<u8>>>;
     }
 }

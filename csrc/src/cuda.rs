@@ -1,5 +1,5 @@
-//! The kernels of `cuda/` on GPUs, without a CUDA toolkit: compiled by NVRTC, which comes with torch, kept on disk, and launched by the
-//! driver.
+//! Compilation, caching and launching of the kernels in `cuda/`, without a CUDA toolkit: NVRTC, which comes with torch, compiles them and
+//! the driver launches them.
 
 mod cache;
 mod compile;
@@ -14,20 +14,20 @@ pub use usage::{KernelUse, usage};
 
 use gpu::launch_kernel;
 
-/// What is wrong, in one sentence.
+/// Result whose error is a message of one sentence.
 pub type Result<T> = std::result::Result<T, String>;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat::cuda")]
 mod ffi {
-    /// Of a launch.
+    /// Number of blocks of a launch in each dimension.
     struct BlockCounts {
         x: u32,
         y: u32,
     }
     extern "Rust" {
-        /// Has the device, by its number, run a kernel in a stream, a `CUstream`. `arguments` is a `void**`, as cuLaunchKernel takes it.
+        /// Launches a kernel on the device of this index, in a stream, a `CUstream`. `arguments` is a `void**`, as in cuLaunchKernel.
         unsafe fn launch_kernel(
             device: i32,
             stream: usize,

@@ -1,59 +1,59 @@
-//! What a GPU does beside its work. Tensors cross the border as addresses of `at::Tensor`, which is what tch's `C_tensor` is. A GPU is
-//! CUDA's, by its number.
+//! GPU events, copies to a GPU, and memory statistics. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`. A GPU is
+//! given by its CUDA device index.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
         include!("device.h");
 
-        /// See `csrc/device.h`.
+        /// Event in a GPU's stream; see `csrc/device.h`.
         type Mark;
 
-        /// See `csrc/device.h`.
+        /// Records an event in a GPU's current stream; see `csrc/device.h`.
         fn mark(gpu: i32) -> Result<UniquePtr<Mark>>;
 
-        /// See `csrc/device.h`.
+        /// Returns the milliseconds between two events; see `csrc/device.h`.
         fn since(self: &Mark, earlier: &Mark) -> Result<f64>;
 
-        /// See `csrc/device.h`.
+        /// Copies on a GPU that may still be in progress; see `csrc/device.h`.
         type Copies;
 
-        /// See `csrc/device.h`.
+        /// Returns the copied tensors; see `csrc/device.h`.
         fn hand_over(self: &Copies, out: &mut [usize]) -> Result<()>;
 
-        /// See `csrc/device.h`.
+        /// Stream for copies to a GPU; see `csrc/device.h`.
         type CopyStream;
 
-        /// See `csrc/device.h`.
+        /// Creates a stream for copies; see `csrc/device.h`.
         fn copy_stream(gpu: i32) -> Result<UniquePtr<CopyStream>>;
 
-        /// See `csrc/device.h`.
+        /// Starts copying tensors to the GPU; see `csrc/device.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `tensors` must be addresses of live tensors.
         unsafe fn copy(self: &CopyStream, tensors: &[usize]) -> Result<UniquePtr<Copies>>;
 
-        /// See `csrc/device.h`.
+        /// Allocates a tensor in page-locked memory; see `csrc/device.h`.
         fn page_locked_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
 
-        /// See `csrc/device.h`.
+        /// Returns the peak of a GPU's tensor memory in bytes; see `csrc/device.h`.
         fn peak_bytes(gpu: i32) -> Result<u64>;
 
-        /// See `csrc/device.h`.
+        /// Resets the peak of a GPU's tensor memory; see `csrc/device.h`.
         fn forget_peak_bytes(gpu: i32) -> Result<()>;
 
-        /// See `csrc/device.h`.
+        /// Disables TF32 in convolutions; see `csrc/device.h`.
         fn leave_out_tf32();
     }
 }
 
-// SAFETY: libtorch's streams and events belong to no thread.
+// SAFETY: libtorch's streams and events are not bound to a thread.
 unsafe impl Send for Mark {}
-// SAFETY: as above, and tensors go from thread to thread.
+// SAFETY: as above, and tensors may be sent between threads.
 unsafe impl Send for Copies {}
 // SAFETY: as above.
 unsafe impl Send for CopyStream {}

@@ -1,43 +1,43 @@
-//! What fitting pictures to photos needs beside drawing them. Tensors cross the border as addresses of `at::Tensor`, which is what
-//! tch's `C_tensor` is.
+//! Losses and optimizer steps that fit rendered images to photos. Tensors are passed as addresses of `at::Tensor`, which is tch's
+//! `C_tensor`.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// A step of Adam on one tensor. Tensors are addresses of at::Tensor (tch's C_tensor) that the call borrows.
+    /// Arguments of a step of Adam on one tensor. Tensors are addresses of `at::Tensor` (tch's `C_tensor`) that the call borrows.
     struct AdamArguments {
-        /// What is updated.
+        /// Tensor to update.
         value: usize,
-        /// Its gradient.
+        /// Gradient of the value.
         gradient: usize,
         /// Running mean of the gradient.
         first: usize,
-        /// Running mean of its square.
+        /// Running mean of the squared gradient.
         second: usize,
-        /// The learning rate over 1 − β₁ᵗ.
+        /// Learning rate divided by 1 − β₁ᵗ.
         rate: f64,
-        /// √(1 − β₂ᵗ).
+        /// Bias correction of the second moment, √(1 − β₂ᵗ).
         root: f64,
-        /// Of the value, taken away.
+        /// Fraction of the value that is subtracted.
         decay: f64,
-        /// How much of `first` stays.
+        /// Decay rate of `first`.
         beta1: f64,
-        /// How much of `second` stays.
+        /// Decay rate of `second`.
         beta2: f64,
-        /// Added to the root of `second`.
+        /// Constant added to the square root of `second`.
         epsilon: f64,
     }
 
     unsafe extern "C++" {
         include!("fit.h");
 
-        /// See `csrc/fit.h`.
+        /// Computes the photometric loss; see `csrc/fit.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `picture` and `photo` must be addresses of live tensors.
         unsafe fn photometric(
             picture: usize,
             photo: usize,
@@ -46,10 +46,10 @@ mod ffi {
             out: &mut [usize],
         ) -> Result<()>;
 
-        /// See `csrc/fit.h`.
+        /// Computes the depth smoothness loss; see `csrc/fit.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `depths` and `photos` must be addresses of live tensors.
         unsafe fn depth_smoothness(
             depths: usize,
             photos: usize,
@@ -57,10 +57,10 @@ mod ffi {
             out: &mut [usize],
         ) -> Result<()>;
 
-        /// See `csrc/fit.h`.
+        /// Runs a step of Adam; see `csrc/fit.h`.
         ///
         /// # Safety
-        /// The arguments hold addresses of live tensors that nothing else reads or writes meanwhile.
+        /// The arguments must hold addresses of live tensors that nothing else reads or writes meanwhile.
         unsafe fn adam(of: &AdamArguments) -> Result<()>;
     }
 }

@@ -1,4 +1,4 @@
-//! The C++ of GlobalSplat as Rust sees it. A crate of its own, without tch, so that both compile side by side.
+//! Rust bindings of GlobalSplat's C++ code. They form a crate without a dependency on tch, so that the two compile in parallel.
 
 pub mod attention;
 pub mod chunk;

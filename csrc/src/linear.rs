@@ -1,18 +1,18 @@
-//! Linear layers on the CPU. Tensors cross the border as addresses of `at::Tensor`, which is what tch's `C_tensor` is.
+//! Linear layers on the CPU. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
         include!("linear.h");
 
-        /// See `csrc/linear.h`.
+        /// Applies a linear layer; see `csrc/linear.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors; 0 for a bias that isn't there.
+        /// All arguments must be addresses of live tensors; `bias` may be 0 for none.
         unsafe fn linear(xs: usize, weights: usize, bias: usize) -> Result<usize>;
     }
 }

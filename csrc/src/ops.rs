@@ -1,20 +1,20 @@
-//! Which ops libtorch is asked for.
+//! Recording of the libtorch ops that a computation calls.
 
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
         include!("ops.h");
 
-        /// See `csrc/ops.h`.
+        /// Begins recording; see `csrc/ops.h`.
         fn note_ops(outermost: bool);
 
-        /// See `csrc/ops.h`.
+        /// Ends recording and returns the ops; see `csrc/ops.h`.
         fn noted_ops() -> Vec<String>;
     }
 }
 
-/// What `work` gives, and the ops that it had libtorch do on this thread, by the names that `csrc/ops.h` tells, in their order: those
-/// inside of others, and of backward passes on the CPU, too.
+/// Runs `work` and returns its result and all libtorch ops that it ran on this thread, in order and by the names that `csrc/ops.h`
+/// describes. These include ops called by other ops, and ops of backward passes on the CPU.
 pub fn ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
     ffi::note_ops(false);
     let done = work();
@@ -57,7 +57,7 @@ const VIEW_OPS: [&str; 24] = [
     "aten::view_as",
 ];
 
-/// Ops whose answer the host waits for: numbers that it reads, and sizes that depend on values.
+/// Ops for which the host waits: they return values to it, or their output sizes depend on values.
 pub const WAITING: [&str; 7] = [
     "aten::_local_scalar_dense",
     "aten::equal",
@@ -68,22 +68,22 @@ pub const WAITING: [&str; 7] = [
     "aten::repeat_interleave.Tensor",
 ];
 
-/// Returns how many tensors `ops` send to a device, be it the one where they are.
+/// Returns how many tensors `ops` send to a device, including the device on which they already are.
 ///
 /// # Panics
-/// An op waits for a GPU.
+/// Panics if one of the ops waits for a GPU.
 pub fn moves(ops: &[String]) -> usize {
     let waits = ops.iter().find(|op| WAITING.contains(&op.as_str()));
     assert!(waits.is_none(), "{waits:?} waits");
     ops.iter().filter(|op| *op == "aten::to.device").count()
 }
 
-/// Returns how many of `ops` compute something. On a GPU each is a launch, or a few.
+/// Returns the number of `ops` that compute something. On a GPU each is one kernel launch, or a few.
 pub fn computing(ops: &[String]) -> usize {
     ops.iter().filter(|op| !VIEW_OPS.contains(&op.as_str())).count()
 }
 
-/// Returns `ops` without those of our own linear layers in float32, which take a product in blocks on any of libtorch's threads.
+/// Returns `ops` without those of our own float32 linear layers, which compute a product in blocks on any of libtorch's threads.
 pub fn without_own_linear_layers(mut ops: Vec<String>) -> Vec<String> {
     ops.retain(|op| !["aten::copy_", "aten::linear", "mkldnn::_linear_pointwise"].contains(&op.as_str()));
     ops

@@ -1,65 +1,64 @@
-//! What an optimizer does to all of its tensors at once. Tensors cross the border as addresses of `at::Tensor`, which is what tch's
-//! `C_tensor` is.
+//! Optimizer steps on many tensors at once. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// What a step of AdamW does to all of its tensors alike.
+    /// Parameters of an AdamW step that all tensors share.
     struct AdamWNumbers {
-        /// This one counted, from 1.
+        /// Number of this step, counted from 1.
         steps: i64,
-        /// How far it goes, about.
+        /// Learning rate: about the size of the step.
         learning_rate: f64,
-        /// Of the value, taken away, times the learning rate.
+        /// Weight decay: the fraction of the value that is subtracted, times the learning rate.
         weight_decay: f64,
-        /// How much of the first moment stays.
+        /// Decay rate of the first moment.
         beta1: f64,
-        /// How much of the second moment stays.
+        /// Decay rate of the second moment.
         beta2: f64,
-        /// Added to the root of the second moment.
+        /// Constant added to the square root of the second moment.
         epsilon: f64,
     }
 
-    /// What a step of Muon does to all of its matrices alike.
+    /// Parameters of a Muon step that all matrices share.
     struct MuonNumbers {
-        /// So many lie on one another in each, of the same height.
+        /// Number of equally high matrices stacked vertically in each tensor.
         parts: i64,
-        /// How far it goes, about.
+        /// Learning rate: about the size of the step.
         learning_rate: f64,
-        /// Of the value, taken away, times the learning rate.
+        /// Weight decay: the fraction of the value that is subtracted, times the learning rate.
         weight_decay: f64,
-        /// How much of the running mean stays.
+        /// Decay rate of the running mean of the gradient.
         beta: f64,
     }
 
     unsafe extern "C++" {
         include!("optim.h");
 
-        /// See `csrc/optim.h`.
+        /// Computes the norm of all elements of all tensors; see `csrc/optim.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `tensors` must be addresses of live tensors.
         unsafe fn norm(tensors: &[usize], out: &mut [usize]) -> Result<()>;
 
-        /// See `csrc/optim.h`.
+        /// Multiplies tensors by `factor` in place; see `csrc/optim.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors that nothing else reads or writes meanwhile.
+        /// `tensors` must be addresses of live tensors that nothing else reads or writes meanwhile.
         unsafe fn scale(tensors: &[usize], factor: f64) -> Result<()>;
 
-        /// See `csrc/optim.h`.
+        /// Resets gradients to undefined; see `csrc/optim.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `tensors` must be addresses of live tensors.
         unsafe fn forget_gradients(tensors: &[usize]) -> Result<()>;
 
-        /// See `csrc/optim.h`.
+        /// Runs a step of AdamW; see `csrc/optim.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors that nothing else reads or writes meanwhile.
+        /// All addresses must be those of live tensors that nothing else reads or writes meanwhile.
         unsafe fn fused_adamw(
             values: &[usize],
             gradients: &[usize],
@@ -68,10 +67,10 @@ mod ffi {
             of: &AdamWNumbers,
         ) -> Result<()>;
 
-        /// See `csrc/optim.h`.
+        /// Runs a step of Muon; see `csrc/optim.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors that nothing else reads or writes meanwhile.
+        /// All addresses must be those of live tensors that nothing else reads or writes meanwhile.
         unsafe fn muon(
             values: &[usize],
             gradients: &[usize],

@@ -1,33 +1,33 @@
-//! What the processor has, and how it computes.
+//! Features and floating-point modes of the processor.
 
 pub use ffi::*;
 
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// Instructions for products of bf16.
+    /// Instructions for bf16 products.
     #[derive(Debug)]
     enum Bf16 {
-        /// None: such products are slower than those of float32.
+        /// No instructions: bf16 products are slower than float32 products.
         None,
-        /// Of vectors (avx512_bf16): products are about twice as fast as those of float32.
+        /// Vector instructions (avx512_bf16): products are about twice as fast as in float32.
         Vectors,
-        /// Of tiles (AMX): many times as fast.
+        /// Tile instructions (AMX): products are many times as fast as in float32.
         Tiles,
     }
 
     unsafe extern "C++" {
         include!("processor.h");
 
-        /// Of the CPU, as libtorch sees it; none where `GLOBALSPLAT_SIMD` hides them.
+        /// Returns the CPU's bf16 instructions, as libtorch sees them; `None` if `GLOBALSPLAT_SIMD` hides them.
         fn bf16_of_cpu() -> Bf16;
 
-        /// The instruction set of libtorch's own kernels, such as "AVX2".
+        /// Returns the instruction set of libtorch's own kernels, such as "AVX2".
         fn libtorch_simd_level() -> String;
 
-        /// Of the current GPU.
+        /// Returns `true` if the current GPU has bf16 instructions.
         fn gpu_has_bf16() -> bool;
 
-        /// See `csrc/processor.h`.
+        /// Makes this thread treat denormal numbers as 0; see `csrc/processor.h`.
         fn flush_denormals();
     }
 }

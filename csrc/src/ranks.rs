@@ -1,18 +1,18 @@
-//! Processes that train together. Tensors cross the border as addresses of `at::Tensor`, which is what tch's `C_tensor` is.
+//! Communication among processes that train together. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
         include!("ranks.h");
 
-        /// See `csrc/ranks.h`.
+        /// Key-value store that all processes share; see `csrc/ranks.h`.
         type Store;
 
-        /// See `csrc/ranks.h`.
+        /// Connects to the store, or starts it; see `csrc/ranks.h`.
         fn connect(
             host: &str,
             port: u16,
@@ -21,70 +21,70 @@ mod ffi {
             seconds: i64,
         ) -> Result<UniquePtr<Store>>;
 
-        /// See `csrc/ranks.h`.
+        /// Opens another connection, for another thread; see `csrc/ranks.h`.
         fn another(self: &Store) -> Result<UniquePtr<Store>>;
 
-        /// See `csrc/ranks.h`.
+        /// Adds to a number in the store and returns the sum; see `csrc/ranks.h`.
         fn add(self: &Store, key: &str, amount: i64) -> Result<i64>;
 
-        /// See `csrc/ranks.h`.
+        /// Returns `true` if this build supports collectives on CPUs (Gloo).
         fn has_gloo() -> bool;
 
-        /// See `csrc/ranks.h`.
+        /// Returns `true` if this build supports collectives on GPUs (NCCL).
         fn has_nccl() -> bool;
 
-        /// See `csrc/ranks.h`.
+        /// Process group; see `csrc/ranks.h`.
         type Group;
 
-        /// See `csrc/ranks.h`.
+        /// Creates a process group for CPU tensors; see `csrc/ranks.h`.
         fn gloo(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<Group>>;
 
-        /// See `csrc/ranks.h`.
+        /// Creates a process group for GPU tensors; see `csrc/ranks.h`.
         fn nccl(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<Group>>;
 
-        /// See `csrc/ranks.h`.
+        /// Replaces a tensor by its sum over all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
-        /// The address of a live tensor that nothing else reads or writes meanwhile.
+        /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
         unsafe fn all_reduce(self: &Group, tensor: usize) -> Result<()>;
 
-        /// See `csrc/ranks.h`.
+        /// Copies a tensor of rank `from` to all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
-        /// The address of a live tensor that nothing else reads or writes meanwhile.
+        /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
         unsafe fn broadcast(self: &Group, tensor: usize, from: i32) -> Result<()>;
 
-        /// See `csrc/ranks.h`.
+        /// Stacks the tensors of all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
-        /// The address of a live tensor.
+        /// `tensor` must be the address of a live tensor.
         unsafe fn all_gather(self: &Group, tensor: usize, out: &mut [usize]) -> Result<()>;
 
-        /// See `csrc/ranks.h`.
+        /// Shuts the process group down in order; see `csrc/ranks.h`.
         fn shut_down(self: &Group) -> Result<()>;
 
-        /// See `csrc/ranks.h`.
+        /// Gradient buckets that are reduced during the backward pass; see `csrc/ranks.h`.
         type Buckets;
 
-        /// See `csrc/ranks.h`.
+        /// Creates gradient buckets; see `csrc/ranks.h`.
         ///
         /// # Safety
-        /// Addresses of live tensors.
+        /// `parameters` must be addresses of live tensors.
         unsafe fn buckets(group: &Group, parameters: &[usize], bytes: i64) -> Result<UniquePtr<Buckets>>;
 
-        /// See `csrc/ranks.h`.
+        /// Announces the last backward pass of a step; see `csrc/ranks.h`.
         fn begin(self: &Buckets);
 
-        /// See `csrc/ranks.h`.
+        /// Reduces the remaining buckets and waits for all; see `csrc/ranks.h`.
         fn finish(self: &Buckets) -> Result<usize>;
     }
 }
 
-// SAFETY: c10d's stores take calls from any thread.
+// SAFETY: c10d's stores may be called from any thread.
 unsafe impl Send for Store {}
-// SAFETY: as above, one call after the other.
+// SAFETY: as above; concurrent calls are serialized.
 unsafe impl Sync for Store {}
-// SAFETY: c10d's groups belong to no thread.
+// SAFETY: c10d's process groups are not bound to a thread.
 unsafe impl Send for Group {}
-// SAFETY: what they share is parameters, which go from thread to thread.
+// SAFETY: buckets share nothing but parameters, which may be sent between threads.
 unsafe impl Send for Buckets {}

@@ -1,69 +1,69 @@
-//! The splat ops. Tensors cross the border as addresses of `at::Tensor`, which is what tch's `C_tensor` is.
+//! The splat ops. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 
 pub use ffi::*;
 
-// Clippy doesn't see the sections on safety inside of a bridge.
+// Clippy doesn't see the safety sections inside of a bridge.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// Gaussians and cameras of one call. Tensors are addresses of at::Tensor (tch's C_tensor) that the call borrows.
+    /// Gaussians and cameras of one call. Tensors are addresses of `at::Tensor` (tch's `C_tensor`) that the call borrows.
     struct SplatArguments {
-        /// [B, N, 3]
+        /// Means of the Gaussians, [B, N, 3].
         means: usize,
-        /// [B, N, 3]
+        /// Scales of the Gaussians, [B, N, 3].
         scales: usize,
-        /// [B, N, 4]
+        /// Quaternions of the Gaussians, [B, N, 4].
         quaternions: usize,
-        /// [B, N]
+        /// Opacities of the Gaussians, [B, N].
         opacities: usize,
-        /// [B, N, bases, 3]
+        /// Spherical harmonics coefficients, [B, N, bases, 3].
         sh: usize,
-        /// [B, C, 4, 4]
+        /// World-to-camera matrices, [B, C, 4, 4].
         w2c: usize,
-        /// [B, C, 3, 3], pixels
+        /// Camera intrinsics in pixels, [B, C, 3, 3].
         intrinsics: usize,
-        /// Of the pictures, pixels.
+        /// Width of the images in pixels.
         width: i32,
-        /// Of the pictures, pixels.
+        /// Height of the images in pixels.
         height: i32,
-        /// Added to the diagonal of every projected covariance, pixels².
+        /// Value added to the diagonal of every projected covariance, in pixels².
         eps2d: f64,
     }
 
-    /// Wall-clock seconds that the stages of a call took, all its views together.
+    /// Wall-clock seconds of the stages of a call, summed over all its views.
     #[derive(Debug, Clone, Copy)]
     struct StageTimes {
-        /// Gaussians to splats, and to the tiles that these reach.
+        /// Projection of Gaussians to splats, and search for the tiles that they touch.
         project: f64,
-        /// Splats into the order of their depths.
+        /// Sorting of splats by depth.
         sort: f64,
-        /// And into the tiles' lists.
+        /// Sorting of splats into the tiles' lists.
         bin: f64,
-        /// Lists to pictures.
+        /// Blending of the lists into images.
         blend: f64,
-        /// From the pictures' gradients to the splats'.
+        /// Gradients of splats from those of images.
         blend_backward: f64,
-        /// From the splats' gradients to the Gaussians'.
+        /// Gradients of Gaussians from those of splats.
         project_backward: f64,
     }
 
-    /// How much there is to blend, all views of a call together.
+    /// Numbers of pairs to blend, summed over all views of a call.
     #[derive(Debug, Clone, Copy)]
     struct PairCounts {
-        /// (tile, splat) pairs.
+        /// Number of (tile, splat) pairs.
         tile_entries: i64,
-        /// (pixel, splat) pairs whose α is computed.
+        /// Number of (pixel, splat) pairs whose α is computed.
         evaluated: i64,
-        /// (pixel, splat) pairs that are blended.
+        /// Number of (pixel, splat) pairs that are blended.
         contributing: i64,
     }
 
-    /// What all launches of one of the rasterizer's kernels on a GPU took.
+    /// Total time of all launches of one of the rasterizer's GPU kernels.
     #[derive(Debug, Clone)]
     struct KernelTime {
-        /// Its name.
+        /// Name of the kernel.
         kernel: String,
-        /// All of them together.
+        /// Total time in milliseconds.
         milliseconds: f64,
     }
 
@@ -73,52 +73,52 @@ mod ffi {
         include!("splat.h");
         include!("threads.h");
 
-        /// See `csrc/splat.h`.
+        /// Renders Gaussians; see `csrc/splat.h`.
         ///
         /// # Safety
-        /// The arguments hold addresses of live tensors.
+        /// The arguments must hold addresses of live tensors.
         unsafe fn splat(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
-        /// See `csrc/splat.h`.
+        /// Projects Gaussians; see `csrc/splat.h`.
         ///
         /// # Safety
-        /// The arguments hold addresses of live tensors.
+        /// The arguments must hold addresses of live tensors.
         unsafe fn project(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
-        /// The first `out.len()` (1, 4, 9 or 16) spherical harmonics of a unit vector.
+        /// Evaluates the first `out.len()` (1, 4, 9 or 16) spherical harmonics at a unit vector.
         fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
 
-        /// Of the libtorch whose headers this was compiled with.
+        /// Returns the version of the libtorch whose headers this was compiled with.
         fn libtorch_version() -> String;
 
-        /// See `csrc/splat.h`.
+        /// Removes stack traces from libtorch's errors; see `csrc/splat.h`.
         fn leave_out_stack_traces();
 
-        /// See `csrc/cpu/cpu.h`.
+        /// Counts the pairs that a call has to blend; see `csrc/cpu/cpu.h`.
         ///
         /// # Safety
-        /// The arguments hold addresses of live tensors.
+        /// The arguments must hold addresses of live tensors.
         unsafe fn count_pairs(of: &SplatArguments) -> Result<PairCounts>;
 
-        /// See `csrc/cpu/cpu.h`.
+        /// Measures the peak rate of multiply-adds; see `csrc/cpu/cpu.h`.
         fn multiply_add_peak(seconds: f64) -> f64;
 
-        /// See `csrc/cpu/cpu.h`.
+        /// Returns the stage times of this thread's last call; see `csrc/cpu/cpu.h`.
         fn stage_times() -> StageTimes;
 
-        /// See `csrc/cuda/kernel_times.h`.
+        /// Starts or ends the measurement of GPU kernels; see `csrc/cuda/kernel_times.h`.
         fn measure_kernels(on: bool);
 
-        /// See `csrc/cuda/kernel_times.h`.
+        /// Returns the measured times of GPU kernels; see `csrc/cuda/kernel_times.h`.
         fn kernel_times() -> Result<Vec<KernelTime>>;
 
-        /// See `csrc/cpu/cpu.h`.
+        /// Returns the instruction set of the CPU kernels in use; see `csrc/cpu/cpu.h`.
         fn simd_level() -> Result<String>;
 
-        /// See `csrc/threads.h`.
+        /// Returns the number of threads of our own kernels; see `csrc/threads.h`.
         fn threads() -> i32;
 
-        /// See `csrc/threads.h`.
+        /// Sets the number of threads of our own kernels; see `csrc/threads.h`.
         fn set_threads(count: i32);
     }
 }

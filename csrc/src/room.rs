@@ -1,4 +1,4 @@
-//! Memory that is asked for before those are called who don't bear that the system refuses it.
+//! Checks of available memory before calls into libraries that don't handle failed allocations.
 
 pub use ffi::*;
 
@@ -7,7 +7,7 @@ mod ffi {
     unsafe extern "C++" {
         include!("room.h");
 
-        /// See `csrc/room.h`.
+        /// Returns an error unless there is memory for generated code; see `csrc/room.h`.
         fn expect_room_for_code(bytes: i64) -> Result<()>;
     }
 }

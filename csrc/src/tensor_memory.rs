@@ -1,14 +1,14 @@
-//! How much memory tensors take.
+//! Measurement of the memory that tensors take.
 
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
         include!("tensor_memory.h");
 
-        /// See `csrc/tensor_memory.h`.
+        /// Begins counting the bytes of tensors; see `csrc/tensor_memory.h`.
         fn count_tensor_bytes();
 
-        /// See `csrc/tensor_memory.h`.
+        /// Ends counting and returns the peak; see `csrc/tensor_memory.h`.
         fn most_tensor_bytes() -> u64;
     }
 }

@@ -1,8 +1,8 @@
-//! Every target is this file: the name of the binary is that of the reader.
+//! Fuzz target that every fuzz binary shares: the name of the binary selects the reader.
 #![no_main]
 
 #[path = "../../tests/common/readers/mod.rs"]
-#[allow(dead_code)] // every target uses one
+#[allow(dead_code)] // every target uses only one
 mod readers;
 
 use std::sync::OnceLock;

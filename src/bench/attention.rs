@@ -1,4 +1,4 @@
-//! Attention on the CPU: our kernel beside libtorch's, and both beside a matrix product.
+//! Benchmark of attention on the CPU: this crate's kernel, libtorch's, and a matrix product for comparison.
 
 use super::Spread;
 use super::yardstick::Yardstick;
@@ -8,43 +8,44 @@ use crate::render::cpu::simd_level;
 use serde::Serialize;
 use tch::{Device, Kind, Tensor, no_grad};
 
-/// What [`bench_attention`] measured.
+/// Results of [`bench_attention`].
 #[derive(Debug, Serialize)]
 pub struct AttentionReport {
-    /// Instruction set of our kernel.
+    /// Instruction set of this crate's kernel.
     pub simd: String,
-    /// Threads that shared the work.
+    /// Number of threads.
     pub threads: i32,
-    /// Of queries, keys and values.
+    /// Precision of queries, keys and values.
     pub precision: Precision,
-    /// A product of matrices of 2048×2048 in the same precision, in 10⁹ floating-point operations a second.
+    /// Throughput of a product of 2048×2048 matrices in the same precision, in GFLOP/s.
     pub product_gflops: f64,
-    /// Forward and backward, each by whom it is computed.
+    /// Forward and backward pass of each implementation.
     pub rows: Vec<AttentionRow>,
 }
 
-/// One pass in one way.
+/// One pass of one implementation.
 #[derive(Debug, Serialize)]
 pub struct AttentionRow {
-    /// forward or backward.
+    /// Name of the pass: `forward` or `backward`.
     pub pass: &'static str,
-    /// ours, libtorch's, or libtorch's on heads that were copied apart.
+    /// Implementation: `ours`, `libtorch`, or `libtorch, heads apart` (with each head copied into a contiguous tensor).
     pub by: &'static str,
-    /// A call.
+    /// Time of a call.
     pub milliseconds: Spread,
-    /// Of the fastest call, in 10⁹ floating-point operations a second; of backward passes those of recomputed scores count.
+    /// Throughput of the fastest call in GFLOP/s. Backward passes include the operations that recompute the scores.
     pub gflops: f64,
-    /// Of it, what the product reaches.
+    /// Throughput as a fraction of that of the matrix product.
     pub share: f64,
 }
 
-/// By whom, how, of what, and the gradient of what comes out.
+/// Name of an implementation, its function, its inputs, and the gradient of its output.
 type Way<'a> = (&'static str, &'a dyn Fn([&Tensor; 3]) -> Tensor, &'a [Tensor; 3], &'a Tensor);
 
-/// Times `repeats` calls of each, by turns, for `queries` and `keys` of `heads` heads that are `width` wide together.
+/// Times `repeats` calls of each implementation, alternating between them, for `queries` and `keys` with `heads` heads of total width
+/// `width`.
 ///
 /// # Errors
-/// An instruction set that the machine doesn't have.
+/// Fails if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have.
 pub fn bench_attention(
     [queries, keys, width, heads]: [i64; 4],
     precision: Precision,
@@ -52,7 +53,7 @@ pub fn bench_attention(
 ) -> crate::Result<AttentionReport> {
     tch::manual_seed(0);
     let of = |n: i64| Tensor::randn([1, n, width], (Kind::Float, Device::Cpu)).to_kind(precision.kind());
-    // As self-attention has them: parts of what one layer gave.
+    // Use slices of one layer's output, as in self-attention.
     let of_all = |n: i64| of(n).repeat([1, 1, 3]).chunk(3, -1).swap_remove(1);
     let (inputs, gradient) = ([of_all(queries), of_all(keys), of_all(keys)], of(queries));
     let apart = |t: &Tensor| t.unflatten(-1, [heads, width / heads]).transpose(1, 2).contiguous();
@@ -68,7 +69,7 @@ pub fn bench_attention(
     let yardstick = Yardstick::new(precision, Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
-    // The first round warms caches and threads up.
+    // The first round warms up caches and threads.
     for round in 0..=repeats {
         let one_product = yardstick.time();
         let mut measured = vec![];

@@ -1,4 +1,4 @@
-//! The loader: how many views a second reach training as tensors, and where the time goes.
+//! Benchmark of the data loader: views per second that arrive as tensors, and the time of each stage.
 
 use super::video::write_videos;
 use crate::data::{DataConfig, LoadTimes, Loader, Sample, SceneGroups};
@@ -10,66 +10,67 @@ use std::sync::Arc;
 use std::time::Instant;
 use tch::Device;
 
-/// Samples that aren't measured: they fill queues, caches and the allocator's pools.
+/// Number of samples before the measurement starts. They fill queues, caches and the allocator's pools.
 const WARM_UP: u64 = 16;
 
-/// Videos of the made-up data, frames of each, and megabytes of a chunk: two videos.
+/// Number of synthetic videos, of frames per video, and of bytes per chunk, which holds about two videos.
 const VIDEOS: usize = 8;
 const FRAMES: usize = 150;
 const CHUNK_BYTES: usize = 14_000_000;
 
-/// What [`bench_loader`] measured.
+/// Results of [`bench_loader`].
 #[derive(Debug, Serialize)]
 pub struct LoaderReport {
-    /// That load.
+    /// Number of loader threads.
     pub threads: usize,
-    /// Scenes that were delivered.
+    /// Number of scenes that were loaded.
     pub samples: u64,
-    /// Images that were delivered; one that is both context and target counts twice.
+    /// Number of images that were loaded. An image that is both context and target counts twice.
     pub views: u64,
-    /// Images that were decoded for it.
+    /// Number of photos that were decoded.
     pub photos: u64,
-    /// [height, width] of a view.
+    /// Size of a view, `[height, width]`.
     pub size: [u32; 2],
-    /// Scenes a second.
+    /// Scenes per second.
     pub samples_per_second: f64,
-    /// Views a second.
+    /// Views per second.
     pub views_per_second: f64,
-    /// Milliseconds of a thread per decoded photo.
+    /// Time of each stage in one thread per decoded photo, in milliseconds.
     pub milliseconds: StageMilliseconds,
-    /// Resident memory after each tenth of the samples, in bytes: the first holds what a run holds, the last no more.
+    /// Resident memory after each tenth of the samples, in bytes. The first value already includes everything that a run needs, so later
+    /// values should be no larger.
     pub resident_by_tenth: Vec<u64>,
-    /// Resident bytes at the most.
+    /// Peak resident memory, in bytes.
     pub resident_peak: u64,
 }
 
-/// Where time goes, in milliseconds per decoded photo.
+/// Time of each stage, in milliseconds per decoded photo.
 #[derive(Debug, Serialize)]
 pub struct StageMilliseconds {
-    /// Reading chunks.
+    /// Time for reading chunks.
     pub read: f64,
-    /// JPEG to pixels.
+    /// Time for decoding JPEGs.
     pub decode: f64,
-    /// Crop and resize.
+    /// Time for cropping and resizing.
     pub resize: f64,
-    /// Colours.
+    /// Time for colour augmentation.
     pub augment: f64,
-    /// Bytes to float tensors, in the thread that trains.
+    /// Time for converting bytes to float tensors, in the training thread.
     pub to_tensor: f64,
 }
 
-/// Writes the made-up data at `root`: chunks of 640×360 video.
+/// Writes the synthetic dataset to `root`: chunks of 640×360 video.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if a file can't be written.
 pub fn made_up_videos(root: &Path) -> Result<()> {
     write_videos(root, VIDEOS, FRAMES, CHUNK_BYTES)
 }
 
-/// Loads `samples` samples of `scenes` and makes tensors of them, one sample after the other.
+/// Loads `samples` samples of `scenes` one after the other, and converts them to tensors.
 ///
 /// # Errors
-/// What [`Loader`] fails with.
+/// Fails if the [`Loader`] fails.
 pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: u64) -> Result<LoaderReport> {
     let mut loader = Loader::start(config, 0, scenes, 1, 0)?;
     let next = |loader: &mut Loader| -> Result<(u64, u64, LoadTimes, f64)> {

@@ -1,4 +1,4 @@
-//! How fast things are: measured by commands that anyone can run, never by tests.
+//! Benchmarks. They are run by commands, never by tests.
 
 mod attention;
 mod loader;
@@ -24,27 +24,27 @@ use crate::optim::Stopwatch;
 use serde::Serialize;
 use std::borrow::Cow;
 
-/// Of several measurements of the same thing, in milliseconds: the middle one and how far the others lie apart.
+/// Distribution of several measurements of the same operation, in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Spread {
-    /// Half of the measurements are below.
+    /// Median of the measurements.
     pub median: f64,
-    /// The fastest.
+    /// Minimum of the measurements.
     pub least: f64,
-    /// Three of four are below: what a busy machine makes of it.
+    /// 75th percentile of the measurements, which shows the influence of other load on the machine.
     pub upper_quartile: f64,
 }
 
-/// A part of some work.
+/// A section of a measured operation.
 #[derive(Debug, Serialize)]
 pub struct Section {
-    /// What the part is called.
+    /// Name of the section.
     pub name: Cow<'static, str>,
-    /// Of a view, or of a step.
+    /// Time per view or per step.
     pub milliseconds: Spread,
 }
 
-/// Milliseconds that work took, and its sections, each time that it was done.
+/// Times in milliseconds of each run of an operation, in total and by section.
 #[derive(Debug, Default)]
 struct Measured {
     whole: Vec<f64>,
@@ -52,14 +52,14 @@ struct Measured {
 }
 
 impl Measured {
-    /// What `watch` has seen of it this time.
+    /// Adds the times that `watch` recorded for one run.
     fn add(&mut self, watch: &mut Stopwatch) {
         let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
         self.whole.push(times.clone().map(|(_, milliseconds)| milliseconds).sum());
         times.for_each(|(name, milliseconds)| self.add_section(name.into(), milliseconds));
     }
 
-    /// A section alone.
+    /// Adds the time of a single section.
     fn add_section(&mut self, name: Cow<'static, str>, milliseconds: f64) {
         match self.sections.iter_mut().find(|(known, _)| *known == name) {
             Some((_, all)) => all.push(milliseconds),
@@ -67,12 +67,12 @@ impl Measured {
         }
     }
 
-    /// Of at least one time.
+    /// Returns the distributions of the total time and of each section. Requires at least one run.
     fn told(mut self) -> (Spread, Vec<Section>) {
         (Spread::of(std::mem::take(&mut self.whole)), self.sections())
     }
 
-    /// The sections alone, in the order in which they were first added.
+    /// Returns the distribution of each section, in the order in which the sections were first added.
     fn sections(self) -> Vec<Section> {
         let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
         self.sections.into_iter().map(section).collect()
@@ -80,7 +80,7 @@ impl Measured {
 }
 
 impl Spread {
-    /// Of at least one number.
+    /// Computes the distribution of at least one measurement.
     fn of(mut milliseconds: Vec<f64>) -> Self {
         milliseconds.sort_by(f64::total_cmp);
         let at = |share: f64| milliseconds[((milliseconds.len() - 1) as f64 * share).round() as usize];

@@ -1,4 +1,4 @@
-//! A forward pass: how long its parts take, and how much memory it needs.
+//! Benchmark of the forward pass: the time of its parts, and its memory use.
 
 use super::Spread;
 use super::parts::{Part, Parts};
@@ -13,38 +13,38 @@ use crate::optim::Stopwatch;
 use serde::Serialize;
 use tch::{Device, nn, no_grad};
 
-/// Of fresh weights: much as they begin in training.
+/// Standard deviation of the random weights, similar to that of the initial weights in training.
 const WEIGHTS_STD: f64 = 0.02;
 
-/// What [`bench_model`] measured.
+/// Results of [`bench_model`].
 #[derive(Debug, Serialize)]
 pub struct ModelReport {
-    /// Photos that the model sees.
+    /// Number of photos that the model sees.
     pub views: usize,
-    /// [height, width] of them.
+    /// Size of the photos, `[height, width]`.
     pub size: [u32; 2],
-    /// That come out.
+    /// Number of Gaussians in the output.
     pub gaussians: i64,
-    /// Of matrix products.
+    /// Precision of matrix products.
     pub precision: Precision,
-    /// Threads that shared the work of a CPU.
+    /// Number of CPU threads.
     pub threads: i32,
-    /// Passes that were measured.
+    /// Number of measured passes.
     pub repeats: usize,
-    /// From photos to Gaussians, on the device.
+    /// Time from photos to Gaussians, both on the device.
     pub milliseconds: Spread,
-    /// In the order of the work.
+    /// Parts of the pass, in the order of execution.
     pub parts: Vec<Part>,
-    /// A product of large matrices in the same precision, in 10⁹ floating-point operations a second.
+    /// Throughput of a product of large matrices in the same precision, in GFLOP/s.
     pub peak_gflops: f64,
-    /// Bytes that tensors on a GPU, or the process, took at the most during these passes; weights and photos are among them.
+    /// Peak memory during the measured passes in bytes, including weights and photos: that of the GPU's tensors, or that of the process.
     pub peak_bytes: u64,
 }
 
-/// Times `repeats` passes (at least one) of the model that `config` describes, to its final stage, over photos of noise.
+/// Times `repeats` passes (at least one) of the model that `config` describes, up to its final stage, over photos of random noise.
 ///
 /// # Errors
-/// A model that can't be built.
+/// Fails if the model can't be built.
 pub fn bench_model(
     config: &Config,
     precision: Precision,
@@ -71,12 +71,12 @@ pub fn bench_model(
         1e3 * watch.sections()[0].1.as_secs_f64()
     };
     let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
-    // The first pass warms caches, threads and the GPU's libraries up.
+    // The first pass warms up caches, threads and the GPU's libraries.
     forward();
     forget_peak_memory(device);
     for _ in 0..repeats {
         products.push(yardstick.time());
-        // A GPU that works faster than kernels are launched is slowed down by the events around every part.
+        // Events around every part slow down a GPU that runs kernels faster than the host launches them, so time a GPU's pass without them.
         let untold = (device != Device::Cpu).then(forward);
         let told = parts.watch(device, forward);
         passes.push(untold.unwrap_or(told));

@@ -1,4 +1,4 @@
-//! The parts of a model's pass: how long each takes, what it computes, and what it moves.
+//! Parts of a model's pass: the time, the floating-point operations and the memory traffic of each.
 
 use super::Spread;
 use crate::device::Moment;
@@ -8,24 +8,24 @@ use std::cell::RefCell;
 use std::rc::Rc;
 use tch::Device;
 
-/// A part of a pass.
+/// Statistics of a part of a pass.
 #[derive(Debug, Serialize)]
 pub struct Part {
-    /// What the part is called.
+    /// Name of the part.
     pub name: &'static str,
-    /// Of a pass.
+    /// Time of the part per pass.
     pub milliseconds: Spread,
-    /// 10⁹ floating-point operations of its products.
+    /// Floating-point operations of the part's matrix products, in GFLOP.
     pub gflop: f64,
-    /// Of those that gradients take, where they are followed.
+    /// Floating-point operations of the backward pass of these products, in GFLOP; 0 if gradients aren't recorded.
     pub backward_gflop: f64,
-    /// 10⁹ bytes that its products, norms and sums read and write, if each number is moved once.
+    /// Memory traffic of the part's products, norms and sums in GB, if each element is moved once.
     pub gigabytes: f64,
-    /// Of the fastest time, what a product of large matrices reaches; 0 without products.
+    /// Throughput at the minimum time, as a fraction of that of a product of large matrices; 0 for a part without products.
     pub share_of_peak: f64,
 }
 
-/// One part in one pass.
+/// One execution of a part in one pass.
 struct Piece {
     name: &'static str,
     begins: Moment,
@@ -35,7 +35,7 @@ struct Piece {
     bytes: f64,
 }
 
-/// Every pass that was watched.
+/// Statistics of the parts over all watched passes.
 #[derive(Default)]
 pub(super) struct Parts {
     parts: Vec<Sum>,
@@ -51,7 +51,7 @@ struct Sum {
 }
 
 impl Parts {
-    /// Does `pass` and adds its parts, by the clock of `device`.
+    /// Runs `pass` and adds the statistics of its parts, timed by the clock of `device`.
     pub fn watch<T>(&mut self, device: Device, pass: impl FnOnce() -> T) -> T {
         let pieces = Rc::new(RefCell::new(Vec::<Piece>::new()));
         let heard = pieces.clone();
@@ -86,7 +86,7 @@ impl Parts {
         }
         match self.parts.is_empty() {
             true => self.parts = sums,
-            // Every pass is the same.
+            // Every pass has the same parts.
             false => self
                 .parts
                 .iter_mut()
@@ -96,7 +96,7 @@ impl Parts {
         result
     }
 
-    /// Beside products that reach `peak_gflops`.
+    /// Returns the statistics. `peak_gflops` is the throughput of a product of large matrices, which [`Part::share_of_peak`] refers to.
     pub fn told(self, peak_gflops: f64) -> Vec<Part> {
         let part = |sum: Sum| {
             let milliseconds = Spread::of(sum.milliseconds);

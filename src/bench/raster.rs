@@ -1,4 +1,4 @@
-//! The splat op: from Gaussians in tensors to pictures, and back to gradients in tensors.
+//! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
 use super::{Measured, Section, Spread};
 use crate::error::Result;
@@ -14,97 +14,98 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use tch::{Device, Kind, Tensor, no_grad};
 
-/// What [`bench_raster`] measured. All times are milliseconds per view.
+/// Results of [`bench_raster`]. All times are milliseconds per view.
 #[derive(Debug, Serialize)]
 pub struct RasterReport {
-    /// Instruction set of the CPU's kernels.
+    /// Instruction set of the CPU kernels.
     pub simd: String,
-    /// Where the Gaussians are: cpu, or cuda and its number.
+    /// Device that holds the Gaussians: `cpu`, or `cuda:` and the GPU's index.
     pub device: String,
-    /// Threads that shared the work.
+    /// Number of threads.
     pub threads: i32,
-    /// Of the scene.
+    /// Number of Gaussians in the scene.
     pub gaussians: i64,
-    /// Cameras of one call.
+    /// Number of cameras per call.
     pub views: i64,
-    /// Of a picture.
+    /// Width of an image, in pixels.
     pub width: i64,
-    /// Of a picture.
+    /// Height of an image, in pixels.
     pub height: i64,
-    /// A call without gradients.
+    /// Time of a call without gradients.
     pub forward: Spread,
-    /// A call that records gradients, and its backward pass.
+    /// Time of a call that records gradients and of its backward pass.
     pub forward_backward: Spread,
-    /// In the order of the work: the CPU's stages, or a GPU's kernels, all launches of one together.
+    /// Stages on the CPU, or kernels on a GPU, in the order of execution. All launches of a kernel are added up.
     pub stages: Vec<Section>,
-    /// How a GPU's results compare to the CPU's.
+    /// Comparison of a GPU's results with the CPU's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub against_cpu: Vec<Agreement>,
-    /// What there is to blend, per view.
+    /// Number of pairs to blend, per view.
     pub pairs: Pairs,
-    /// Of the CPU.
+    /// Blending throughput, on the CPU only.
     pub rates: Option<Rates>,
-    /// Largest memory of a GPU's tensors, or resident memory, during the calls less that before them, pictures and gradients included.
+    /// Peak memory during the calls minus the memory before them, in bytes, including images and gradients: memory of tensors on a GPU,
+    /// resident memory on the CPU.
     pub working_bytes: u64,
 }
 
-/// How one tensor of a GPU's results compares to the CPU's.
+/// Comparison of one tensor of a GPU's results with the CPU's.
 #[derive(Debug, Serialize)]
 pub struct Agreement {
-    /// Such as `rgb`, or `gradient of means`.
+    /// Name of the tensor, such as `rgb` or `gradient of means`.
     pub tensor: &'static str,
-    /// How many numbers it has.
+    /// Number of elements.
     pub numbers: i64,
-    /// How many of them have other bits.
+    /// Number of elements that aren't bit-identical.
     pub other_bits: i64,
-    /// The norm of the differences over the norm of the CPU's numbers.
+    /// Norm of the differences, divided by the norm of the CPU's values.
     pub relative_difference: f64,
 }
 
-/// What there is to blend in a view.
+/// Number of pairs to blend in a view.
 #[derive(Debug, Serialize)]
 pub struct Pairs {
-    /// (tile, splat) pairs.
+    /// Number of (tile, splat) pairs.
     pub tile_entries: f64,
-    /// (pixel, splat) pairs whose α is computed.
+    /// Number of (pixel, splat) pairs whose α is computed.
     pub evaluated: f64,
-    /// (pixel, splat) pairs that are blended.
+    /// Number of (pixel, splat) pairs that are blended.
     pub contributing: f64,
 }
 
-/// How fast pairs are blended, beside what the machine can do.
+/// Blending throughput, compared with the peak of the machine.
 #[derive(Debug, Serialize)]
 pub struct Rates {
-    /// What the threads together reach with multiply-adds alone, in 10⁹ floating-point operations per second.
+    /// Throughput of all threads with multiply-adds alone, in GFLOP/s.
     pub peak_gflops: f64,
-    /// Blending.
+    /// Throughput of blending.
     pub blend: Rate,
-    /// Its backward pass.
+    /// Throughput of the backward pass of blending.
     pub blend_backward: Rate,
 }
 
-/// How fast contributing pairs are dealt with.
+/// Throughput in contributing pairs.
 #[derive(Debug, Serialize)]
 pub struct Rate {
-    /// In 10⁹ a second.
+    /// Contributing pairs per second, in 10⁹.
     pub gpairs_per_second: f64,
-    /// Floating-point operations that a pair asks for, of what multiply-adds alone reach.
+    /// Floating-point operations that these pairs need per second, as a fraction of the multiply-add throughput.
     pub share_of_peak: f64,
 }
 
-/// Floating-point operations of a pair in `csrc/raster/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1,
-/// and A, C and D 9.
+/// Floating-point operations per pair in `csrc/raster/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D 9.
 const FORWARD_OPERATIONS: f64 = 38.;
-/// Up to T as forward, 28, w 1, q 8, what remains 2, ν with a reciprocal 8, and the ten sums 19.
+/// Floating-point operations per pair of the backward pass: 28 up to T as in the forward pass, w 1, q 8, the remainder 2, ν with a
+/// reciprocal 8, and the ten sums 19.
 const BACKWARD_OPERATIONS: f64 = 66.;
 
-/// How long the peak is measured.
+/// Duration of the multiply-add measurement, in seconds.
 const PEAK_SECONDS: f64 = 0.2;
 
-/// Times `repeats` calls of the splat op without gradients and as many with them, by turns.
+/// Times `repeats` calls of the rasterizer without gradients and as many with gradients, alternating between them.
 ///
 /// # Errors
-/// What [`render()`] refuses.
+/// Fails if [`render()`] fails.
 pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
     let device = gaussians.means.device();
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
@@ -116,7 +117,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     };
     let (mut forward, mut forward_backward) = (vec![], vec![]);
     let mut stages: Vec<StageTimes> = vec![];
-    // The first round warms caches and threads up.
+    // The first round warms up caches and threads.
     for round in 0..=repeats {
         let mut watch = Stopwatch::of(device);
         watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
@@ -167,13 +168,13 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     })
 }
 
-/// An objective that every picture's every number takes part in.
+/// Returns an objective that depends on every element of every image.
 fn sum_of_pictures(pictures: &Pictures) -> Tensor {
     let [rgb, alpha, depth] = [&pictures.rgb, &pictures.alpha, &pictures.depth].map(|t| t.sum(Kind::Float));
     rgb + alpha + depth
 }
 
-/// Measures each kernel of a GPU, in calls of their own: events around every launch slow a call down.
+/// Times each kernel of a GPU. It makes calls of its own, because events around every launch slow a call down.
 fn kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
     let views = (cameras.w2c.size()[0] * cameras.w2c.size()[1]) as f64;
     let mut measured = Measured::default();
@@ -188,7 +189,7 @@ fn kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<V
     Ok(measured.sections())
 }
 
-/// Compares what a GPU draws, and its gradients, to the CPU's.
+/// Compares the images and gradients of a GPU with the CPU's.
 fn against_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Agreement>> {
     let here = pictures_and_gradients(gaussians, cameras)?;
     let cpu = pictures_and_gradients(&gaussians.to_device(Device::Cpu), &cameras.to_device(Device::Cpu))?;
@@ -205,7 +206,7 @@ fn against_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Agreement
     Ok(here.iter().zip(&cpu).map(agreement).collect())
 }
 
-/// Draws, and takes the gradients of a sum of all pictures.
+/// Renders the images, and computes the gradients of the sum of all images.
 fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<(&'static str, Tensor)>> {
     let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
     let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
@@ -251,9 +252,8 @@ fn rates(stages: &[Section], pairs: &Pairs) -> Rates {
     }
 }
 
-/// A scene shaped like a trained one, and `views` cameras that walk past it, made from a fixed seed. Sizes in the picture,
-/// their elongation and opacities follow the published 16K splats; more Gaussians are smaller ones, so that they cover as
-/// much.
+/// Returns a synthetic scene that resembles a trained one, and `views` cameras that move past it, from a fixed seed. Projected sizes,
+/// elongations and opacities follow the published 16K splats. With more Gaussians each is smaller, so that they cover the same area.
 pub fn made_up_scene(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (width, height) = (f64::from(size.width), f64::from(size.height));
@@ -304,7 +304,7 @@ fn walk(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
     }
 }
 
-/// A standard normal number, by Box and Muller.
+/// Samples a standard normal value with the Box-Muller transform.
 fn normal(random: &mut impl Rng) -> f64 {
     let (radius, angle) = (1. - random.random::<f64>(), random.random::<f64>());
     (-2. * radius.ln()).sqrt() * (std::f64::consts::TAU * angle).cos()

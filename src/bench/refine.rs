@@ -1,4 +1,4 @@
-//! A step of refining a splat: how much of it is rendering.
+//! Benchmark of a refinement step: the time of its parts, and the share of rendering.
 
 use super::{Spread, made_up_scene};
 use crate::data::ViewBatch;
@@ -12,36 +12,38 @@ use serde::Serialize;
 use std::time::Duration;
 use tch::Device;
 
-/// Photos of the made-up scene.
+/// Number of photos of the synthetic scene.
 const PHOTOS: usize = 8;
-/// Before those that are measured.
+/// Number of steps before the measurement starts.
 const WARM_UP: u64 = 5;
 
-/// What [`bench_refine`] measured.
+/// Results of [`bench_refine`].
 #[derive(Debug, Serialize)]
 pub struct RefineReport {
-    /// Of the splat.
+    /// Number of Gaussians in the splat.
     pub gaussians: i64,
-    /// Pictures in a step.
+    /// Number of images per step.
     pub views: usize,
-    /// [height, width] of them.
+    /// Size of the images, `[height, width]`.
     pub size: [u32; 2],
-    /// Threads that shared the work.
+    /// Number of threads.
     pub threads: i32,
-    /// Steps that were measured.
+    /// Number of measured steps.
     pub steps: u64,
-    /// Of a whole step.
+    /// Time of a whole step.
     pub milliseconds: Spread,
-    /// The mean time of its parts, in the order of the work.
+    /// Mean time of each part of a step in milliseconds, in the order of execution.
     pub sections: Vec<(&'static str, f64)>,
-    /// Of the time, what isn't rendering, forward or backward; on the CPU alone, whose rasterizer tells its own.
+    /// Share of the time that isn't rendering, forward or backward. `None` on a GPU: only the CPU rasterizer reports the time of its
+    /// backward pass.
     pub other_share: Option<f64>,
 }
 
-/// Times `steps` steps on `device`, on photos of `size` of a made-up scene with `count` Gaussians, which are begun with.
+/// Times `steps` steps on `device`, with photos of `size` of a synthetic scene with `count` Gaussians. The optimization starts from these
+/// Gaussians.
 ///
 /// # Errors
-/// What the rasterizer refuses.
+/// Fails if the rasterizer fails.
 pub fn bench_refine(
     count: usize,
     size: ImageSize,

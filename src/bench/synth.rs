@@ -1,32 +1,33 @@
-//! Made-up videos: how many views a second one core makes.
+//! Benchmark of synthetic videos: views per second that one core renders.
 
 use crate::scene::ImageSize;
 use crate::synth::{Video, VideoSettings};
 use serde::Serialize;
 use std::time::Instant;
 
-/// What [`bench_synth`] measured.
+/// Results of [`bench_synth`].
 #[derive(Debug, Serialize)]
 pub struct SynthReport {
-    /// Worlds that were made.
+    /// Number of synthetic scenes.
     pub videos: u64,
-    /// Views that were taken of them.
+    /// Number of views that were rendered.
     pub views: usize,
-    /// [height, width] of a view.
+    /// Size of a view, `[height, width]`.
     pub size: [u32; 2],
-    /// Rays from the eye a pixel; each asks a lamp by another one.
+    /// Camera rays per pixel. Each of them casts one shadow ray towards a lamp.
     pub rays_per_pixel: u32,
-    /// Triangles of a world, the mean.
+    /// Mean number of triangles per scene.
     pub triangles: usize,
-    /// Views a second of one thread, worlds being there.
+    /// Views per second of one thread, without the time for building the scenes.
     pub views_per_second: f64,
-    /// 10⁶ rays a second of one thread, shadows counted: two for each sample.
+    /// Rays per second of one thread, in 10⁶, including shadow rays: two rays per sample.
     pub megarays_per_second: f64,
-    /// Seconds until a world can be looked at, on all threads.
+    /// Time in seconds for building a scene, on all threads.
     pub seconds_per_world: f64,
 }
 
-/// Makes `videos` worlds and takes `frames` views of each, of side `side`, on the calling thread.
+/// Builds `videos` synthetic scenes, and renders `frames` square views of each with sides of `side` pixels on the calling thread.
+/// `progress` is called after each scene.
 pub fn bench_synth(videos: u64, frames: usize, side: u32, mut progress: impl FnMut()) -> SynthReport {
     let settings = VideoSettings { frames, size: ImageSize { height: side, width: side }, pictures: vec![] };
     let (mut making, mut taking, mut triangles) = (0., 0., 0);

@@ -1,4 +1,4 @@
-//! A training step: how long its parts take, and how much memory it needs.
+//! Benchmark of a training step: the time of its parts, and its memory use.
 
 use super::parts::{Part, Parts};
 use super::yardstick::Yardstick;
@@ -21,72 +21,75 @@ use serde::Serialize;
 use std::sync::Arc;
 use tch::Device;
 
-/// Products that the machine is measured by.
+/// Number of matrix products that measure the peak throughput of the machine.
 const PRODUCTS: usize = 5;
-/// Far end of the made-up scenes' frusta.
+/// Far plane of the synthetic scenes' frusta.
 const FAR: f64 = 40.;
 
-/// What [`bench_train`] measured.
+/// Results of [`bench_train`].
 #[derive(Debug, Serialize)]
 pub struct TrainReport {
-    /// Scenes in a step.
+    /// Number of scenes per step.
     pub scenes: usize,
-    /// Photos that the model sees of a scene.
+    /// Number of context photos per scene, which the model sees.
     pub context_views: usize,
-    /// Pictures of a scene that are compared.
+    /// Number of target views per scene, which are rendered and compared.
     pub target_views: usize,
-    /// [height, width] of both.
+    /// Size of context and target views, `[height, width]`.
     pub size: [u32; 2],
-    /// Of a scene.
+    /// Number of Gaussians per scene.
     pub gaussians: i64,
-    /// The network of L_perc.
+    /// Network of L_perc.
     pub perceptual: PerceptualKind,
-    /// Threads that shared the work.
+    /// Number of threads.
     pub threads: i32,
-    /// Slices of a step that these threads follow side by side. Sections, parts and the peak are of the first, with its share of them.
+    /// Number of slices of a step that run in parallel on these threads. Sections, parts and the peak throughput are those of the first
+    /// slice, with its share of the threads.
     pub slices_at_once: usize,
-    /// Steps that were measured.
+    /// Number of measured steps.
     pub steps: usize,
-    /// Of a whole step.
+    /// Time of a whole step.
     pub milliseconds: Spread,
-    /// In the order of the work.
+    /// Sections of a step, in the order of execution.
     pub sections: Vec<Section>,
-    /// Of all forward passes, again where rounds are computed again; and what their gradients take.
+    /// Parts of all forward passes, including the rounds that are recomputed by checkpointing, with the operations of their backward
+    /// passes.
     pub parts: Vec<Part>,
-    /// Of matrix products.
+    /// Precision of matrix products.
     pub precision: Precision,
-    /// A product of large matrices in that precision, in 10⁹ floating-point operations a second.
+    /// Throughput of a product of large matrices in the same precision, in GFLOP/s.
     pub peak_gflops: f64,
-    /// Bytes that tensors on a GPU, or the process, took at the most.
+    /// Peak memory in bytes: that of the GPU's tensors, or that of the process.
     pub peak_bytes: u64,
-    /// What working together costs, where there are several processes.
+    /// Cost of distributed training; `None` for a single process.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub together: Option<Together>,
 }
 
-/// What it costs processes to make a step together.
+/// Cost of distributed training with several ranks.
 #[derive(Debug, Serialize)]
 pub struct Together {
-    /// How many there are.
+    /// Number of ranks.
     pub ranks: usize,
-    /// Scenes that all of them make in a second.
+    /// Scenes per second of all ranks together.
     pub scenes_per_second: f64,
-    /// Of a step that each of them makes by itself, all at the same time.
+    /// Time of a step without communication, with all ranks running at the same time.
     pub apart_milliseconds: Spread,
-    /// Of adding all gradients up with nothing else to do meanwhile.
+    /// Time of summing the gradients over all ranks when nothing overlaps with it.
     pub communication_milliseconds: Spread,
-    /// The share of it that was over when the backward pass was, in the step that waited least: others wait for slower ranks, too.
+    /// Share of this communication that overlaps with the backward pass, in the step with the shortest wait. Other steps include waiting
+    /// for slower ranks.
     pub hidden: f64,
-    /// Bytes of the gradients.
+    /// Size of the gradients, in bytes.
     pub gradient_bytes: u64,
 }
 
-/// Times `steps` steps (at least one) of what `config` says, from the curriculum's last stage, on made-up scenes: pictures
-/// of noise, cameras on a short path. L_perc is left out where its weights aren't there. The parts of a step are told by the
-/// device's own clock. Of several ranks, all call this, each with scenes of its own.
+/// Times `steps` training steps (at least one) with `config`, at the final stage of the curriculum. The scenes are synthetic: images of
+/// random noise, and cameras on a short path. L_perc is left out if its weights are missing. Sections and parts are timed by the clock of
+/// the device. With several ranks, all of them call this function, each with scenes of its own.
 ///
 /// # Errors
-/// What [`Trainer`] fails with, or another rank that is gone.
+/// Fails if the [`Trainer`] fails or another rank is gone.
 pub fn bench_train(
     config: &Config,
     steps: usize,
@@ -146,7 +149,7 @@ pub fn bench_train(
     })
 }
 
-/// `steps` steps, after one that warms caches, threads and the GPU's libraries up.
+/// Times `steps` steps, after one that warms up caches, threads and the GPU's libraries.
 fn measure(
     trainer: &mut Trainer,
     scenes: &[LoadedScene],
@@ -170,7 +173,7 @@ fn measure(
     Ok(measured)
 }
 
-/// What is left of ranks' steps without communication, and of communication without steps.
+/// Times the ranks' communication without steps, and their steps without communication.
 fn together(
     trainer: Trainer,
     scenes: &[LoadedScene],
@@ -202,7 +205,7 @@ fn together(
     })
 }
 
-/// As many views as a step takes, context and target apart.
+/// Returns a scene of random noise with as many views as a step takes. Context and target views are disjoint.
 pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
     let data = &config.data;
     let views = data.context_views + data.target_views;
@@ -215,7 +218,7 @@ pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
     };
     let mut images = vec![0; views * 3 * width as usize * height as usize];
     ChaCha8Rng::seed_from_u64(seed).fill_bytes(&mut images);
-    // Targets lie between context views, as far as there are enough of them.
+    // Target views lie between context views, if there are enough of those.
     let is_target = |view: &usize| (view + 1) * data.target_views / views > view * data.target_views / views;
     let (target, context) = (0..views).partition(is_target);
     LoadedScene {
@@ -272,7 +275,7 @@ mod tests {
             &["train.checkpoint_rounds=true"],
             &["model.streams=single", "model.self_attention_blocks=4"],
             &["data.context_views=24", "data.target_views=12"],
-            // Side by side, each slice would be another thread's.
+            // A micro-batch avoids parallel slices, each of which would run on another thread.
             &["loss.consistency_alpha=0", "loss.consistency_depth=0", "train.micro_batch=2"],
         ] {
             let ratio = estimate_over_peak(settings);

@@ -1,4 +1,4 @@
-//! Made-up video for measuring: frames that are as hard to decode as photos, in chunks as RealEstate10K comes in.
+//! Synthetic video for benchmarks: frames that are as hard to decode as photos, in chunks like those of RealEstate10K.
 
 use crate::data::{ChunkWriter, open_capture, write_cameras_json};
 use crate::error::{Error, Result};
@@ -8,21 +8,21 @@ use image::{Rgb, RgbImage, imageops};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use std::path::Path;
 
-/// As of RealEstate10K.
+/// Size of a frame in pixels, as in RealEstate10K.
 const WIDTH: u32 = 640;
 const HEIGHT: u32 = 360;
-/// A frame of it takes about 45 KB, with colours at half the resolution as video has them.
+/// JPEG quality. A frame takes about 45 KB, with colours at half the resolution as in video.
 const QUALITY: u8 = 95;
-/// Pixels that a frame is moved by.
+/// Horizontal offset between consecutive frames, in pixels.
 const STEP: u32 = 2;
 
-/// Writes `videos` videos of `frames` frames into chunks of about `chunk_bytes` in `root`, which is there already.
+/// Writes `videos` videos of `frames` frames in chunks of about `chunk_bytes` to the existing folder `root`.
 pub(super) fn write_videos(root: &Path, videos: usize, frames: usize, chunk_bytes: usize) -> Result<()> {
     let mut writer = ChunkWriter::new(root, chunk_bytes)?;
     let folder = root.join(format!(".globalsplat-frames-{}", std::process::id()));
     std::fs::create_dir(&folder).map_err(Error::write(&folder))?;
     for video in 0..videos {
-        // A capture is named by its folder.
+        // A capture is named after its folder.
         let capture = folder.join(format!("video_{video:03}"));
         std::fs::create_dir(&capture).map_err(Error::write(&capture))?;
         let panorama = panorama(WIDTH + STEP * frames as u32, video as u64);
@@ -50,7 +50,7 @@ fn encode(frame: &RgbImage) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A steady walk to the right.
+/// Returns cameras that move to the right at a constant speed.
 fn cameras(frames: usize) -> Vec<Camera> {
     let (width, height) = (f64::from(WIDTH), f64::from(HEIGHT));
     let intrinsics = Intrinsics { fx: 0.5 * width, fy: 0.5 * width, cx: width / 2., cy: height / 2. };
@@ -58,7 +58,7 @@ fn cameras(frames: usize) -> Vec<Camera> {
     (0..frames).map(|frame| Camera { intrinsics, c2w: at(frame), width: WIDTH, height: HEIGHT }).collect()
 }
 
-/// Octaves of noise whose strengths fall off as in photos; fine detail is grey, as it is there.
+/// Returns a sum of octaves of noise whose amplitudes fall off as in photos. Fine octaves are grey, as fine detail is in photos.
 fn panorama(width: u32, seed: u64) -> RgbImage {
     const OCTAVES: i32 = 7;
     const GREY_FROM: i32 = 4;
@@ -75,12 +75,12 @@ fn panorama(width: u32, seed: u64) -> RgbImage {
                 *value += FALL_OFF.powi(octave) * grey.unwrap_or_else(|| of(channel as u64));
             }
         }
-        // Sums of noise stay near the middle: stretched to all of the range.
+        // Sums of noise stay near the middle, so stretch them to the whole range.
         Rgb(colour.map(|value| (255. * (0.5 + 1.6 * (value / sum - 0.5))) as u8))
     })
 }
 
-/// Smooth between random numbers at whole coordinates, in [0, 1].
+/// Interpolates smoothly between random values at integer coordinates. The result is in [0, 1].
 fn noise(x: f64, y: f64, seed: u64) -> f64 {
     let (left, top) = (x.floor(), y.floor());
     let smooth = |t: f64| t * t * (3. - 2. * t);

@@ -1,10 +1,10 @@
-//! What the machine can do at best: a product of large square matrices, which all other products are measured by.
+//! Peak throughput of a device: a product of large square matrices, which all other products are compared with.
 
 use crate::model::Precision;
 use crate::optim::Stopwatch;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
-/// Two matrices to multiply, as the model's layers multiply theirs.
+/// Two square matrices, multiplied in the same way as in the model's linear layers.
 pub(super) struct Yardstick {
     matrix: Tensor,
     layer: nn::Linear,
@@ -12,7 +12,7 @@ pub(super) struct Yardstick {
 }
 
 impl Yardstick {
-    /// Of numbers in that precision, on that device.
+    /// Creates random matrices in `precision` on `device`, with sides of 2048 on the CPU and 8192 on a GPU.
     pub fn new(precision: Precision, device: Device) -> Self {
         let side = if device == Device::Cpu { 2048 } else { 8192 };
         let matrix = Tensor::randn([side, side], (Kind::Float, device)).to_kind(precision.kind());
@@ -20,14 +20,14 @@ impl Yardstick {
         Yardstick { matrix, layer, precision }
     }
 
-    /// Milliseconds of one product.
+    /// Returns the time of one product, in milliseconds.
     pub fn time(&self) -> f64 {
         let mut watch = Stopwatch::of(self.matrix.device());
         no_grad(|| watch.time("product", || drop(self.precision.linear(&self.layer, &self.matrix))));
         1e3 * watch.sections()[0].1.as_secs_f64()
     }
 
-    /// 10⁹ floating-point operations a second of a product that takes so long.
+    /// Returns the throughput in GFLOP/s of a product that takes `milliseconds`.
     pub fn gflops(&self, milliseconds: f64) -> f64 {
         2e-6 * (self.matrix.size()[0] as f64).powi(3) / milliseconds
     }

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use tch::Device;
 
-/// Measure how fast this machine runs the parts.
+/// Measure the speed of the program's parts on this machine.
 #[derive(Args)]
 pub struct Bench {
     #[command(subcommand)]
@@ -47,44 +47,44 @@ impl Bench {
         }
     }
 
-    /// Whether processes share it out.
+    /// Returns `true` if the processes that torchrun started share the work.
     pub fn is_shared(&self) -> bool {
         matches!(self.part, Part::Train(_))
     }
 }
 
-/// The splat op, forward and backward, stage by stage.
+/// Benchmark the splat op, forward and backward, stage by stage.
 ///
-/// Without --splat and --scene the input is made up: 16,384 Gaussians shaped like a trained scene, 12 cameras, 256x256.
+/// Without --splat and --scene the input is synthetic: 16,384 Gaussians shaped like a trained scene, 12 cameras, 256x256.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench raster\n  \
     globalsplat bench raster --splat room.ply --scene captures/room --threads 1")]
 pub struct Raster {
-    /// A splat: .ply, .compressed.ply, .spz or .splat
+    /// Splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE", requires = "scene")]
     splat: Option<PathBuf>,
-    /// The capture whose cameras look at it, all in one call
+    /// Capture whose cameras render the splat, all in one call
     #[arg(long, value_name = "PATH", requires = "splat")]
     scene: Option<PathBuf>,
-    /// Gaussians of the made-up scene
+    /// Number of Gaussians in the synthetic scene
     #[arg(long, value_name = "N", default_value_t = 16_384, conflicts_with = "splat")]
     gaussians: usize,
-    /// Cameras that look at the made-up scene, all in one call
+    /// Number of cameras of the synthetic scene, all in one call
     #[arg(long, value_name = "N", default_value_t = 12, conflicts_with = "splat")]
     cameras: usize,
-    /// Picture size of the made-up scene's cameras
+    /// Image size of the synthetic scene's cameras
     #[arg(long, value_name = "WxH", default_value = "256x256", conflicts_with = "splat")]
     size: String,
-    /// A table instead: made-up scenes of 16K to 1M Gaussians, one camera of 256x256 to 1920x1080
+    /// Print a scaling table instead: synthetic scenes of 16K to 1M Gaussians, one camera of 256x256 to 1920x1080
     #[arg(long, conflicts_with_all = ["splat", "gaussians", "cameras", "size"])]
     scaling: bool,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Threads that share the work; by default all cores
+    /// Number of threads; by default all cores
     #[arg(long, value_name = "N")]
     threads: Option<u16>,
-    /// Calls that are timed
+    /// Number of timed calls
     #[arg(long, value_name = "N", default_value_t = 30)]
     repeats: u32,
     /// Print the measurements as one JSON object
@@ -106,7 +106,7 @@ impl Raster {
                 Error::Request("--gaussians and --cameras are expected to be 1 or more".into()).into()
             );
         }
-        // Before tensors are made: a device that isn't there is told at once.
+        // Before tensors are created, so that a missing device is reported immediately.
         let device = device::parse(&self.device)?;
         if self.scaling {
             return self.scaling(device);
@@ -135,24 +135,24 @@ impl Raster {
     }
 }
 
-/// The loader, from chunks of JPEGs to augmented training samples in tensors, stage by stage.
+/// Benchmark the loader, from chunks of JPEGs to augmented training samples in tensors, stage by stage.
 ///
-/// Without --data the input is made up: chunks of 640x360 video. Samples are the paper's, 24 context and 12 target views of
-/// 256x256.
+/// Without --data the input is synthetic: chunks of 640x360 video. Samples have the paper's shape, 24 context and 12 target
+/// views of 256x256.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench loader\n  \
     globalsplat bench loader --data datasets/re10k --threads 8 --samples 10000 --json")]
 pub struct Loader {
-    /// A data set, of which the part `train` is taken, or captures
+    /// Dataset, of which the split `train` is used, or captures
     #[arg(long, value_name = "ROOT")]
     data: Option<PathBuf>,
-    /// Write the made-up data into this folder and leave them there
+    /// Write the synthetic data into this folder and keep them
     #[arg(long, value_name = "DIR", conflicts_with = "data")]
     keep: Option<PathBuf>,
-    /// Threads that load; by default one a core
+    /// Number of loader threads; by default one per core
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
     threads: u16,
-    /// Samples that are measured
+    /// Number of measured samples
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
     samples: u64,
     /// Print the measurements as one JSON object
@@ -248,7 +248,7 @@ impl Raster {
     }
 }
 
-/// Rows and columns of the scaling table.
+/// Gaussian counts (rows) and image sizes (columns) of the scaling table.
 const GAUSSIANS: [usize; 4] = [16_384, 65_536, 262_144, 1_048_576];
 const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
 
@@ -295,14 +295,14 @@ fn print_report(r: &RasterReport) {
     println!("working memory {:.0} MB", r.working_bytes as f64 * 1e-6);
 }
 
-/// Made-up videos: views a second of one core, four rays a pixel, with shadows.
+/// Benchmark the synthesis of videos: views per second on one core, four rays per pixel, with shadows.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat bench synth --size 256")]
 pub struct Synth {
-    /// Worlds
+    /// Number of synthetic scenes
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..))]
     videos: u64,
-    /// Views of each
+    /// Number of views per scene
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=10_000))]
     frames: u32,
     /// Side of a view in pixels

@@ -5,32 +5,32 @@ use globalsplat::bench::{AttentionReport, bench_attention};
 use globalsplat::error::Error;
 use tch::Device;
 
-/// Attention on the CPU, forward and backward: our kernel and libtorch's, beside a matrix product.
+/// Benchmark attention on the CPU, forward and backward: our kernel and libtorch's, compared with a matrix product.
 ///
-/// Without options it is the paper's main model, whose slots look at 24 photos of 256x256.
+/// The default sizes are those of the paper's main model, whose slots attend to 24 photos of 256x256.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench attention --threads 1\n  \
     globalsplat bench attention --queries 2057 --keys 2057 --repeats 20 --json")]
 pub struct Attention {
-    /// Rows that look
+    /// Number of query rows
     #[arg(long, value_name = "N", default_value_t = 2053, value_parser = clap::value_parser!(u32).range(1..))]
     queries: u32,
-    /// Rows that are looked at
+    /// Number of key and value rows
     #[arg(long, value_name = "N", default_value_t = 24_580, value_parser = clap::value_parser!(u32).range(1..))]
     keys: u32,
-    /// Of a row, all heads together
+    /// Width of a row, all heads together
     #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u16).range(1..))]
     width: u16,
-    /// Heads
+    /// Number of heads
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..))]
     heads: u16,
-    /// Of queries, keys and values: f32, bf16, or auto: bf16 for wide models where the processor has instructions for it
+    /// Precision of queries, keys and values: f32, bf16, or auto: bf16 for wide models if the processor has instructions for it
     #[arg(long, default_value = "f32")]
     precision: String,
-    /// Threads that share the work; by default all cores
+    /// Number of threads; by default all cores
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Calls that are timed
+    /// Number of timed calls
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
     /// Print the measurements as one JSON object

@@ -1,11 +1,11 @@
-//! What the commands of `bench` have in common: the configuration that is measured, and tables.
+//! Code that the subcommands of `bench` share: reading the measured configuration, and printing tables.
 
 use anyhow::Result;
 use globalsplat::bench::{Part, Section, Spread};
 use globalsplat::config::Config;
 use std::path::Path;
 
-/// The configuration that a measurement is of; without a file, the defaults, which are the paper's main model.
+/// Reads the configuration to measure; without a file, the defaults, which are the paper's main model.
 pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
     Ok(match file {
         Some(file) => Config::read(file, set)?,
@@ -13,7 +13,7 @@ pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
     })
 }
 
-/// A line for each section, with its share, and one for the whole.
+/// Prints one line per section, with its share of the whole, and one for the whole.
 pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
     println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "least", "3 of 4", "share");
     let row = |name: &str, s: &Spread| {
@@ -24,7 +24,7 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
     row(name, whole);
 }
 
-/// The parts of a forward pass, beside `whole`.
+/// Prints a table of the parts of a forward pass, with their shares of `whole`.
 pub fn print_parts(title: &str, parts: &[Part], whole: &Spread) {
     println!(
         "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
@@ -40,7 +40,7 @@ pub fn print_parts(title: &str, parts: &[Part], whole: &Spread) {
     }
 }
 
-/// Prints the line of one part: its median and least time in milliseconds, its share of `whole`, and `rest`.
+/// Prints the line of one part: its median and minimum time in milliseconds, its share of `whole`, and `rest`.
 pub fn print_part(name: &str, s: &Spread, whole: &Spread, rest: &str) {
     let share = 1e2 * s.median / whole.median;
     println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);

@@ -5,9 +5,9 @@ use clap::Args;
 use globalsplat::bench::{ModelReport, Part, bench_model};
 use std::path::PathBuf;
 
-/// A forward pass, photos to Gaussians, part by part, over photos of noise and with fresh weights.
+/// Benchmark a forward pass, photos to Gaussians, part by part, on photos of noise and with newly initialized weights.
 ///
-/// Without --config it is the paper's main model, 256x256 pixels.
+/// Without --config the model is the paper's main model, 256x256 pixels.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench model\n  \
     globalsplat bench model --config configs/tiny.toml --views 12\n  \
@@ -16,19 +16,19 @@ pub struct Model {
     /// Configuration file; see configs/
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Override a key of it
+    /// Override a key of the configuration
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Photos that the model sees
+    /// Number of input photos
     #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(1..))]
     views: u16,
-    /// Passes that are measured
+    /// Number of measured passes
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
-    /// Matrix products in f32, bf16, or auto: bf16 for wide models where the device has instructions for it
+    /// Precision of matrix products: f32, bf16, or auto: bf16 for wide models if the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
     /// Print the measurements as one JSON object

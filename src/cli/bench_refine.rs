@@ -4,25 +4,25 @@ use clap::Args;
 use globalsplat::bench::{RefineReport, bench_refine};
 use globalsplat::refine::RefineConfig;
 
-/// A step of `refine`, part by part, on a made-up scene.
+/// Benchmark a step of `refine`, part by part, on a synthetic scene.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  globalsplat bench refine\n  globalsplat bench refine --size 64x64 --set views=4"
 )]
 pub struct Refine {
-    /// Of the splat
+    /// Number of Gaussians in the splat
     #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = clap::value_parser!(u32).range(1..))]
     gaussians: u32,
-    /// Of the photos
+    /// Size of the photos
     #[arg(long, value_name = "WxH", default_value = "256x256")]
     size: String,
-    /// Steps that are measured
+    /// Number of measured steps
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     steps: u64,
-    /// Change a number of the method
+    /// Override a setting of the refinement
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: String,
     /// Print the measurements as one JSON object

@@ -13,11 +13,11 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
 use tch::Device;
 
-/// A training step, part by part, on made-up scenes: pictures of noise, all Gaussians shown.
+/// Benchmark a training step, part by part, on synthetic scenes: photos of noise, all Gaussians visible.
 ///
-/// Without --config it is the paper's main model, 24 context and 12 target views of 256x256. L_perc takes part where its
-/// weights are there. Under torchrun it also tells what working together costs: time of a step apart, of communication by itself, and
-/// how much of that the backward pass hides.
+/// Without --config the model is the paper's main model, 24 context and 12 target views of 256x256. L_perc is included if its
+/// weights are found. Under torchrun the report includes the cost of distributed training: the time of a step without
+/// communication, of communication alone, and how much of that the backward pass hides.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench train\n  \
     globalsplat bench train --config configs/first_light.toml --steps 20\n  \
@@ -28,20 +28,20 @@ pub struct Train {
     /// Configuration file; see configs/
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Override a key of it, as in train.checkpoint_rounds=true
+    /// Override a key of the configuration, as in train.checkpoint_rounds=true
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Scenes in a step; auto takes the largest of train.batch, half of it, a quarter, … that fits into the device's memory without
-    /// train.micro_batch
+    /// Number of scenes per step; auto takes the largest of train.batch, half of it, a quarter, … that fits into the device's
+    /// memory without train.micro_batch
     #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
     batch: Batch,
-    /// Steps that are measured
+    /// Number of measured steps
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     steps: u32,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Share the optimizer's moments out over the processes that torchrun started
+    /// Shard the optimizer's moments across the processes that torchrun started
     #[arg(long)]
     shard_optimizer: bool,
     /// Print the measurements as one JSON object
@@ -49,7 +49,7 @@ pub struct Train {
     json: bool,
 }
 
-/// How many scenes a step has.
+/// Number of scenes per step, as `--batch` takes it.
 #[derive(Debug, Clone, Copy)]
 enum Batch {
     Auto,
@@ -94,7 +94,8 @@ impl Train {
         Ok(())
     }
 
-    /// With the batch that fits by the estimate; where a GPU has too little memory all the same, with half as many scenes.
+    /// Runs the benchmark with the batch size that fits by the estimate; if a GPU still runs out of memory, halves it and tries
+    /// again.
     fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
         let wanted = config.train.batch;
         let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);

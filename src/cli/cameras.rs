@@ -1,4 +1,4 @@
-//! Cameras for a splat whose capture tells none, and how far from the capture's cameras the splat is.
+//! Cameras for a splat without a capture, and the distance from a capture's cameras to the splat.
 
 use anyhow::Result;
 use glam::{DMat4, DVec3};
@@ -7,15 +7,15 @@ use globalsplat::render::SplatRenderer;
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_point};
 use tch::Kind;
 
-/// What a camera in the middle of the capture sees at its centre, half of the pixels being nearer; the splat's typical size where it
-/// sees nothing.
+/// Returns the median rendered depth of the capture's middle camera, over the pixels with an alpha of at least 0.5; if there
+/// are none, the splat's typical distance.
 pub fn median_depth(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<f64> {
     let rendered = renderer.render(&cameras[cameras.len() / 2..][..1])?.remove(0);
     let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
     Ok(if seen.numel() == 0 { renderer.frame().typical_distance() } else { seen.median().double_value(&[]) })
 }
 
-/// Around the middle of the splat's opaque part, far enough to see most of it.
+/// Returns cameras on an orbit around the opacity-weighted centre of the splat, far enough away to see most of it.
 pub fn orbit_around_splat(
     splat: &Splat,
     ImageSize { width, height }: ImageSize,
@@ -33,7 +33,7 @@ pub fn orbit_around_splat(
         .sqrt()
         .double_value(&[]);
     let centre = splat.origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
-    // Gaussians in one place are as far apart as they are large.
+    // Gaussians that all have the same mean: use their size instead of the spread.
     let radius = 3. * if spread > 0. { spread } else { splat.frame().typical_distance() };
     let (w, h) = (f64::from(width), f64::from(height));
     let focal = w.min(h);

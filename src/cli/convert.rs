@@ -12,48 +12,48 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
-/// On an orbit around a splat whose capture isn't named.
+/// Number and size of views on an orbit around a splat, if no capture is given.
 const VIEWS: usize = 8;
 const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
 
-/// Write a splat in another format, or with spherical harmonics of another degree, and tell what is lost.
+/// Write a splat in another format, or with spherical harmonics of another degree, and report the loss.
 ///
 /// Formats are 3DGS' PLY (.ply), PlayCanvas' compressed PLY (.compressed.ply), Niantic's SPZ (.spz) and antimatter15's .splat,
-/// which has no spherical harmonics. What was written is read again and drawn beside the original: the loss is the PSNR between
-/// both, of eight views around the splat or of the capture's cameras.
+/// which has no spherical harmonics. The written file is read again and rendered beside the original: the loss is the PSNR
+/// between both, over eight views around the splat or over the capture's cameras.
 ///
-/// SPZ's coefficients are within ±1 and a .splat has one for each colour; viewers for browsers hold no more of a PLY's, either
-/// (--for-viewers). Where the capture is named, those that are left show its cameras what all did before; else what can't be held is
-/// cut off, which may cost much.
+/// SPZ stores coefficients within ±1, and a .splat stores only one coefficient per colour channel; viewers for browsers keep no
+/// more of a PLY's coefficients, either (--for-viewers). With a capture, the remaining coefficients are fitted to look the same
+/// from its cameras; otherwise values out of range are clamped, which may cost much quality.
 ///
-/// Gaussians that can't be drawn are left out and counted: those with numbers that aren't finite, which other commands refuse, and
-/// those whose rotation has length 0.
+/// Gaussians that can't be rendered are removed and counted: those with values that aren't finite, which other commands refuse,
+/// and those whose rotation has length 0.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
     globalsplat convert room.ply shared.ply --for-viewers --scene captures/room")]
 pub struct Convert {
-    /// The splat: .ply, .compressed.ply, .spz or .splat
+    /// Input splat: .ply, .compressed.ply, .spz or .splat
     #[arg(value_name = "FROM")]
     from: PathBuf,
-    /// The file to write, whose ending tells the format
+    /// Output file, whose extension selects the format
     #[arg(value_name = "TO")]
     to: PathBuf,
-    /// Leave out spherical harmonics of higher degrees, or add some that are 0
+    /// Remove spherical harmonics of higher degrees, or add some that are 0
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..=3))]
     sh_degree: Option<i64>,
     /// Keep within what viewers for browsers show, whatever the format holds: a Gaussian's own colour in [0, 1], other
     /// coefficients within ±1
     #[arg(long)]
     for_viewers: bool,
-    /// Lose least for the cameras of this capture, and tell the loss by them
+    /// Minimize the loss for the cameras of this capture, and report the loss over them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
-    /// Write coordinates relative to the centre of the scene, which goes to a file beside the splat: far from the world's origin, as in
-    /// UTM coordinates, float32 and the formats' own numbers lose detail
+    /// Write coordinates relative to the centre of the scene, which is stored in a file beside the splat: far from the world's
+    /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
     local_origin: bool,
-    /// Print what was done as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -68,7 +68,7 @@ impl Convert {
         inputs.check_file(&self.to)?;
         let original = read_splat_without_invalid(&self.from)?;
         warn(&original.warnings);
-        // Before the file is replaced, if it is the same.
+        // Before the file is replaced, in case input and output are the same.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.unwrap_or(original.sh_degree());
         let limits = match self.for_viewers {
@@ -78,14 +78,14 @@ impl Convert {
         let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
         let fitted = match &capture {
             Some(capture) => Some(fit(&capture.cameras())?),
-            // What writes cuts off by itself.
+            // The writer clamps by itself.
             None if !self.for_viewers => None,
             None => Some(fit(&[])?),
         };
         let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
         let origin = self.local_origin.then(|| match &capture {
             Some(capture) => LocalFrame::from_cameras(&capture.cameras()).origin,
-            // A splat that has an origin keeps it.
+            // A splat that already has an origin keeps it.
             None if original.origin != DVec3::ZERO => original.origin,
             None => original.frame().origin,
         });
@@ -115,7 +115,7 @@ impl Convert {
         Ok(())
     }
 
-    /// Says so where coefficients are beyond what is held, and nobody said for which cameras that matters.
+    /// Warns if coefficients are out of the representable range and no capture was given to fit the others to.
     fn tell_cut(&self, original: &Splat, held: &Tensor) {
         let cut = original.gaussians.sh.narrow(2, 0, held.size()[2]).not_equal_tensor(held);
         let share = 100. * cut.to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);

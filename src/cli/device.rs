@@ -1,10 +1,10 @@
-//! `--device cpu|cuda[:N]`.
+//! Parser of `--device cpu|cuda[:N]`.
 
 use globalsplat::{Error, Result};
 use std::ffi::CStr;
 use tch::{Cuda, Device};
 
-/// Parses a device and makes sure that it is there.
+/// Parses a device and checks that it is available.
 pub fn parse(name: &str) -> Result<Device> {
     let refused = |why: &str| Error::Request(format!("--device {name}: {why}"));
     let index = match name.split_once(':') {
@@ -23,15 +23,15 @@ pub fn parse(name: &str) -> Result<Device> {
     Ok(Device::Cuda(index))
 }
 
-/// Loads libtorch's CUDA half where there is one, or tells why it can't be. The program isn't linked to it: loading it takes longer
-/// than a small job on the CPU, and machines without a GPU may not have it.
+/// Loads libtorch's CUDA library if there is one, or returns why it can't be loaded. The program isn't linked to it: loading it
+/// takes longer than a small job on the CPU, and machines without a GPU may not have it.
 pub fn load_cuda() -> std::result::Result<(), String> {
     // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
     let loaded = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
     if !loaded.is_null() {
         return Ok(());
     }
-    // SAFETY: an error's words, which nothing else asks for before they are copied.
+    // SAFETY: dlerror returns a terminated string, and nothing else calls it before the string is copied.
     let words = unsafe { CStr::from_ptr(libc::dlerror()) };
     Err(format!("its half for CUDA can't be loaded: {}", words.to_string_lossy()))
 }

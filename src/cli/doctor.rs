@@ -17,21 +17,22 @@ use std::fmt::Display;
 use std::path::PathBuf;
 use tch::Device;
 
-/// Tell what this machine offers: libtorch, devices, SIMD level, threads, GPUs and what they need, and the weights and the ffmpeg found.
+/// Report what this machine offers: libtorch, devices, SIMD level, threads, GPUs and their requirements, and the weights and
+/// the ffmpeg found.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels\n  \
     globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
 pub struct Doctor {
-    /// Compile the kernels for every kind of GPU that NVRTC knows, and tell what each takes of it
+    /// Compile the kernels for every GPU architecture that NVRTC supports, and report the resources that each uses
     #[arg(long)]
     kernels: bool,
-    /// Tell how much memory a training step by this configuration takes, on a CPU and on a GPU
+    /// Report how much memory a training step with this configuration takes, on a CPU and on a GPU
     #[arg(long, value_name = "FILE", conflicts_with = "kernels")]
     config: Option<PathBuf>,
-    /// Override a key of it, as in train.micro_batch=4
+    /// Override a key of the configuration, as in train.micro_batch=4
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     set: Vec<String>,
-    /// Print it as one JSON object
+    /// Print the report as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -171,12 +172,12 @@ impl Doctor {
     }
 }
 
-/// As in 9.0, of 90.
+/// Formats a compute capability: 90 gives `9.0`.
 fn capability(architecture: i32) -> String {
     format!("{}.{}", architecture / 10, architecture % 10)
 }
 
-/// As in 13.0, of 13000.
+/// Formats a CUDA version: 13000 gives `13.0`.
 fn cuda_version(version: i32) -> String {
     format!("{}.{}", version / 1000, version % 1000 / 10)
 }
@@ -188,7 +189,7 @@ fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Val
     }
 }
 
-/// Of the driver's GPUs, those that torch can use come first, and have their kernels.
+/// Returns the driver's GPUs as JSON. Those that torch can use come first, and have their kernels.
 fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) -> Value {
     let told = driver.gpus.iter().enumerate().map(|(number, gpu)| {
         json!({
@@ -217,7 +218,8 @@ fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str)
     }
 }
 
-/// A column for each kind of device, and whether it fits into those that are here.
+/// Prints the memory of a training step, a column for each kind of device, and whether it fits into the devices of this
+/// machine.
 fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()> {
     let cpu = MemoryEstimate::of(config, Device::Cpu)?;
     let gpu = MemoryEstimate::of(config, Device::Cuda(0))?;
@@ -276,7 +278,7 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
     Ok(())
 }
 
-/// A table, a row for each kernel and a column for each architecture.
+/// Prints a table of the resources of kernels, a row for each kernel and a column for each architecture.
 fn kernels(as_json: bool) -> globalsplat::Result<()> {
     let nvrtc = Nvrtc::find().map_err(Error::Request)?;
     let mut of_all: Vec<(i32, Vec<KernelUse>)> = vec![];

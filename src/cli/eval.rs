@@ -21,16 +21,16 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::Device;
 
-/// Score a model, splats or pictures against photos: PSNR, SSIM, and LPIPS where `make weights` was run.
+/// Evaluate a model, splats or images against photos: PSNR, SSIM, and LPIPS if `make weights` was run.
 ///
-/// Of one capture (--scene): with --weights the model sees the views that are not held out, and the others are its targets; with
-/// --splat or --renders all views are targets.
+/// One capture (--scene): with --weights the input views of the model are those that are not held out, and the others are its
+/// targets; with --splat or --renders all views are targets.
 ///
-/// Of a data set (--data, --index, --out), by the paper's protocol: every scene's context frames are shown and its target frames
-/// scored. DIR gets report.html, scores.json, scores.csv and every scene's scores as they come; the same command goes on where
-/// it was stopped, and scores again what was changed since. Several indices make one report. Anybody's splats are DIR/SCENE.ply, or .spz and the like,
-/// anybody's pictures DIR/SCENE/000012.png, named by the frame. Started by torchrun, many processes share the scenes out:
-/// docs/distributed.md.
+/// A dataset (--data, --index, --out), by the paper's protocol: every scene's context frames are the input and its target
+/// frames are scored. DIR gets report.html, scores.json, scores.csv and the scores of every scene as soon as they are computed;
+/// the same command resumes an interrupted evaluation, and scores again what has changed since. Several indices make one
+/// report. Splats from other methods are DIR/SCENE.ply, or .spz and the like, images from other methods DIR/SCENE/000012.png,
+/// named by the frame. Started by torchrun, several processes share the scenes: docs/distributed.md.
 #[derive(Args)]
 #[command(group(ArgGroup::new("subject").required(true)))]
 #[command(group(ArgGroup::new("photos").required(true)))]
@@ -39,59 +39,60 @@ use tch::Device;
     globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k\n  \
     globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --views-at 512 --pictures-at 512")]
 pub struct Eval {
-    /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt)
+    /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
     weights: Option<PathBuf>,
-    /// A splat in the capture's world: .ply, .compressed.ply, .spz or .splat; with --data a folder of them
+    /// Splat in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat; with --data a folder of splats
     #[arg(long, value_name = "FILE|DIR", group = "subject")]
     splat: Option<PathBuf>,
-    /// A folder of pictures named as the photos; with --data a folder of these
+    /// Folder of images named like the photos; with --data a folder of such folders
     #[arg(long, value_name = "DIR", group = "subject")]
     renders: Option<PathBuf>,
-    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH", group = "photos")]
     scene: Option<PathBuf>,
-    /// The data set: a folder of chunks with an index.json, one with such a folder named test, or one of captures
+    /// Dataset: a folder of chunks with an index.json, one with such a folder named test, or one of captures
     #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
     data: Option<PathBuf>,
-    /// Context and target frames of its scenes; may be given more than once
+    /// Context and target frames of the dataset's scenes; may be given more than once
     #[arg(long, value_name = "FILE.json", requires = "data", conflicts_with = "scene")]
     index: Vec<PathBuf>,
     /// Folder for the report and the scores
     #[arg(long, value_name = "DIR", requires = "data", conflicts_with = "scene")]
     out: Option<PathBuf>,
-    /// How the report calls what is scored; by default as its file or folder
+    /// Name of the method in the report; by default the name of its file or folder
     #[arg(long, requires = "data", conflicts_with = "scene")]
     name: Option<String>,
-    /// How the report calls the data set; by default re10k, acid or dl3dv, if its folder or the index bears one of these names as
-    /// a whole word, else as its folder
+    /// Name of the dataset in the report; by default re10k, acid or dl3dv, if its folder or the index has one of these names as
+    /// a whole word, else the name of its folder
     #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
     dataset: Option<String>,
-    /// Target views: every:N, every:N+K, or none for the capture's own test part; by default as the model was trained
+    /// Target views: every:N, every:N+K, or none for the capture's own test split; by default as in the model's training
     #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
     holdout: Option<String>,
-    /// Photos the model is shown, spread over the path of the camera; by default all that are not held out
+    /// Number of input photos, spread along the camera path; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
-    /// Show the model photos of this height, a multiple of what it was trained with
+    /// Height of the model's input photos in pixels, a multiple of the height it was trained with
     #[arg(long, value_name = "PIXELS", conflicts_with_all = ["splat", "renders"])]
     views_at: Option<u32>,
-    /// What a photo of N times the height becomes: N² views that share its pixels out (polyphase), one larger view (whole), or N²
-    /// times the same view of a photo made small again (repeated)
+    /// Conversion of a photo of N times the height: N² views that share its pixels (polyphase), one larger view (whole), or N²
+    /// copies of one view of the downscaled photo (repeated)
     #[arg(long, value_name = "HOW", requires = "views_at", default_value_t)]
     views_as: ViewsAs,
-    /// Score pictures of this height, in the shape of the model's images, or square; by default as large as the model's images, for
-    /// others' pictures of a data set 256, and of one capture as its photos
+    /// Height of the scored images in pixels, in the shape of the model's images, or square; by default the size of the model's
+    /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
     #[arg(long, value_name = "PIXELS")]
     pictures_at: Option<u32>,
-    /// Also write a picture: photo, render and depth side by side, a row per view; shrunk where it would have more than 64 million
-    /// pixels
+    /// Also write an image: photo, render and depth side by side, a row per view; downscaled if it would have more than 64
+    /// million pixels
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
-    /// f32, bf16 for the model's matrix products, or auto: bf16 for wide models where the device has instructions for it
+    /// Precision: f32, bf16 for the model's matrix products, or auto: bf16 for wide models if the device has instructions for
+    /// it
     #[arg(long, default_value = "auto", conflicts_with_all = ["splat", "renders"])]
     precision: String,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
     /// Print the scores as one JSON object
@@ -108,7 +109,7 @@ impl Eval {
         }
     }
 
-    /// Whether processes share it out.
+    /// Returns `true` if the processes that torchrun started share the work.
     pub fn is_shared(&self) -> bool {
         self.data.is_some()
     }
@@ -131,7 +132,7 @@ impl Eval {
         }
         let mut made = self.method(model).synthesize(scene, device)?;
         warn(&made.warnings);
-        let peak_memory = peak_memory_bytes(); // of the method, not of the networks that judge it
+        let peak_memory = peak_memory_bytes(); // of the method, without the networks of the metrics
         let perceptual = Perceptual::find(device)?;
         let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(made.scene.target.len()));
         let scores = judge(&mut made, &perceptual, |truth, picture, _| {
@@ -139,7 +140,7 @@ impl Eval {
             row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&truth.image, rendered))
         })?;
         let scene = &made.scene;
-        // Beside a model, what answering without one would score.
+        // For a model, also score the trivial baselines that use only the input photos.
         let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
         if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
             say_shrunk(path, sheet.write(path)?);
@@ -178,7 +179,7 @@ impl Eval {
         Ok(())
     }
 
-    /// What a model is shown and has to match; of splats and pictures all photos.
+    /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let picture_size = self.picture_size(model)?;
         let Some(model) = model else {
@@ -188,7 +189,7 @@ impl Eval {
         Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, picture_size)?)
     }
 
-    /// What the photos that `model` is shown of `scene` would score, as large as the pictures are.
+    /// Scores the baselines that use only the input photos of `scene`, at the size of the scored images.
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
         let size = self.picture_size(Some(model))?;
         let photos = match size == model.input.photo_size(model.config.data.image_size) {
@@ -208,12 +209,12 @@ impl Eval {
         }
     }
 
-    /// Whether a size was asked for that photos may lack the pixels for.
+    /// Returns `true` if the user chose a size that may exceed the resolution of the photos.
     fn chooses_size(&self) -> bool {
         self.views_at.is_some() || self.pictures_at.is_some()
     }
 
-    /// Of what is scored.
+    /// Returns the size of the scored images.
     fn picture_size(&self, model: Option<Model>) -> Result<ImageSize> {
         let default = model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size);
         let Some(height) = self.pictures_at else { return Ok(default) };
@@ -235,7 +236,7 @@ impl Eval {
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 
-    /// The model, and what it is to see of photos.
+    /// Returns the model and the way it gets its input photos.
     fn model<'a>(&self, loaded: Option<&'a LoadedModel>) -> Result<Option<Model<'a>>> {
         let Some(loaded) = loaded else { return Ok(None) };
         let trained = loaded.config.data.image_size;
@@ -249,7 +250,7 @@ impl Eval {
         Ok(Some(Model { input, ..loaded.into() }))
     }
 
-    /// The files of what is judged, of a data set by `methods`, one for each scene.
+    /// Returns the input files of the evaluation; for a dataset, `methods` has one method per scene.
     fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> Inputs {
         let mut inputs = Inputs::default();
         match &self.weights {
@@ -259,7 +260,7 @@ impl Eval {
         inputs
     }
 
-    /// Refuses an output that would replace what is read.
+    /// Returns an error if an output would replace an input.
     fn check_outputs<'a>(
         &self,
         dataset: &Dataset,
@@ -280,14 +281,14 @@ impl Eval {
         Ok(())
     }
 
-    /// The file or folder that is judged.
+    /// Returns the file or folder that is evaluated.
     fn path(&self) -> &Path {
         let paths = [&self.weights, &self.splat, &self.renders];
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
     }
 
-    /// Tells what is judged from others: weights by their name and all that their files hold. Every scene's splat or pictures are told
-    /// apart one by one, so of their folder it is the place.
+    /// Returns a string that identifies what is evaluated: for weights their file name and a checksum of all their files.
+    /// Splats and images are compared scene by scene, so for them it is the path of their folder.
     fn fingerprint(&self) -> Result<String> {
         let Some(weights) = &self.weights else {
             return Ok(self.path().canonicalize()?.display().to_string());
@@ -306,7 +307,7 @@ impl Eval {
     }
 }
 
-/// The data set's side of the command.
+/// Evaluation of a dataset.
 impl Eval {
     fn run_dataset(&self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
@@ -436,12 +437,12 @@ impl Eval {
     }
 }
 
-/// [height, width] of the protocol's pictures (spec 9.1).
+/// Size of the protocol's images, [height, width] (spec 9.1).
 const PROTOCOL_SIZE: [u32; 2] = [256, 256];
-/// In pixels: SSIM looks through windows of 11×11.
+/// Allowed sides of scored images in pixels: SSIM uses windows of 11×11.
 const PICTURE_SIDES: RangeInclusive<u32> = 11..=16_384;
 
-/// Where each index's scores go: into `out` itself where there is one alone.
+/// Returns the output folder of each index's scores: `out` itself if there is only one index.
 fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
     let stem = |index: &EvaluationIndex| out.join(index.file.file_stem().unwrap_or_default());
     let folders: Vec<_> = match indices {
@@ -461,7 +462,7 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
 fn print_table(scores: &CaptureScores) {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
     println!("{}: {} views{gaussians}", scores.scene, scores.views.len());
-    // Columns that no view would fill are left out.
+    // Columns without any value are left out.
     let columns = [
         ("LPIPS-VGG", scores.views.iter().any(|view| view.lpips_vgg.is_some())),
         ("LPIPS-Alex", scores.views.iter().any(|view| view.lpips_alex.is_some())),

@@ -21,13 +21,13 @@ pub struct Export {
     /// Folder of a run
     #[arg(long, value_name = "RUN", group = "source")]
     run: Option<PathBuf>,
-    /// Of the run, the weights that validation found best, instead of the newest
+    /// Export the run's best weights by validation, instead of the newest
     #[arg(long, conflicts_with = "config")]
     best: bool,
-    /// Fresh weights of a configuration instead, as training would begin with
+    /// Export newly initialized weights of a configuration instead, as at the start of training
     #[arg(long, value_name = "FILE", group = "source")]
     config: Option<PathBuf>,
-    /// safetensors, or a checkpoint that torch.load reads, in the layout of the authors'
+    /// Format: safetensors, or a checkpoint that torch.load reads, in the authors' layout
     #[arg(long, value_enum, default_value = "safetensors")]
     format: Format,
     #[command(flatten)]

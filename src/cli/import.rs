@@ -8,21 +8,21 @@ use serde_json::json;
 use std::path::PathBuf;
 use tch::Device;
 
-/// Take over weights from a checkpoint of the authors' or anybody's state dict, as safetensors with a configuration.
+/// Convert weights from the authors' checkpoint or any state dict to safetensors with a configuration.
 ///
-/// The model's shape is read off the tensors; optimizer state, other networks and settings beside them are left out. Nothing in
-/// the file is run: one that would run code in Python is refused. What shapes don't tell, the number of attention heads and the stage
-/// that the model ends in, is the paper's, and told; --set says it otherwise.
+/// The model's shape is inferred from the tensors; optimizer state, other networks and settings beside them are ignored.
+/// Nothing in the file is executed: a file that would run code in Python is refused. Settings that shapes don't determine, the
+/// number of attention heads and the final stage of the model, default to the paper's and are reported; --set overrides them.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  globalsplat import --from globalsplat_16k.ckpt --out model.safetensors\n  \
     globalsplat import --from dense_32k.ckpt --set curriculum.final_stage=4 --out model.safetensors"
 )]
 pub struct Import {
-    /// What torch.save or Lightning wrote, or a safetensors file with or without a configuration
+    /// File that torch.save or Lightning wrote, or a safetensors file with or without a configuration
     #[arg(long, value_name = "FILE")]
     from: PathBuf,
-    /// Say a key of the configuration otherwise, as in model.heads=4; may be given more than once
+    /// Override a key of the configuration, as in model.heads=4; may be given more than once
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
     #[command(flatten)]

@@ -10,15 +10,15 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
-/// Tell what is in a splat, a weights file, a capture, a chunk, or a folder of chunks.
+/// Print the contents of a splat, a weights file, a capture, a chunk, or a folder of chunks.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat inspect room.ply")]
 pub struct Inspect {
-    /// A splat (.ply, .compressed.ply, .spz, .splat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
+    /// Splat (.ply, .compressed.ply, .spz, .splat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
     /// index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
-    /// Print it as one JSON object
+    /// Print the contents as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -60,7 +60,7 @@ impl Inspect {
     }
 }
 
-/// Smallest, median and largest.
+/// Returns the minimum, median and maximum.
 fn range(t: &Tensor) -> Value {
     let t = t.to_kind(Kind::Double);
     if t.numel() == 0 {
@@ -98,7 +98,7 @@ fn weights(path: &Path) -> Result<Value> {
     kinds.dedup();
     let bytes = std::fs::metadata(weights.path())?.len();
     let [configuration, stage] = [CONFIG_KEY, STAGE_KEY].map(|key| weights.metadata().get(key).cloned());
-    // Of weights without a configuration, what their shapes tell.
+    // For weights without a configuration, infer it from the shapes.
     let model = ModelFile::of(weights, &[]).ok();
     let configuration = configuration.or(model.as_ref().map(|model| model.config.to_toml()));
     Ok(json!({

@@ -1,7 +1,7 @@
-//! The command line: one file per command, which parses, calls the library and prints.
+//! The command line: one file per command, which parses arguments, calls the library and prints the result.
 //!
-//! Exit codes: 0 done, 1 the work failed, 2 the request was wrong. Results go to standard output (with `--json` one
-//! object), everything else to standard error.
+//! Exit codes: 0 success, 1 the work failed, 2 the request was wrong. Results go to standard output (with `--json` one object),
+//! everything else to standard error.
 
 mod bench;
 mod bench_attention;
@@ -52,7 +52,7 @@ const DONE: u8 = 0;
 const FAILED: u8 = 1;
 const WRONG_REQUEST: u8 = 2;
 
-/// Posed photos to a compact 3D Gaussian splat in one forward pass.
+/// Turn posed photos into a compact 3D Gaussian splat in one forward pass.
 #[derive(Parser)]
 #[command(name = "globalsplat", version, propagate_version = true)]
 struct Cli {
@@ -105,7 +105,7 @@ impl Command {
         }
     }
 
-    /// Whether processes that `torchrun` started share the work out.
+    /// Returns `true` if the processes that `torchrun` started share the work of this command.
     fn is_shared(&self) -> bool {
         match self {
             Command::Train(_) => true,
@@ -124,16 +124,16 @@ pub fn main() -> ExitCode {
             if ranks::is_first() {
                 let _ = e.print();
             }
-            // --help and --version come as errors too, with exit code 0.
+            // clap returns --help and --version as errors too, with exit code 0.
             return ExitCode::from(e.exit_code() as u8);
         }
     };
     memory::end_as_failed();
-    // Before there are other threads.
+    // This must precede the start of other threads.
     globalsplat::model::flush_denormals();
     #[cfg(target_os = "linux")]
     let _heeding = neighbours::heed();
-    // What libtorch refuses below the library's own checks arrives as a panic: still one sentence for the user.
+    // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| {
         if !cli.command.is_shared() {
@@ -157,14 +157,14 @@ pub fn main() -> ExitCode {
     ExitCode::from(code)
 }
 
-/// Says what went wrong. What comes from below the program's own checks is told as a person would.
+/// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
 fn tell(message: &str, others_are_lost: bool) {
     let Some(message) = ranks::what_to_tell(message, others_are_lost) else { return };
     const PRINTING: &str = "failed printing to stdout: ";
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: the system refuses memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
-        // Who reads no further, such as `head`, has what they want.
+        // A reader that closes the pipe early, such as `head`, is no error.
         if !why.contains("Broken pipe") {
             eprintln!("globalsplat: standard output can't be written: {why}");
         }
@@ -173,7 +173,7 @@ fn tell(message: &str, others_are_lost: bool) {
     }
 }
 
-/// A picture size as `--size` takes it.
+/// Parses an image size as `--size` takes it.
 fn parse_size(text: &str) -> Result<ImageSize, Error> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     match sides {
@@ -182,7 +182,7 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
     }
 }
 
-/// Becomes true when the user or the system asks the program to stop.
+/// Returns a flag that becomes true when the user or the system asks the program to stop.
 fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
@@ -190,7 +190,7 @@ fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// Refuses fewer photos, by --views, than a scene can be made of.
+/// Returns an error if --views is smaller than the number of photos that a reconstruction needs.
 fn check_views(views: Option<usize>) -> Result<(), Error> {
     match views {
         Some(views @ ..2) => Err(Error::Request(format!("--views is {views}, expected 2 or more"))),
@@ -198,21 +198,21 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
     }
 }
 
-/// Opens a capture and says what is left out or changed of it.
+/// Opens a capture and prints warnings about what is ignored or changed in it.
 fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
     let capture = globalsplat::data::open_capture(path)?;
     warn(capture.warnings());
     Ok(capture)
 }
 
-/// Says what is left out or changed of an input, a line each.
+/// Prints warnings about what is ignored or changed in an input, one per line.
 fn warn(lines: &[String]) {
     if ranks::is_first() {
         lines.iter().for_each(|line| eprintln!("{line}"));
     }
 }
 
-/// Says the first few of what is left out or changed of many inputs, and how many more lines there are.
+/// Prints the first few warnings about what is ignored or changed in many inputs, and the number of further lines.
 fn warn_of_many<'a>(lines: impl Iterator<Item = &'a String>) {
     const SHOWN: usize = 5;
     let lines: Vec<String> = lines.cloned().collect();
@@ -231,7 +231,7 @@ fn print_json(value: &serde_json::Value) {
     println!("{value}");
 }
 
-/// Says that the pictures in the picture at `path` are shrunk, if the sides of the largest are divided by more than 1.
+/// Reports that the photos in the file at `path` are downscaled, if the sides of the largest are divided by more than 1.
 fn say_shrunk(path: &Path, by: i64) {
     if by > 1 {
         eprintln!(

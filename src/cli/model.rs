@@ -1,4 +1,4 @@
-//! `--weights`, `--precision auto|f32|bf16` and `--views-at`.
+//! Shared code for `--weights`, `--precision auto|f32|bf16` and `--views-at`.
 
 use super::ranks;
 use globalsplat::config::Config;
@@ -9,7 +9,7 @@ use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
 
-/// What `--precision` asks for; nothing is `auto`.
+/// Parses `--precision`; `auto` gives `None`.
 pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
     if asked == "auto" {
         return Ok(None);
@@ -20,7 +20,8 @@ pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
     Ok(Some(precision))
 }
 
-/// The precision that is `asked` for, or [`Precision::best_on`] `device` for tokens of `width` numbers. The slower one is told of.
+/// Returns the precision `asked`, or [`Precision::best_on`] `device` for tokens of `width` elements. Warns if bf16 is the
+/// slower one.
 pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precision {
     let precision = asked.unwrap_or_else(|| Precision::best_on(device, width));
     if precision == Precision::Bf16 && Precision::fastest_on(device) == Precision::F32 && ranks::is_first() {
@@ -29,7 +30,7 @@ pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precis
     precision
 }
 
-/// Reads the model in `weights`, or the one that comes with this program, which computes in [`precision`] from then on.
+/// Loads the model in `weights`, or the one embedded in this program, to compute in [`precision`].
 pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) -> Result<LoadedModel> {
     let file = match weights {
         Some(weights) => ModelFile::open(weights, &[])?,
@@ -49,15 +50,15 @@ pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) ->
     Ok(loaded)
 }
 
-/// What errors and reports call the weights.
+/// Returns the name of the weights in errors and reports.
 pub fn name(weights: Option<&Path>) -> &Path {
     weights.unwrap_or(Path::new(SHIPPED_MODEL))
 }
 
-/// Told where photos are smaller than what they are fitted to.
+/// Warning for photos that are smaller than the size they are resized to.
 pub const ENLARGED: &str = "smaller photos are enlarged, which shows no more of the scene";
 
-/// What photos become for a model that was trained with images of `trained`.
+/// Describes the size to which photos are resized for a model that was trained with images of `trained`.
 pub fn shown_as(input: Input, trained: ImageSize) -> String {
     let pixels = |size: ImageSize| format!("{}×{} pixels", size.width, size.height);
     let (photo, trained, views) =
@@ -72,7 +73,7 @@ pub fn shown_as(input: Input, trained: ImageSize) -> String {
     }
 }
 
-/// What is to be told of weights whose training was stopped on the way.
+/// Returns a warning about weights whose training was stopped before the final stage.
 pub fn early_stage(stage: Stage, config: &Config) -> Option<String> {
     let last = config.curriculum.final_stage();
     let Stage { index, mix } = stage;

@@ -1,10 +1,10 @@
-//! Other processes on the same cores, and how OpenMP's threads wait for each other beside them.
+//! Guard against oversubscription: changes how OpenMP's threads wait when other processes use the same cores.
 //!
-//! Between two operations a thread of libgomp, which libtorch computes with, spins for milliseconds until the next one. Alone
-//! that is the fastest way to wait. Where another process takes a core, threads spin for one that isn't running, and training
-//! slows several times over. libgomp itself spins next to never once it manages more threads than there are cores. So while
-//! others take cores it is given a team of threads that does nothing. The threads at work stay as many: on their number results
-//! depend.
+//! Between two operations a thread of libgomp, the OpenMP runtime of libtorch, spins for milliseconds until the next one. This
+//! is the fastest way to wait if the process is alone. If another process takes a core, threads spin while they wait for one
+//! that isn't running, and training slows down several times. libgomp itself hardly spins once it manages more threads than
+//! there are cores. So while other processes take cores, we start an additional team of threads that does nothing. The number
+//! of working threads doesn't change, since results depend on it.
 
 use std::fs::read_to_string;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -12,16 +12,17 @@ use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};
 
-/// How often it is looked who computes: a few clock ticks, in which the system counts.
+/// Interval between two measurements of CPU time: some clock ticks, the unit in which the system counts.
 const INTERVAL: Duration = Duration::from_millis(200);
 
-/// The part of a core that others may take until threads stop spinning, and the part below which they spin again.
+/// Fraction of a core that other processes may take before threads stop spinning, and the fraction below which they spin again.
 const CROWDED: f64 = 0.25;
 const QUIET: f64 = 0.1;
 
-/// Heeds other processes while this is held. Where it can't be known what they do, threads go on waiting as they do.
+/// Starts the guard, which runs until the returned value is dropped. If the CPU time of other processes can't be measured,
+/// threads wait as usual.
 pub fn heed() -> Option<Background> {
-    // Refused, it is as if nobody else were there.
+    // Without the guard's thread, the program runs as if no other process used the cores.
     Background::start("neighbours", |until: Receiver<()>| {
         let mut crowds = Vec::new();
         let mut before = Times::now();
@@ -33,7 +34,7 @@ pub fn heed() -> Option<Background> {
             if threads < 2 || missing < QUIET {
                 crowds.clear();
             } else if missing > CROWDED && crowds.is_empty() {
-                // Until there are more threads than cores: one team, but for who asked for fewer threads.
+                // More threads than cores are needed: one team is enough unless the user asked for fewer threads.
                 let teams = (later.cores + 1).saturating_sub(threads).div_ceil(threads - 1);
                 crowds.extend((0..teams).map_while(|_| crowd()));
             }
@@ -42,25 +43,25 @@ pub fn heed() -> Option<Background> {
     })
 }
 
-/// A team of threads more that libgomp manages, asleep, while this is held.
+/// Starts an additional, sleeping team of libgomp threads that lives until the returned value is dropped.
 fn crowd() -> Option<Background> {
     Background::start("crowd", |until: Receiver<()>| {
-        // Large enough that libtorch shares it among threads: one that isn't libgomp's gets a team of its own, and keeps it
-        // until it ends.
+        // Large enough for libtorch to split across threads: a thread that libgomp didn't start gets a team of its own, and
+        // keeps it until it ends.
         let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
         let _ = until.recv();
     })
 }
 
-/// A thread that is told to end, and waited for, when this is dropped: one that is left to itself may still be inside libtorch
-/// when the process takes that down.
+/// Background thread that ends and is joined when this is dropped: a detached thread may still be inside libtorch when the
+/// process unloads libtorch.
 pub struct Background {
     tell: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Background {
-    /// None where the system refuses a thread.
+    /// Starts the thread, or returns `None` if the system refuses to create one.
     fn start(name: &str, work: impl FnOnce(Receiver<()>) + Send + 'static) -> Option<Background> {
         let (tell, until) = channel();
         let thread = Builder::new().name(name.into()).spawn(move || work(until)).ok()?;
@@ -77,19 +78,19 @@ impl Drop for Background {
     }
 }
 
-/// Time computed until now, on the cores that this process may use.
+/// CPU time used so far, on the cores that this process may use.
 struct Times {
     at: Instant,
     cores: usize,
-    /// By all processes, in seconds.
+    /// CPU time of all processes, in seconds.
     all: f64,
-    /// By this one, in seconds.
+    /// CPU time of this process, in seconds.
     own: f64,
 }
 
 impl Times {
     fn now() -> Option<Times> {
-        // SAFETY: both are plain data, for which zero is a value, and the calls fill them.
+        // SAFETY: both are plain data for which zero is a valid value, and the calls fill them.
         let (set, usage, tick) = unsafe {
             let mut set: libc::cpu_set_t = std::mem::zeroed();
             let mut usage: libc::rusage = std::mem::zeroed();
@@ -99,7 +100,7 @@ impl Times {
         }?;
         let seconds = |time: libc::timeval| time.tv_sec as f64 + 1e-6 * time.tv_usec as f64;
         let own = seconds(usage.ru_utime) + seconds(usage.ru_stime);
-        // SAFETY: it is asked for bits that the set has.
+        // SAFETY: the index is within the bits of the set.
         let ours = |core: usize| core < libc::CPU_SETSIZE as usize && unsafe { libc::CPU_ISSET(core, &set) };
         let table = read_to_string("/proc/stat").ok()?;
         let busy: Vec<u64> = table.lines().filter_map(|line| busy_ticks(line, ours)).collect();
@@ -107,14 +108,14 @@ impl Times {
         Some(Times { at: Instant::now(), cores: busy.len(), all, own })
     }
 
-    /// How many cores others took since then.
+    /// Returns the number of cores that other processes used since `then`.
     fn others_since(&self, then: &Times) -> f64 {
         ((self.all - then.all) - (self.own - then.own)) / (self.at - then.at).as_secs_f64()
     }
 }
 
-/// The clock ticks that one of our cores was busy for, of its line in `/proc/stat`: `cpuN user nice system idle iowait irq softirq
-/// steal …` (proc_stat(5)).
+/// Returns the clock ticks that one of our cores was busy for, from its line in `/proc/stat`: `cpuN user nice system idle
+/// iowait irq softirq steal …` (proc_stat(5)).
 fn busy_ticks(line: &str, ours: impl Fn(usize) -> bool) -> Option<u64> {
     let mut words = line.strip_prefix("cpu")?.split(' ');
     if !ours(words.next()?.parse().ok()?) {
@@ -162,7 +163,8 @@ mod tests {
         assert!(others > 0.2, "{others}");
     }
 
-    /// Threads of this process that are called so. One of a team has the name of the thread that it was made for.
+    /// Returns the number of threads of this process with that name. The threads of a team inherit the name of the thread that
+    /// the team was created for.
     fn called(name: &str) -> usize {
         let tasks = std::fs::read_dir("/proc/self/task").unwrap();
         let names = tasks.filter_map(|task| read_to_string(task.ok()?.path().join("comm")).ok());

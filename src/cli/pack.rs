@@ -7,10 +7,10 @@ use globalsplat::io::{Inputs, check_writable_dir};
 use serde_json::json;
 use std::path::PathBuf;
 
-/// Pack captures into the chunks that RealEstate10K, ACID and DL3DV come in.
+/// Pack captures into chunks, the format of RealEstate10K, ACID and DL3DV.
 ///
-/// The folder gets an index.json and files that Python's torch.load reads. JPEG and PNG photos of 8-bit RGB are taken bit for bit,
-/// unless lens distortion has to be removed; all others are encoded anew.
+/// The folder gets an index.json and files that Python's torch.load reads. JPEG and PNG photos of 8-bit RGB are copied bit for
+/// bit, unless lens distortion has to be removed; all others are encoded again.
 #[derive(Args)]
 #[command(after_help = "Example:\n  globalsplat pack captures/room captures/garden --out chunks/train")]
 pub struct Pack {
@@ -20,10 +20,10 @@ pub struct Pack {
     /// Folder for index.json, 000000.torch, …
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Megabytes of photos in a chunk, about
+    /// Approximate megabytes of photos per chunk
     #[arg(long, value_name = "MB", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=2000))]
     chunk_size: u32,
-    /// Print what was written as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }

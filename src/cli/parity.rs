@@ -3,16 +3,16 @@ use anyhow::Result;
 use clap::Args;
 use std::path::PathBuf;
 
-/// Answer the cases that parity/run.py asks.
+/// Answer the requests of parity/run.py.
 #[derive(Args)]
 pub struct Parity {
     /// Folder of request files
     #[arg(long, value_name = "DIR")]
     requests: PathBuf,
-    /// Folder for the answers
+    /// Folder for the responses
     #[arg(long, value_name = "DIR")]
     responses: PathBuf,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
 }

@@ -1,4 +1,4 @@
-//! Progress on standard error: a bar where that is a terminal, else a line every half minute.
+//! Progress on standard error: a progress bar on a terminal, otherwise a line every half minute.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::{IsTerminal, stderr};
@@ -6,32 +6,32 @@ use std::ops::Deref;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
-/// Between lines.
+/// Interval between lines.
 const PAUSE: Duration = Duration::from_secs(30);
 
-/// A bar, and a thread that writes lines where nobody sees it.
+/// Progress bar, with a thread that writes lines if standard error is not a terminal.
 pub struct Progress {
     bar: ProgressBar,
-    /// Ends the thread by being dropped.
+    /// Channel whose drop ends the thread.
     _lines: Option<Sender<()>>,
 }
 
-/// What a bar counts.
+/// Unit of a bar's position.
 #[derive(Clone, Copy)]
 enum Unit {
-    /// Items by this name, as fast as they come.
+    /// Items with this name, at a measured rate.
     Items(&'static str),
-    /// Seconds of a time that is given: what is left of it is no guess.
+    /// Seconds of a fixed time budget, so the time left is exact.
     Seconds,
 }
 
-/// Progress over `length` items with rate and time left.
+/// Creates a progress bar over `length` items, with rate and time left.
 pub fn bar(length: u64, unit: &'static str) -> Progress {
     let template = format!("{{bar:30}} {{pos}}/{{len}} {unit} {{per_sec}} {{elapsed}} <{{eta}} {{msg}}");
     progress(length, &template, Unit::Items(unit))
 }
 
-/// Progress over a time: its position is how many seconds are gone.
+/// Creates a progress bar over a time budget: its position is the number of seconds elapsed.
 pub fn seconds_of(time: Duration) -> Progress {
     progress(time.as_secs_f64().ceil() as u64, "{bar:30} {pos}/{len} s {msg}", Unit::Seconds)
 }
@@ -44,7 +44,7 @@ fn progress(length: u64, template: &str, unit: Unit) -> Progress {
     Progress { bar, _lines: lines }
 }
 
-/// The same where this is the first of the processes that share the work; nothing where it isn't.
+/// Creates a [`bar`] in the first of the processes that share the work, and a hidden one in the others.
 pub fn of_first(is_first: bool, length: u64, unit: &'static str) -> Progress {
     match is_first {
         true => bar(length, unit),
@@ -70,7 +70,8 @@ fn write_lines(bar: ProgressBar, unit: Unit) -> Sender<()> {
     sender
 }
 
-/// Where the work stands, as `600 of 3000 steps, 8.1 a second, 5 minutes left, loss 0.02` or `20 of 60 seconds, 40 seconds left`.
+/// Formats the progress, as `600 of 3000 steps, 8.1 a second, 5 minutes left, loss 0.02` or `20 of 60 seconds, 40 seconds
+/// left`.
 fn line(bar: &ProgressBar, unit: Unit) -> String {
     let (done, of) = (bar.position(), bar.length().unwrap_or(0));
     let mut line = match unit {
@@ -87,7 +88,7 @@ fn line(bar: &ProgressBar, unit: Unit) -> String {
     line
 }
 
-/// How fast the work is, and how long it will take; nobody knows that of work that stands still.
+/// Formats the rate and the time left; there is no estimate if the work has stalled.
 fn rate(per_second: f64, left: Duration) -> String {
     const FOR_EVER: Duration = Duration::from_secs(365 * 24 * 3600);
     if left > FOR_EVER {
@@ -96,7 +97,7 @@ fn rate(per_second: f64, left: Duration) -> String {
     format!(", {per_second:.1} a second, {} left", duration(left))
 }
 
-/// In words, to the precision that anybody needs.
+/// Formats a duration in words, rounded to seconds, minutes or hours.
 fn duration(time: Duration) -> String {
     let (minutes, hours) = (time.as_secs().div_ceil(60), time.as_secs() / 3600);
     match time.as_secs() {
@@ -121,7 +122,7 @@ mod tests {
         assert!(line.starts_with("4 of 10 scenes, ") && line.ends_with(" left, loss 0.5"), "{line}");
     }
 
-    /// However fast the work goes, and whatever it is.
+    /// The time left of a fixed budget is independent of the rate of the work.
     #[test]
     fn time_that_is_given_is_what_is_left() {
         let bar = ProgressBar::hidden();

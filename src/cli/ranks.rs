@@ -1,4 +1,4 @@
-//! Being one of several processes that `torchrun` started.
+//! Distributed runs: this process as one of several that `torchrun` started.
 
 use super::device;
 use globalsplat::error::{Error, Result};
@@ -6,21 +6,21 @@ use globalsplat::ranks::{Group, Place, Watch};
 use std::sync::OnceLock;
 use tch::Device;
 
-/// How this process keeps in touch with its others, if it has any.
+/// Connection to the other processes, if there are any.
 static WATCH: OnceLock<Watch> = OnceLock::new();
 
-/// Meets the processes that were started together with this one, to work on the device called `name`: `cuda` is for each of them
-/// the GPU of its own.
+/// Joins the group of processes started together with this one, to work on the device called `name`: `cuda` means a GPU of its
+/// own for each process.
 pub fn join(name: &str) -> Result<(Group, Device)> {
     let Some(place) = Place::of_process()? else { return Ok((Group::alone(), device::parse(name)?)) };
     let watch = Watch::begin(&place, |why| {
         why.iter().for_each(|why| eprintln!("globalsplat: {why}"));
-        // Whatever waits for a rank that hangs isn't waited for.
-        // SAFETY: nothing is done after it.
+        // Work that waits for a hung rank is abandoned.
+        // SAFETY: nothing runs after it.
         unsafe { libc::_exit(super::FAILED.into()) }
     })?;
     let watch = WATCH.get_or_init(|| watch);
-    // Cores are shared among the processes of a machine, as torchrun shares libtorch's threads.
+    // The processes of a machine share its cores, as torchrun divides libtorch's threads.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = (cores / place.local_ranks).max(1);
     rayon::ThreadPoolBuilder::new()
@@ -41,12 +41,12 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
     Ok((Group::join(&place, watch.store(), device)?, device))
 }
 
-/// Whether what concerns all processes alike is this one's to say.
+/// Returns `true` in the process that prints messages on behalf of all.
 pub fn is_first() -> bool {
     !matches!(Place::of_process(), Ok(Some(Place { rank: 1.., .. })))
 }
 
-/// That torchrun didn't start several of this process, whose work isn't shared out.
+/// Returns an error if torchrun started several processes for a command that can't be distributed.
 pub fn refuse() -> Result<()> {
     let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
     let Ok(Some(Place { rank, ranks, .. })) = Place::of_process() else { return Ok(()) };
@@ -55,12 +55,12 @@ pub fn refuse() -> Result<()> {
         (true, 0) => Err(Error::Request(format!(
             "this is work for one process, and torchrun started {ranks}: expected train, eval --data or bench train"
         ))),
-        // The first one says so.
+        // The first process reports the error.
         (true, _) => std::process::exit(super::WRONG_REQUEST.into()),
     }
 }
 
-/// What this process should print of why it fails: one of all speaks.
+/// Returns the error message that this process should print, or `None` if another process reports it.
 pub fn what_to_tell(message: &str, others_are_lost: bool) -> Option<String> {
     match WATCH.get() {
         Some(watch) => watch.tell(message, others_are_lost),
@@ -68,7 +68,7 @@ pub fn what_to_tell(message: &str, others_are_lost: bool) -> Option<String> {
     }
 }
 
-/// The last that a process does.
+/// Leaves the group of processes; the last call of a process.
 pub fn leave(failed: bool) {
     if let Some(watch) = WATCH.get() {
         watch.leave(failed);

@@ -14,54 +14,55 @@ use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-/// Make a splat from posed photos.
+/// Turn posed photos into a splat.
 ///
-/// The splat is in the capture's own world, so the capture's cameras see it where the photos show it.
+/// The splat is in the capture's own world coordinates, so a render from a camera of the capture matches its photo.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
     globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply\n  \
     globalsplat reconstruct --weights model.safetensors --scene captures/room --views-at 512 --out room.ply")]
 pub struct Reconstruct {
-    /// Weights: what `export` or `import` wrote, or a checkpoint (.ckpt); by default those that come with this program
+    /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt); by default the weights embedded in this
+    /// program
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
-    /// The splat to write: .ply, .compressed.ply, .spz or .splat
+    /// Output splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Use this many photos at most, spread over the path of the camera; by default as many as the weights say, 24 for those that
-    /// come with this program
+    /// Maximum number of photos, spread along the camera path; by default the number that the weights were configured for, 24
+    /// for the weights embedded in this program
     #[arg(long, value_name = "N")]
     views: Option<usize>,
-    /// Show photos of this height, a multiple of what the model was trained with: of N times that a photo becomes N² views, which
-    /// share its pixels out; time and memory grow with views, N²-fold at most
+    /// Height of the input photos in pixels, a multiple of the height the model was trained with: at N times that height a
+    /// photo becomes N² views that share its pixels; time and memory grow with the number of views, N²-fold at most
     #[arg(long, value_name = "PIXELS")]
     views_at: Option<u32>,
-    /// Views not to use: every:N, every:N+K, or none but the capture's own test part
+    /// Held-out views: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
-    /// Then refine the splat on all photos shown, for so long: as `refine --from weights` does
+    /// Also refine the splat on all input photos for this time, as `refine --from weights` does; as in 60s or 2m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "views_at"])]
     refine: Option<f64>,
-    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
-    /// in UTM coordinates, float32 loses detail
+    /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
+    /// world's origin, as in UTM coordinates, float32 loses detail
     #[arg(long)]
     local_origin: bool,
-    /// f32, bf16 for matrix products, or auto: bf16 for wide models where the device has instructions for it
+    /// Precision: f32, bf16 for matrix products, or auto: bf16 for wide models if the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Print what was done as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }
 
 impl Reconstruct {
-    /// The same, and then some time for the Gaussians.
+    /// Returns the `refine` command that reconstructs the same splat and then optimizes its Gaussians for `seconds`.
     fn refined(self, seconds: f64) -> Refine {
         Refine {
             splat: None,
@@ -168,7 +169,7 @@ impl Reconstruct {
     }
 }
 
-/// `60`, `60s` or `2m`, in seconds.
+/// Parses a time, `60`, `60s` or `2m`, and returns it in seconds.
 fn parse_seconds(text: &str) -> Result<f64, String> {
     let (number, unit) = match text.strip_suffix('m') {
         Some(minutes) => (minutes, 60.),
@@ -178,8 +179,8 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
     seconds.filter(|s| *s > 0. && s.is_finite()).ok_or_else(|| "expected a time, as in 60s or 2m".into())
 }
 
-/// What is done to a capture's photos before `shown` of them are seen by a model that was trained with images of `trained`, if
-/// anything.
+/// Describes how the capture's photos are selected and resized before a model that was trained with images of `trained` gets
+/// `shown` of them; `None` if they are used unchanged.
 fn fitting(capture: &Capture, shown: usize, input: Input, trained: ImageSize) -> Option<String> {
     let size = input.photo_size(trained);
     let sizes: BTreeSet<(u32, u32)> = capture.cameras().iter().map(|c| (c.width, c.height)).collect();

@@ -23,114 +23,116 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// As many as the models of the paper's main size make.
+/// Default number of Gaussians, equal to that of the paper's main model.
 pub const DEFAULT_GAUSSIANS: u32 = 16_384;
-/// Said where the work is ended before there is a splat.
+/// Message if the user stops the program before there is a splat.
 const NOTHING_YET: &str = "stopped before there was a splat: nothing is written";
-/// The longest time that can be asked for: a year.
+/// Maximum of `--seconds`: a year.
 const MAX_SECONDS: f64 = 365. * 24. * 3600.;
-/// Of the time, what scoring the views held out takes at most, before and after.
+/// Maximum share of the time budget for scoring the held-out views, before and after.
 const SCORING_SHARE: f64 = 0.05;
-/// What writing a splat and leaving take, and a Gaussian more of it.
+/// Estimated time to write a splat and exit: a constant, and the time per Gaussian.
 const WRITING: Duration = Duration::from_millis(200);
 const WRITING_GAUSSIAN: Duration = Duration::from_micros(2);
-/// Cameras for which the colours of a splat are fitted to what its file can hold, at most.
+/// Maximum number of cameras for which a splat's colours are fitted to the range of its file format.
 const FITTED_CAMERAS: usize = 64;
-/// Photos that LPIPS compares where no views are held out, at most.
+/// Maximum number of photos that LPIPS compares if no views are held out.
 const LPIPS_PHOTOS: usize = 8;
 
-/// Make a splat sharp on the photos of its scene, or make one of the photos alone.
+/// Optimize a splat on the photos of its scene, or create one from the photos alone.
 ///
-/// Its Gaussians, as many as there are, are optimized until they show what the photos show. Without --splat they begin where the
-/// photos agree on what is seen; no weights are needed, and no GPU. Ctrl-C ends the work early and keeps what there is.
+/// The Gaussians, whose number stays fixed, are optimized until their renders match the photos. Without --splat they are
+/// initialized where the depths of several photos agree; neither weights nor a GPU are needed. Ctrl-C ends the optimization
+/// early and writes the current splat.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
     globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
     globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
 pub struct Refine {
-    /// The splat to begin with, in the capture's world: .ply, .compressed.ply, .spz or .splat
+    /// Initial splat, in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
     pub splat: Option<PathBuf>,
-    /// What to begin with where there is no splat: the photos alone, or what a model makes of them
+    /// Initialization without --splat: from the photos alone, or from a model's reconstruction
     #[arg(long, value_enum, conflicts_with = "splat")]
     pub from: Option<From>,
-    /// Weights that `globalsplat export` wrote, to begin with; by default those that come with this program
+    /// Weights of the initial model, as `globalsplat export` writes them; by default the weights embedded in this program
     #[arg(long, value_name = "FILE", conflicts_with = "splat")]
     pub weights: Option<PathBuf>,
-    /// What is optimized: Gaussians, the tokens that a model decodes them from, or these first and then those
+    /// Optimized parameters: Gaussians, the tokens that a model decodes them from, or both: first tokens, then Gaussians
     #[arg(long, value_enum, default_value_t = SpaceName::Gaussians, conflicts_with = "splat")]
     pub space: SpaceName,
-    /// The capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// The splat to write, of one of these endings
+    /// Output splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-    /// Write coordinates relative to the centre of the cameras, which goes to a file beside the splat: far from the world's origin, as
-    /// in UTM coordinates, float32 loses detail
+    /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
+    /// world's origin, as in UTM coordinates, float32 loses detail
     #[arg(long)]
     pub local_origin: bool,
-    /// How many Gaussians, where none were begun with, or a model's that are fewer
+    /// Number of Gaussians, not allowed with --splat; a model's reconstruction may have more
     #[arg(long, value_name = "N", default_value_t = DEFAULT_GAUSSIANS, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     pub gaussians: u32,
-    /// How long, all in all: from the start of the program to its end
+    /// Total time in seconds, from the start of the program to its end
     #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
     pub seconds: f64,
-    /// How many steps instead: the same steps and seed give the same bytes
+    /// Number of steps, instead of a time: the same steps and seed give the same bytes
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
-    /// Other random numbers for another seed
+    /// Seed of the random numbers
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub seed: u64,
-    /// Views to keep out and to score by: every:N, every:N+K, or none but the capture's own test part
+    /// Views to hold out and score: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     pub holdout: String,
-    /// Use so many of the other views at most, spread over the path of the camera
+    /// Maximum number of the other views, spread along the camera path
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
-    /// Cut and resize photos to this; by default they keep their shape, with 512 pixels along the longer side at most
+    /// Crop and resize photos to this size; by default they keep their aspect ratio, with at most 512 pixels along the longer
+    /// side
     #[arg(long, value_name = "WxH")]
     pub size: Option<String>,
-    /// Also learn how far each camera is from where it was said to be
+    /// Also optimize a correction of each camera's pose
     #[arg(long)]
     pub correct_poses: bool,
-    /// Also learn by what each photo is brighter, or of another white, than the others
+    /// Also optimize a correction of each photo's exposure and white balance
     #[arg(long)]
     pub correct_exposures: bool,
-    /// Also write a picture: photo, render and depth side by side, a row per view held out, or else per view
+    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
     #[arg(long, value_name = "FILE.png")]
     pub sheet: Option<PathBuf>,
-    /// Also score by LPIPS, before and after, where its weights are found; it takes its own time, once the splat is written
+    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
     #[arg(long)]
     pub lpips: bool,
-    /// Change a number of the method, as in views=4; docs/refine.md has them
+    /// Override a setting of the method, as in views=4; docs/refine.md lists them
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Where the splat is optimized: cpu, cuda or cuda:N
+    /// Device of the optimization: cpu, cuda or cuda:N
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
-    /// Print what was done as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,
 }
 
-/// What is begun with.
+/// Initialization of the optimization.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum From {
-    /// Pixels, where the photos agree
+    /// Pixels at which the depths of the photos agree
     Nothing,
-    /// What a model makes of the photos; of pixels, what its Gaussians lack to --gaussians
+    /// A model's reconstruction, and pixels for the Gaussians that it lacks to --gaussians
     Weights,
 }
 
-/// What is optimized.
+/// Parameters that are optimized.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum SpaceName {
-    /// Each by itself
+    /// Each Gaussian by itself
     Gaussians,
-    /// A model's
+    /// Tokens of a model
     Tokens,
-    /// Tokens first
+    /// Tokens first, then Gaussians
     Both,
 }
 
@@ -192,7 +194,7 @@ impl Refine {
             (None, Some(loaded)) => Initial::Model { loaded, views: self.views },
             (None, None) => Initial::Photos,
         };
-        // Depths of some photos make a splat, too.
+        // Depths of a subset of the photos are enough for an initial splat, too.
         stop.set_ends_at_once(loaded.is_some());
         let initial = session.start(initial)?;
         stop.set_ends_at_once(false);
@@ -213,7 +215,7 @@ impl Refine {
         }
         let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
-        // What wasn't changed is written as it was.
+        // An unchanged splat is written as it was read.
         let refined;
         let written = match splat.as_ref().filter(|_| result.is_initial) {
             Some(splat) => splat,
@@ -274,7 +276,7 @@ impl Refine {
         })
     }
 
-    /// What writing takes, after the optimization.
+    /// Estimates the time for writing the splat and the sheet, after the optimization.
     fn time_after(&self, session: &RefineSession, gaussians: &Gaussians) -> Result<Duration> {
         let count = gaussians.count().max(i64::from(self.gaussians)) as u32;
         let mut time = WRITING + WRITING_GAUSSIAN * count;
@@ -296,7 +298,7 @@ impl Refine {
     ) {
         let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
         let (count, photos) = (result.gaussians.count(), session.photos().len());
-        // Of the views held out, or else of photos.
+        // Scores are of the held-out views if there are any, else of the photos.
         let distances = lpips.map(|scores| scores.map(|scores| scores.lpips_vgg)).unwrap_or_default();
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
@@ -341,7 +343,7 @@ impl Refine {
         }
     }
 
-    /// Refuses outputs that would replace what is read, but for the splat that is begun with.
+    /// Returns an error if an output would replace an input, except the initial splat.
     fn check_outputs(&self, capture: &Capture) -> Result<()> {
         let mut inputs = Inputs::default();
         capture.add_inputs(&mut inputs);
@@ -352,7 +354,7 @@ impl Refine {
     }
 }
 
-/// What the user or the system asks for by Ctrl-C or SIGTERM.
+/// Request of the user or the system to stop, by Ctrl-C or SIGTERM.
 #[derive(Clone, Default)]
 struct StopRequest {
     is_requested: Arc<AtomicBool>,
@@ -360,8 +362,8 @@ struct StopRequest {
 }
 
 impl StopRequest {
-    /// Listens from now on. The first request ends the process at once as long as nothing is there that could be kept, a second one at
-    /// any time: files appear whole or not at all.
+    /// Installs the signal handlers. The first request ends the process immediately as long as there is no splat to keep, a
+    /// second one at any time: files are written whole or not at all.
     fn install() -> Result<Self> {
         let request = StopRequest::default();
         request.set_ends_at_once(true);
@@ -370,7 +372,8 @@ impl StopRequest {
             let is_second = handler.is_requested.swap(true, Ordering::Relaxed);
             if is_second || handler.ends_at_once.load(Ordering::Relaxed) {
                 eprintln!("globalsplat: {}", if is_second { "stopped at once" } else { NOTHING_YET });
-                // SAFETY: ends the process. Destructors of libraries would wait for the threads that work.
+                // SAFETY: `_exit` ends the process without running destructors of libraries, which would wait for the working
+                // threads.
                 unsafe { libc::_exit(FAILED.into()) }
             }
         })?;
@@ -386,12 +389,12 @@ impl StopRequest {
     }
 }
 
-/// The progress of a session.
+/// Progress bar of a session.
 struct Bar {
     bar: Progress,
     budget: Budget,
     clock: Instant,
-    /// Photos to be read.
+    /// Number of photos to read.
     count: usize,
 }
 
@@ -415,7 +418,7 @@ impl Bar {
         self.bar.set_message(message);
         match (event, self.budget) {
             (RefineEvent::Optimizing { steps, .. }, Budget::Steps(_)) => {
-                // The start says nothing of how fast steps are.
+                // The time of the initialization says nothing about the rate of the steps.
                 if self.bar.position() == 0 {
                     self.bar.reset_eta();
                 }
@@ -427,14 +430,14 @@ impl Bar {
     }
 }
 
-/// Scores splats of a capture, until the user asks for an end.
+/// Scores splats on views of a capture, until the user asks to stop.
 struct Scorer<'a> {
     name: &'a str,
     stop: &'a StopRequest,
 }
 
 impl Scorer<'_> {
-    /// Those of `views`, spread over all, that are scored in a share of the time.
+    /// Returns an evenly spaced subset of `views` that can be scored within [`SCORING_SHARE`] of the time budget.
     fn affordable(&self, gaussians: &Gaussians, views: &[View], budget: Budget) -> Result<Vec<View>> {
         let every = match budget {
             Budget::Time(time) if !views.is_empty() => {
@@ -454,7 +457,8 @@ impl Scorer<'_> {
         Ok(scores.filter(|scores| scores.views.len() == views.len()))
     }
 
-    /// LPIPS before and after: of the views held out, or else of a few photos. None where the user asks for an end.
+    /// Computes LPIPS before and after: on the held-out views, or else on a few photos. Returns `None` if the user asks to
+    /// stop.
     fn lpips(
         &self,
         before: &Gaussians,
@@ -478,7 +482,7 @@ impl Scorer<'_> {
     }
 }
 
-/// Those of which the sheet has a row: held out, or else all.
+/// Returns the views that have a row in the sheet: the held-out views, or else all photos.
 fn sheet_views<'a>(session: &'a RefineSession) -> &'a [View] {
     if session.held_out().is_empty() { session.photos() } else { session.held_out() }
 }
@@ -491,7 +495,7 @@ fn sheet_of(gaussians: &Gaussians, views: &[View]) -> globalsplat::Result<Contac
     Ok(rows)
 }
 
-/// What was learned of the photos, in one line, if anything was.
+/// Describes the largest learned corrections in one line, or returns `None` if there are none.
 fn told_of(corrected: &[Correction]) -> Option<String> {
     let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
     let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);

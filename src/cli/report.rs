@@ -6,7 +6,7 @@ use globalsplat::io::{Inputs, check_writable_file};
 use serde_json::json;
 use std::path::PathBuf;
 
-/// Show evaluations beside what the paper published: one HTML page, pictures and plots included.
+/// Compare evaluations with the paper's published results: one HTML page, images and plots included.
 #[derive(Args)]
 #[command(
     after_help = "Example:\n  globalsplat report runs/mine/eval_24 runs/other/eval_24 --out report.html"
@@ -15,10 +15,10 @@ pub struct Report {
     /// Folders that `globalsplat eval --out` wrote
     #[arg(value_name = "DIR", required = true)]
     folders: Vec<PathBuf>,
-    /// The page
+    /// Output page
     #[arg(long, value_name = "FILE.html")]
     out: PathBuf,
-    /// Print what the page shows as one JSON object
+    /// Print the contents of the page as one JSON object
     #[arg(long)]
     json: bool,
 }

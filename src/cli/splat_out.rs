@@ -1,4 +1,4 @@
-//! A splat that is written, about the world's origin or a local one.
+//! Output of a splat, with coordinates relative to the world's origin or to a local one.
 
 use glam::DVec3;
 use globalsplat::error::Result;
@@ -7,7 +7,7 @@ use globalsplat::render::HarmonicLimits;
 use globalsplat::scene::Camera;
 use std::path::Path;
 
-/// Checks that the origin of a splat at `path` could be written, if it is to be (`is_local`).
+/// Checks that the origin file of a splat at `path` can be written, if one is to be written (`is_local`).
 ///
 /// # Errors
 /// A request error that names the file.
@@ -15,14 +15,14 @@ pub fn check_origin(path: &Path, is_local: bool) -> Result<()> {
     if is_local { check_writable_origin(path) } else { Ok(()) }
 }
 
-/// Writes as [`write`] does, in spherical harmonics that the format holds and that show `cameras` the same.
+/// Calls [`write`] with spherical harmonics fitted to the range of the format, so that the splat looks the same from `cameras`.
 pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: Option<DVec3>) -> Result<()> {
     let limits = HarmonicLimits::up_to(splat.sh_degree());
     write(path, &fit_splat(path, splat, &limits, cameras)?, local_origin)
 }
 
-/// Writes `splat` at `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are the world's, and what
-/// float32 loses of them is said on standard error.
+/// Writes `splat` to `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are world coordinates,
+/// and their loss of precision in float32 is reported on standard error.
 pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<()> {
     if let Some(origin) = local_origin {
         return write_local_splat(path, &splat.with_origin(origin));

@@ -15,15 +15,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
-/// Of photos in a chunk, about.
+/// Approximate bytes of photos per chunk.
 const CHUNK_BYTES: usize = 20_000_000;
 
-/// Make videos of made-up worlds, with exact cameras, to train and to judge by.
+/// Generate videos of synthetic scenes, with exact cameras, for training and evaluation.
 ///
-/// Rooms and open scenes full of things of all shapes and surfaces, filmed on the way past them or around one, ray traced, in the
-/// chunks that RealEstate10K comes in, with an index.json and an evaluation_index.json. The same seed makes the same bytes, and where
-/// it was stopped the same command goes on.
-/// Training makes them as it goes where data.captures names "synth:seed=1,scenes=10000".
+/// The scenes are rooms and outdoor scenes full of objects of all shapes and materials, filmed along a path past them or around
+/// one, ray traced, in the chunk format of RealEstate10K, with an index.json and an evaluation_index.json. The same seed gives
+/// the same bytes, and the same command resumes an interrupted run.
+/// Training generates them on the fly if data.captures contains "synth:seed=1,scenes=10000".
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
     globalsplat synth --out worlds/train --scenes 2000\n  \
@@ -35,36 +35,36 @@ pub struct Synth {
     /// Number of videos
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(MadeUp::SCENES))]
     scenes: u64,
-    /// Other worlds for another seed
+    /// Seed of the scenes
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
-    /// The number of the first video, to go on where others of the seed end
+    /// Index of the first video, to continue after others of the same seed
     #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(MadeUp::FIRST))]
     first: u64,
-    /// Photos of each
+    /// Number of photos per video
     #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u64).range(MadeUp::FRAMES))]
     frames: u64,
     /// Side of a photo in pixels
     #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(MadeUp::SIZE))]
     size: u64,
-    /// PNG and JPEG files to be seen on walls and things
+    /// Folder of PNG and JPEG files to use as textures of walls and objects
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
-    /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite where the sky is
+    /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite in the sky
     #[arg(long)]
     depth: bool,
-    /// A picture of what came out, a video a row
+    /// Also write an overview image, a row per video
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
-    /// Captures of a small room made of Gaussians instead, its splat beside them
+    /// Write captures of a small room made of Gaussians instead, with its splat beside them
     #[arg(long, conflicts_with_all = ["first", "pictures", "depth", "sheet"])]
     gaussians: bool,
-    /// Print what was written as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// Videos on a sheet at most, and pictures of each.
+/// Maximum number of videos in the overview, and number of images of each.
 const SHEET: (usize, usize) = (16, 8);
 
 impl Synth {
@@ -113,7 +113,7 @@ impl Synth {
                 if self.depth && !file.exists() {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
-                // A sheet shows pictures as they were made, not the JPEGs of a chunk.
+                // A sheet shows images as they were rendered, not the JPEGs of a chunk.
                 match self.sheet.is_some() && number < SHEET.0 {
                     true => note(&videos.capture(number)?),
                     false => note(capture),
@@ -121,7 +121,7 @@ impl Synth {
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
-        // So many worlds at once: most of making one is work for a single thread.
+        // This many scenes at once: most of generating one is work for a single thread.
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
             let make = |&number| {
                 let capture = videos.capture(number)?;
@@ -143,7 +143,7 @@ impl Synth {
         if let Some(sheet) = &self.sheet {
             write_png(sheet, &tile_vertically(&rows))?;
         }
-        // Last: a folder with the index of its chunks is finished, and nothing more is written there.
+        // This must be last: a folder with the index of its chunks is finished, and nothing more is written there.
         let chunks = writer.finish()?;
         bar.finish_and_clear();
         let (out, scenes) = (self.out.display(), self.scenes);
@@ -188,7 +188,7 @@ impl Synth {
     }
 }
 
-/// Pictures of a video side by side, from the first to the last.
+/// Returns images of a video side by side, from the first to the last.
 fn sheet_row(capture: &Capture) -> Result<Tensor, Error> {
     let shown: Vec<usize> = (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
     let pictures: Vec<Tensor> = capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();

@@ -17,11 +17,11 @@ use std::time::Instant;
 
 /// Train a model on captures, or on chunks of RealEstate10K and the like.
 ///
-/// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command goes on from there. Now and then, and at the end, views
-/// and scenes that are held out are rendered and scored, beside the answer "the nearest photo that was shown"; RUN/best is
-/// the checkpoint that did best. RUN/curves.svg shows how it went, and TensorBoard RUN/tensorboard.
+/// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command resumes from it. Periodically, and at the end, held-out
+/// views and scenes are rendered and scored, compared with the baseline "nearest input photo"; RUN/best is the best checkpoint.
+/// RUN/curves.svg plots the run, and RUN/tensorboard is for TensorBoard.
 ///
-/// Started by torchrun, many processes train together, each on a GPU of its own (--device cuda) or on threads of the CPU:
+/// Started by torchrun, several processes train together, each on a GPU of its own (--device cuda) or on threads of the CPU:
 /// docs/distributed.md.
 #[derive(Args)]
 #[command(
@@ -33,24 +33,23 @@ pub struct Train {
     /// Configuration file; see configs/
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Override a key of it, as in train.steps=100
+    /// Override a key of the configuration, as in train.steps=100
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Folder of the run: checkpoints, best, the resolved configuration, metrics.jsonl, tensorboard
     #[arg(long, value_name = "RUN")]
     out: PathBuf,
-    /// auto: from the newest checkpoint in RUN if there is one; never: from step 0; or a checkpoint's folder
+    /// Checkpoint to resume: auto: the newest in RUN if there is one; never: start from step 0; or a checkpoint's folder
     #[arg(long, value_name = "auto|never|PATH", default_value = "auto")]
     resume: OsString,
-    /// Weights to begin with, where RUN has no checkpoint, instead of fresh ones, of a model of the same shape, or of one with patches two, three
-    /// or more times as wide, or with a half, a third or less of the scene tokens; all Gaussians are shown from the
-    /// first step on
+    /// Initial weights, if RUN has no checkpoint: of a model of the same shape, or of one with patches two, three or more times
+    /// as wide, or with a half, a third or less of the scene tokens; all Gaussians are rendered from the first step on
     #[arg(long, value_name = "FILE")]
     from: Option<PathBuf>,
-    /// cpu, cuda or cuda:N
+    /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Share the optimizer's moments out over the processes that torchrun started, for less memory; checkpoints are the same
+    /// Shard the optimizer's moments across the processes that torchrun started, for less memory; checkpoints are the same
     #[arg(long)]
     shard_optimizer: bool,
     /// Print the result as one JSON object
@@ -58,7 +57,7 @@ pub struct Train {
     json: bool,
 }
 
-/// Shows how the run went.
+/// Plot of the run.
 const CURVES_FILE: &str = "curves.svg";
 
 impl Train {
@@ -133,7 +132,8 @@ impl Train {
         self.report(&outcome, seconds, held_out.scores(), &bad_data)
     }
 
-    /// Refuses a folder whose files would replace what is read. The configuration may be the run's own, of which the same is left.
+    /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is
+    /// rewritten unchanged.
     fn check_outputs(&self, config: &Config, scenes: &TrainingScenes) -> Result<()> {
         let mut inputs = Inputs::default();
         scenes.add_inputs(&self.out, &mut inputs);
@@ -184,7 +184,7 @@ impl Train {
             bar.set_position(report.step + 1);
             let mse = report.losses[Term::Mse];
             let mse = smooth_mse.map_or(mse, |old: f64| 0.98 * old + 0.02 * mse);
-            // What a skipped step was off by is no number.
+            // The loss of a skipped step may not be finite.
             smooth_mse = Some(mse).filter(|mse| mse.is_finite()).or(smooth_mse);
             bar.set_message(format!(
                 "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e} {samples_per_second:.1} samples/s{validation}",

@@ -1,4 +1,4 @@
-//! What `export` and `import` write, and what they tell of it.
+//! Output of weights, shared by `export` and `import`.
 
 use super::{model, print_json};
 use anyhow::Result;
@@ -12,21 +12,21 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use tch::nn;
 
-/// In bytes, as Hugging Face's libraries have it.
+/// Default maximum size of a shard in bytes, the same as in Hugging Face's libraries.
 const MAX_SHARD_SIZE: u64 = 5_000_000_000;
 
 #[derive(Args)]
 pub struct WeightsOut {
-    /// The file to write
+    /// Output file
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// How weights are stored
+    /// Data type of the stored weights
     #[arg(long, value_enum, default_value = "f32")]
     dtype: Dtype,
-    /// Weights in more bytes than this go to several safetensors files with an index, as in 500MB; by default 5GB
+    /// Maximum size of a safetensors file, as in 500MB; larger weights are split into several with an index; by default 5GB
     #[arg(long, value_name = "SIZE", value_parser = parse_size)]
     max_shard_size: Option<u64>,
-    /// Print what was written as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -37,16 +37,16 @@ enum Dtype {
     Bf16,
 }
 
-/// What contains weights.
+/// File format of weights.
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 pub enum Format {
     Safetensors,
-    /// A checkpoint for torch.load, as the authors' are
+    /// A checkpoint for torch.load, in the authors' layout
     Torch,
 }
 
 impl WeightsOut {
-    /// Refuses, before the work, what could not be written after it, and what would replace one of `inputs`.
+    /// Returns an error, before the work, if the output couldn't be written, or would replace one of `inputs`.
     pub fn check(&self, format: Format, inputs: &Inputs) -> Result<()> {
         if format == Format::Torch && self.max_shard_size.is_some() {
             let why = "--max-shard-size: a checkpoint for torch is one file, expected --format safetensors";
@@ -54,7 +54,7 @@ impl WeightsOut {
         }
         check_writable_file(&self.out)?;
         inputs.check_file(&self.out)?;
-        // Shards have numbers in their names.
+        // Shards have their index in the file name.
         let Some(index) = shard_index(&self.out) else { return Ok(()) };
         let stem = format!("{}-", self.out.file_stem().unwrap_or_default().to_string_lossy());
         let beside = index.parent().and_then(|folder| folder.read_dir().ok());
@@ -64,7 +64,7 @@ impl WeightsOut {
         Ok(shards.try_for_each(|file| inputs.check_file(&file))?)
     }
 
-    /// Writes the variables of `vs` and tells it; JSON gets the entries of `more`, too, and people `note`.
+    /// Writes the variables of `vs` and reports it; the JSON output also gets the entries of `more`, the text output `note`.
     pub fn write(
         &self,
         vs: &nn::VarStore,
@@ -88,7 +88,7 @@ impl WeightsOut {
                 self.out.clone()
             }
         };
-        // Of one file with its header.
+        // A single file counts with its header.
         let bytes = if written == self.out { std::fs::metadata(&written)?.len() } else { bytes as u64 };
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
         if self.json {
@@ -109,7 +109,7 @@ impl WeightsOut {
     }
 }
 
-/// Bytes of `500MB` or `5GB`, by thousands as disks are sold.
+/// Parses a size, as `500MB` or `5GB`, and returns it in bytes; units are decimal.
 fn parse_size(text: &str) -> Result<u64, String> {
     let units = [("GB", 1_000_000_000), ("MB", 1_000_000), ("KB", 1000), ("B", 1), ("", 1)];
     let (number, unit) =

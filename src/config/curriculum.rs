@@ -1,20 +1,20 @@
-//! How many Gaussians a scene token shows, when.
+//! Configuration of the coarse-to-fine curriculum: the number of Gaussians per scene token in the course of training.
 
 use crate::error::{Error, Result};
 use crate::model::{ModelConfig, Stage};
 use serde::{Deserialize, Serialize};
 
-/// The coarse-to-fine curriculum (spec 8.7).
+/// Coarse-to-fine curriculum (spec 8.7).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CurriculumConfig {
-    /// The stage that training ends in and inference uses: 2^s Gaussians per scene token.
+    /// Stage in which training ends and that inference uses. In stage s, a scene token has 2^s Gaussians.
     pub final_stage: u32,
-    /// Steps at which stages 1, 2, … begin. Those beyond the final stage are ignored.
+    /// Steps at which stages 1, 2, … begin, in ascending order. Entries beyond the final stage are ignored.
     pub boundaries: Vec<u64>,
-    /// Steps over which λ goes from 0 to 1 after a boundary.
+    /// Number of steps after a boundary over which λ rises from 0 to 1.
     pub transition: u64,
-    /// The final stage from the first step: an ablation.
+    /// If `true`, training is in the final stage from the first step on (an ablation).
     pub full_capacity: bool,
 }
 
@@ -30,14 +30,14 @@ impl Default for CurriculumConfig {
 }
 
 impl CurriculumConfig {
-    /// The stage of inference.
+    /// Returns the stage that inference uses, complete.
     pub fn final_stage(&self) -> Stage {
         Stage::complete(self.final_stage)
     }
-    /// Whether the numbers fit together, and `model`.
+    /// Checks that the values are valid and fit `model`.
     ///
     /// # Errors
-    /// Names the first field that doesn't.
+    /// Returns an error that names the first invalid field.
     pub(super) fn check(&self, model: &ModelConfig) -> Result<()> {
         let CurriculumConfig { final_stage, boundaries, full_capacity, .. } = self;
         if *final_stage > model.max_stage() {

@@ -1,9 +1,9 @@
-//! Keys by their dotted names: `section.key`.
+//! Access to configuration keys by their dotted names, `section.key`.
 
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 
-/// The keys at which two configurations differ, both with every key written out, as "train.batch 2 → 4".
+/// Returns the keys at which two configurations differ, each as "train.batch 2 → 4". Both are TOML texts with every key written out.
 pub(crate) fn changed_keys(before: &str, after: &str) -> Vec<String> {
     let keys = |text: &str| {
         let mut keys = BTreeMap::new();
@@ -19,7 +19,7 @@ pub(crate) fn changed_keys(before: &str, after: &str) -> Vec<String> {
     changed.collect()
 }
 
-/// Collects the values in a table of tables by their dotted keys.
+/// Collects the values of a table of tables into a map from dotted keys to values.
 fn flatten(key: &str, value: toml::Value, into: &mut BTreeMap<String, toml::Value>) {
     match value {
         toml::Value::Table(table) => {
@@ -34,7 +34,7 @@ fn flatten(key: &str, value: toml::Value, into: &mut BTreeMap<String, toml::Valu
     }
 }
 
-/// Sets `section.key` of `section.key=value`.
+/// Sets the key that `assignment`, `section.key=value`, names in `table`.
 pub(super) fn override_key(table: &mut toml::Table, assignment: &str) -> Result<()> {
     let refused = || Error::Request(format!("--set {assignment}: expected section.key=value"));
     let (key, value) = assignment.split_once('=').ok_or_else(refused)?;

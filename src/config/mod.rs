@@ -1,6 +1,6 @@
-//! A run's configuration: one TOML file, every key with the paper's value as its default. Unknown keys are errors.
+//! Configuration of a run: one TOML file, in which every key defaults to the paper's value. Unknown keys are errors.
 //!
-//! `data`, `loss` and `model` have the sections that are about them; those about training are here.
+//! The sections `data`, `loss` and `model` are defined in the modules of these names; the sections on training are defined here.
 
 mod curriculum;
 mod keys;
@@ -19,19 +19,19 @@ use keys::override_key;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Everything a run depends on.
+/// Configuration of a run. It holds everything that the run depends on.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// The network.
+    /// Network.
     pub model: ModelConfig,
-    /// What it looks at.
+    /// Datasets, and how views are sampled from them.
     pub data: DataConfig,
-    /// How many Gaussians, when.
+    /// Curriculum: the number of Gaussians per scene token in the course of training.
     pub curriculum: CurriculumConfig,
-    /// The factors of the loss.
+    /// Terms of the loss and their factors.
     pub loss: LossConfig,
-    /// How it learns.
+    /// Optimizer, learning rate schedule, checkpoints and logs.
     pub train: TrainConfig,
 }
 
@@ -39,18 +39,18 @@ impl Config {
     /// Reads `file` and applies `overrides`, each `section.key=value` with a TOML value (a bare word counts as a string).
     ///
     /// # Errors
-    /// A file that can't be read, unknown keys, values of the wrong type, numbers that don't fit together.
+    /// Returns an error if the file can't be read, a key is unknown, a value has the wrong type, or values don't fit together.
     pub fn read(file: &Path, overrides: &[String]) -> Result<Self> {
         let text = std::fs::read_to_string(file).map_err(Error::read(file))?;
         Self::parse(&text, overrides, file)
     }
 
-    /// As [`Config::read`], from `text` that came from `origin`.
+    /// Parses `text` and applies `overrides` like [`Config::read`]. `origin` is the file that error messages name.
     ///
     /// # Errors
-    /// As there.
+    /// Returns an error if `text` isn't TOML, a key is unknown, a value has the wrong type, or values don't fit together.
     pub fn parse(text: &str, overrides: &[String], origin: &Path) -> Result<Self> {
-        // The file by itself first, so that its errors tell a line.
+        // Parse the file without overrides first, so that its errors give a line.
         let mut table: toml::Table = text
             .parse()
             .map_err(|e: toml::de::Error| Error::input(origin, "the file", one_line(&e, text), "TOML"))?;
@@ -70,7 +70,7 @@ impl Config {
         Ok(config)
     }
 
-    /// As TOML, every key written out.
+    /// Returns the configuration as TOML, with every key written out.
     pub fn to_toml(&self) -> String {
         toml::to_string_pretty(self).expect("a configuration is numbers, strings and lists")
     }
@@ -86,7 +86,7 @@ impl Config {
     }
 }
 
-/// The parser's message and where, on one line.
+/// Returns the parser's message and the line of the error, on one line.
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().replace('\n', " ");
     match error.span() {

@@ -1,59 +1,61 @@
-//! The optimizer's numbers, and how a run keeps books.
+//! Configuration of training: optimizer, schedule, checkpoints and logs.
 
 use crate::error::{Error, Result};
 use crate::model::Precision;
 use serde::{Deserialize, Serialize};
 
-/// What updates the encoder's matrices; all else is updated by AdamW.
+/// Optimizer of the encoder's matrices. AdamW updates all other weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OptimizerKind {
-    /// AdamW, as the paper.
+    /// AdamW, as in the paper.
     AdamW,
     /// Muon.
     Muon,
 }
 
-/// Optimizer, schedule and bookkeeping.
+/// Optimizer, learning rate schedule, checkpoints and logs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
-    /// Of initial weights and of everything drawn.
+    /// Seed of the initial weights and of everything else that is drawn at random.
     pub seed: u64,
-    /// Optimizer steps.
+    /// Number of optimizer steps.
     pub steps: u64,
-    /// Scenes in a step.
+    /// Number of scenes in a step. With several processes, the number of scenes of each process.
     pub batch: usize,
-    /// Scenes that go through the model at a time, for less memory; the gradient is that of the whole step. 0 for all at
-    /// once. With `loss.consistency_depth`, whose mean is over pixels that only pictures tell, it takes a forward pass more.
+    /// Number of scenes that go through the model at a time, or 0 for all scenes of a step at once. A smaller number needs less memory; the
+    /// gradient is still that of the whole step. If `loss.consistency_depth` is used, a step in several slices takes one more forward pass:
+    /// this term is a mean over pixels that are known only after rendering.
     pub micro_batch: usize,
-    /// Whether the encoder keeps nothing of a round but what it began with, and computes the round again in the backward
-    /// pass: less memory, a fifth more time.
+    /// If `true`, the encoder keeps only the input of each round and recomputes the round in the backward pass (gradient checkpointing).
+    /// Training needs less memory and a fifth more time.
     pub checkpoint_rounds: bool,
-    /// `f32`, or `bf16` for the encoder's matrix products and the network of L_perc, which is faster for wide models where the
-    /// machine has instructions for it.
+    /// Precision: `f32`, or `bf16` for the encoder's matrix products and the network of L_perc. `bf16` is faster for wide models on
+    /// machines that have instructions for it.
     pub precision: Precision,
-    /// `adamw`, or `muon` for the encoder's matrices.
+    /// Optimizer: `adamw` for all weights, or `muon` for the encoder's matrices and AdamW for all other weights.
     pub optimizer: OptimizerKind,
     /// Peak learning rate.
     pub learning_rate: f64,
-    /// Share of the steps over which the learning rate rises.
+    /// Share of the steps, from 0 to 1, over which the learning rate rises to its peak.
     pub warmup: f64,
-    /// Of weights with two or more dimensions.
+    /// Decoupled weight decay of weights with two or more dimensions.
     pub weight_decay: f64,
-    /// Largest norm of the gradient.
+    /// Maximum norm of the gradient. A gradient with a larger norm is scaled down to it.
     pub gradient_clip: f64,
-    /// Steps between checkpoints.
+    /// Number of steps between checkpoints.
     pub checkpoint_every: u64,
-    /// Checkpoints kept.
+    /// Number of checkpoints to keep.
     pub keep_checkpoints: usize,
-    /// Steps between validations; 0 for one at the end alone.
+    /// Number of steps between validations, or 0 to validate only at the end.
     pub validate_every: u64,
-    /// Steps in a row that may be skipped, because their loss or gradient isn't finite, before training fails.
+    /// Maximum number of consecutive steps with a loss or gradient that isn't finite. Such steps are skipped; training fails when this many
+    /// have been skipped in a row.
     pub max_skipped: u64,
-    /// Steps between numbers for TensorBoard; `metrics.jsonl` has those of every step.
+    /// Number of steps between scalars in the TensorBoard log. `metrics.jsonl` has the values of every step.
     pub log_every: u64,
-    /// Steps between pictures for TensorBoard; 0 for none.
+    /// Number of steps between images in the TensorBoard log, or 0 for no images.
     pub pictures_every: u64,
 }
 
@@ -82,8 +84,10 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
+    /// Checks that the values are valid.
+    ///
     /// # Errors
-    /// Names the first field that can't be.
+    /// Returns an error that names the first invalid field.
     pub(super) fn check(&self) -> Result<()> {
         for (field, value) in [
             ("train.batch", self.batch as u64),

@@ -1,4 +1,4 @@
-//! Views as the tensors that model and renderer take.
+//! Batches of views: images and cameras as the tensors that the model and the renderer take.
 
 use super::capture::View;
 use crate::render::Cameras;
@@ -7,32 +7,34 @@ use glam::DMat4;
 use std::borrow::Borrow;
 use tch::{Device, Kind, Tensor};
 
-/// V views of one scene, B = 1; or of B scenes after [`ViewBatch::stack`].
+/// V views of one scene (B = 1), or of each of B scenes after [`ViewBatch::stack`].
 #[derive(Debug)]
 pub struct ViewBatch {
-    /// [B, V, 3, H, W] in [0, 1].
+    /// Images, `[B, V, 3, H, W]`, values in [0, 1].
     pub images: Tensor,
-    /// Camera-to-world, [B, V, 4, 4].
+    /// Camera-to-world matrices, `[B, V, 4, 4]`.
     pub c2w: Tensor,
-    /// World-to-camera, [B, V, 4, 4].
+    /// World-to-camera matrices, `[B, V, 4, 4]`.
     pub w2c: Tensor,
-    /// In pixels, [B, V, 3, 3].
+    /// Intrinsic matrices in pixels, `[B, V, 3, 3]`.
     pub intrinsics: Tensor,
 }
 
-/// Puts views of one size together; `poses` (camera-to-world) stand for the views' own, as after normalization.
+/// Stacks views of equal size into a batch of one scene on `device`.
+///
+/// `poses` (camera-to-world) replace the views' own poses, for example with normalized ones.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
     let images: Vec<&Tensor> = views.iter().map(|view| &view.borrow().image).collect();
     let images = Tensor::stack(&images, 0).unsqueeze(0).to_device(device);
     ViewBatch::with_images(images, &[view_matrices(&cameras_at(views, poses), device)])
 }
 
-/// The cameras of `views`, at `poses` instead of their own.
+/// Returns the cameras of `views` with `poses` in place of their own poses.
 pub(crate) fn cameras_at<V: Borrow<View>>(views: &[V], poses: &[DMat4]) -> Vec<Camera> {
     views.iter().zip(poses).map(|(view, &c2w)| Camera { c2w, ..view.borrow().camera }).collect()
 }
 
-/// c2w, w2c and intrinsics, [1, V, …] each.
+/// Returns the tensors c2w, w2c and intrinsics of one scene, `[1, V, …]` each.
 pub(super) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
     let count = cameras.len() as i64;
     let matrices = |rows: Vec<f64>, size: i64| {
@@ -46,24 +48,24 @@ pub(super) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
 }
 
 impl ViewBatch {
-    /// `images` [B, V, 3, H, W] of B scenes whose cameras are `matrices`, as [`view_matrices`] makes them.
+    /// Builds a batch from `images` `[B, V, 3, H, W]` and the `matrices` of B scenes, one result of [`view_matrices`] per scene.
     pub(super) fn with_images(images: Tensor, matrices: &[[Tensor; 3]]) -> Self {
         let cat =
             |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
         ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
-    /// All four, in the order in which [`ViewBatch::of_tensors`] takes them.
+    /// Returns the four tensors in the order that [`ViewBatch::of_tensors`] takes.
     pub(super) fn tensors(&self) -> [&Tensor; 4] {
         [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
     }
 
-    /// From what [`ViewBatch::tensors`] gives.
+    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`].
     pub(super) fn of_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4]) -> Self {
         ViewBatch { images, c2w, w2c, intrinsics }
     }
 
-    /// The cameras that took the views.
+    /// Returns the cameras of the views.
     pub fn cameras(&self) -> Cameras {
         let size = self.images.size();
         Cameras {
@@ -74,9 +76,9 @@ impl ViewBatch {
         }
     }
 
-    /// The views at `positions`, of every scene.
+    /// Returns the views at `positions` of every scene.
     pub fn select(&self, positions: &[usize]) -> Self {
-        // Positions as a tensor would have to be sent to the device.
+        // An index tensor would have to be copied to the device first.
         let select = |t: &Tensor| {
             Tensor::stack(&positions.iter().map(|&view| t.select(1, view as i64)).collect::<Vec<_>>(), 1)
         };
@@ -88,7 +90,7 @@ impl ViewBatch {
         }
     }
 
-    /// `count` of the scenes, from `first` on.
+    /// Returns `count` of the scenes, starting at `first`.
     pub fn scenes(&self, first: i64, count: i64) -> Self {
         let narrow = |t: &Tensor| t.narrow(0, first, count);
         ViewBatch {
@@ -99,7 +101,7 @@ impl ViewBatch {
         }
     }
 
-    /// Scenes with equally many views along the batch.
+    /// Concatenates scenes that have equally many views along the batch dimension.
     pub fn stack<B: Borrow<ViewBatch>>(scenes: &[B]) -> Self {
         let cat = |field: fn(&ViewBatch) -> &Tensor| {
             Tensor::cat(&scenes.iter().map(|scene| field(scene.borrow())).collect::<Vec<_>>(), 0)

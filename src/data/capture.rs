@@ -1,4 +1,4 @@
-//! A capture: what every format on disk is read into.
+//! The in-memory representation of a capture, common to all file formats.
 
 use super::holdout::Holdout;
 use super::pixels::{Distortion, Lens, Planes, fit, looked_at, undistort};
@@ -16,36 +16,36 @@ use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 use tch::Tensor;
 
-/// A view without its pixels.
+/// A view whose pixels are not loaded.
 #[derive(Debug, Clone)]
 pub(super) struct Frame {
     pub photo: Photo,
-    /// As the capture names the image.
+    /// Name of the image in the capture.
     pub name: String,
-    /// At the size of the file; a pinhole camera, which the image is once `distortion` is removed.
+    /// Pinhole camera of the image after `distortion` is removed, at the size of the image file.
     pub camera: Camera,
-    /// Of the lens that took the image in the file.
+    /// Distortion of the lens that took the image in the file.
     pub distortion: Distortion,
 }
 
-/// Where a view's encoded image is.
+/// Source of a view's encoded image.
 #[derive(Debug, Clone)]
 pub(super) enum Photo {
     /// An image file.
     File(PathBuf),
-    /// A part of a file that holds many images and is in memory.
+    /// A byte range of an in-memory file that holds many images.
     Part {
         file: Arc<Vec<u8>>,
         bytes: Range<usize>,
-        /// As errors call it.
+        /// Name that error messages use for the image.
         name: PathBuf,
     },
-    /// Not taken yet: picture `index` of a made-up video.
+    /// Frame `index` of a synthetic video, which is not rendered yet.
     Made { video: Arc<Video>, index: usize },
 }
 
 impl Photo {
-    /// As errors call it.
+    /// Returns the path that error messages use for the image.
     fn file(&self) -> &Path {
         match self {
             Photo::File(path) | Photo::Part { name: path, .. } => path,
@@ -62,41 +62,41 @@ impl Photo {
     }
 }
 
-/// Memory for photos that are decoded at the same time, which are small once they are fitted to a model.
+/// Memory limit for photos that are decoded at the same time. A photo is small again once it is fitted to the model's image size.
 const DECODED_BYTES: u64 = 1 << 30;
-/// What decoding takes: the decoder's pixels and those without distortion, in 8 bits.
+/// Memory per pixel while a photo is decoded: the decoder's 8-bit pixels and those with the distortion removed.
 const DECODED_BYTES_PER_PIXEL: u64 = 8;
 
-/// Posed photos of one scene. The images are read when they are loaded.
+/// Posed photos of one scene. Images are read only when they are loaded.
 #[derive(Debug, Clone)]
 pub struct Capture {
-    /// The folder's name, or the key in a chunk.
+    /// Name of the folder, or key of the scene in a chunk.
     pub name: String,
     file: PathBuf,
-    /// Those of its own test part last.
+    /// Frames of all views. Those of the capture's own test part come last.
     frames: Vec<Frame>,
-    /// Of `frames`, those to learn from.
+    /// Number of frames in the training part, which come first in `frames`.
     train: usize,
     is_complete: bool,
     warnings: Vec<String>,
 }
 
-/// What a format's reader leaves out or changes.
+/// Record of what a format's reader leaves out or changes.
 #[derive(Debug, Default)]
 pub(super) struct Changes {
-    /// Names of photos that aren't there.
+    /// Names of missing photos.
     pub absent: Vec<String>,
-    /// Names of photos whose pose was a rotation times a factor, and the factor, which was taken out.
+    /// Names of photos whose pose contained a scaled rotation, each with the scale factor that was removed.
     pub scaled: Vec<(String, f64)>,
-    /// Other changes, a line each.
+    /// Descriptions of other changes, one line each.
     pub lines: Vec<String>,
 }
 
 impl Changes {
-    /// Refuses a capture of `present` photos that lacks so many that nothing can be made of the others.
+    /// Checks that enough photos are left if some are missing. The number of existing photos is `present`.
     ///
     /// # Errors
-    /// Fewer than two, where `purpose` needs photos.
+    /// Fails if fewer than two photos are left and `purpose` needs photos.
     pub fn check(&self, file: &Path, present: usize, purpose: Purpose) -> Result<()> {
         match (self.absent.first(), purpose) {
             (Some(name), Purpose::Photos) if present < FEWEST_VIEWS => {
@@ -107,7 +107,7 @@ impl Changes {
         }
     }
 
-    /// Takes the scale out of `c2w`, the pose of photo `name`, if it is a rotation times a factor, and else leaves it as it is.
+    /// Removes the scale from `c2w`, the pose of photo `name`, if its rotation is scaled. Returns any other pose unchanged.
     pub fn unscaled(&mut self, name: &str, c2w: DMat4) -> DMat4 {
         match nearest_rigid_of_scaled(&c2w) {
             Ok((rigid, scale)) if check_pose(&c2w).is_err() => {
@@ -118,7 +118,7 @@ impl Changes {
         }
     }
 
-    /// A line for each kind of change to what `file` describes, of which `present` photos are left.
+    /// Returns one line for each kind of change to the capture that `file` describes, of which `present` photos are left.
     fn into_lines(self, file: &Path, present: usize) -> Vec<String> {
         let file = file.display();
         let mut lines = vec![];
@@ -139,10 +139,10 @@ impl Changes {
     }
 }
 
-/// Views that a scene can be made of.
+/// Minimum number of views that a scene can be reconstructed from.
 const FEWEST_VIEWS: usize = 2;
 
-/// The first few of `names`, and how many more there are.
+/// Formats the first few of `names` and the number of the remaining ones.
 pub(super) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
     const SHOWN: usize = 3;
     let more = names.len().saturating_sub(SHOWN);
@@ -150,45 +150,46 @@ pub(super) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> Strin
     if more == 0 { shown } else { format!("{shown} and {more} more") }
 }
 
-/// A photo and where it was taken from.
+/// A photo and its camera.
 #[derive(Debug)]
 pub struct View {
-    /// As the capture names the image.
+    /// Name of the image in the capture.
     pub name: String,
-    /// [3, H, W] in [0, 1].
+    /// Pixels, `[3, H, W]`, values in [0, 1].
     pub image: Tensor,
-    /// At the size of `image`.
+    /// Camera at the size of `image`.
     pub camera: Camera,
 }
 
 impl View {
-    /// The same; the pixels are shared.
+    /// Returns a copy that shares the pixels.
     pub fn shallow_clone(&self) -> Self {
         View { name: self.name.clone(), image: self.image.shallow_clone(), camera: self.camera }
     }
 
-    /// Fitted to `size`, as [`Capture::load`] does it, without reading the photo again.
+    /// Returns the view fitted to `size` as [`Capture::load`] does, without reading the photo again.
     ///
     /// # Errors
-    /// libtorch's refusal of an image of another shape.
+    /// Fails if libtorch rejects the image because of its shape.
     pub fn fitted(&self, size: ImageSize) -> Result<Self> {
         let (planes, camera) = fit(&io::rgb_from_tensor(&self.image)?, &self.camera, size);
         Ok(View { name: self.name.clone(), image: planes.to_tensor(), camera })
     }
 }
 
-/// What a capture is read for.
+/// Purpose for which a capture is read.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Purpose {
-    /// Its photos, which have to be there.
+    /// The capture's photos, which must exist.
     Photos,
-    /// Its cameras alone. Where the file doesn't tell how large its photos are and they aren't there to be asked, they are
-    /// taken to be of this size.
+    /// The capture's cameras alone. A photo whose size is neither in the capture's file nor readable from the photo itself is
+    /// assumed to have this size.
     Cameras(Option<ImageSize>),
 }
 
 impl Purpose {
-    /// The size of the photo `field`, (width, height), of which `file` tells none; `asked` is what the photo says of itself.
+    /// Returns the size (width, height) of the photo `field`, for which `file` declares none. `asked` is the size read from the
+    /// photo itself.
     pub(super) fn size(self, file: &Path, field: &str, asked: Result<(u32, u32)>) -> Result<(u32, u32)> {
         match (asked, self) {
             (Ok(size), _) => Ok(size),
@@ -203,9 +204,9 @@ impl Purpose {
 }
 
 impl Capture {
-    /// Checks what every format has to hold: two views, or one camera of a path, rigid poses, sensible intrinsics. Where a photo is
-    /// smaller or larger than `frames` say, and of the same aspect, its intrinsics are scaled. `changes` are what the format's
-    /// reader left out or changed.
+    /// Checks the requirements common to all formats: at least two views, or one camera of a path; rigid poses; valid intrinsics.
+    /// If a photo's size differs from that in `frames` but the aspect ratio agrees, its intrinsics are scaled. `changes` lists what
+    /// the format's reader left out or changed.
     pub(super) fn new(
         name: String,
         file: PathBuf,
@@ -227,7 +228,7 @@ impl Capture {
         Ok(Capture { name, file, frames, train, is_complete, warnings })
     }
 
-    /// Adds `frames`, which `file` describes, as those that are held out unless another split is asked for.
+    /// Adds `frames`, described by `file`, as the test part, which is held out unless another split is requested.
     pub(super) fn with_test(
         mut self,
         file: &Path,
@@ -241,25 +242,25 @@ impl Capture {
         Ok(self)
     }
 
-    /// Adds `lines` before the other warnings.
+    /// Inserts `lines` before the other warnings.
     pub(super) fn with_warnings(mut self, mut lines: Vec<String>) -> Self {
         lines.append(&mut self.warnings);
         self.warnings = lines;
         self
     }
 
-    /// Returns what was left out or changed when the capture was opened, a line for each kind, with counts and names.
+    /// Returns what was left out or changed when the capture was opened: one line for each kind of change, with counts and names.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Returns whether every photo that the capture names is there, so that the positions of its views are its author's.
+    /// Returns `true` if every photo named by the capture exists, so that the indices of its views are those in the capture's file.
     pub fn is_complete(&self) -> bool {
         self.is_complete
     }
 
-    /// Returns the positions of the views to show and of those to hold out. [`Holdout::None`] holds out the capture's own test part,
-    /// if it has one; any other split is made of the remaining views alone, and leaves that part aside.
+    /// Returns the indices of the context views and those of the held-out views. [`Holdout::None`] holds out the capture's own test
+    /// part, if it has one. Any other split is made of the remaining views alone and leaves the test part out.
     pub fn split(&self, holdout: Holdout) -> (Vec<usize>, Vec<usize>) {
         match holdout {
             Holdout::None => (0..self.len()).partition(|&view| view < self.train),
@@ -267,56 +268,57 @@ impl Capture {
         }
     }
 
-    /// Returns whether the capture itself says which views are to be held out.
+    /// Returns `true` if the capture itself defines which views are held out.
     pub fn has_test_part(&self) -> bool {
         self.train < self.len()
     }
 
-    /// Returns the positions of the views that pictures from elsewhere are scored at: the capture's own test part, else all.
+    /// Returns the indices of the views at which images from elsewhere are scored: the capture's own test part if it has one,
+    /// otherwise all views.
     pub fn scored_views(&self) -> Vec<usize> {
         if self.has_test_part() { (self.train..self.len()).collect() } else { (0..self.len()).collect() }
     }
 
-    /// Number of views.
+    /// Returns the number of views.
     pub fn len(&self) -> usize {
         self.frames.len()
     }
 
-    /// Never: a capture has two views at least.
+    /// Returns `true` if there are no views, which never happens: a capture has at least one camera.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
 
-    /// The file that describes the capture.
+    /// Returns the file that describes the capture.
     pub fn file(&self) -> &Path {
         &self.file
     }
 
-    /// The cameras, at the sizes of the files.
+    /// Returns the cameras, at the sizes of the image files.
     pub fn cameras(&self) -> Vec<Camera> {
         self.frames.iter().map(|frame| frame.camera).collect()
     }
 
-    /// Whether any photo has fewer pixels than `size` along a side: to be fitted it is enlarged, which shows no more of the scene.
+    /// Returns `true` if any photo has fewer pixels than `size` along a side. Fitting enlarges such a photo, which adds no detail.
     pub fn has_smaller(&self, size: ImageSize) -> bool {
         let is_smaller = |camera: &Camera| camera.height < size.height || camera.width < size.width;
         self.frames.iter().any(|frame| is_smaller(&frame.camera))
     }
 
-    /// The images' names, in order.
+    /// Returns the names of the images, in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.frames.iter().map(|frame| frame.name.as_str())
     }
 
-    /// What pictures of the views are called, one by one, without their ending: as the photos are, in folders below the one
-    /// that all of them share. Each is another one: where endings alone tell photos apart they are part of the name, and where
-    /// nothing does, numbers stand for the names.
+    /// Returns a unique file name without extension for the rendered image of each view. The names are those of the photos,
+    /// relative to the deepest folder that contains all of them. If the names differ only in their extensions, the extensions
+    /// become part of the names. If they aren't unique even then, numbers replace them.
     pub fn picture_names(&self) -> Vec<String> {
         self.picture_names_with(&[""])
     }
 
-    /// Returns [`Capture::picture_names`] for several pictures of each view, whose names end in `suffixes`: no two of all these are
-    /// the same, either.
+    /// Returns names like [`Capture::picture_names`] for several images of each view, whose names end in `suffixes`. No two of the
+    /// names with suffixes are equal.
     pub fn picture_names_with(&self, suffixes: &[&str]) -> Vec<String> {
         picture_names(&self.names().collect::<Vec<_>>(), suffixes)
     }
@@ -325,7 +327,7 @@ impl Capture {
     pub fn add_inputs(&self, inputs: &mut Inputs) {
         let described = described_in(&self.file);
         inputs.add(&described);
-        // A COLMAP model is in several files.
+        // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
         let siblings = form.and_then(|_| std::fs::read_dir(described.parent()?).ok());
         for sibling in siblings.into_iter().flatten().flatten() {
@@ -340,10 +342,10 @@ impl Capture {
         }
     }
 
-    /// Reads the views of `indices`, fitted to `size`, or as they are.
+    /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`.
     ///
     /// # Errors
-    /// An image that is missing, can't be decoded, or has another size than the capture declares.
+    /// Fails if an image is missing, can't be decoded, or has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
         let lens = self.shared_lens(indices, size);
         let pixels = |&index: &usize| {
@@ -356,7 +358,7 @@ impl Capture {
         for indices in indices.chunks(at_once) {
             let load = |&index: &usize| self.load_view(&self.frames[index], size, lens.as_ref());
             let loaded: Vec<_> = indices.par_iter().map(load).collect();
-            // Of several that can't be read the first one is told.
+            // If several images can't be read, the error is that of the first one.
             for view in loaded {
                 views.push(view?);
             }
@@ -364,16 +366,17 @@ impl Capture {
         Ok(views)
     }
 
-    /// [`Capture::load`] of every view.
+    /// Reads every view like [`Capture::load`].
     ///
     /// # Errors
-    /// As there.
+    /// Fails like [`Capture::load`].
     pub fn load_all(&self, size: Option<ImageSize>) -> Result<Vec<View>> {
         self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
-    /// What the first of several views was taken through, as others mostly are, too. Not of the largest photos: it takes 16 bytes a
-    /// pixel, and nobody has looked yet whether they are as large as the capture says.
+    /// Returns the lens of the first of several views, which most other views usually share. Returns `None` for a single view, for a
+    /// lens without distortion, and for the largest photos: the lens takes 16 bytes per pixel, and the size that the capture declares
+    /// isn't verified yet.
     fn shared_lens(&self, indices: &[usize], size: Option<ImageSize>) -> Option<Lens> {
         const MOST_PIXELS: u64 = 1 << 23;
         let Frame { camera, distortion, .. } = &self.frames[*indices.first()?];
@@ -383,11 +386,11 @@ impl Capture {
         is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
     }
 
-    /// Computes the CRC-32 of what views `indices` are: their photos' files, as they are, and their cameras. Made-up photos are told
-    /// apart by their cameras alone.
+    /// Computes the CRC-32 of the views `indices`: the bytes of their photo files, and their cameras. Synthetic photos contribute
+    /// their cameras alone.
     ///
     /// # Errors
-    /// A photo that can't be read.
+    /// Fails if a photo can't be read.
     pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
         let mut hasher = crc32fast::Hasher::new();
         for index in indices {
@@ -409,8 +412,8 @@ impl Capture {
         Ok(View { name: frame.name.clone(), image: planes.to_tensor(), camera })
     }
 
-    /// Depths of view `index` along its camera's axis at its pixels' centres, row by row, in the capture's unit and infinite where
-    /// the sky is: made-up captures alone know them.
+    /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
+    /// infinite in the sky. Returns `None` unless the capture is synthetic.
     pub fn depth(&self, index: usize) -> Option<Vec<f32>> {
         match &self.frames[index].photo {
             Photo::Made { video, index } => Some(video.depth(*index)),
@@ -418,15 +421,16 @@ impl Capture {
         }
     }
 
-    /// The photo of view `index` at its camera's size, lens distortion removed.
+    /// Returns the photo of view `index` at its camera's size, with lens distortion removed.
     ///
     /// # Errors
-    /// As [`Capture::load`].
+    /// Fails like [`Capture::load`].
     pub(super) fn photo(&self, index: usize) -> Result<RgbImage> {
         self.read_photo(&self.frames[index], None, None)
     }
 
-    /// The photo, lens distortion removed as far as fitting it to `size` looks at it; by `lens` if it is the camera's.
+    /// Reads the photo and removes lens distortion, at least in the part that fitting to `size` reads. Uses `lens` if it matches
+    /// the frame.
     fn read_photo(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<RgbImage> {
         if let Photo::Made { video, index } = &frame.photo {
             return Ok(video.photo(*index));
@@ -450,8 +454,8 @@ impl Capture {
         Err(Error::input(frame.photo.file(), "the image", found, expected))
     }
 
-    /// The image file of view `index` as a pinhole camera would have written it: its own bytes where it is 8-bit RGB, upright
-    /// and free of distortion.
+    /// Returns the image file of view `index` as a pinhole camera would have written it. These are the original bytes if the image
+    /// is 8-bit RGB, upright and free of distortion.
     pub(super) fn encoded(&self, index: usize) -> Result<Vec<u8>> {
         let frame = &self.frames[index];
         let bytes = frame.photo.read()?;
@@ -464,7 +468,7 @@ impl Capture {
     }
 }
 
-/// The file in `path`, which may have the key of one of its scenes after a `#`.
+/// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.
 fn described_in(path: &Path) -> PathBuf {
     let files = io::files_and_keys(path).rev().map(|(file, _)| file);
     std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
@@ -485,8 +489,8 @@ fn check_frames(
     Ok(lines)
 }
 
-/// Scales the intrinsics of `frames` to photos that are of another size than `file` says and agree with its aspect, and says so in
-/// a line. What a photo says of itself is found when it is loaded.
+/// Scales the intrinsics of `frames` to photos whose size differs from that in `file` but whose aspect ratio agrees with it, and
+/// returns a line about it. A photo whose size can't be read keeps its camera; loading it reports the error.
 fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     let scaled = |frame: &Frame| match &frame.photo {
         Photo::File(path) => scaled_to(&frame.camera, io::read_image_size(path).ok()?),
@@ -516,8 +520,8 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     ))
 }
 
-/// Returns `camera` at the size of a photo, (width, height), if that is another one and of the same aspect up to a pixel of the
-/// smaller. A photo that lies on its side may be turned when it is loaded.
+/// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
+/// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
 fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
     let said = (camera.width, camera.height);
     let choices = [(width, height), (height, width)];
@@ -562,7 +566,7 @@ fn picture_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
     choices.into_iter().find(is_unique).unwrap_or_else(|| (0..names.len()).map(numbered).collect())
 }
 
-/// Rigid poses and sensible intrinsics.
+/// Checks that poses are rigid and that intrinsics are valid.
 pub(super) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a Camera>) -> Result<()> {
     for (i, camera) in cameras.enumerate() {
         let field = |name: String| format!("{name} of view {i}");
@@ -602,7 +606,7 @@ mod tests {
         for photo in [(519, 339), (339, 519), (519, 300), (260, 180), (600, 339), (64, 64), (1038, 600)] {
             assert_eq!(size(photo), None, "{photo:?}");
         }
-        // Halves and eighths, cut or rounded; twice as large; one row more; on its side.
+        // Halves and eighths, rounded down or up; twice the size; one row more. Below: width and height swapped.
         for photo in [(259, 169), (260, 170), (64, 42), (65, 42), (1038, 678), (1037, 678), (519, 340)] {
             assert_eq!(size(photo), Some(photo), "{photo:?}");
         }

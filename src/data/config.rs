@@ -1,4 +1,4 @@
-//! Which data a run looks at, and how.
+//! Configuration of the data of a run.
 
 use super::holdout::Holdout;
 use crate::error::{Error, Result};
@@ -7,27 +7,27 @@ use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// How context views are chosen from a window.
+/// Method of choosing context views from a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Sampling {
-    /// All frames alike, as the paper says.
+    /// Uniformly at random over all frames, as in the paper.
     Uniform,
-    /// A random one first, then always the frame whose camera is farthest from those chosen, as the published code does.
+    /// A random frame first, then repeatedly the frame whose camera is farthest from those chosen, as in the published code.
     Farthest,
 }
 
-/// How far colours may be changed; the paper jitters and tells no numbers. 0 leaves an adjustment out.
+/// Ranges of the colour jitter. The paper applies jitter but gives no values. A value of 0 disables an adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct JitterConfig {
-    /// Factors on colours are 1 − this to 1 + this.
+    /// Maximum brightness change x: colours are multiplied by a factor from 1 − x to 1 + x.
     pub brightness: f64,
-    /// Factors on the distance from the image's mean grey are 1 − this to 1 + this.
+    /// Maximum contrast change x: distances from the image's mean grey are multiplied by a factor from 1 − x to 1 + x.
     pub contrast: f64,
-    /// Factors on the distance from a pixel's grey are 1 − this to 1 + this.
+    /// Maximum saturation change x: distances from the pixel's grey are multiplied by a factor from 1 − x to 1 + x.
     pub saturation: f64,
-    /// Hues turn by up to this share of the circle, either way; ½ at most.
+    /// Maximum hue rotation in either direction, as a fraction of the full circle; at most ½.
     pub hue: f64,
 }
 
@@ -38,52 +38,54 @@ impl Default for JitterConfig {
 }
 
 impl JitterConfig {
-    /// Changes nothing.
+    /// Settings that leave colours unchanged.
     pub const OFF: Self = JitterConfig { brightness: 0., contrast: 0., saturation: 0., hue: 0. };
 }
 
-/// Captures and views.
+/// Settings for captures and views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Captures, folders of captures, or data sets of chunks, of which the part `train` is taken. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    /// Captures, folders of captures, or datasets of chunks, of which the `train` part is used. `${NAME}` and `${NAME:-default}`
+    /// stand for environment variables.
     pub captures: Vec<String>,
-    /// [height, width] that images are fitted to.
+    /// Size [height, width] that images are fitted to.
     pub image_size: ImageSize,
-    /// In which sizes a scene is shown to a model that is used: what the largest distance between two cameras becomes. Of several,
-    /// and of what lies around the best, the splat that shows the photos best is kept (spec 9.9): in validation, too. Training has 1
-    /// alone.
+    /// Scene scales at inference: the largest distance between two cameras is scaled to each of these values. If there are several,
+    /// they and values around the best one are tried, and the splat that reproduces the photos best is kept (spec 9.9). This
+    /// applies to validation, too. Training always uses 1.
     pub extents: Vec<f64>,
-    /// Views the model sees of a scene in a training step, at most.
+    /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
-    /// Where it isn't 0, every step draws how many views the model sees of its scenes: from this to `context_views`.
+    /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
     pub fewest_context_views: usize,
-    /// Views of a scene that its pictures are compared with in a training step.
+    /// Number of target views per scene that renderings are compared with in a training step.
     pub target_views: usize,
-    /// [shortest, longest] part of a video, in frames, that the views of a training step are from, at most the whole of it. A
-    /// video that is shorter than the shortest is skipped.
+    /// Range [shortest, longest] of the number of frames of a video from which the views of a training step are drawn, at most the
+    /// whole video. A video that is shorter than the shortest window is skipped.
     pub window: [usize; 2],
-    /// How context views are chosen: `uniform` or `farthest`.
+    /// Method of choosing context views: `uniform` or `farthest`.
     pub sampling: Sampling,
-    /// The part of a photo that is shown in training is smaller than it could be by a factor of 1 to 1 + this.
+    /// Maximum extra crop x: in training, the visible part of a photo is smaller than the largest possible one by a factor of 1 to
+    /// 1 + x.
     pub extra_crop: f64,
-    /// Whether every other sample in training is mirrored.
+    /// If `true`, training samples are mirrored with probability ½.
     pub flip: bool,
-    /// How far training changes colours.
+    /// Ranges of the colour jitter in training.
     pub jitter: JitterConfig,
-    /// Views never shown in training: the targets of validation.
+    /// Views that are never used in training: the targets of validation.
     pub holdout: Holdout,
-    /// What validation looks at besides: captures, folders of captures, or data sets, of which the part `test` is taken.
+    /// Additional validation data: captures, folders of captures, or datasets, of which the `test` part is used.
     pub validation: Vec<String>,
-    /// Scenes of `validation` at most, spread evenly over all of them.
+    /// Maximum number of scenes of `validation`, spread evenly over all of them.
     pub validation_scenes: usize,
-    /// Share of the scenes that may be unusable before training fails: too short, or broken in any way.
+    /// Maximum share of unusable scenes, too short or broken in any way, before training fails.
     pub max_bad_share: f64,
-    /// Threads that load; 0 for one a core.
+    /// Number of loader threads; 0 for one per core.
     pub threads: usize,
-    /// Scenes that are loaded ahead.
+    /// Number of scenes to prefetch.
     pub ahead: usize,
-    /// Decoded photos are kept where all of them together take no more than this, in 10⁶ bytes.
+    /// Size limit of the photo cache in 10⁶ bytes. Decoded photos are kept only if all of them together fit.
     pub photo_megabytes: u64,
 }
 
@@ -113,19 +115,19 @@ impl Default for DataConfig {
 }
 
 impl DataConfig {
-    /// `captures` with environment variables filled in.
+    /// Returns `captures` with environment variables expanded.
     ///
     /// # Errors
-    /// A variable that isn't set and has no default.
+    /// Fails if a variable is not set and has no default.
     pub fn capture_paths(&self) -> Result<Vec<PathBuf>> {
         self.captures.iter().map(|path| expand_path(path)).collect()
     }
 
-    /// Everything that validation's scores depend on.
+    /// Returns all settings that the validation scores depend on, as a string.
     pub(crate) fn validation_settings(&self) -> String {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
         let views = (self.image_size, self.context_views, self.target_views, self.window);
-        // As runs tell it that began before there were extents.
+        // Omitting the default value keeps the string of runs that began before `extents` existed.
         let settings = match self.extents == [1.] {
             true => serde_json::to_string(&(scenes, views)),
             false => serde_json::to_string(&(scenes, views, &self.extents)),
@@ -133,18 +135,18 @@ impl DataConfig {
         settings.expect("numbers and strings")
     }
 
-    /// `validation` with environment variables filled in.
+    /// Returns `validation` with environment variables expanded.
     ///
     /// # Errors
-    /// As [`DataConfig::capture_paths`].
+    /// Fails like [`DataConfig::capture_paths`].
     pub fn validation_paths(&self) -> Result<Vec<PathBuf>> {
         self.validation.iter().map(|path| expand_path(path)).collect()
     }
 
-    /// Whether the numbers fit together.
+    /// Checks that the values are consistent.
     ///
     /// # Errors
-    /// Names the first field that doesn't.
+    /// Names the first invalid field.
     pub fn check(&self) -> Result<()> {
         let [shortest, longest] = self.window;
         if shortest > longest {

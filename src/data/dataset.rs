@@ -1,4 +1,4 @@
-//! Data sets: many captures under one name (spec 10.8).
+//! Datasets: many captures under one name (spec 10.8).
 
 use super::capture::Capture;
 use super::formats::{
@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The part of a data set that a model learns from, or the one it is judged by.
+/// Part of a dataset: the one to train on or the one to evaluate on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
     /// The folder `train`.
@@ -39,35 +39,36 @@ impl Split {
 /// Captures that are read from disk together, and their names.
 #[derive(Debug, Clone)]
 pub struct SceneGroup {
-    /// As [`SceneGroup::path`].
+    /// Path as returned by [`SceneGroup::path`].
     path: PathBuf,
     source: Source,
-    /// Which of a chunk's scenes belong to the data set; a folder's own name, or its path where others have that name.
+    /// Keys of the chunk's scenes that belong to the dataset. For a folder, its name, or its path if another folder has the same
+    /// name.
     pub keys: Vec<String>,
 }
 
-/// What scenes are read from.
+/// Source that scenes are read from.
 #[derive(Debug, Clone)]
 enum Source {
-    /// A file of one scene or more.
+    /// A file with one or more scenes.
     Chunk,
     /// A capture of another format.
     Folder,
-    /// The video of that number among those.
+    /// The synthetic video of this index.
     MadeUp(Arc<MadeUp>, usize),
 }
 
-/// The captures of one split, which are found now and read later.
+/// The captures of one split. They are located when the dataset is opened and read later.
 #[derive(Debug, Clone)]
 pub struct Dataset {
-    /// The folder's name.
+    /// Name of the folder.
     pub name: String,
     groups: Vec<SceneGroup>,
     warnings: Vec<String>,
     made_by: Option<String>,
 }
 
-/// A group in memory, images still encoded.
+/// A group in memory, with images still encoded.
 #[derive(Debug, Clone)]
 pub enum OpenGroup {
     /// Scenes of a chunk.
@@ -77,13 +78,16 @@ pub enum OpenGroup {
 }
 
 impl Dataset {
-    /// The data set at `root`: made-up videos by their name; a folder of chunks with an `index.json`, {key: chunk}, or one with such folders named `train`
-    /// and `test`, of which `split` is taken; else every capture in it, as by [`super::find_captures`], but for those in the
-    /// folder of the other part.
+    /// Opens the dataset at `root`, one of the following:
+    ///
+    /// - synthetic videos, by their name;
+    /// - a folder of chunks with an `index.json`, {key: chunk};
+    /// - a folder with such folders named `train` and `test`, of which `split` is taken;
+    /// - a folder of captures: all that [`super::find_captures`] finds, except those in the folder of the other split.
     ///
     /// # Errors
-    /// Nothing of that kind there, or an index that is no such object. Chunks that the index names are looked for when they
-    /// are opened.
+    /// Fails if there is nothing of that kind at `root`, or if the index is not such an object. Chunks named by the index are not
+    /// looked for until they are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = MadeUp::named(root)? {
             let made_by = Some(videos.made_by());
@@ -96,7 +100,7 @@ impl Dataset {
         let (groups, warnings) = match indexed {
             Some(folder) => (chunk_groups(&folder)?, vec![]),
             None => {
-                // A capture may have its photos in a folder of that name.
+                // A capture may keep its photos in a folder of that name.
                 let part =
                     Some(root.join(split.folder())).filter(|folder| folder.is_dir() && !is_capture(root));
                 capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
@@ -105,29 +109,28 @@ impl Dataset {
         Ok(Dataset { name, groups, warnings, made_by: None })
     }
 
-    /// Returns a line for each folder that couldn't be looked into.
+    /// Returns a line for each folder that couldn't be read.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Every group, in the order of their paths.
+    /// Returns all groups, ordered by path.
     pub fn groups(&self) -> &[SceneGroup] {
         &self.groups
     }
 
-    /// Returns what made-up videos depend on beside their name: the program's version, and pictures that are seen in them. Of other
-    /// data sets it is nothing.
+    /// Returns what synthetic videos depend on besides their name: the program's version, and the images that appear in them.
+    /// Returns `None` for other datasets.
     pub fn made_by(&self) -> Option<&str> {
         self.made_by.as_deref()
     }
 
-    /// Adds the files that the data set is read from to `inputs`, as far as what is written below the folder `output` could be one
-    /// of them.
+    /// Adds to `inputs` the files of the dataset that writing below the folder `output` could overwrite.
     pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
         self.groups.iter().for_each(|group| group.add_inputs(output, inputs));
     }
 
-    /// The number of scenes.
+    /// Returns the number of scenes.
     pub fn scenes(&self) -> usize {
         self.groups.iter().map(|group| group.keys.len()).sum()
     }
@@ -137,7 +140,7 @@ impl SceneGroup {
     /// Reads the group.
     ///
     /// # Errors
-    /// A chunk or capture that is missing or broken.
+    /// Fails if a chunk or capture is missing or broken.
     pub fn open(&self) -> Result<OpenGroup> {
         match &self.source {
             Source::Chunk => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
@@ -146,8 +149,8 @@ impl SceneGroup {
         }
     }
 
-    /// Adds the files that the group is read from to `inputs`, as far as what is written below the folder `output` could be one of
-    /// them. A capture that can't be opened has none: whoever opens it says so.
+    /// Adds to `inputs` the files of the group that writing below the folder `output` could overwrite. Adds none of a capture that
+    /// can't be opened; opening it elsewhere reports the error.
     pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
         let resolved = |path: &Path| path.canonicalize().unwrap_or(path.to_owned());
         match &self.source {
@@ -167,22 +170,22 @@ impl SceneGroup {
         }
     }
 
-    /// Whether it is a capture's folder, of which an open capture holds little more than the cameras.
+    /// Returns `true` if the group is a capture's folder. Once open, such a capture holds little more than its cameras.
     pub fn is_folder(&self) -> bool {
         matches!(self.source, Source::Folder)
     }
 
-    /// The chunk, or the capture's folder; of all made-up videos the same, as their keys tell them apart.
+    /// Returns the path of the chunk or of the capture's folder. All synthetic videos share one path; their keys tell them apart.
     pub fn path(&self) -> &Path {
         &self.path
     }
 }
 
 impl OpenGroup {
-    /// The scene `key`.
+    /// Returns the scene `key`.
     ///
     /// # Errors
-    /// One that isn't there, or breaks what every capture has to hold.
+    /// Fails if the scene doesn't exist or violates the requirements on captures.
     pub fn capture(&self, key: &str) -> Result<Capture> {
         match self {
             OpenGroup::Chunk(chunk) => chunk.capture(key),
@@ -223,7 +226,7 @@ fn made_up_groups(videos: MadeUp) -> Vec<SceneGroup> {
     videos.keys().into_iter().enumerate().map(group).collect()
 }
 
-/// Of the captures in `root` those that aren't in `except`, and what couldn't be looked into.
+/// Returns the captures in `root` except those in `except`, and warnings about folders that couldn't be read.
 fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<String>)> {
     let CaptureFolders { mut folders, warnings } = capture_folders(root)?;
     folders.retain(|folder| !folder.starts_with(except));
@@ -234,7 +237,7 @@ fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<St
     let names: Vec<String> = folders.iter().map(|folder| folder_name(folder)).collect();
     let mut counts: BTreeMap<&String, usize> = BTreeMap::new();
     names.iter().for_each(|name| *counts.entry(name).or_default() += 1);
-    // Of two folders of one name, the path below the root tells which.
+    // Folders with the same name are told apart by their paths below the root.
     let key = |folder: &Path, name: &String| match counts[name] {
         1 => name.clone(),
         _ => folder.strip_prefix(root).unwrap_or(folder).to_string_lossy().into_owned(),

@@ -1,26 +1,26 @@
-//! Which views a model is shown, and which are held out to score it by.
+//! Split of a capture's views into those shown to the model and those held out for evaluation.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// `none`, or `every:N` with an optional `+K`: views K, K + N, K + 2N, … are held out.
+/// Setting `none`, or `every:N` with an optional `+K`: views K, K + N, K + 2N, … are held out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Holdout {
-    /// Every view is shown.
+    /// No view is held out.
     None,
-    /// Views `first`, `first + every`, … are not.
+    /// Views `first`, `first + every`, … are held out.
     Every {
-        /// 2 or more.
+        /// Interval between held-out views, at least 2.
         every: usize,
-        /// Below `every`.
+        /// Index of the first held-out view, less than `every`.
         first: usize,
     },
 }
 
 impl Holdout {
-    /// Indices of the views shown and of those held out, out of `count`.
+    /// Returns the indices of the views shown and of those held out, out of `count`.
     pub fn split(&self, count: usize) -> (Vec<usize>, Vec<usize>) {
         (0..count).partition(|i| match self {
             Holdout::None => true,

@@ -1,4 +1,4 @@
-//! Made-up videos, named where a data set is named: `synth:seed=1,scenes=10000`.
+//! Synthetic videos. They are named in place of a dataset path: `synth:seed=1,scenes=10000`.
 
 use super::capture::{Capture, Changes, Frame, Photo, Purpose};
 use super::pixels::Distortion;
@@ -11,47 +11,47 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// As an error tells it.
+/// Description of the expected name for error messages.
 const EXPECTED: &str =
     "synth:seed=S,scenes=N and, if need be, first=I, frames=F, size=PIXELS, pictures=FOLDER";
 
-/// Videos of one seed, each made when it is asked for.
+/// Synthetic videos of one seed, each generated on request.
 #[derive(Debug, Clone)]
 pub struct MadeUp {
-    /// As it was written.
+    /// Name as the user wrote it.
     name: String,
     seed: u64,
-    /// The number of the first video: others of the same seed can be kept for validation.
+    /// Index of the first video. Other videos of the same seed can be reserved for validation.
     first: u64,
     scenes: u64,
     settings: VideoSettings,
-    /// Of the files of pictures that are seen on things, if there are some.
+    /// Checksum of the image files that are shown on surfaces, if there are any.
     pictures_checksum: Option<u32>,
 }
 
 impl MadeUp {
-    /// What such a name begins with.
+    /// Prefix of the name of synthetic videos.
     pub(super) const PREFIX: &str = "synth:";
 
-    /// How many videos there can be.
+    /// Allowed number of videos.
     pub const SCENES: RangeInclusive<u64> = 1..=1_000_000;
-    /// The number that the first can have.
+    /// Allowed index of the first video.
     pub const FIRST: RangeInclusive<u64> = 0..=1 << 32;
-    /// Photos of each.
+    /// Allowed number of photos of each video.
     pub const FRAMES: RangeInclusive<u64> = 3..=10_000;
-    /// Side of a photo in pixels.
+    /// Allowed side length of a photo in pixels.
     pub const SIZE: RangeInclusive<u64> = 16..=8192;
 
-    /// `scenes` videos of `seed`, from number `first` on.
+    /// Creates `scenes` videos of `seed`, starting at index `first`.
     pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> MadeUp {
         let name = format!("{}seed={seed},first={first},scenes={scenes}", Self::PREFIX);
         MadeUp { name, seed, first, scenes, settings, pictures_checksum: None }
     }
 
-    /// What `path` names, if it is no path but made-up videos.
+    /// Parses `path` as the name of synthetic videos. Returns `None` if it is an ordinary path.
     ///
     /// # Errors
-    /// A name that begins as theirs, with a field that is missing, unknown or no number in its range.
+    /// Fails if the name has the prefix of synthetic videos, but a field is missing, repeated, unknown or out of range.
     pub fn named(path: &Path) -> Result<Option<MadeUp>> {
         let Some(fields) = path.to_str().and_then(|name| name.strip_prefix(Self::PREFIX)) else {
             return Ok(None);
@@ -98,26 +98,26 @@ impl MadeUp {
         Ok(Some(MadeUp { name, seed, first, scenes, settings, pictures_checksum }))
     }
 
-    /// Returns what the videos depend on beside their name.
+    /// Returns what the videos depend on besides their name.
     pub(super) fn made_by(&self) -> String {
         let pictures = self.pictures_checksum.map(|checksum| format!(", pictures {checksum:08x}"));
         format!("globalsplat {}{}", env!("CARGO_PKG_VERSION"), pictures.unwrap_or_default())
     }
 
-    /// Names of the scenes.
+    /// Returns the names of the scenes.
     pub fn keys(&self) -> Vec<String> {
         (self.first..self.first + self.scenes).map(|number| self.key(number)).collect()
     }
 
-    /// Name of the scene of a number: of all that are of the seed, not of these.
+    /// Returns the name of scene `number`, counted over all scenes of the seed.
     fn key(&self, number: u64) -> String {
         format!("{}_{number:06}", self.seed)
     }
 
-    /// Makes video `index` of them, its pictures not yet.
+    /// Generates video number `index` of this set without rendering its images.
     ///
     /// # Errors
-    /// None but what every capture is checked for.
+    /// Fails only if the capture violates the checks that apply to every capture.
     pub fn capture(&self, index: usize) -> Result<Capture> {
         let number = self.first + index as u64;
         let video = Arc::new(Video::new(self.seed, number, &self.settings));
@@ -133,16 +133,16 @@ impl MadeUp {
     }
 }
 
-/// Pictures that are to be seen on things: all that lie in `folder`.
+/// Reads the images to show on surfaces: all image files in `folder`.
 ///
 /// # Errors
-/// No folder, none in it, or one that can't be read.
+/// Fails if the folder doesn't exist or contains no image, or if an image can't be read.
 pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
     let files = picture_files(folder)?;
     files.iter().map(|file| Ok(Arc::new(Texture::of_picture(&read_image(file)?)))).collect()
 }
 
-/// Lists the pictures in `folder`, one at least, by their names.
+/// Lists the image files in `folder`, at least one, sorted by name.
 fn picture_files(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(Error::read(folder))?;
     let mut files = vec![];

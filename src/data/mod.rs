@@ -1,4 +1,4 @@
-//! Captures: posed photos on disk, read, checked, resized, and put into tensors.
+//! Captures: posed photos on disk. This module reads, checks and resizes them and converts them to tensors.
 
 mod batch;
 mod capture;
@@ -28,7 +28,7 @@ pub use pixels::{Planes, fit};
 pub use polyphase::polyphase;
 pub use room::write_room;
 
-// For processes that tell each other.
+// Exchanged between processes.
 pub(crate) use loading::News;
-// For the parity checks, which run every part by itself.
+// Used by the parity checks, which run every part separately.
 pub(crate) use pixels::{Jitter, Region, Resampler};

@@ -1,14 +1,14 @@
-//! A photo as several smaller views that share its pixels out among themselves (spec 9.8).
+//! Decomposition of a photo into several smaller views, each of which holds a share of its pixels (spec 9.8).
 
 use super::capture::View;
 use crate::error::{Error, Result};
 use crate::scene::Camera;
 
-/// Phase² views of `photo`, each with every `phase`-th row and column of it: pixel (phase·i + a, phase·j + b), row and column,
-/// is pixel (i, j) of view phase·a + b, which sees it along the same ray.
+/// Splits `photo` into phase² views, each with every `phase`-th row and column. Pixel (phase·i + a, phase·j + b), row and column,
+/// becomes pixel (i, j) of view phase·a + b and keeps its ray.
 ///
 /// # Errors
-/// A side that `phase` doesn't divide.
+/// Fails if `phase` doesn't divide a side.
 pub fn polyphase(photo: &View, phase: u32) -> Result<Vec<View>> {
     let Camera { intrinsics, c2w, width, height } = photo.camera;
     if [height, width].iter().any(|side| side.checked_rem(phase) != Some(0)) {
@@ -44,7 +44,7 @@ mod tests {
 
     const PHASES: [u32; 4] = [1, 2, 3, 6];
 
-    /// Off-centre, of a camera that is turned and moved; pixels are numbered.
+    /// Returns a photo with an off-centre principal point and a rotated and translated camera. Its pixels are numbered.
     fn photo() -> View {
         let (width, height) = (36, 24);
         let intrinsics = Intrinsics { fx: 31.7, fy: 29.3, cx: 16.9, cy: 13.4 };
@@ -55,7 +55,7 @@ mod tests {
         View { name: "images/000.png".into(), image, camera }
     }
 
-    /// View, row and column of photo pixel (`y`, `x`) among so many views.
+    /// Returns the view, row and column of photo pixel (`y`, `x`) for this `phase`.
     fn place(phase: usize, y: usize, x: usize) -> (usize, usize, usize) {
         (phase * (y % phase) + x % phase, y / phase, x / phase)
     }
@@ -90,7 +90,7 @@ mod tests {
         }
     }
 
-    /// By the code that makes the model's image tokens.
+    /// The code that builds the model's image tokens computes the same rays for the views as for the photo.
     #[test]
     fn the_model_is_told_the_same_rays() {
         let photo = photo();
@@ -104,7 +104,7 @@ mod tests {
         for phase in PHASES {
             let found = rays(&polyphase(&photo, phase).unwrap());
             let p = i64::from(phase);
-            // [1, a·b, i, j, 6] to [1, 1, i·a, j·b, 6].
+            // Rearrange [1, a·b, i, j, 6] to [1, 1, i·a, j·b, 6].
             let joined = found.view([p, p, 24 / p, 36 / p, 6]).permute([2, 0, 3, 1, 4]);
             let off = (joined.reshape([1, 1, 24, 36, 6]) - &expected).abs().max().double_value(&[]);
             assert!(off < 1e-6, "phase {phase}: {off}");

@@ -1,4 +1,4 @@
-//! Procedural rooms, photographed by our own rasterizer, as captures on disk.
+//! Procedural rooms, rendered by this crate's rasterizer, as captures on disk.
 
 use super::formats::write_cameras_json;
 use crate::error::{Error, Result};
@@ -10,14 +10,13 @@ use std::path::Path;
 
 const PHOTOS: &str = "images";
 const TRUTH: &str = "truth.ply";
-/// All that a room's folder has.
+/// All entries of a room's folder.
 const FILES: [&str; 3] = ["cameras.json", TRUTH, PHOTOS];
 
-/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `truth.ply`. A room that is there is
-/// replaced.
+/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `truth.ply`. An existing room is replaced.
 ///
 /// # Errors
-/// Anything but a room there, or the system's refusal to write.
+/// Fails if anything other than a room exists at `path`, or if a file can't be written.
 pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> Result<()> {
     check_free(path)?;
     let Room { gaussians, cameras } = Room::new(seed, frames, size);
@@ -38,7 +37,7 @@ fn photo_name(index: usize) -> String {
     format!("{index:03}.png")
 }
 
-/// That nothing is at `path`, or a room and nothing else.
+/// Checks that `path` doesn't exist, or contains a room and nothing else.
 fn check_free(path: &Path) -> Result<()> {
     let _swapping = lock_parent(path);
     if !path.exists() {

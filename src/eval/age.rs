@@ -1,15 +1,16 @@
-//! How long the process has lived.
+//! Age of the running process.
 
 use std::time::Duration;
 
-/// Since the system began to load the program, to a hundredth of a second: libtorch is large. Linux alone tells.
+/// Returns the time since the system began to load the program, to a hundredth of a second. It includes the loading of libtorch, which is
+/// large. Returns `None` on systems other than Linux.
 pub fn process_age() -> Option<Duration> {
-    // Behind the name, which may hold anything: the 22nd field, in ticks since the system's start.
+    // The start time is the 22nd field, in clock ticks since boot. Count the fields after the program's name, which may contain anything.
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
     let began: f64 = stat.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()?;
     let uptime = std::fs::read_to_string("/proc/uptime").ok()?;
     let now: f64 = uptime.split(' ').next()?.parse().ok()?;
-    // SAFETY: sysconf only tells a number.
+    // SAFETY: `sysconf` only returns a number.
     let ticks = unsafe { libc::sysconf(libc::_SC_CLK_TCK) } as f64;
     Duration::try_from_secs_f64(now - began / ticks).ok()
 }

@@ -1,4 +1,4 @@
-//! Truth, render and depth side by side: what a person looks at first.
+//! Contact sheets for visual inspection: ground truth, render and depth side by side.
 
 use crate::error::Result;
 use crate::io::{Mosaic, colourize_depth, enlarge, shrink, subsample};
@@ -6,23 +6,23 @@ use crate::render::Rendered;
 use std::path::Path;
 use tch::Tensor;
 
-/// Small pictures are enlarged to about this many pixels.
+/// Height in pixels that small images are enlarged to, or a little less.
 const HEIGHT: i64 = 256;
 
-/// A row per view: photo, render, depth. Large pictures of many views are shrunk.
+/// A sheet with a row per view: photo, render, depth. Large images of many views are shrunk.
 #[derive(Debug)]
 pub struct ContactSheet(Mosaic);
 
 impl ContactSheet {
-    /// Begins a sheet of `views` rows.
+    /// Creates a sheet for `views` rows.
     pub fn new(views: usize) -> Self {
         ContactSheet(Mosaic::column(views))
     }
 
-    /// Adds the row of a photo, `truth` [3, H, W], and what was rendered from its camera.
+    /// Adds the row of a view: the photo `truth` `[3, H, W]`, and what was rendered from its camera.
     ///
     /// # Errors
-    /// libtorch's refusal of pictures of different sizes.
+    /// Fails if the images differ in size.
     pub fn add(&mut self, truth: &Tensor, rendered: &Rendered) -> Result<()> {
         let factor = self.0.factor(3, truth);
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
@@ -31,10 +31,10 @@ impl ContactSheet {
         self.0.add_shrunk(&pictures.map(|picture| enlarge(&picture, HEIGHT)))
     }
 
-    /// Writes the sheet as a PNG, and returns by how much the sides of the largest pictures were divided: 1 where nothing was shrunk.
+    /// Writes the sheet as a PNG. Returns the factor by which the sides of the largest images were divided: 1 if nothing was shrunk.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Fails if the file can't be written.
     pub fn write(self, path: &Path) -> Result<i64> {
         let shrunk_by = self.0.shrunk_by();
         self.0.write(path)?;

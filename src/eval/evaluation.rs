@@ -1,104 +1,106 @@
-//! What an evaluation over a data set found: the contents of `scores.json`, which the report shows.
+//! Results of an evaluation over a dataset: the contents of `scores.json`, which the report shows.
 
 use super::scores::CaptureScores;
 use crate::reconstruct::Input;
 use serde::{Deserialize, Serialize};
 
-/// One method (a model, somebody's splats, somebody's pictures) scored by one index.
+/// Scores of one method (a model, given splats or given images) on the scenes of one index.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Evaluation {
-    /// How its row is called in tables.
+    /// Name of the method's row in tables.
     pub method: String,
-    /// The data set's name, as `re10k` or `acid`.
+    /// Name of the dataset, such as `re10k` or `acid`.
     pub dataset: String,
-    /// The index file's name.
+    /// Name of the index file.
     pub index: String,
-    /// Context views of every scene.
+    /// Number of context views of every scene.
     pub context_views: usize,
-    /// What a model saw of them, where one was run.
+    /// Conversion of the context photos into the model's views; `None` if no model was run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub input: Option<Input>,
-    /// [height, width] of the pictures that were scored.
+    /// `[height, width]` of the images that were scored.
     pub image_size: [u32; 2],
-    /// Scenes that the index names; the data set may hold fewer.
+    /// Number of scenes that the index names; the dataset may hold fewer.
     pub indexed_scenes: usize,
     /// Means over the scenes.
     pub summary: Summary,
-    /// What the scores cost, where a model was run.
+    /// Time, memory and size; `None` if no model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub efficiency: Option<Efficiency>,
-    /// Processor, cores and device that computed it.
+    /// Processor, cores and device that the scores were computed on.
     pub machine: String,
-    /// One by one, in the index's order.
+    /// Scores of each scene, in the order of the index.
     pub scenes: Vec<SceneScores>,
-    /// Scenes that couldn't be scored, and why.
+    /// Scenes that couldn't be scored, with the reason.
     pub failures: Vec<Failure>,
 }
 
 /// Means over scenes, each of which is a mean over its target views.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Summary {
-    /// In dB.
+    /// Mean PSNR in dB.
     pub psnr: f64,
-    /// As scikit-image's.
+    /// Mean structural similarity, computed as in scikit-image.
     pub ssim: f64,
-    /// Absent where the network's weights were.
+    /// Mean LPIPS with VGG-16; `None` if a scene lacks it, for example because the network's weights are missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_vgg: Option<f64>,
-    /// Absent where the network's weights were.
+    /// Mean LPIPS with AlexNet; `None` if a scene lacks it, for example because the network's weights are missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
-    /// Gaussians of a scene, where splats were scored.
+    /// Mean number of Gaussians per scene; `None` if no splats were scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<f64>,
 }
 
-/// What reconstructing a scene costs.
+/// Cost of reconstructing a scene.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Efficiency {
-    /// Mean seconds of the forward pass, or passes, from views in memory to Gaussians, without scenes that warmed up, where there are
-    /// others.
+    /// Mean time in seconds of the forward pass, or passes, from views in memory to Gaussians. Warm-up scenes are excluded unless there are
+    /// no others.
     pub forward_seconds: f64,
-    /// Scenes that the mean is of.
+    /// Number of scenes in the mean time.
     pub timed_scenes: usize,
-    /// The largest resident size of the process, in bytes.
+    /// Peak resident memory of the process, in bytes.
     pub peak_memory_bytes: u64,
-    /// The largest amount of the GPU's memory in use, in bytes, where one was used and tells.
+    /// Peak memory of the tensors on the GPU, in bytes; `None` without a GPU, or if it isn't known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_device_memory_bytes: Option<u64>,
-    /// Mean size of a scene's splat as a PLY.
+    /// Mean size of a scene's splat as a PLY, in bytes.
     pub splat_bytes: f64,
 }
 
-/// One scene's scores.
+/// Scores of one scene.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SceneScores {
-    /// Means over the target views, and each of them.
+    /// Means over the target views, and the scores of each view.
     #[serde(flatten)]
     pub scores: CaptureScores,
-    /// Frames that were shown.
+    /// Context frames.
     pub context: Vec<usize>,
-    /// Frames that had to be matched.
+    /// Target frames.
     pub target: Vec<usize>,
-    /// Whether photos have fewer pixels than they were shown or matched with.
+    /// `true` if photos had to be enlarged to the size of the context or target views.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub enlarged: bool,
-    /// Size of the splat as a PLY, where there is one.
+    /// Size of the splat as a PLY, in bytes; `None` if there is no splat.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub splat_bytes: Option<u64>,
-    /// What was left out of the splat's file, a sentence each.
+    /// Warnings about data that was left out of the splat's file, a sentence each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
-    /// Of the forward pass, or passes, where a model was run.
+    /// Time in seconds of the forward pass, or passes; `None` if no model was run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_seconds: Option<f64>,
-    /// Whether the scene was the process's first, whose time includes that of warming up.
+    /// `true` if the scene was the first one of the process, so that its time includes the warm-up.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub warm_up: bool,
-    /// The largest resident size of the process up to then, in bytes, where a model was run and nothing else yet.
+    /// Peak resident memory of the process after the reconstruction, in bytes. Only the first scene that a process scores with a model has
+    /// it: later peaks would include the networks of LPIPS.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_memory_bytes: Option<u64>,
-    /// The memory of the GPU that the process held then, in bytes, where one was used and tells.
+    /// Peak memory of the tensors on the GPU after the reconstruction, in bytes. Only the first scene that a process scores with a model on
+    /// a GPU has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_device_memory_bytes: Option<u64>,
 }
@@ -106,14 +108,14 @@ pub struct SceneScores {
 /// A scene that couldn't be scored.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Failure {
-    /// By which the index names it.
+    /// Key of the scene in the index.
     pub scene: String,
-    /// One sentence.
+    /// Error message, one sentence.
     pub error: String,
 }
 
 impl Summary {
-    /// Of `scenes`, which are one at least. A distance that any scene lacks has no mean.
+    /// Computes the means over `scenes`, at least one. An LPIPS or a number of Gaussians that any scene lacks has no mean.
     pub fn of(scenes: &[SceneScores]) -> Self {
         let mean = |value: &dyn Fn(&CaptureScores) -> Option<f64>| {
             let values: Option<Vec<f64>> = scenes.iter().map(|scene| value(&scene.scores)).collect();
@@ -130,7 +132,7 @@ impl Summary {
 }
 
 impl Efficiency {
-    /// Of scenes that a model was run on; none where it wasn't.
+    /// Computes the cost from the scenes that a model was run on; `None` if there are none.
     pub(super) fn of(scenes: &[SceneScores]) -> Option<Self> {
         let time = |scene: &SceneScores| scene.forward_seconds;
         let mut times: Vec<f64> = scenes.iter().filter(|scene| !scene.warm_up).filter_map(time).collect();
@@ -149,10 +151,11 @@ impl Efficiency {
     }
 }
 
-/// What a scene's files are called, before the ending: its name, or, where a file system, a shell or a web page could read that
-/// as more than a name, one with `_` in such places and a checksum that tells it from others.
+/// Returns the name of a scene's files, without the extension. This is the scene's name, unless a file system, a shell or a web page could
+/// read that as more than a name: then each such character is replaced by `_`, and a checksum keeps the names unique.
 pub fn scene_file_name(scene: &str) -> String {
-    /// File systems allow 255 bytes, of which an ending and a temporary file's name need some.
+    /// Maximum number of characters of the name. File systems allow 255 bytes, some of which the extension and the name of a temporary file
+    /// need.
     const LONGEST: usize = 128;
     let harmless = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     if scene.len() <= LONGEST && scene.chars().all(harmless) {

@@ -1,4 +1,4 @@
-//! What a splat loses on its way into another file: both drawn from the same cameras.
+//! Loss of quality when a splat is converted to another format: both versions are rendered from the same cameras.
 
 use super::metrics::squared_error;
 use crate::error::Result;
@@ -7,11 +7,11 @@ use crate::loss::psnr_of_mse;
 use crate::render::SplatRenderer;
 use crate::scene::Camera;
 
-/// PSNR in dB of what `cameras` see of `copy` against what they see of `original`, of the mean squared error over all pixels;
-/// none where these are the same.
+/// Returns the PSNR in dB between the renders of `copy` and of `original` from `cameras`, from the mean squared error over all pixels.
+/// Returns `None` if the renders are identical.
 ///
 /// # Errors
-/// Those of rendering.
+/// Fails if rendering fails.
 pub fn psnr_between(original: &Splat, copy: &Splat, cameras: &[Camera]) -> Result<Option<f64>> {
     let frame = original.frame();
     let [original, copy] =

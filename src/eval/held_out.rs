@@ -1,4 +1,4 @@
-//! Validation: what training never shows is rendered and scored while it goes on (spec 8.8).
+//! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
 use super::photo_source::PhotoSource;
 use super::scene::split_views;
@@ -25,34 +25,34 @@ pub struct HeldOut {
     scores: Vec<HeldOutScores>,
 }
 
-/// Where target views come from.
+/// Source of the context and target views of a validation scene.
 #[derive(Debug)]
 enum HeldOutScene {
-    /// The views that are held out of a capture.
+    /// Views that are held out of a capture.
     Views(Capture),
-    /// The views that are held out of a scene in a chunk, or of a made-up one. It is opened when it is needed: chunks and worlds
-    /// are large.
+    /// Views that are held out of a scene in a chunk, or of a synthetic scene. Chunks and synthetic scenes are large, so it is opened only
+    /// when it is needed.
     ViewsInGroup(SceneGroup, String),
     /// A scene that is held out as a whole.
     Whole(SceneGroup, String),
 }
 
-/// A scene's scores.
+/// Validation scores of a scene.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct HeldOutScores {
-    /// The model's.
+    /// Scores of the model.
     pub ours: CaptureScores,
-    /// Of the photo that was taken nearest, among those that the model saw.
+    /// Scores of the nearest context photo, which each target is compared with.
     pub nearest: CaptureScores,
 }
 
 impl HeldOut {
-    /// What `config` holds out: of `training`, which it is trained on (all captures, and at most `config.validation_scenes`
-    /// scenes in chunks), and of `config.validation`.
+    /// Finds the validation scenes that `config` asks for: views held out of `training` (of all captures, and of at most
+    /// `config.validation_scenes` scenes in chunks), and the scenes of `config.validation`.
     ///
     /// # Errors
-    /// Nothing known at one of the paths, a capture that `config.holdout` leaves too few views, or a held-out scene that is
-    /// broken or has too few.
+    /// Fails if one of the paths holds no known dataset, if `config.holdout` leaves a capture too few views, or if a held-out scene is
+    /// broken or has too few views.
     pub fn find(config: &DataConfig, training: &TrainingScenes) -> Result<Self> {
         let mut scenes = vec![];
         let holds_out = |capture: &&Capture| config.holdout != Holdout::None || capture.has_test_part();
@@ -87,32 +87,33 @@ impl HeldOut {
         Ok(HeldOut { config: config.clone(), scenes, trained_on, warnings, scores: vec![] })
     }
 
-    /// Whether nothing is held out.
+    /// Returns `true` if nothing is held out.
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
     }
 
-    /// Scenes held out as a whole that are learned all the same: their scores tell nothing of scenes never seen.
+    /// Returns the names of the scenes that are held out as a whole although they are also trained on. Their scores say nothing about
+    /// unseen scenes.
     pub fn trained_on(&self) -> &[String] {
         &self.trained_on
     }
 
-    /// Returns what is left out or changed of the scenes held out as a whole, a line each.
+    /// Returns the warnings about the scenes held out as a whole: a line for each kind of data that was left out or changed.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// What the last validation found.
+    /// Returns the scores of the last validation.
     pub fn scores(&self) -> &[HeldOutScores] {
         &self.scores
     }
 }
 
 impl HeldOutScene {
-    /// Its name, context and target views.
+    /// Loads the name, the context views and the target views of the scene.
     fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
         let size = Some(config.image_size);
-        // As many as in training: a model that has seen few at a time needn't fit in memory with hundreds.
+        // Use as many context views as in training: a model trained on a few views need not fit in memory with hundreds.
         let context_views = config.context_views.max(2);
         let (capture, (context, target)) = match self {
             HeldOutScene::Views(capture) => {
@@ -137,20 +138,20 @@ impl HeldOutScene {
     }
 }
 
-/// What a rank found in its share of the scenes, each by its number.
+/// Results of a rank for its share of the scenes, each with the index of its scene.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct Found {
     scores: Vec<(usize, HeldOutScores)>,
-    /// What is wrong with those that can't be used.
+    /// Error messages of the scenes that can't be used.
     unusable: Vec<(usize, String)>,
-    /// Why the model can't be judged.
+    /// Error message if the model can't be evaluated.
     failed: Option<String>,
-    /// Whether somebody asked to stop.
+    /// `true` if the caller asked to stop.
     stopped: bool,
 }
 
 impl HeldOut {
-    /// Looks at the scenes whose turn it is among the trainer's ranks.
+    /// Evaluates this rank's share of the scenes: every n-th of them for n ranks.
     fn judge_share(&self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Found {
         let (mut found, group) = (Found::default(), trainer.group());
         for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.ranks()) {
@@ -177,7 +178,7 @@ impl HeldOut {
     }
 }
 
-/// What the model makes of the views `context` of scene `name`, held against `target`.
+/// Reconstructs scene `name` from the views `context` and scores the renders against `target`.
 fn judge_views(
     trainer: &Trainer,
     name: &str,
@@ -233,14 +234,14 @@ impl Validator for HeldOut {
     }
 }
 
-/// By which a scene is known again: the file that it lies in, and its key there.
+/// Identity of a scene: its file, and its key in that file.
 type Place = (PathBuf, Option<String>);
 
 fn place(file: &Path, key: Option<&String>) -> Place {
     (file.canonicalize().unwrap_or(file.to_owned()), key.cloned())
 }
 
-/// Of every scene of `training`.
+/// Returns the identities of all scenes of `training`.
 fn places(training: &TrainingScenes) -> BTreeSet<Place> {
     let captures = training.captures().iter().map(|capture| place(capture.file(), None));
     let others = training.others().iter();
@@ -248,7 +249,7 @@ fn places(training: &TrainingScenes) -> BTreeSet<Place> {
     captures.chain(others).collect()
 }
 
-/// At most so many scenes of `groups`, spread evenly over all of them.
+/// Returns at most `most` scenes of `groups`, spread evenly over all of them.
 fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     let scenes: Vec<_> =
         groups.iter().flat_map(|group| group.keys.iter().map(move |key| (group, key))).collect();
@@ -257,8 +258,9 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
-/// The context and target views of a held-out scene, always the same: as many as in training, at even distances along the
-/// camera's path, from the middle of a video that is longer than training's.
+/// Returns the context and target views of a scene that is held out as a whole. The choice is deterministic: as many views as in training,
+/// at even distances along the camera's path, from the middle of a video that is longer than the training window. A capture with a test
+/// part of its own takes its targets from that part.
 fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
     if capture.has_test_part() {
@@ -298,7 +300,7 @@ mod tests {
         };
         let (_, context, target) = HeldOutScene::Views(capture).load(&config).unwrap();
         let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
-        // Of views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
+        // The context views are chosen among views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
         let context = names(&context);
         assert_eq!((context.len(), target.len()), (4, 4));
         assert_eq!((context[0].as_str(), context[3].as_str()), ("images/000.png", "images/011.png"));

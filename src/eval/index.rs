@@ -1,4 +1,4 @@
-//! Evaluation indices: which frames of which scenes are context, and which are targets.
+//! Evaluation indices: the context and target frames of each scene.
 
 use crate::data::Capture;
 use crate::error::{Error, Result};
@@ -7,50 +7,49 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The frames of one scene.
+/// Frames of one scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFrames {
-    /// Shown to the model.
+    /// Context frames, which the model sees.
     pub context: Vec<usize>,
-    /// What has to be matched.
+    /// Target frames, which are rendered and scored.
     pub target: Vec<usize>,
 }
 
 impl SceneFrames {
-    /// Of a video of `count` frames, three at least: every other one is shown, and every other one of the rest has to be matched.
+    /// Splits a video of `count` frames, at least three: every other frame is context, and every other one of the rest is a target.
     pub fn alternating(count: usize) -> Self {
         SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
     }
 
-    /// Returns a checksum of these frames' photos, as their files are, and of their cameras.
+    /// Returns a checksum of the unmodified photo files of these frames, and of their cameras.
     ///
     /// # Errors
-    /// A photo that can't be read.
+    /// Fails if a photo can't be read.
     pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
         capture.checksum(self.context.iter().chain(&self.target).copied())
     }
 
-    /// What pictures of the targets are called, without their ending: by their numbers, as chunks name frames.
+    /// Returns the file names of the target images without their extensions: six-digit frame numbers, as chunks name frames.
     pub(super) fn picture_names(&self) -> Vec<String> {
         self.target.iter().map(|frame| format!("{frame:06}")).collect()
     }
 }
 
-/// The contents of an index file: `{scene: {"context": [frames], "target": [frames]}}`, where null stands for a scene that is
-/// left out.
+/// Contents of an index file: `{scene: {"context": [frames], "target": [frames]}}`. A scene that is null is left out.
 #[derive(Debug, Clone)]
 pub struct EvaluationIndex {
-    /// The file.
+    /// Path of the index file.
     pub file: PathBuf,
-    /// By the scene's key.
+    /// Frames of each scene, by the scene's key.
     pub scenes: BTreeMap<String, SceneFrames>,
 }
 
 impl EvaluationIndex {
-    /// Reads an index.
+    /// Reads an index from `file`.
     ///
     /// # Errors
-    /// A file that can't be read, is no index, or has a scene with fewer than two context frames or no target.
+    /// Fails if the file can't be read, is not an index, names no scene, or has a scene with fewer than two context frames or no target.
     pub fn read(file: &Path) -> Result<Self> {
         let expected = "{scene: {\"context\": [frames], \"target\": [frames]} or null}";
         let scenes: BTreeMap<String, Option<SceneFrames>> = serde_json::from_str(&read_text(file)?)
@@ -70,28 +69,28 @@ impl EvaluationIndex {
         Ok(EvaluationIndex { file: file.to_owned(), scenes })
     }
 
-    /// Writes it where it says.
+    /// Writes the index to [`EvaluationIndex::file`].
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Fails if the file can't be written.
     pub fn write(&self) -> Result<()> {
         write_json(&self.file, &self.scenes)
     }
 
-    /// The file's name.
+    /// Returns the name of the index file.
     pub fn name(&self) -> String {
         self.file.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// Context frames of a scene: of the first, as indices have as many for each.
+    /// Returns the number of context frames of the first scene. Indices have the same number for every scene.
     pub fn context_views(&self) -> usize {
         self.scenes.values().next().map_or(0, |frames| frames.context.len())
     }
 
-    /// The frames of scene `key`, which has `count`.
+    /// Returns the frames of scene `key`, which has `count` frames.
     ///
     /// # Errors
-    /// A frame that isn't there.
+    /// Fails if the index names a frame that the scene doesn't have.
     pub(super) fn frames(&self, key: &str, count: usize) -> Result<&SceneFrames> {
         let frames = &self.scenes[key];
         match frames.context.iter().chain(&frames.target).find(|&&frame| frame >= count) {

@@ -1,4 +1,4 @@
-//! What a sweep keeps on disk to go on from: whose scores they are, and every scene's as they come.
+//! Files from which an interrupted evaluation resumes: the settings that it was started with, and the scores of each finished scene.
 
 use super::evaluation::{SceneScores, scene_file_name};
 use super::scores_file::{REPORT, SCORES, TABLE, comparison_path};
@@ -7,10 +7,10 @@ use crate::io::write_json;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// The file that an evaluation begins with.
+/// Name of the file that an evaluation writes first.
 const IDENTITY: &str = "evaluation.json";
 
-/// By which a sweep that goes on is recognized.
+/// Settings that must be equal for an evaluation to resume.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Identity {
     #[serde(rename = "subject")]
@@ -20,16 +20,16 @@ pub(super) struct Identity {
     pub image_size: [u32; 2],
 }
 
-/// A scene's scores on disk.
+/// Scores of a scene as they are stored on disk.
 #[derive(Serialize, Deserialize)]
 pub(super) struct Kept {
     #[serde(flatten)]
     pub scores: SceneScores,
-    /// What tells the files that were scored from others in their place.
+    /// Checksums of the files that were scored, by which replaced files are detected.
     pub files: Option<String>,
 }
 
-/// The files that an evaluation of the scenes `keys` writes into the folder `out`.
+/// Returns the paths of the files that an evaluation of the scenes `keys` writes into the folder `out`.
 pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a String>) -> Vec<PathBuf> {
     let journal = Journal::of(out);
     let of_scene = |key: &'a String| [journal.file(key), comparison_path(out, key)];
@@ -37,19 +37,19 @@ pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a Strin
     keys.into_iter().flat_map(of_scene).chain(of_all).collect()
 }
 
-/// The folder `scenes` of an evaluation.
+/// The folder `scenes` of an evaluation, which holds a file of scores per scene.
 pub(super) struct Journal {
     scenes: PathBuf,
 }
 
 impl Journal {
-    /// Goes on in the folder `out`, or begins there.
+    /// Opens the journal in the folder `out`, or creates it.
     ///
     /// # Errors
-    /// Scores of something else in it, or the system's refusal to write.
+    /// Fails if `out` holds files of another evaluation or a broken journal, or if it can't be written.
     pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
         let file = out.join(IDENTITY);
-        // An evaluation begins with that file, so these would be somebody else's.
+        // An evaluation writes `file` first, so without it these files belong to something else.
         let others = [SCORES, TABLE, REPORT];
         if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
         {
@@ -58,7 +58,7 @@ impl Journal {
         }
         let journal = Journal::of(out);
         std::fs::create_dir_all(&journal.scenes).map_err(Error::write(&journal.scenes))?;
-        // Where nothing was scored yet, there is nothing to mix up.
+        // If no scene has been scored yet, different settings do no harm.
         let mut entries = std::fs::read_dir(&journal.scenes).map_err(Error::read(&journal.scenes))?;
         if entries.next().is_some()
             && let Ok(text) = std::fs::read(&file)
@@ -85,21 +85,21 @@ impl Journal {
         Ok(journal)
     }
 
-    /// In the folder `out`, where it was opened.
+    /// Returns the journal in the folder `out`, without accessing the disk.
     pub fn of(out: &Path) -> Self {
         Journal { scenes: out.join("scenes") }
     }
 
-    /// Returns the scores of scene `key` from before. What can't be read is none.
+    /// Returns the stored scores of scene `key`. Returns `None` if there are none, or if they can't be read.
     pub fn kept(&self, key: &str) -> Option<Kept> {
         let kept: Kept = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
         (kept.scores.scores.scene == key).then_some(kept)
     }
 
-    /// Keeps the scores of scene `key`, which are of `files`.
+    /// Stores the scores of scene `key`. `files` identifies the files that were scored.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Fails if the file can't be written.
     pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
         write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })
     }

@@ -1,13 +1,13 @@
-//! What the figures were measured on.
+//! Description of the machine that results were measured on.
 
 use crate::error::Result;
 use crate::render::cpu::simd_level;
 use tch::Device;
 
-/// Processor, cores and device, as `Intel(R) Xeon(R), 2 cores, avx512`.
+/// Returns the processor, cores, SIMD level and device, such as `Intel(R) Xeon(R), 2 cores, avx512`.
 ///
 /// # Errors
-/// A SIMD level that is forced and not there.
+/// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
 pub fn machine(device: Device) -> Result<String> {
     let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let named = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));

@@ -1,22 +1,23 @@
-//! How much memory the process has taken, and its tensors on a GPU.
+//! Memory use of the process, and of its tensors on a GPU.
 
 use crate::render::cuda::Driver;
 use globalsplat_csrc::device as ffi;
 use std::path::{Path, PathBuf};
 use tch::Device;
 
-/// The resident size now, in bytes; where the system doesn't tell, the largest so far.
+/// Returns the current resident memory in bytes, or the peak where the system doesn't report the current value.
 pub fn resident_memory_bytes() -> u64 {
     let from_linux = || -> Option<u64> {
         let pages: u64 = std::fs::read_to_string("/proc/self/statm").ok()?.split(' ').nth(1)?.parse().ok()?;
-        // SAFETY: sysconf only tells a number.
+        // SAFETY: `sysconf` only returns a number.
         let page = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
         Some(pages * u64::try_from(page).ok()?)
     };
     from_linux().unwrap_or_else(peak_memory_bytes)
 }
 
-/// Bytes that tensors on `device` took at the most, since the program began or since [`forget_peak_memory`]; none for the CPU.
+/// Returns the peak memory of the tensors on `device` in bytes, since the start of the program or the last [`forget_peak_memory`]; `None`
+/// for the CPU.
 pub fn device_memory_bytes(device: Device) -> Option<u64> {
     match device {
         Device::Cuda(number) => ffi::peak_bytes(number as i32).ok(),
@@ -24,13 +25,13 @@ pub fn device_memory_bytes(device: Device) -> Option<u64> {
     }
 }
 
-/// The total memory of `device` in bytes: of a GPU, or of the machine, or less where a control group allows the process less. `None` where
-/// it is unknown.
+/// Returns the total memory of `device` in bytes: that of the GPU, or that of the machine, or the limit of the process's control group if
+/// that is lower. Returns `None` if it is unknown.
 pub fn total_memory_bytes(device: Device) -> Option<u64> {
     match device {
         Device::Cuda(number) => Driver::find().ok()?.gpus.get(number).map(|gpu| gpu.memory as u64),
         _ => {
-            // SAFETY: sysconf only tells numbers.
+            // SAFETY: `sysconf` only returns numbers.
             let [pages, page] = [libc::_SC_PHYS_PAGES, libc::_SC_PAGESIZE]
                 .map(|name| u64::try_from(unsafe { libc::sysconf(name) }).ok());
             let of_machine = pages? * page?;
@@ -39,7 +40,7 @@ pub fn total_memory_bytes(device: Device) -> Option<u64> {
     }
 }
 
-/// The limits of the process's control group and of those above it, in bytes (cgroups(7), version 2).
+/// Returns the memory limits of the process's control group and of its ancestors, in bytes (cgroups(7), version 2).
 fn group_limits() -> impl Iterator<Item = u64> {
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let group = groups.lines().find_map(|line| line.strip_prefix("0::/")).unwrap_or_default().to_string();
@@ -50,30 +51,30 @@ fn group_limits() -> impl Iterator<Item = u64> {
     folders.into_iter().filter_map(limit)
 }
 
-/// The largest memory that work on `device` took: of tensors on it, or of the process.
+/// Returns the peak memory in bytes of work on `device`: that of the GPU's tensors, or that of the process.
 pub fn peak_memory_bytes_on(device: Device) -> u64 {
     device_memory_bytes(device).unwrap_or_else(peak_memory_bytes)
 }
 
-/// Forgets the largest memory so far, of the process and on `device`: what is told is of what comes from now on. Of the process only
-/// Linux can.
+/// Resets the peak memory of the process and of `device`, so that later peaks count from now on. The peak of the process can be reset on
+/// Linux only.
 pub fn forget_peak_memory(device: Device) {
-    // Where it can't be, the peak stays what it was.
+    // If the reset isn't supported, the old peak remains.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     if let Device::Cuda(number) = device {
         let _ = ffi::forget_peak_bytes(number as i32);
     }
 }
 
-/// The largest resident size so far, in bytes.
+/// Returns the peak resident memory of the process so far, in bytes.
 pub fn peak_memory_bytes() -> u64 {
-    // SAFETY: rusage is plain numbers, for which zero is valid, and getrusage only writes into it.
+    // SAFETY: `rusage` consists of plain numbers, for which zero is valid, and `getrusage` only writes into it.
     let usage = unsafe {
         let mut usage: libc::rusage = std::mem::zeroed();
         libc::getrusage(libc::RUSAGE_SELF, &mut usage);
         usage
     };
-    // Linux counts kibibytes, macOS bytes.
+    // Linux reports KiB, macOS bytes.
     let unit = if cfg!(target_os = "macos") { 1 } else { 1024 };
     usage.ru_maxrss as u64 * unit
 }
@@ -89,7 +90,7 @@ mod tests {
         drop(std::hint::black_box(vec![1u8; BYTES]));
         let with = peak_memory_bytes();
         forget_peak_memory(Device::Cpu);
-        // Other tests take memory meanwhile, but less.
+        // Other tests allocate memory at the same time, but less.
         assert!(peak_memory_bytes() + (BYTES as u64) / 2 < with);
         assert_eq!(device_memory_bytes(Device::Cpu), None);
     }

@@ -1,4 +1,4 @@
-//! What is judged: a model, somebody's splats, somebody's pictures; by one scene as by a data set.
+//! Methods under evaluation: a model, given splats or given images, for a single scene or a whole dataset.
 
 use super::memory::{device_memory_bytes, peak_memory_bytes};
 use super::perceptual::Perceptual;
@@ -17,55 +17,54 @@ use glam::{DMat4, DVec3};
 use std::path::{Path, PathBuf};
 use tch::{Device, Tensor};
 
-/// Makes pictures of a scene's target views.
+/// A method that produces images of a scene's target views.
 #[derive(Debug, Clone)]
 pub enum Method<'a> {
     /// A model, which sees the context views.
     Model(Model<'a>),
-    /// A splat in the capture's own world.
+    /// A splat in the capture's own world coordinates.
     Splat(PathBuf),
-    /// A folder of pictures named as the photos ([`crate::data::Capture::picture_names`]).
+    /// A folder of images named like the photos ([`crate::data::Capture::picture_names`]).
     Renders(PathBuf),
 }
 
-/// What a method makes of a scene. Its pictures of the target views come one by one: the first is made at once, and the others when
-/// [`judge`] asks for them.
+/// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`judge`] needs them.
 #[derive(Debug)]
 pub struct Synthesis {
-    /// The scene.
+    /// Scene with its context and target views.
     pub scene: EvalScene,
     source: PictureSource,
-    /// Until it is judged.
+    /// Photo and image of the first target view, until [`judge`] takes them.
     first: Option<(View, Picture)>,
-    /// Of the splat, where there is one.
+    /// Number of Gaussians of the splat; `None` if there is no splat.
     pub gaussians: Option<i64>,
-    /// Of the PLY that the splat is, or would be.
+    /// Size in bytes of the splat as a PLY, whatever its format; `None` if there is no splat.
     pub splat_bytes: Option<u64>,
-    /// Of a model's forward pass, or passes.
+    /// Time in seconds of the model's forward pass, or passes; `None` if no model was run.
     pub forward_seconds: Option<f64>,
-    /// What was left out of the splat's file, a sentence each.
+    /// Warnings about data that was left out of the splat's file, a sentence each.
     pub warnings: Vec<String>,
 }
 
-/// Where pictures of the target views come from.
+/// Source of the images of the target views.
 #[derive(Debug)]
 enum PictureSource {
-    /// A splat, rendered from these poses (camera-to-world, in the splat's world).
+    /// A splat, rendered from these poses (camera-to-world, in the splat's world coordinates).
     Splat(SplatRenderer, Vec<DMat4>),
-    /// A folder of pictures.
+    /// A folder of images.
     Folder(PathBuf),
 }
 
-/// A picture of a target view.
+/// An image of a target view.
 #[derive(Debug)]
 pub struct Picture {
-    /// [3, H, W].
+    /// Colours, `[3, H, W]`.
     pub rgb: Tensor,
-    /// The same with depth, where a splat was rendered here.
+    /// Render with depth, if the image was rendered from a splat here.
     pub rendered: Option<Rendered>,
 }
 
-/// What a model took, in bytes.
+/// Peak memory of a model, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Memory {
     pub host: u64,
@@ -73,8 +72,8 @@ pub(super) struct Memory {
 }
 
 impl Method<'_> {
-    /// That of scene `key`, where this one names a folder with `SCENE.ply` or a splat of another format, or with folders `SCENE`
-    /// or `SCENE/color` of pictures, for every scene.
+    /// Returns the method for scene `key`, given a method that names the folder for all scenes. The folder holds `SCENE.ply` or a splat of
+    /// another format for each scene, or a folder `SCENE` or `SCENE/color` of images.
     pub fn of_scene(&self, key: &str) -> Self {
         match self {
             Method::Model(model) => Method::Model(*model),
@@ -86,16 +85,16 @@ impl Method<'_> {
         }
     }
 
-    /// Makes pictures of the scene's target views, rendered on `device`, the first of them at once.
+    /// Produces images of the scene's target views, rendered on `device`. The first of them is rendered at once.
     ///
     /// # Errors
-    /// Whatever the reconstruction fails with, a splat that can't be read, a first photo or picture that can't.
+    /// Fails if the reconstruction fails, or if the splat, the first photo or the first image can't be read.
     pub fn synthesize(&self, scene: EvalScene, device: Device) -> Result<Synthesis> {
         let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
                 let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
                 let splat = Splat::of(&made.gaussians)?;
-                // The normalized world is a local frame already.
+                // The normalized world is already a local frame.
                 let frame = LocalFrame { origin: DVec3::ZERO, scale: 1. };
                 let renderer = SplatRenderer::new(&made.gaussians, DVec3::ZERO, frame);
                 let source = PictureSource::Splat(renderer.to_device(device), made.target_poses);
@@ -119,7 +118,7 @@ impl Method<'_> {
         })
     }
 
-    /// Adds the files of a splat or pictures to `inputs`.
+    /// Adds the files of a splat or of images to `inputs`.
     pub fn add_inputs(&self, inputs: &mut Inputs) {
         match self {
             Method::Model(_) => {}
@@ -131,7 +130,7 @@ impl Method<'_> {
         }
     }
 
-    /// How photos become what a model sees; none where no model is judged.
+    /// Returns the conversion of photos into the model's views; `None` if no model is evaluated.
     pub fn input(&self) -> Option<Input> {
         match self {
             Method::Model(model) => Some(model.input),
@@ -139,7 +138,7 @@ impl Method<'_> {
         }
     }
 
-    /// What context photos have to be fitted to; none where no model looks at them.
+    /// Returns the size that context photos have to be fitted to; `None` if no model is evaluated.
     pub(super) fn photo_size(&self) -> Option<ImageSize> {
         match self {
             Method::Model(model) => Some(model.input.photo_size(model.config.data.image_size)),
@@ -147,7 +146,7 @@ impl Method<'_> {
         }
     }
 
-    /// So far; none where no model is judged.
+    /// Returns the peak memory so far; `None` if no model is evaluated.
     pub(super) fn memory(&self) -> Option<Memory> {
         match self {
             Method::Model(model) => {
@@ -158,11 +157,11 @@ impl Method<'_> {
         }
     }
 
-    /// Returns a checksum of what a scene's splat or pictures called `names` hold, by which they are told from others in their place.
-    /// Of a model it is nothing.
+    /// Returns a checksum of the scene's splat, or of its images called `names`, by which replaced files are detected. Returns `None` for a
+    /// model.
     ///
     /// # Errors
-    /// A file that can't be read.
+    /// Fails if a file can't be read.
     pub(super) fn checksum(&self, names: &[String]) -> Result<Option<u32>> {
         match self {
             Method::Model(_) => Ok(None),
@@ -179,7 +178,7 @@ impl Method<'_> {
 }
 
 impl PictureSource {
-    /// Makes the picture of target view `i` of `scene`, and loads its photo.
+    /// Produces the image of target view `i` of `scene`, and loads its photo.
     fn picture(&self, scene: &EvalScene, i: usize) -> Result<(View, Picture)> {
         let truth = scene.target.load(i)?;
         let picture = match self {
@@ -197,10 +196,10 @@ impl PictureSource {
     }
 }
 
-/// Scores a method's pictures one by one, LPIPS included. `see` is shown every photo with its picture and score.
+/// Scores the images of a method one by one, including LPIPS. `see` is called with every photo, its image and its score.
 ///
 /// # Errors
-/// A photo or picture that can't be read, a picture of another size than its view, and those of `see`.
+/// Fails if a photo or an image can't be read, if an image differs in size from its view, or if `see` fails.
 pub fn judge(
     made: &mut Synthesis,
     perceptual: &Perceptual,
@@ -217,10 +216,10 @@ pub fn judge(
     Ok(CaptureScores::of(&scene.name, scores, *gaussians))
 }
 
-/// What pictures of the views `truth` are worth, LPIPS included.
+/// Scores images of the views `truth`, including LPIPS.
 ///
 /// # Errors
-/// A picture of another size than its view.
+/// Fails if an image differs in size from its view.
 pub fn judge_pictures(
     scene: &str,
     pictures: &[Tensor],
@@ -234,7 +233,7 @@ pub fn judge_pictures(
     Ok(CaptureScores::of(scene, scores, gaussians))
 }
 
-/// Finds the picture `name` in `folder`, whatever its ending.
+/// Finds the image `name` in `folder`, with any of the known extensions.
 fn find_picture(folder: &Path, name: &str) -> Result<PathBuf> {
     let candidates = PHOTO_EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
     let found = candidates.iter().find(|path| path.is_file()).cloned();

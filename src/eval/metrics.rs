@@ -1,16 +1,17 @@
-//! Picture metrics (spec 9.4), in float64 on values clamped to [0, 1].
+//! Image metrics (spec 9.4), in float64 on values clamped to [0, 1].
 
 use crate::loss::{self, psnr_of_mse};
 use tch::{Kind, Tensor};
 
-/// A picture is compared in bands of rows of about this many pixels, so that the float64 copies of a large one don't exist at once.
+/// Approximate number of pixels of a band of rows. Images are compared band by band, so that a large one is never held in float64 as a
+/// whole.
 const BAND_PIXELS: i64 = 1 << 20;
-/// Side of the windows that SSIM looks through, in pixels.
+/// Side of the SSIM windows, in pixels.
 pub(super) const SSIM_WINDOW: i64 = 11;
-/// Rows that a band shares with the next one, so that every window is inside of a band.
+/// Number of rows that a band shares with the next one, so that every window lies inside a band.
 const SSIM_OVERLAP: i64 = SSIM_WINDOW - 1;
 
-/// Returns rows `first` to `first + count` of a picture [3, H, W] in float64, clamped to [0, 1], on the CPU.
+/// Returns rows `first` to `first + count` of an image `[3, H, W]` in float64, clamped to [0, 1], on the CPU.
 fn band(picture: &Tensor, first: i64, count: i64) -> Tensor {
     let rows = picture.detach().narrow(-2, first, count);
     rows.to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
@@ -22,7 +23,7 @@ fn bands(rows: i64, width: i64) -> impl Iterator<Item = (i64, i64)> {
     (0..rows).step_by(height as usize).map(move |first| (first, height.min(rows - first)))
 }
 
-/// Sums up the squared differences of two pictures [3, H, W], values clamped to [0, 1].
+/// Returns the sum of squared differences of two images `[3, H, W]`, with values clamped to [0, 1].
 pub(super) fn squared_error(picture: &Tensor, truth: &Tensor) -> f64 {
     let size = picture.size();
     let error = |(first, count)| {
@@ -31,15 +32,15 @@ pub(super) fn squared_error(picture: &Tensor, truth: &Tensor) -> f64 {
     bands(size[1], size[2]).map(error).sum()
 }
 
-/// Peak signal-to-noise ratio in dB of two pictures of one shape, [3, H, W].
+/// Returns the peak signal-to-noise ratio in dB of two images of the same shape, `[3, H, W]`.
 pub fn psnr(picture: &Tensor, truth: &Tensor) -> f64 {
     psnr_of_mse(squared_error(picture, truth) / picture.numel() as f64)
 }
 
-/// Structural similarity of two pictures [3, H, W], H and W at least 11.
+/// Returns the structural similarity of two images `[3, H, W]`. H and W are at least 11.
 pub fn ssim(picture: &Tensor, truth: &Tensor) -> f64 {
     let size = picture.size();
-    // Rows whose windows are inside.
+    // Number of rows of windows that lie inside the image.
     let rows = size[1] - SSIM_OVERLAP;
     let weighted = |(first, count)| {
         let band = |picture| band(picture, first, count + SSIM_OVERLAP);

@@ -1,4 +1,5 @@
-//! Judging pictures: metrics, what is judged and by what, validation, the paper's protocol over a data set, and its report.
+//! Evaluation of rendered images: metrics, the methods and scenes under evaluation, validation, the paper's protocol over a dataset, and
+//! its report.
 
 mod age;
 mod comparison_image;

@@ -1,4 +1,4 @@
-//! LPIPS in evaluation: wherever its weights are found.
+//! LPIPS in evaluation, with the networks whose weights are installed.
 
 use super::scores::{CaptureScores, ViewScore};
 use crate::data::View;
@@ -8,7 +8,7 @@ use crate::loss::{Lpips, LpipsNetwork};
 use crate::scene::ImageSize;
 use tch::{Device, Tensor};
 
-/// The networks whose weights were found.
+/// LPIPS networks whose weights were found.
 #[derive(Debug)]
 pub struct Perceptual {
     vgg: Option<Lpips>,
@@ -16,10 +16,10 @@ pub struct Perceptual {
 }
 
 impl Perceptual {
-    /// Loads what is in the folders of pretrained weights. Weights that are absent are no error.
+    /// Loads the networks from the folders of pretrained weights. Missing weights are no error.
     ///
     /// # Errors
-    /// A file that holds something else.
+    /// Fails if a file holds something else.
     pub fn find(device: Device) -> Result<Self> {
         let load = |network: LpipsNetwork| {
             find_pretrained(network.file_name()).map(|path| Lpips::load(&path, network, device)).transpose()
@@ -27,8 +27,8 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Adds to `score` how far a picture [3, H, W], clamped to [0, 1], is from `truth`. What a network tells stays out where it is absent
-    /// or the view is too small for it.
+    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `truth`. A distance is
+    /// `None` if its network is missing or the view is too small for it.
     pub(super) fn add_to(&self, score: ViewScore, picture: &Tensor, truth: &View) -> ViewScore {
         ViewScore {
             lpips_vgg: distance(self.vgg.as_ref(), picture, &truth.image),
@@ -37,7 +37,7 @@ impl Perceptual {
         }
     }
 
-    /// Whether `scores` of views of one size lack a distance that the weights that are there could tell.
+    /// Returns `true` if `scores` lack a distance that the installed weights could compute for views of `size`.
     pub fn could_add_to(scores: &CaptureScores, size: ImageSize) -> bool {
         let side = i64::from(size.height.min(size.width));
         let networks = [(LpipsNetwork::Vgg16, scores.lpips_vgg), (LpipsNetwork::AlexNet, scores.lpips_alex)];
@@ -48,7 +48,7 @@ impl Perceptual {
         })
     }
 
-    /// Why `scores`, which have been added to, lack a distance; `None` where they don't.
+    /// Explains why `scores`, to which the available distances have been added, lack a distance. Returns `None` if they lack none.
     pub fn why_absent(&self, scores: &CaptureScores) -> Option<String> {
         let networks = [
             (LpipsNetwork::Vgg16, &self.vgg, scores.lpips_vgg),

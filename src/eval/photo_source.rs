@@ -1,30 +1,30 @@
-//! Photos that are needed one after the other.
+//! Photos that are loaded one at a time.
 
 use crate::data::{Capture, View};
 use crate::error::Result;
 use crate::scene::ImageSize;
 use glam::DMat4;
 
-/// Photos of a capture. They are decoded when they are asked for, so that large ones don't fill the memory all at once.
+/// Photos of a capture. They are decoded on access, so that large photos don't fill the memory all at once.
 #[derive(Debug)]
 pub enum PhotoSource {
     /// Photos in memory.
     Loaded(Vec<View>),
     /// Photos in their files.
     OnDisk {
-        /// The capture that they are of.
+        /// Capture that holds the photos.
         capture: Capture,
-        /// Their positions in it.
+        /// Positions of the photos in the capture.
         indices: Vec<usize>,
-        /// What they are called.
+        /// Names of the photos.
         names: Vec<String>,
-        /// The size that they are fitted to; without one they are loaded as they are.
+        /// Size that the photos are fitted to; `None` loads them at their own size.
         size: Option<ImageSize>,
     },
 }
 
 impl PhotoSource {
-    /// Returns the photos of `indices`, by their names in `capture`, fitted to `size`.
+    /// Creates a source of the photos `indices` of `capture`, under their names in the capture, fitted to `size`.
     pub fn of(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Self {
         let all: Vec<&str> = capture.names().collect();
         let names = indices.iter().map(|&index| all[index].to_string()).collect();
@@ -39,12 +39,12 @@ impl PhotoSource {
         }
     }
 
-    /// Returns whether there are none.
+    /// Returns `true` if there are no photos.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Returns the poses of the photos, camera-to-world, which need no pixels.
+    /// Returns the poses of the photos, camera-to-world, without loading pixels.
     pub fn poses(&self) -> Vec<DMat4> {
         match self {
             PhotoSource::Loaded(views) => views.iter().map(|view| view.camera.c2w).collect(),
@@ -55,10 +55,10 @@ impl PhotoSource {
         }
     }
 
-    /// Loads photo `i` of them.
+    /// Loads photo number `i`.
     ///
     /// # Errors
-    /// A photo that can't be read.
+    /// Fails if the photo can't be read.
     pub fn load(&self, i: usize) -> Result<View> {
         match self {
             PhotoSource::Loaded(views) => Ok(views[i].shallow_clone()),

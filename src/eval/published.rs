@@ -1,4 +1,4 @@
-//! What the paper's tables say, method by method, exactly as printed there (spec 9.6).
+//! Published results: the paper's tables, method by method, exactly as printed (spec 9.6).
 
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -8,102 +8,102 @@ use std::sync::OnceLock;
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Published {
-    /// RealEstate10K and ACID by number of context views, pictures of 256×256.
+    /// Results on RealEstate10K and ACID by number of context views, images of 256×256.
     pub novel_views: Vec<PublishedMethod>,
     /// Cost of a reconstruction from 24 context views, on an A100 with 64 GB.
     pub efficiency: Vec<PublishedEfficiency>,
     /// GlobalSplat on RealEstate10K by the number of latents and of Gaussians that each decodes to.
     pub compactness: Vec<PublishedCompactness>,
-    /// GlobalSplat on RealEstate10K with one part changed.
+    /// GlobalSplat on RealEstate10K with one component changed.
     pub ablations: Vec<PublishedAblation>,
 }
 
-/// [height, width] of the pictures in [`Published::novel_views`].
+/// `[height, width]` of the images in [`Published::novel_views`].
 pub const IMAGE_SIZE: [u32; 2] = [256, 256];
 
-/// Data sets that are known by a name: in [`PublishedMethod::dataset`] and in files, and as people call them.
+/// Known datasets: the key, as in [`PublishedMethod::dataset`] and in files, and the name for readers.
 pub(super) const DATASETS: [(&str, &str); 3] =
     [("re10k", "RealEstate10K"), ("acid", "ACID"), ("dl3dv", "DL3DV")];
 
-/// The name in files of the data set that is called `name`, either way.
+/// Returns the key of the dataset called `name`, which is the key or the name for readers, in any case.
 pub(super) fn known_dataset(name: &str) -> Option<&'static str> {
     let is =
         |(file, people): &(&str, &str)| [file, people].iter().any(|known| known.eq_ignore_ascii_case(name));
     DATASETS.iter().find(|names| is(names)).map(|(file, _)| *file)
 }
 
-/// One method on one data set.
+/// Scores of one method on one dataset.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedMethod {
-    /// `re10k` or `acid`.
+    /// Key of the dataset, `re10k` or `acid`.
     pub dataset: String,
-    /// As the paper calls it.
+    /// Name of the method in the paper.
     pub method: String,
-    /// By the number of context views.
+    /// Scores by number of context views.
     pub scores: BTreeMap<usize, PublishedScores>,
 }
 
-/// What a table has for one method and number of context views; `None` where it has a dash.
+/// Table entries for one method and number of context views; `None` where the table has a dash.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub struct PublishedScores {
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: Option<f64>,
     /// Structural similarity.
     pub ssim: Option<f64>,
-    /// The table's LPIPS.
+    /// LPIPS, as the table has it.
     pub lpips: Option<f64>,
-    /// Thousands of Gaussians; `None` also for methods that make no Gaussians.
+    /// Thousands of Gaussians; `None` also for methods that produce no Gaussians.
     pub kilo_gaussians: Option<f64>,
 }
 
-/// One method's cost.
+/// Cost of one method.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedEfficiency {
-    /// As the paper calls it.
+    /// Name of the method in the paper.
     pub method: String,
-    /// Largest allocation of the GPU's memory, in GB.
+    /// Peak GPU memory allocation, in GB.
     pub peak_memory_gb: f64,
-    /// One forward pass, in milliseconds.
+    /// Time of one forward pass, in milliseconds.
     pub milliseconds: f64,
-    /// A scene on disk, in MB; `None` for methods that write none.
+    /// Size of a scene on disk, in MB; `None` for methods that write no files.
     pub disk_mb: Option<f64>,
 }
 
-/// One size of the model.
+/// Scores of one size of the model.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedCompactness {
-    /// In all.
+    /// Total number of Gaussians.
     pub gaussians: u32,
-    /// Scene tokens.
+    /// Number of scene tokens.
     pub latents: u32,
-    /// Gaussians that a token decodes to.
+    /// Number of Gaussians that a token decodes to.
     pub splats_per_token: u32,
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,
-    /// The table's LPIPS.
+    /// LPIPS, as the table has it.
     pub lpips: f64,
 }
 
-/// One variant of the model.
+/// Scores of one variant of the model.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedAblation {
-    /// What is different.
+    /// Description of the change.
     pub variant: String,
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,
-    /// The table's LPIPS.
+    /// LPIPS, as the table has it.
     pub lpips: f64,
 }
 
-/// The paper's tables.
+/// Returns the paper's tables.
 pub fn published() -> &'static Published {
     static TABLES: OnceLock<Published> = OnceLock::new();
     TABLES

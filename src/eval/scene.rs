@@ -1,4 +1,4 @@
-//! What a method is judged by: photos that it may see, and photos that it has to match.
+//! Scenes for evaluation: context photos, which a method may see, and target photos, which it has to match.
 
 use super::index::{EvaluationIndex, SceneFrames};
 use super::photo_source::PhotoSource;
@@ -8,27 +8,28 @@ use crate::reconstruct::load_context;
 use crate::scene::ImageSize;
 use std::sync::mpsc::SyncSender;
 
-/// A scene, with the photos that a model is shown in memory.
+/// A scene, with the context photos in memory.
 #[derive(Debug)]
 pub struct EvalScene {
-    /// The capture's, or the key in an index.
+    /// Name of the capture, or key of the scene in an index.
     pub name: String,
-    /// The photos that a model is shown; none where no model is judged.
+    /// Context photos, which the model sees; empty if no model is evaluated.
     pub context: Vec<View>,
-    /// What has to be matched, loaded one by one.
+    /// Target photos, loaded one by one.
     pub target: PhotoSource,
-    /// What pictures of the targets are called, without their ending.
+    /// File names of the target images, without their extensions.
     pub picture_names: Vec<String>,
-    /// Their positions in the capture, where an index tells them.
+    /// Positions of the context and target photos in the capture; `None` without an index.
     pub frames: Option<SceneFrames>,
-    /// A checksum of the photos and cameras that an index tells; 0 without one.
+    /// Checksum of the photos and cameras that the index names; 0 without an index.
     pub(super) checksum: u32,
-    /// Whether photos of the capture were enlarged, to be shown or to be matched.
+    /// `true` if photos of the capture were enlarged to the size of the context or target views.
     pub enlarged: bool,
 }
 
 impl EvalScene {
-    /// Every photo of `capture`, or of its own test part if it has one, fitted to `size` or as it is, for splats and pictures.
+    /// Creates a scene for splats and images. Its targets are all photos of `capture`, or those of its own test part if it has one, fitted
+    /// to `size` if given.
     pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Self {
         let (views, names) = (capture.scored_views(), capture.picture_names());
         EvalScene {
@@ -42,11 +43,11 @@ impl EvalScene {
         }
     }
 
-    /// For a model: it is shown the photos that `holdout` leaves, or so many of them, spread over the camera's path, fitted to
-    /// `photo_size`, and has to match the others at `picture_size`.
+    /// Creates a scene for a model. The context consists of the photos that `holdout` leaves, or of `views` of them, spread over the
+    /// camera's path, and is fitted to `photo_size`. The targets are the held-out photos, fitted to `picture_size`.
     ///
     /// # Errors
-    /// Nothing held out, or photos that can't be read.
+    /// Fails if nothing is held out, if fewer than two photos are left, or if photos can't be read.
     pub fn held_out(
         capture: &Capture,
         holdout: Holdout,
@@ -67,7 +68,7 @@ impl EvalScene {
         })
     }
 
-    /// The frames of scene `key` in `index`, named by their numbers.
+    /// Creates the scene from the frames of `key` in the loader's index. The target images are named by frame numbers.
     fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
         if !capture.is_complete() {
             let expected = "all that it names, as an index counts them";
@@ -100,7 +101,7 @@ impl EvalScene {
     }
 }
 
-/// Positions of the views that `holdout` leaves, and of those that it holds out.
+/// Returns the positions of the views that `holdout` leaves, and of those that it holds out.
 pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
     let (context, held_out) = capture.split(holdout);
     if held_out.is_empty() || context.len() < 2 {
@@ -111,17 +112,17 @@ pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<us
     Ok((context, held_out))
 }
 
-/// Reads the scenes of an index, beside the thread that judges them.
+/// Loader of the scenes of an index. It runs on another thread than the evaluation.
 pub(super) struct SceneLoader<'a> {
     pub index: &'a EvaluationIndex,
-    /// Of the targets.
+    /// Size of the target views.
     pub picture_size: ImageSize,
-    /// Of the context, which only a model looks at.
+    /// Size of the context views; `None` if no model is evaluated.
     pub photo_size: Option<ImageSize>,
 }
 
 impl SceneLoader<'_> {
-    /// Sends the scenes of `groups` one by one, each chunk read once, until nobody listens.
+    /// Sends the scenes of `groups` one by one until the receiver is dropped. Each chunk is read once.
     pub fn send(
         &self,
         groups: Vec<(&SceneGroup, Vec<String>)>,

@@ -1,4 +1,4 @@
-//! A splat's scores on views, one after the other.
+//! Scores of a splat on views, computed one view at a time.
 
 use super::method::judge_pictures;
 use super::perceptual::Perceptual;
@@ -8,11 +8,11 @@ use crate::error::Result;
 use crate::render::render_views;
 use crate::scene::Gaussians;
 
-/// Scores a splat on `views`, LPIPS included where `perceptual` is given. `go_on` is asked before each view, with how many are done; when
-/// it says no, means are over these. None where none is done.
+/// Scores a splat on `views`, including LPIPS if `perceptual` is given. `go_on` is called before each view with the number of finished
+/// views. If it returns `false`, the means are over the finished views. Returns `None` if no view is finished.
 ///
 /// # Errors
-/// What the rasterizer refuses.
+/// Fails if the rasterizer fails.
 pub fn score_views(
     scene: &str,
     gaussians: &Gaussians,

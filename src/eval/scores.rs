@@ -1,4 +1,4 @@
-//! Pictures against photos, view by view.
+//! Scores of rendered images against photos, view by view.
 
 use super::metrics::{SSIM_WINDOW, psnr, ssim};
 use super::photo_source::PhotoSource;
@@ -8,49 +8,49 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
-/// One view's scores.
+/// Scores of one view.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ViewScore {
-    /// As the capture names it.
+    /// Name of the photo in the capture.
     pub image: String,
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
-    /// As scikit-image's.
+    /// Structural similarity, computed as in scikit-image.
     pub ssim: f64,
-    /// The distance by VGG-16's features, where its weights are at hand.
+    /// LPIPS with VGG-16; `None` if the network's weights are missing or the view is too small.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_vgg: Option<f64>,
-    /// The distance by AlexNet's features, where its weights are at hand.
+    /// LPIPS with AlexNet; `None` if the network's weights are missing or the view is too small.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
 }
 
-/// A capture's scores: means over its views, and each of them.
+/// Scores of a capture: means over its views, and the scores of each view.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CaptureScores {
-    /// The capture's name.
+    /// Name of the capture.
     pub scene: String,
-    /// In dB, mean over the views.
+    /// Mean PSNR over the views, in dB.
     pub psnr: f64,
-    /// Mean over the views.
+    /// Mean structural similarity over the views.
     pub ssim: f64,
-    /// Mean over the views, where every one has it.
+    /// Mean LPIPS with VGG-16 over the views; `None` if a view lacks it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_vgg: Option<f64>,
-    /// Mean over the views, where every one has it.
+    /// Mean LPIPS with AlexNet over the views; `None` if a view lacks it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
-    /// Number of Gaussians, where a splat was scored.
+    /// Number of Gaussians; `None` if no splat was scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<i64>,
-    /// One by one.
+    /// Scores of each view.
     pub views: Vec<ViewScore>,
 }
 
-/// Scores pictures [3, H, W] against views of the same sizes, without LPIPS, which [`super::Perceptual`] adds.
+/// Scores images `[3, H, W]` against views of the same sizes, without LPIPS, which [`super::Perceptual`] adds.
 ///
 /// # Errors
-/// A picture of another size than its view, or one that is too small for SSIM.
+/// Fails if an image differs in size from its view or is too small for SSIM.
 pub fn score(
     scene: &str,
     pictures: &[Tensor],
@@ -61,10 +61,10 @@ pub fn score(
     Ok(CaptureScores::of(scene, scores.collect::<Result<_>>()?, gaussians))
 }
 
-/// Scores a picture [3, H, W] against a view of the same size, without LPIPS.
+/// Scores an image `[3, H, W]` against a view of the same size, without LPIPS.
 ///
 /// # Errors
-/// A picture of another size than its view, or one that is too small for SSIM.
+/// Fails if the image differs in size from the view or is too small for SSIM.
 pub(super) fn score_view(picture: &Tensor, view: &View) -> Result<ViewScore> {
     let (found, expected) = (picture.size(), view.image.size());
     if found != expected {
@@ -83,7 +83,7 @@ pub(super) fn score_view(picture: &Tensor, view: &View) -> Result<ViewScore> {
 }
 
 impl CaptureScores {
-    /// Takes the means over `views`, one at least.
+    /// Computes the means over `views`, at least one.
     pub(super) fn of(scene: &str, views: Vec<ViewScore>, gaussians: Option<i64>) -> Self {
         let mean = |value: fn(&ViewScore) -> Option<f64>| {
             let values: Option<Vec<f64>> = views.iter().map(value).collect();
@@ -101,20 +101,20 @@ impl CaptureScores {
     }
 }
 
-/// What answering without looking would score for the target views of a scene.
+/// Scores of two baselines that only copy context photos, for the target views of a scene.
 #[derive(Debug, Clone)]
 pub struct Baselines {
-    /// With the context photo that was taken nearest.
+    /// Scores of the nearest context photo.
     pub nearest_photo: CaptureScores,
-    /// With the mean of all context photos.
+    /// Scores of the mean of all context photos.
     pub mean_photo: CaptureScores,
 }
 
 impl Baselines {
-    /// Scores the targets of a scene. All photos are of one size, and one context photo is there at least.
+    /// Scores the baselines on the targets of a scene. All photos have the same size, and there is at least one context photo.
     ///
     /// # Errors
-    /// Photos of different sizes, or ones that can't be read.
+    /// Fails if photos differ in size or can't be read.
     pub fn of(scene: &str, context: &PhotoSource, target: &PhotoSource) -> Result<Self> {
         let mut sum = context.load(0)?.image.copy();
         for i in 1..context.len() {
@@ -132,7 +132,7 @@ impl Baselines {
     }
 }
 
-/// Scores, for every target view, the context photo that was taken nearest, by camera centres.
+/// Scores, for every target view, the context photo whose camera centre is nearest.
 pub(super) fn nearest_context_baseline(
     scene: &str,
     context: &PhotoSource,

@@ -1,5 +1,5 @@
-//! The files of an evaluation: `scores.json` for programs and the report, `scores.csv` for spreadsheets, and where the
-//! pictures of its scenes lie.
+//! Files of an evaluation: `scores.json` for programs and the report, `scores.csv` for spreadsheets, and the comparison images of its
+//! scenes.
 
 use super::evaluation::{Evaluation, scene_file_name};
 use crate::error::{Error, Result};
@@ -8,16 +8,17 @@ use serde::Serialize;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-/// Range of PSNR in dB for pictures in [0, 1]: identical pictures have 100. The margin is for rounding of means.
+/// Range of PSNR in dB for images in [0, 1]: identical images have 100. The margin allows for rounding of means.
 const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
 
 pub(super) const SCORES: &str = "scores.json";
-/// The scores for spreadsheets.
+/// Name of the file of scores for spreadsheets.
 pub const TABLE: &str = "scores.csv";
-/// The page that shows them.
+/// Name of the report's page.
 pub const REPORT: &str = "report.html";
 
-/// The picture of a scene's worst view in the folder of its evaluation: truth, render, error and depth side by side.
+/// Returns the path of the comparison image of a scene's worst view in the evaluation's folder: ground truth, render, error and depth side
+/// by side.
 pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
     folder.join("scenes").join(format!("{}.jpg", scene_file_name(scene)))
 }
@@ -25,7 +26,7 @@ pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
 /// Writes `folder/scores.json`.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if the file can't be written.
 pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
     write_json(&folder.join(SCORES), evaluation)
 }
@@ -33,7 +34,7 @@ pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
 /// Reads `folder/scores.json`.
 ///
 /// # Errors
-/// A missing file, invalid JSON, a missing field, or a PSNR outside 0 to 100 dB, from which plots can't be drawn.
+/// Fails if the file is missing, isn't valid JSON, lacks a field, or has a PSNR outside 0 to 100 dB, which can't be plotted.
 pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     let path = folder.join(SCORES);
     let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
@@ -68,10 +69,10 @@ struct Line<'a> {
     forward_seconds: Option<f64>,
 }
 
-/// Writes a line for every scene and target view at `path`; what is absent stays empty.
+/// Writes a line for every scene and target view to `path`. Missing values are left empty.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if the file can't be written.
 pub fn write_csv(path: &Path, evaluation: &Evaluation) -> Result<()> {
     write_atomically(path, |writer| {
         let refused = |e: csv::Error| Error::write(path)(std::io::Error::other(e));

@@ -1,5 +1,5 @@
-//! A method over a data set, by an index: the paper's protocol (spec 9.1). Every scene's scores are kept on disk as they
-//! come, so a sweep that was stopped goes on where it was.
+//! Evaluation of a method over a dataset, by an index: the paper's protocol (spec 9.1). The scores of every scene are stored as soon as
+//! they are computed, so an interrupted evaluation resumes after the last finished scene.
 
 use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
@@ -22,53 +22,53 @@ use std::path::Path;
 use std::sync::mpsc::sync_channel;
 use tch::{Device, Tensor};
 
-/// What to evaluate, and where to.
+/// Evaluation of a method over a dataset.
 #[derive(Debug)]
 pub struct Sweep<'a> {
-    /// What is judged; of splats and pictures the folder that has those of every scene.
+    /// Method under evaluation. For splats and images, this is the folder that holds those of every scene.
     pub method: Method<'a>,
-    /// How the report calls it.
+    /// Name of the method in the report.
     pub name: String,
-    /// What tells this method from others, so that a stopped sweep doesn't go on with another one's scores.
+    /// Identity of the method, so that an interrupted evaluation doesn't resume with the scores of another method.
     pub fingerprint: String,
-    /// The scenes.
+    /// Dataset that holds the scenes.
     pub dataset: &'a Dataset,
-    /// The folder that they were found in.
+    /// Folder of the dataset.
     pub root: &'a Path,
-    /// How the report calls them, as [`Sweep::dataset_name`] tells.
+    /// Name of the dataset in the report, from [`Sweep::dataset_name`].
     pub dataset_name: String,
-    /// Their frames.
+    /// Index of the scenes' context and target frames.
     pub index: &'a EvaluationIndex,
-    /// Of pictures, and of the photos that they have to match.
+    /// Size of the images, and of the target photos that they are compared with.
     pub picture_size: ImageSize,
     /// Processor, cores and device.
     pub machine: String,
-    /// What splats are rendered on.
+    /// Device that splats are rendered on.
     pub device: Device,
-    /// The folder for `scenes/`.
+    /// Output folder, which holds `scenes/`.
     pub out: &'a Path,
-    /// The processes that share the scenes out. All of them see `out`.
+    /// Group of processes that divide the scenes among themselves. All of them have access to `out`.
     pub group: &'a Group,
 }
 
-/// What a rank did of its share.
+/// Results of a rank for its share of the scenes.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct Share {
     scenes: Vec<SceneScores>,
     failures: Vec<Failure>,
-    /// Whether somebody asked to stop.
+    /// `true` if the caller asked to stop.
     stopped: bool,
 }
 
-/// Scenes that are loaded while others are judged.
+/// Number of loaded scenes that may wait while another one is evaluated.
 const LOADED_AHEAD: usize = 1;
 
 impl Sweep<'_> {
-    /// How the report calls the data set at `root`: as `said`, else by the name of a known one that is a word of its folder's
-    /// name, else of the index's, else as its folder.
+    /// Returns the name of the dataset at `root` for the report. This is `said` if given; else the known dataset that is a word of the
+    /// folder's name; else the known dataset that is a word of the index's name; else the name of the folder.
     ///
     /// # Errors
-    /// Two known names in the one that decides, or another in the index than in the folder.
+    /// Fails if the name that decides contains two known datasets, or if the index names another one than the folder.
     pub fn dataset_name(said: Option<&str>, root: &Path, index: &EvaluationIndex) -> Result<String> {
         if let Some(name) = said {
             return Ok(known_dataset(name).unwrap_or(name).to_string());
@@ -89,12 +89,13 @@ impl Sweep<'_> {
         Err(Error::input(&index.file, "the data set", found, "a single one, as --dataset names"))
     }
 
-    /// Runs over the scenes that the index and the data set share. `observe` hears how many of how many are done, and says
-    /// whether to go on. Of several ranks each does its share, and is told the whole.
+    /// Scores the scenes that the index and the dataset have in common. `observe` is called with the number of finished scenes and the
+    /// total, and returns `false` to stop. `judges` loads the networks of LPIPS. With several ranks, each scores its share, and all of them
+    /// return the whole.
     ///
     /// # Errors
-    /// No scene in common, scores of another method in `out`, every scene failing, another rank that is gone, or having been told to
-    /// stop. A scene that fails is kept in [`Evaluation::failures`].
+    /// Fails if there is no scene in common, if `out` holds scores of another method, if every scene fails, if another rank is gone, or if
+    /// `observe` asked to stop. A scene that fails is recorded in [`Evaluation::failures`].
     pub fn run(
         &self,
         judges: impl FnOnce() -> Result<Perceptual>,
@@ -150,7 +151,7 @@ impl Sweep<'_> {
         })
     }
 
-    /// Opens the journal: scores that are in it, and the scenes that have none, group after group.
+    /// Opens the journal. Returns the scores that it holds, and the keys of the scenes that it has no scores of, group after group.
     fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
         let journal = Journal::open(self.out, &self.identity()?)?;
         let (mut kept, mut missing) = (vec![], vec![]);
@@ -167,7 +168,7 @@ impl Sweep<'_> {
         Ok((kept, missing))
     }
 
-    /// This rank's of the scenes `missing`, with the groups that hold them.
+    /// Returns this rank's share of the scenes `missing`, with the groups that hold them.
     fn share(&self, missing: &[String]) -> Vec<(&SceneGroup, Vec<String>)> {
         let own: BTreeSet<&String> =
             missing.iter().skip(self.group.rank()).step_by(self.group.ranks()).collect();
@@ -176,7 +177,7 @@ impl Sweep<'_> {
         self.dataset.groups().iter().map(|group| (group, of_group(group))).collect()
     }
 
-    /// Scores `own` scenes; `kept` ones have been.
+    /// Scores the scenes `own`. `kept` is the number of scenes that have been scored before.
     fn run_share(
         &self,
         own: Vec<(&SceneGroup, Vec<String>)>,
@@ -188,8 +189,8 @@ impl Sweep<'_> {
         let total = kept + own.iter().map(|(_, keys)| keys.len()).sum::<usize>();
         let mut share = Share::default();
         let mut go_on = observe(kept, total);
-        // Loading the judges' networks would count as the method's memory, so they come after the first scene of which pictures
-        // were made, whatever failed before it.
+        // The networks of LPIPS would count towards the method's memory. Load them after the first scene that images were rendered of, even
+        // if scenes before it failed.
         let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
         let (picture_size, photo_size) = (self.picture_size, self.method.photo_size());
         let loader = SceneLoader { index: self.index, picture_size, photo_size };
@@ -220,7 +221,7 @@ impl Sweep<'_> {
                         memory = None;
                         share.scenes.push(scene);
                     }
-                    // What can't be written now can't be written for the next scene.
+                    // If this file can't be written, the next scene's can't either.
                     Err(e @ Error::Write { .. }) => return Err(e),
                     Err(e) => share.failures.push(Failure { scene: key, error: e.to_string() }),
                 }
@@ -232,10 +233,11 @@ impl Sweep<'_> {
         Ok(share)
     }
 
-    /// By which a sweep that goes on is recognized.
+    /// Returns the settings that must be equal for the evaluation to resume.
     fn identity(&self) -> Result<Identity> {
         let index = std::fs::read(&self.index.file).map_err(Error::read(&self.index.file))?;
-        // Its name alone doesn't tell, many a folder is called `test`: but that of made-up videos, which lie nowhere.
+        // The folder's name alone doesn't identify a dataset, since many folders are called `test`, so use its absolute path. Synthetic
+        // videos have no folder, so the path stays as it is.
         let root = self.root.canonicalize().unwrap_or(self.root.to_owned());
         let made_by = self.dataset.made_by().map_or(String::new(), |made_by| format!(" of {made_by}"));
         Ok(Identity {
@@ -246,8 +248,8 @@ impl Sweep<'_> {
         })
     }
 
-    /// Returns scores from before of scene `key`, which is one of those that `open` opens. What is of other files, or lacks a score
-    /// that could be had now, is scored again.
+    /// Returns the stored scores of scene `key`, which is in the group that `open` opens. Returns `None`, so that the scene is scored
+    /// again, if they are of other files or lack a score that can be computed now.
     fn kept<'a>(
         &self,
         journal: &Journal,
@@ -264,15 +266,15 @@ impl Sweep<'_> {
         (kept.files.as_ref() == Some(&content)).then_some(kept.scores)
     }
 
-    /// Returns what tells the files of which scene `key` was scored from others in their place: checksums of the splat or pictures, if
-    /// these are judged, and of the photos and cameras, which is `photos`.
+    /// Returns a string that identifies the files from which scene `key` is scored: checksums of the splat or the images, if these are
+    /// evaluated, and `photos`, the checksum of the photos and cameras.
     fn content(&self, key: &str, photos: u32) -> Result<String> {
         let names = self.index.scenes[key].picture_names();
         let made = self.method.of_scene(key).checksum(&names)?.map(|made| format!("{made:08x} "));
         Ok(format!("{}{photos:08x}", made.unwrap_or_default()))
     }
 
-    /// The groups that hold indexed scenes, with these.
+    /// Returns the groups of the dataset, each with the keys of its scenes that are in the index.
     fn wanted(&self) -> Result<Vec<(&SceneGroup, Vec<String>)>> {
         let indexed = |group: &SceneGroup| -> Vec<String> {
             group.keys.iter().filter(|key| self.index.scenes.contains_key(*key)).cloned().collect()
@@ -288,7 +290,7 @@ impl Sweep<'_> {
         Err(Error::input(&self.index.file, "what the index names", found, expected))
     }
 
-    /// The scene's scores; its worst view is drawn.
+    /// Scores the scene, and writes the comparison image of its worst view.
     fn judge(&self, mut made: Synthesis, perceptual: &Perceptual) -> Result<SceneScores> {
         let mut worst: Option<(f64, Tensor)> = None;
         let scores = judge(&mut made, perceptual, |truth, picture, score| {
@@ -317,7 +319,8 @@ impl Sweep<'_> {
     }
 }
 
-/// What the folder of the data set at `root` is called; of a part, `test` or `train`, the folder that it is a part of.
+/// Returns the name of the folder of the dataset at `root`. If that is a split (`test` or `train`), returns the name of the folder above
+/// it.
 fn own_folder(root: &Path) -> String {
     let root = root.canonicalize().unwrap_or(root.to_owned());
     let folders = root.ancestors().take(3).filter_map(|folder| folder.file_name());
@@ -326,7 +329,7 @@ fn own_folder(root: &Path) -> String {
     own.or(names.first()).cloned().unwrap_or_default()
 }
 
-/// The known data sets that words of `name` name.
+/// Returns the known datasets that are words of `name`.
 fn known_words(name: &str) -> Vec<&'static str> {
     let words = name.split(|c: char| !c.is_alphanumeric());
     let known: BTreeSet<_> = words.filter_map(known_dataset).collect();
@@ -356,7 +359,7 @@ mod tests {
             ("data/acid", "acid_from_re10k_3v.json", "acid"),
             ("data/re10k", "acid_from_re10k_3v.json", "re10k"),
             ("data/placid", "myre10k_3v.json", "placid"),
-            // What is above isn't the data's own.
+            // The folders above the dataset's own don't count.
             ("re10k/mine", "index.json", "mine"),
             ("mine/test", "index.json", "mine"),
             ("test/test/test", "index.json", "test"),

@@ -1,4 +1,4 @@
-//! Files that grow by whole records.
+//! Files to which whole records are appended.
 
 use super::atomic::check_regular;
 use crate::error::{Error, Result};
@@ -6,20 +6,21 @@ use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// A file that records are added to; one that can't be written, as on a full disk, leaves no part of itself.
+/// A file to which records are appended. If a record can't be written, for example because the disk is full, no part of it stays in the
+/// file.
 #[derive(Debug)]
 pub struct AppendFile {
     path: PathBuf,
     file: File,
-    /// Of whole records, in bytes.
+    /// Length of the whole records, in bytes.
     length: u64,
 }
 
 impl AppendFile {
-    /// Opens the file at `path` to go on at its end, or makes it.
+    /// Opens the file at `path` to append to it, or creates it.
     ///
     /// # Errors
-    /// Anything but a regular file there, or the system's refusal.
+    /// Returns an error if something other than a regular file is at `path`, or if the file can't be opened.
     pub fn open(path: &Path) -> Result<Self> {
         check_regular(path)?;
         let file = OpenOptions::new().create(true).append(true).open(path).map_err(Error::write(path))?;
@@ -27,12 +28,12 @@ impl AppendFile {
         Ok(AppendFile { path: path.to_owned(), file, length })
     }
 
-    /// Adds `record`. After an error it may be tried again.
+    /// Appends `record`. After an error, the call may be repeated.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn append(&mut self, record: &[u8]) -> Result<()> {
-        // Before, in case that what was left of an earlier one couldn't be taken away after it.
+        // Truncate before writing too: removing what was left of an earlier record may have failed.
         if let Err(e) = self.file.set_len(self.length).and_then(|()| self.file.write_all(record)) {
             let _ = self.file.set_len(self.length);
             return Err(Error::write(&self.path)(e));

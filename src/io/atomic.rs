@@ -1,9 +1,9 @@
-//! Files and folders that appear whole or not at all. Nothing is removed but what the program made: its temporary files and
-//! folders bear its name, and of a folder that is replaced only the files go that it is known to make.
+//! Atomic writes: files and folders appear complete or not at all. Only what the program created is removed: temporary files and folders
+//! that bear its name, and, from a folder that is replaced, the files that the program is known to create.
 //!
-//! A temporary file or folder lies beside what it becomes, as `.NAME.globalsplat-partial`, or `-1`, `-2`, … after that where
-//! another process writes the same. Its process holds a lock on it, so that one without a lock was left by a process that was
-//! ended: the next one that writes the same removes it.
+//! A temporary file or folder lies beside its final path, as `.NAME.globalsplat-partial`, with `-1`, `-2`, … appended if other processes
+//! write to the same path. Its process holds a lock on it. A temporary file without a lock was left by a process that was killed: the next
+//! process that writes to the same path removes it.
 
 use crate::error::{Error, Result};
 use serde::Serialize;
@@ -11,26 +11,27 @@ use std::fs::{self, File, FileType, Metadata, OpenOptions};
 use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-/// What is being written.
+/// Suffix of files and folders that are being written.
 const PARTIAL: &str = "globalsplat-partial";
-/// What has been moved away to make room.
+/// Suffix of folders that were moved out of the way.
 const OLD: &str = "globalsplat-old";
-/// What temporary names have of the final one, in bytes: it may be as long as the file system allows by itself.
+/// Maximum length in bytes of the part of a temporary name that is taken from the final one, which may be as long as the file system
+/// allows.
 const NAME_BYTES: usize = 48;
 
-/// Writes `path` by way of a temporary file beside it: a reader sees the older file or the new one, never a part, and a
-/// full disk leaves the older one as it was. Links are followed, and the new file has the permissions of the older one.
+/// Writes `path` through a temporary file beside it: readers see the old file or the new one, never a part, and a full disk leaves the old
+/// one unchanged. Links are followed, and the new file has the permissions of the old one.
 ///
 /// # Errors
-/// What `fill` returns, anything but a regular file at `path`, or the system's refusal to write.
+/// Returns the error of `fill`, or an error if something other than a regular file is at `path` or the file can't be written.
 pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     write_partially(path, fill)?.keep()
 }
 
-/// As [`write_atomically`], but for the name, which the file gets when it is kept.
+/// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
 ///
 /// # Errors
-/// As there.
+/// Returns the errors of [`write_atomically`].
 pub fn write_partially(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<PartialFile> {
     let partial = PartialFile::create(path)?;
     let mut writer = BufWriter::new(&partial.file);
@@ -39,26 +40,26 @@ pub fn write_partially(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<
     Ok(partial)
 }
 
-/// Writes `value`, which is made of numbers, texts, lists and maps by names, as JSON that a person can read, whole or not at all.
+/// Writes `value`, which consists of numbers, strings, lists and maps with string keys, as pretty-printed JSON, atomically.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Returns an error if the file can't be written.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let json = serde_json::to_vec_pretty(value).expect("numbers and texts");
     write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
 }
 
-/// Puts the folder that `fill` makes at `path`, whole: it is filled under another name and then renamed. `made` are the names
-/// that such a folder has; whatever else is in one that was there before is there afterwards.
+/// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `made` lists the names
+/// of the entries that such a folder has; all other entries of the old folder are kept in the new one.
 ///
 /// # Errors
-/// What `fill` returns, anything but a folder at `path`, or the system's refusal to write.
+/// Returns the error of `fill`, or an error if something other than a folder is at `path` or the folder can't be written.
 pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
     fs::create_dir_all(parent_of(&target)).map_err(Error::write(path))?;
     let make = |place: &Path| {
         fs::create_dir(place)?;
-        // Another process may have removed it before it was locked, and made its own.
+        // Another process may have removed the folder before it was locked, and created its own.
         File::open(place)
             .map_err(|e| if e.kind() == ErrorKind::NotFound { ErrorKind::AlreadyExists.into() } else { e })
     };
@@ -90,14 +91,14 @@ pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Resul
     Ok(())
 }
 
-/// Has processes that replace folders beside `path` do it one after the other, until what is returned is dropped. Without it, a
-/// folder is gone for a moment. Where the file system has no locks, there is none.
+/// Locks the parent folder of `path` until the returned file is dropped, so that processes replace folders in it one at a time. Without the
+/// lock, a folder may be missing for a moment. Returns `None` if the file system has no locks.
 pub fn lock_parent(path: &Path) -> Option<File> {
     let parent = File::open(parent_of(path)).ok()?;
     parent.lock().ok().map(|()| parent)
 }
 
-/// Removes the folder `retired`, of whose files `made` are the program's, once the others are in the folder `heir`.
+/// Removes the entries `made`, which belong to the program, from the folder `retired`, after moving its other entries to the folder `heir`.
 fn retire(retired: &Path, heir: &Path, made: &[&str]) -> Result<()> {
     if !retired.is_dir() {
         return Ok(());
@@ -114,11 +115,11 @@ fn retire(retired: &Path, heir: &Path, made: &[&str]) -> Result<()> {
     remove_made(retired, made)
 }
 
-/// Removes the folder at `path`, of whose files `made` are the program's, as one: where it can't be removed, it is all there or
-/// under the name of what is half written. What else is in it stays, in a folder of its name.
+/// Removes the folder at `path`, whose entries `made` belong to the program, in one step: if the removal fails, the folder is either
+/// complete or under the name of a partial one. If it has other entries, they stay in the folder under its name.
 ///
 /// # Errors
-/// The system's refusal to read or write.
+/// Returns an error if the folder can't be read or removed.
 pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
     for entry in fs::read_dir(path).map_err(Error::read(path))? {
         let name = entry.map_err(Error::read(path))?.file_name();
@@ -131,7 +132,7 @@ pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
     unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
 }
 
-/// Removes `made` from `folder`, and the folder itself, if nothing else is in it.
+/// Removes `made` from `folder`, and the folder itself if it has no other entries.
 fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
     for name in made {
         let path = folder.join(name);
@@ -144,12 +145,11 @@ fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
     }
 }
 
-/// Puts right what [`replace_dir`] and [`remove_dir`] left in `folder` when their process was ended: folders that were moved away
-/// come back where nothing has taken their place, and those half filled or half removed go. Nothing is done where there is no
-/// such folder.
+/// Repairs what [`replace_dir`] and [`remove_dir`] left in `folder` when their process was killed: folders that were moved away are
+/// restored unless another one has taken their path, and partially filled or removed folders are deleted. No-op if `folder` doesn't exist.
 ///
 /// # Errors
-/// The system's refusal to read, rename or remove.
+/// Returns an error if an entry can't be read, renamed or removed.
 pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
     if !folder.is_dir() {
         return Ok(());
@@ -171,27 +171,27 @@ pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
     Ok(())
 }
 
-/// A file that is being filled beside its place, and gone unless it is kept.
+/// A file that is written beside its final path, and removed on drop unless it is kept.
 #[derive(Debug)]
 pub struct PartialFile {
-    /// As errors call it.
+    /// Path in error messages.
     path: PathBuf,
-    /// Where it goes: `path` with links followed.
+    /// Final path: `path` with links followed.
     target: PathBuf,
-    /// Where it is filled, by this process alone.
+    /// Temporary path, which only this process uses.
     pub place: PathBuf,
-    /// The file there, empty at first.
+    /// Open file at `place`, initially empty.
     pub file: File,
-    /// Whether nothing is at `place` any more.
+    /// `true` if there is no file at `place` any more.
     is_gone: bool,
 }
 
 impl PartialFile {
-    /// Makes the file that is to become the one at `path`. One that replaces another can be read by the same people, and by its
-    /// owner be written.
+    /// Creates the temporary file for the file at `path`. If it replaces a file, it has the permissions of that file, and its owner may
+    /// write it.
     ///
     /// # Errors
-    /// Anything but a regular file at `path`, or the system's refusal to write.
+    /// Returns an error if something other than a regular file is at `path`, or if the file can't be written.
     pub fn create(path: &Path) -> Result<Self> {
         let target = target_of(path, Metadata::is_file, "the name of a file")?;
         let make = |place: &Path| OpenOptions::new().write(true).create_new(true).open(place);
@@ -203,10 +203,10 @@ impl PartialFile {
         Ok(PartialFile { path: path.to_owned(), target, place, file, is_gone: false })
     }
 
-    /// Gives it its name.
+    /// Renames the file to its final path.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn keep(mut self) -> Result<()> {
         let whole = self.file.sync_all().and_then(|()| fs::rename(&self.place, &self.target));
         whole.map_err(Error::write(&self.path))?;
@@ -215,7 +215,7 @@ impl PartialFile {
         Ok(())
     }
 
-    /// Removes it.
+    /// Removes the file.
     fn remove(mut self) -> io::Result<()> {
         self.is_gone = true;
         unless_missing(fs::remove_file(&self.place))
@@ -230,10 +230,10 @@ impl Drop for PartialFile {
     }
 }
 
-/// Checks that a file could be written at `path`; its folder is made if need be. Call it before the work, not after.
+/// Checks that a file could be written at `path`, and creates its folder if necessary. Call it before the work starts.
 ///
 /// # Errors
-/// A request error that names the path: anything but a regular file there, or what the system refuses.
+/// Returns a request error that names the path if something other than a regular file is there, or if the file can't be written.
 pub fn check_writable_file(path: &Path) -> Result<()> {
     let parent = match target_of(path, Metadata::is_file, "the name of a file") {
         Ok(target) => parent_of(&target).to_owned(),
@@ -243,17 +243,17 @@ pub fn check_writable_file(path: &Path) -> Result<()> {
     probe(path, path)
 }
 
-/// Checks that files could be written under the folder `path`, which is made if need be.
+/// Checks that files could be written in the folder `path`, and creates it if necessary.
 ///
 /// # Errors
-/// A request error that names the path: anything but a folder there, or what the system refuses.
+/// Returns a request error that names the path if something other than a folder is there, or if the folder can't be written.
 pub fn check_writable_dir(path: &Path) -> Result<()> {
     let folder = target_of(path, Metadata::is_dir, "the name of a folder").map_err(refused)?;
     fs::create_dir_all(&folder).map_err(Error::write(path)).map_err(refused)?;
     probe(&folder.join("globalsplat-probe"), path)
 }
 
-/// Makes a file beside `file` and removes it again; errors call it `named`.
+/// Creates a file beside `file` and removes it again; errors name the path `named`.
 fn probe(file: &Path, named: &Path) -> Result<()> {
     let named_so = |e: Error| match e {
         Error::Write { source, .. } => Error::write(named)(source),
@@ -263,28 +263,28 @@ fn probe(file: &Path, named: &Path) -> Result<()> {
     removed.and_then(|removed| removed.map_err(Error::write(named))).map_err(refused)
 }
 
-/// What the system refuses is a wrong request.
+/// Converts a write error into a request error, unless the disk is full.
 fn refused(e: Error) -> Error {
     match e {
-        // There may be room later.
+        // Disk space may become available later.
         full if full.is_disk_full() => full,
         Error::Write { .. } => Error::Request(e.to_string()),
         other => other,
     }
 }
 
-/// Checks that a regular file is at `path`, or nothing.
+/// Checks that `path` is a regular file or doesn't exist.
 ///
 /// # Errors
-/// A request error that names the path.
+/// Returns a request error that names the path.
 pub fn check_regular(path: &Path) -> Result<()> {
     target_of(path, Metadata::is_file, "the name of a file").map(drop).map_err(refused)
 }
 
-/// Where what is written to `path` goes: links are followed, also one whose target isn't there yet.
+/// Returns the path that a write to `path` changes: links are followed, even if their target doesn't exist yet.
 ///
 /// # Errors
-/// Anything at `path` that `is_expected` says no of, such as a device.
+/// Returns an error if `is_expected` returns `false` for what is at `path`, for example for a device.
 fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) -> Result<PathBuf> {
     let refuse = |found: &str| Err(Error::input(path, "the output", found, expected));
     match fs::metadata(path) {
@@ -295,7 +295,7 @@ fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) ->
     }
     let mut target = path.to_owned();
     while let Ok(link) = fs::read_link(&target) {
-        // As /dev/stdout and /dev/fd/1 are.
+        // For example /dev/stdout and /dev/fd/1.
         if parent_of(&target).canonicalize().is_ok_and(|folder| folder.starts_with("/proc")) {
             return refuse("an open file of a process");
         }
@@ -333,8 +333,8 @@ fn writable_by_owner(permissions: fs::Permissions) -> fs::Permissions {
     permissions
 }
 
-/// Takes a temporary name beside `target` for this process alone. `make` makes what is to be there, new, and opens it: the lock on
-/// it lasts until that is closed.
+/// Claims a temporary path beside `target` for this process alone. `make` creates a new file or folder there and opens it. It stays locked
+/// until the returned file is closed.
 fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<(PathBuf, File)> {
     for place in free_names(target) {
         let file = match make(&place) {
@@ -342,7 +342,7 @@ fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<
             Err(e) if e.kind() == ErrorKind::AlreadyExists => continue,
             Err(e) => return Err(e),
         };
-        // Without locks nobody takes it for abandoned, and nobody removes what was.
+        // On file systems without locks, no process takes it for abandoned, and abandoned files stay.
         let _ = file.lock();
         // Another process may have found it before it was locked, and removed it.
         if is_at(&file, &place) {
@@ -356,15 +356,15 @@ fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<
     unreachable!("names without end")
 }
 
-/// The temporary names for `target` that nothing has, once what was abandoned there is removed.
+/// Returns the temporary paths for `target` that are free, after removing what was abandoned there.
 fn free_names(target: &Path) -> impl Iterator<Item = PathBuf> {
-    // A removal that fails leaves the name taken.
+    // If the removal fails, the path counts as taken.
     let is_free =
         |name: &PathBuf| name.symlink_metadata().is_err() || remove_abandoned(name).unwrap_or(false);
     temporary_names(target).filter(is_free)
 }
 
-/// All temporary names for `target`, without end.
+/// Returns all temporary paths for `target`, as an infinite iterator.
 fn temporary_names(target: &Path) -> impl Iterator<Item = PathBuf> {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
     let ends = name.char_indices().map(|(at, letter)| at + letter.len_utf8());
@@ -377,7 +377,7 @@ fn temporary_names(target: &Path) -> impl Iterator<Item = PathBuf> {
     })
 }
 
-/// Removes the temporary file or folder at `place` unless a process works on it, and returns whether it did.
+/// Removes the temporary file or folder at `place` unless a process uses it. Returns `true` if it was removed.
 fn remove_abandoned(place: &Path) -> io::Result<bool> {
     let kind = place.symlink_metadata()?.file_type();
     if !kind.is_file() && !kind.is_dir() {
@@ -391,7 +391,7 @@ fn remove_abandoned(place: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
-/// Whether `file` is what lies at `place`.
+/// Returns `true` if `file` is the file or folder at `place`.
 fn is_at(file: &File, place: &Path) -> bool {
     #[cfg(unix)]
     {
@@ -407,7 +407,7 @@ fn is_at(file: &File, place: &Path) -> bool {
     }
 }
 
-/// Where the folder at `path` is moved to make room for its successor.
+/// Returns the path to which the folder at `path` is moved while it is replaced.
 fn old_name(path: &Path) -> PathBuf {
     let mut name = std::ffi::OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
@@ -415,7 +415,7 @@ fn old_name(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// What isn't there needs no removing.
+/// Ignores the error that there was nothing to remove.
 fn unless_missing(removed: io::Result<()>) -> io::Result<()> {
     match removed {
         Err(e) if e.kind() != ErrorKind::NotFound => Err(e),
@@ -427,8 +427,8 @@ fn parent_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Puts the names in a folder on the disk: a rename is only safe from a power cut then. Not every file system can; then it is best
-/// effort.
+/// Syncs the entries of a folder to the disk, without which a rename may be lost in a power cut. Best effort: not every file system
+/// supports it.
 fn sync_dir(path: &Path) {
     if let Ok(dir) = File::open(path) {
         let _ = dir.sync_all();
@@ -460,7 +460,7 @@ mod tests {
             names.iter().for_each(|name| fs::write(folder.join(name), name).unwrap());
         };
         make(&["model", "state"]);
-        // Of one that was removed by half before, nothing hinders.
+        // A partial removal from before must not get in the way.
         fs::create_dir_all(root.path().join(".step.globalsplat-partial/model")).unwrap();
         remove_dir(&folder, &["model", "state"]).unwrap();
         assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
@@ -475,7 +475,7 @@ mod tests {
     fn writers_of_one_file_have_names_of_their_own() {
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("room.ply");
-        // Left by processes that were ended.
+        // Left by processes that were killed.
         for left in [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"] {
             fs::write(root.path().join(left), "left").unwrap();
         }

@@ -1,17 +1,17 @@
-//! Checksums of what files hold.
+//! Checksums of the contents of files.
 
 use crate::error::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// Bytes that are read at a time.
+/// Number of bytes that are read at a time.
 const BUFFER: usize = 1 << 20;
 
 /// Computes the CRC-32 of the contents of `files`, one after the other, without holding any of them in memory.
 ///
 /// # Errors
-/// A file that can't be read.
+/// Returns an error if a file can't be read.
 pub fn checksum(files: impl IntoIterator<Item = impl AsRef<Path>>) -> Result<u32> {
     let (mut hasher, mut buffer) = (crc32fast::Hasher::new(), vec![0; BUFFER]);
     for path in files {

@@ -1,32 +1,33 @@
-//! Depth as colours that a person can compare: equal steps look equally large.
+//! Colours for depth that people can compare: equal steps look equally large.
 
 use tch::{Kind, Tensor};
 
-/// Depth behind less opacity than this is no depth.
+/// Minimum opacity at which depth is valid.
 const MIN_ALPHA: f64 = 0.05;
 
-/// Depths and their ranges that are 0 are divided by as this, so that colours are the same whatever the unit is.
+/// Smallest divisor, which replaces depths and ranges of 0. It is so small that colours don't depend on the unit.
 const SMALLEST: f64 = f32::MIN_POSITIVE as f64;
 
-/// matplotlib's viridis, from far to near: dark violet, blue, green, yellow. Of the well-known ones its lightness grows in the most
-/// even steps, so it reads the same in grey and for the colour-blind; and what is far isn't black, which is where nothing is.
+/// Colour map from far to near, matplotlib's viridis: dark violet, blue, green, yellow. Its lightness grows in the most even steps among
+/// the well-known colour maps, so it reads the same in grey and for the colour-blind. Far depths aren't black, which is the colour of empty
+/// pixels.
 const COLOURS: colorous::Gradient = colorous::VIRIDIS;
-/// As many as the gradient has, and as a picture of 8 bits tells apart.
+/// Number of colours: as many as the gradient has, and as an 8-bit image distinguishes.
 const STEPS: usize = 256;
 
-/// Which depths the colours are for. One scale for all frames of a film keeps it from flickering.
+/// Range of depths that the colours cover. One scale for all frames of a video prevents flicker.
 #[derive(Debug, Clone, Copy)]
 pub struct DepthScale {
-    /// 1/depth of the darkest colour.
+    /// Inverse depth, 1/depth, of the darkest colour.
     far: f64,
-    /// 1/depth of the brightest.
+    /// Inverse depth, 1/depth, of the brightest colour.
     near: f64,
 }
 
 impl DepthScale {
-    /// From the 2nd to the 98th percentile of inverse depth in all `pictures`, each a depth and its opacity, [H, W].
+    /// Computes the scale from the 2nd to the 98th percentile of inverse depth in all `pictures`, each a depth and its opacity, [H, W].
     pub fn of(pictures: &[(&Tensor, &Tensor)]) -> Self {
-        /// Pixels that tell percentiles as well as more do; libtorch sorts 2²⁴ at most.
+        /// Number of pixels that suffices for percentiles; libtorch sorts at most 2²⁴ values.
         const ENOUGH: i64 = 1 << 20;
         let inverses =
             |&(depth, alpha): &(&Tensor, &Tensor)| inverse(depth).masked_select(&seen(depth, alpha));
@@ -39,8 +40,8 @@ impl DepthScale {
         DepthScale { far: bound(0.02), near: bound(0.98) }
     }
 
-    /// Depth [H, W] as colours [3, H, W]: near is bright, far dark, evenly by inverse depth; where little is seen (`alpha`) it
-    /// fades to black.
+    /// Converts depth [H, W] to colours [3, H, W]: near is bright, far is dark, linear in inverse depth. Where little is visible (`alpha`),
+    /// the colour fades to black.
     pub fn colourize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
         let share = (inverse(depth) - self.far) / (self.near - self.far).max(SMALLEST);
         let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
@@ -52,7 +53,7 @@ impl DepthScale {
     }
 }
 
-/// [`DepthScale::colourize`] on the picture's own scale.
+/// Converts depth to colours like [`DepthScale::colourize`], on the scale of this image.
 pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
     DepthScale::of(&[(depth, alpha)]).colourize(depth, alpha)
 }
@@ -65,7 +66,7 @@ fn seen(depth: &Tensor, alpha: &Tensor) -> Tensor {
     alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.))
 }
 
-/// RGB in [0, 1], from far to near.
+/// Returns the colour map as RGB in [0, 1], from far to near.
 pub fn depth_colours() -> [[f32; 3]; STEPS] {
     std::array::from_fn(|step| {
         let colorous::Color { r, g, b } = COLOURS.eval_rational(step, STEPS);
@@ -77,7 +78,7 @@ pub fn depth_colours() -> [[f32; 3]; STEPS] {
 mod tests {
     use super::*;
 
-    /// CIELAB's L*, from 0 to 100, of an sRGB colour (IEC 61966-2-1, CIE 15).
+    /// Returns CIELAB's L*, from 0 to 100, of an sRGB colour (IEC 61966-2-1, CIE 15).
     fn lightness(colour: [f32; 3]) -> f64 {
         let linear = colour.map(|value| match f64::from(value) {
             value if value <= 0.04045 => value / 12.92,
@@ -92,7 +93,7 @@ mod tests {
 
     #[test]
     fn lightness_grows_in_even_steps() {
-        // Sixteen at a time: 8 bits round by more than single steps are apart.
+        // Every 15th colour: the rounding to 8 bits is larger than single steps.
         let levels: Vec<f64> = depth_colours().iter().step_by(15).map(|&colour| lightness(colour)).collect();
         let steps: Vec<f64> = levels.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let mean = steps.iter().sum::<f64>() / steps.len() as f64;
@@ -125,12 +126,12 @@ mod tests {
         let scale = DepthScale::of(&[(&first, &opaque), (&second, &opaque)]);
         let two = |picture: &Tensor, x: i64| scale.colourize(picture, &opaque).select(2, x);
         assert_eq!(two(&first, 1), two(&second, 0));
-        // On scales of their own, 2 is the farthest in one and the nearest in the other.
+        // On scales of their own, a depth of 2 is the farthest in one image and the nearest in the other.
         assert_ne!(
             colourize_depth(&first, &opaque).select(2, 1),
             colourize_depth(&second, &opaque).select(2, 0)
         );
-        // Nothing is seen, and nothing goes wrong.
+        // If nothing is visible, the image is black.
         let nothing = opaque.zeros_like();
         assert_eq!(colourize_depth(&first, &nothing).sum(Kind::Float).double_value(&[]), 0.);
     }

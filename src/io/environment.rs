@@ -1,13 +1,13 @@
-//! Environment variables in what a configuration names.
+//! Expansion of environment variables in paths of a configuration.
 
 use crate::error::{Error, Result};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// The path that `text` names, with `${NAME}` and `${NAME:-default}` filled in. An empty variable counts as none.
+/// Returns the path that `text` names, with `${NAME}` and `${NAME:-default}` expanded. An empty variable counts as unset.
 ///
 /// # Errors
-/// A variable that isn't set and has no default.
+/// Returns an error if a variable is unset and has no default.
 pub fn expand_path(text: &str) -> Result<PathBuf> {
     expand(text).map(PathBuf::from)
 }

@@ -1,4 +1,4 @@
-//! Event files, which TensorBoard shows: TFRecords of `Event` messages, of which this is all that we need.
+//! Event files, which TensorBoard shows: TFRecords of `Event` messages. These are all the fields that we need:
 //!
 //! ```text
 //! message Event   { double wall_time = 1; int64 step = 2; string file_version = 3; Summary summary = 5;
@@ -16,11 +16,11 @@ use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tch::Tensor;
 
-/// What readers know the format by.
+/// Version string by which readers recognize the format.
 const VERSION: &str = "brain.Event:2";
-/// `SessionLog.START`.
+/// Value of `SessionLog.START`.
 const START: u64 = 1;
-/// `Image.colorspace`.
+/// Value of `Image.colorspace` for RGB.
 const RGB: u64 = 3;
 
 /// A file of events, written by one process.
@@ -30,28 +30,29 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Makes the file at `path`, whose name has to contain `tfevents`.
+    /// Creates the file at `path`, whose name must contain `tfevents`.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if the file can't be opened.
     pub fn create(path: &Path) -> Result<Self> {
         Ok(EventFile { file: AppendFile::open(path)? })
     }
 
-    /// The first thing to write: whatever files before this one tell of `step` and later steps is void.
+    /// Writes the first records of the file: the version, and a session start that invalidates events of `step` and later steps in earlier
+    /// files.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn start(&mut self, step: u64) -> Result<()> {
         let version = record(&Message::event(0).bytes(3, VERSION.as_bytes()));
         let session = record(&Message::event(step).message(7, &Message::default().varint(1, START)));
         self.file.append(&[version, session].concat())
     }
 
-    /// Numbers of one step, by their tags.
+    /// Writes the scalars of one step, by tag.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
             summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
@@ -59,10 +60,10 @@ impl EventFile {
         self.file.append(&record(&Message::event(step).message(5, &summary)))
     }
 
-    /// A picture [3, H, W] in [0, 1].
+    /// Writes an image [3, H, W] in [0, 1].
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn picture(&mut self, step: u64, tag: &str, picture: &Tensor) -> Result<()> {
         let pixels = rgb_from_tensor(picture)?;
         let image = Message::default()
@@ -81,7 +82,7 @@ impl EventFile {
 struct Message(Vec<u8>);
 
 impl Message {
-    /// An `Event` of `step`, now.
+    /// Creates an `Event` of `step` with the current time.
     fn event(step: u64) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         let mut event = Message::default();
@@ -90,7 +91,7 @@ impl Message {
         event.varint(2, step)
     }
 
-    /// Wire types: 0 varint, 1 eight bytes, 2 length and bytes, 5 four bytes.
+    /// Appends the key of a field. Wire types: 0 varint, 1 eight bytes, 2 length and bytes, 5 four bytes.
     fn key(&mut self, field: u64, wire_type: u64) {
         push_varint(&mut self.0, field << 3 | wire_type);
     }
@@ -127,19 +128,19 @@ fn push_varint(bytes: &mut Vec<u8>, mut value: u64) {
     bytes.push(value as u8);
 }
 
-/// A TFRecord: the length, its checksum, the message, its checksum.
+/// Returns a TFRecord: the length, its checksum, the message, its checksum.
 fn record(message: &Message) -> Vec<u8> {
     let length = (message.0.len() as u64).to_le_bytes();
     let sums = [masked_crc32c(&length), masked_crc32c(&message.0)].map(u32::to_le_bytes);
     [&length[..], &sums[0], &message.0, &sums[1]].concat()
 }
 
-/// A checksum of data that may hold checksums themselves.
+/// Returns the masked CRC-32C of `bytes`, for data that may contain checksums themselves.
 pub(super) fn masked_crc32c(bytes: &[u8]) -> u32 {
     crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
-/// CRC-32 with Castagnoli's polynomial.
+/// Returns the CRC-32 of `bytes` with Castagnoli's polynomial.
 fn crc32c(bytes: &[u8]) -> u32 {
     const TABLE: [u32; 256] = {
         const POLYNOMIAL: u32 = 0x82f6_3b78; // bits reversed

@@ -1,4 +1,4 @@
-//! Event files from behind: what another process has written so far, and its pictures.
+//! Reader for event files that another process is still writing: the events so far, and their images.
 
 use super::event_file::masked_crc32c;
 use crate::error::{Error, Result};
@@ -6,27 +6,27 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-/// A longer record isn't one of ours: it is stepped over.
+/// Maximum length of a message in bytes. A longer record isn't one of ours and is skipped.
 const LONGEST: u64 = 64 << 20;
-/// Of a record, before its message: the length, and the checksum of that.
+/// Number of bytes of a record before its message: the length, and its checksum.
 const HEAD: usize = 12;
-/// Of a record, after its message: a checksum.
+/// Number of bytes of a record after its message: a checksum.
 const TAIL: u64 = 4;
 const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
 
-/// Something that an event file tells.
+/// An event of an event file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SeenEvent {
     pub step: u64,
-    /// When it was written, in seconds since 1970.
+    /// Time at which it was written, in seconds since 1970.
     pub wall_time: f64,
-    /// Whether the run begins here: what was told before of this step and later ones is void.
+    /// `true` if the run starts here: earlier events of this step and later steps are invalid.
     pub is_start: bool,
-    /// Where in the file it begins, if it has a picture.
+    /// Offset of the event in the file, if it has an image.
     pub picture: Option<u64>,
 }
 
-/// A file that may still grow, read from where it was left.
+/// Reader for a file that may still grow, which continues where it stopped.
 #[derive(Debug)]
 pub struct EventReader {
     path: PathBuf,
@@ -34,20 +34,21 @@ pub struct EventReader {
 }
 
 impl EventReader {
-    /// Of the file at `path`, which is opened when it is read.
+    /// Creates a reader for the file at `path`, which is opened when it is read.
     pub fn new(path: &Path) -> Self {
         EventReader { path: path.to_owned(), position: 0 }
     }
 
-    /// Whether the file is no longer the one that was read: gone, or shorter.
+    /// Returns `true` if the file is no longer the one that was read: it is missing or shorter.
     pub fn is_void(&self) -> bool {
         std::fs::metadata(&self.path).map_or(true, |file| file.len() < self.position)
     }
 
-    /// What was added since the last time. Half a record is left for the next one; behind a damaged one there is nothing.
+    /// Returns the events that were added since the last call. An incomplete record is left for the next call; nothing is read after a
+    /// damaged one.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if the file can't be read.
     pub fn read_new(&mut self) -> Result<Vec<SeenEvent>> {
         let read = || Error::read(&self.path);
         let file = File::open(&self.path).map_err(read())?;
@@ -75,10 +76,10 @@ impl EventReader {
     }
 }
 
-/// The PNG in the event that begins `at` bytes into the file, if there is one.
+/// Returns the PNG in the event at the offset `at` in the file, if there is one.
 ///
 /// # Errors
-/// The system's refusal.
+/// Returns an error if the file can't be read.
 pub fn read_picture(path: &Path, at: u64) -> Result<Option<Vec<u8>>> {
     let mut file = File::open(path).map_err(Error::read(path))?;
     file.seek(SeekFrom::Start(at)).map_err(Error::read(path))?;
@@ -88,7 +89,7 @@ pub fn read_picture(path: &Path, at: u64) -> Result<Option<Vec<u8>>> {
     Ok(png(&message).map(<[u8]>::to_vec))
 }
 
-/// The length of the message that follows; none where the checksum says that it is no length.
+/// Reads the length of the message that follows, or returns `None` if its checksum doesn't match.
 fn read_head(file: &mut impl Read) -> std::io::Result<Option<u64>> {
     let mut head = [0; HEAD];
     file.read_exact(&mut head)?;
@@ -103,7 +104,7 @@ fn event(message: &[u8], at: u64) -> Option<SeenEvent> {
         match (number, field) {
             (1, Field::Eight(bytes)) => event.wall_time = f64::from_le_bytes(bytes),
             (2, Field::Varint(step)) => event.step = step,
-            // The format's version tells of no step.
+            // The version of the format belongs to no step.
             (3, _) => return None,
             (7, _) => event.is_start = true,
             _ => {}
@@ -113,7 +114,7 @@ fn event(message: &[u8], at: u64) -> Option<SeenEvent> {
     Some(event)
 }
 
-/// Summary.value.image.encoded_image_string of an event, if it is a PNG.
+/// Returns Summary.value.image.encoded_image_string of an event, if it is a PNG.
 fn png(event: &[u8]) -> Option<&[u8]> {
     [5, 1, 4, 4]
         .into_iter()
@@ -126,7 +127,7 @@ fn png(event: &[u8]) -> Option<&[u8]> {
         .filter(|bytes| bytes.starts_with(PNG))
 }
 
-/// A protobuf message's fields with their numbers, up to where it is no such message.
+/// Iterator over a protobuf message's fields with their numbers, which stops where the bytes are no valid message.
 struct Fields<'a>(&'a [u8]);
 
 enum Field<'a> {
@@ -194,7 +195,7 @@ mod tests {
         assert_eq!(seen.iter().map(|e| (e.step, e.is_start)).collect::<Vec<_>>(), [(7, true), (8, false)]);
         assert!(seen.iter().all(|event| event.wall_time > 1.7e9 && event.picture.is_none()));
 
-        // A record that is half there waits for its other half.
+        // An incomplete record is read once it is complete.
         file.picture(9, "train/views", &Tensor::zeros([3, 4, 5], (Kind::Float, Device::Cpu))).unwrap();
         let whole = std::fs::read(&path).unwrap();
         std::fs::write(&path, &whole[..whole.len() - 9]).unwrap();
@@ -207,7 +208,7 @@ mod tests {
         assert_eq!(reader.read_new().unwrap(), []);
         assert!(!reader.is_void());
 
-        // Nothing behind a damaged length is believed.
+        // Nothing after a damaged length is read.
         std::fs::write(&path, [&whole[..], &[255; 40]].concat()).unwrap();
         assert_eq!(reader.read_new().unwrap(), []);
         assert_eq!(read_picture(&path, whole.len() as u64).unwrap(), None);

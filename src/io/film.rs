@@ -1,4 +1,4 @@
-//! Moving pictures, frame by frame: GIF by ourselves, MP4 by the ffmpeg on the PATH. Nothing half-written stays behind.
+//! Videos, written frame by frame: GIF by our own code, MP4 by the ffmpeg on the PATH. No partial file stays behind.
 
 use super::atomic::PartialFile;
 use super::images::rgb_from_tensor;
@@ -12,17 +12,17 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 use tch::Tensor;
 
-/// A film that is being written. It appears at its path when it is finished; one that is dropped before leaves nothing.
+/// A video that is being written. It appears at its path when it is finished; a video that is dropped earlier leaves no file.
 pub struct Film {
     path: PathBuf,
     size: ImageSize,
     frames: u32,
     encoder: Encoder,
-    // After the encoder, which writes to it until it is dropped.
+    // Declared after the encoder to be dropped after it: the encoder writes to this file until it is dropped.
     partial: PartialFile,
 }
 
-/// Told by the ending.
+/// Format of a video, determined by its extension.
 enum Format {
     Gif,
     Mp4,
@@ -44,10 +44,11 @@ enum Encoder {
 }
 
 impl Film {
-    /// Whether there could be a film at `path`, `.gif` or `.mp4`. Call it before the work, not after.
+    /// Checks that a video could be written at `path`, `.gif` or `.mp4`. Call it before the work starts.
     ///
     /// # Errors
-    /// Another ending, more frames per second than the format has, or no ffmpeg with libx264 for `.mp4`.
+    /// Returns an error for another extension, for more frames per second than the format supports, or if there is no ffmpeg with libx264
+    /// for `.mp4`.
     pub fn check(path: &Path, frames_per_second: u32) -> Result<()> {
         match Format::of(path) {
             Some(Format::Gif) => Gif::check(path, frames_per_second),
@@ -56,15 +57,15 @@ impl Film {
         }
     }
 
-    /// Whether the ending of `path` is that of a film.
+    /// Returns `true` if `path` has the extension of a video.
     pub fn is_name(path: &Path) -> bool {
         Format::of(path).is_some()
     }
 
-    /// Begins a film of `size`; an MP4 has even sides, and loses a row or a column that is too many.
+    /// Starts a video of `size`. An MP4 has even sides: the last row or column is cropped if their number is odd.
     ///
     /// # Errors
-    /// As [`Film::check`], a size that the format doesn't know, or the system's refusal to write.
+    /// Returns the errors of [`Film::check`], and an error if the format doesn't support the size or the file can't be written.
     pub fn begin(path: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         Self::check(path, frames_per_second)?;
         let partial = PartialFile::create(path)?;
@@ -75,10 +76,10 @@ impl Film {
         Ok(Film { path: path.to_owned(), size, frames: 0, encoder, partial })
     }
 
-    /// Adds a frame [3, H, W], in [0, 1], with a white margin where it is smaller than the film.
+    /// Adds a frame [3, H, W] in [0, 1], with a white margin if it is smaller than the video.
     ///
     /// # Errors
-    /// The encoder's or the system's refusal.
+    /// Returns an error if the frame can't be encoded or written.
     pub fn add(&mut self, frame: &Tensor) -> Result<()> {
         let (height, width) = (i64::from(self.size.height), i64::from(self.size.width));
         let margin = [0, width - frame.size()[2], 0, height - frame.size()[1]];
@@ -90,10 +91,10 @@ impl Film {
         }
     }
 
-    /// Puts the film where it belongs.
+    /// Finishes the video and moves it to its path.
     ///
     /// # Errors
-    /// A film without a frame; the encoder's or the system's refusal.
+    /// Returns an error if the video has no frame, or if it can't be encoded or written.
     pub fn finish(self) -> Result<()> {
         let Film { path, frames, encoder, partial, .. } = self;
         if frames == 0 {
@@ -115,7 +116,7 @@ struct Gif {
 
 impl Gif {
     fn check(path: &Path, frames_per_second: u32) -> Result<()> {
-        // Frames last hundredths of a second, and browsers slow down those that last one alone.
+        // Delays are in hundredths of a second, and browsers slow down frames with a delay of one.
         const MOST: u32 = 50;
         match frames_per_second {
             1..=MOST => Ok(()),
@@ -137,11 +138,11 @@ impl Gif {
     }
 
     fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
-        // 1 is the best palette, 30 the fastest.
+        // 1 gives the best palette, 30 is the fastest.
         const SPEED: i32 = 10;
         let (width, height) = (frame.width() as u16, frame.height() as u16);
         let mut encoded = gif::Frame::from_rgb_speed(width, height, frame, SPEED);
-        // Rounded so that frames don't drift from their times.
+        // The end time of each frame is rounded, so that frames don't drift from their times.
         let hundredths = |frames: u32| (100 * frames + self.frames_per_second / 2) / self.frames_per_second;
         encoded.delay = (hundredths(self.frames + 1) - hundredths(self.frames)) as u16;
         self.frames += 1;
@@ -161,10 +162,10 @@ fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
     }
 }
 
-/// The version of the ffmpeg on the PATH that encodes H.264.
+/// Returns the version of the ffmpeg on the PATH, which must be able to encode H.264.
 ///
 /// # Errors
-/// What is missing, and how to get it.
+/// Returns a message that says what is missing and how to install it.
 pub fn find_ffmpeg() -> std::result::Result<String, String> {
     const GET: &str = "(Debian and Ubuntu: apt install ffmpeg; macOS: brew install ffmpeg)";
     let output = Command::new("ffmpeg").arg("-encoders").stdin(Stdio::null()).output();
@@ -175,20 +176,20 @@ pub fn find_ffmpeg() -> std::result::Result<String, String> {
     if !String::from_utf8_lossy(&output.stdout).split_whitespace().any(|word| word == ENCODER) {
         return Err(format!("the ffmpeg on the PATH lacks {ENCODER} {GET}"));
     }
-    // It begins with "ffmpeg version 5.1.9-0+deb12u1 Copyright …".
+    // The banner begins with "ffmpeg version 5.1.9-0+deb12u1 Copyright …".
     let banner = String::from_utf8_lossy(&output.stderr);
     Ok(banner.split_whitespace().nth(2).unwrap_or("of unknown version").into())
 }
 
-/// The best one that ffmpeg has for H.264, and one that machines without a GPU have.
+/// Best H.264 encoder of ffmpeg, which machines without a GPU have too.
 const ENCODER: &str = "libx264";
 
-/// H.264 in 4:2:0, which every player and browser shows.
+/// Encoder for H.264 in 4:2:0, which every player and browser shows.
 struct Mp4 {
     ffmpeg: Child,
-    /// Until the film ends.
+    /// Standard input of ffmpeg, until the video ends.
     input: Option<ChildStdin>,
-    /// Standard error, read while frames are written: a full pipe would stop both.
+    /// Thread that reads standard error while frames are written: a full pipe would block both processes.
     said: Option<JoinHandle<String>>,
 }
 
@@ -203,9 +204,9 @@ impl Mp4 {
     }
 
     fn begin(path: &Path, place: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
-        /// Next to nothing is lost to the eye; ffmpeg's own choice is 23.
+        /// Constant rate factor with almost no visible loss; ffmpeg's default is 23.
         const QUALITY: &str = "18";
-        /// sRGB says so. Without, players take small films for BT.601 and large ones for BT.709, and colours shift.
+        /// Declaration of sRGB colours. Without it, players assume BT.601 for small videos and BT.709 for large ones, and colours shift.
         const COLOURS: [&str; 8] = [
             "-colorspace",
             "bt709",
@@ -239,13 +240,13 @@ impl Mp4 {
             .args(["-r", &frames_per_second.to_string(), "-i", "-", "-vf", &format!("{even},{to_yuv}")])
             .args(["-c:v", ENCODER, "-crf", QUALITY, "-pix_fmt", "yuv420p"])
             .args(COLOURS)
-            // What a player needs to know first comes first, so that a page shows the film while it still loads.
+            // Puts the index that a player needs at the start, so that a page shows the video while it still loads.
             .args(["-movflags", "+faststart", "-f", "mp4"])
             .arg(place)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped());
-        // Ctrl-C is for the program, which then ends it.
+        // Ctrl-C must reach only this program, which then ends ffmpeg.
         #[cfg(unix)]
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         let mut ffmpeg =
@@ -263,7 +264,7 @@ impl Mp4 {
     fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
         match self.input.as_mut().expect("the film goes on").write_all(frame) {
             Ok(()) => Ok(()),
-            // What ffmpeg says tells more than the broken pipe.
+            // The message of ffmpeg is more helpful than the broken pipe.
             Err(_) => {
                 self.end(path).and(Err(Error::Failed(format!("{}: ffmpeg ended early", path.display()))))
             }
@@ -274,7 +275,7 @@ impl Mp4 {
         self.end(path)
     }
 
-    /// Waits until ffmpeg has written what it was given.
+    /// Closes the input of ffmpeg and waits until it has written everything.
     fn end(&mut self, path: &Path) -> Result<()> {
         self.input = None;
         let status = self.ffmpeg.wait().map_err(Error::write(path))?;
@@ -291,7 +292,7 @@ impl Mp4 {
 
 impl Drop for Mp4 {
     fn drop(&mut self) {
-        // Nothing happens to one that has ended.
+        // No-op if ffmpeg has ended already.
         let _ = self.ffmpeg.kill();
         let _ = self.ffmpeg.wait();
     }

@@ -1,4 +1,4 @@
-//! Images between files and tensors, and pictures for people.
+//! Conversion of images between files and tensors, and images for display.
 
 use super::jpeg::{END_MARKER, check_jpeg, jpeg_size};
 use super::{check_writable_file, write_atomically};
@@ -13,40 +13,40 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
-/// Of the names of photos.
+/// File extensions of photos.
 pub const PHOTO_EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
-/// Reads any image as 8-bit RGB, pixels as they are stored: grey is repeated, what is transparent lies over black, 16 bits
+/// Reads any image as 8-bit RGB, with pixels as they are stored: grey is repeated, transparent pixels are composited over black, 16 bits
 /// are rounded to 8.
 ///
 /// # Errors
-/// A file that is missing, can't be decoded, or is cut short.
+/// Returns an error if the file is missing, can't be decoded, or is truncated.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     Ok(rgb_over_black(decode(&bytes, path)?.image))
 }
 
-/// A photo's pixels.
+/// Pixels of a photo.
 #[derive(Debug)]
 pub struct Photo {
-    /// 8-bit RGB.
+    /// Pixels in 8-bit RGB.
     pub pixels: RgbImage,
-    /// Whether its file holds 8-bit RGB, and these pixels: no palette, grey, CMYK or opacity, not turned and not converted.
+    /// `true` if the file holds exactly these pixels in 8-bit RGB: no palette, grey, CMYK or opacity, not rotated and not converted.
     pub as_stored: bool,
-    /// Whether its file is a JPEG.
+    /// `true` if the file is a JPEG.
     pub is_jpeg: bool,
 }
 
-/// Decodes the photo that `file` holds, `encoded`, whose capture declares it to be `size` = (width, height), as
-/// [`read_image`] does.
+/// Decodes the photo `encoded`, the contents of `file`, like [`read_image`]. The capture declares the photo to have `size` = (width,
+/// height).
 ///
-/// Cameras turned on their side store the pixels as the sensor has them, and which way is up as EXIF orientation. Most tools
-/// that make captures, COLMAP among them, don't look at it, so their intrinsics refer to the pixels as stored; some turn the
-/// photo first. The declared size tells which: the orientation is applied only where the stored size isn't the declared one
-/// and the turned size is. A photo that fits neither way is returned as stored; compare its size.
+/// Cameras turned on their side store the pixels as the sensor has them, and the orientation in EXIF. Most tools that create captures,
+/// COLMAP among them, ignore it, so their intrinsics refer to the pixels as stored; others rotate the photo first. The declared size
+/// distinguishes the two: the orientation is applied only if the stored size isn't the declared one and the rotated size is. A photo that
+/// matches neither way is returned as stored, so the caller must compare its size.
 ///
 /// # Errors
-/// As [`read_image`].
+/// Returns the errors of [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Photo> {
     let Decoded { mut image, orientation, format, is_rgb } = decode(encoded, file)?;
     let stored = (image.width(), image.height());
@@ -65,10 +65,10 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Pho
     Ok(Photo { pixels: rgb_over_black(image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
 }
 
-/// A photo as a JPEG of high quality, or as a PNG.
+/// Encodes a photo as a JPEG of high quality, or as a PNG.
 ///
 /// # Errors
-/// A size that the format doesn't know.
+/// Returns an error if the format doesn't support the size.
 pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
     const QUALITY: u8 = 95;
     let mut bytes = Cursor::new(vec![]);
@@ -80,17 +80,17 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// As [`read_image_size`], of an image in memory; `None` for what is no image.
+/// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it is no image.
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
     let dimensions =
         || ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok();
     jpeg_size(Cursor::new(encoded)).or_else(dimensions)
 }
 
-/// (width, height) of the pixels as stored, from the image's header alone.
+/// Returns (width, height) of the pixels as stored, from the image's header alone.
 ///
 /// # Errors
-/// A file that is missing or is no image.
+/// Returns an error if the file is missing or is no image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     let file = std::fs::File::open(path).map_err(Error::read(path))?;
     let mut reader = BufReader::new(file);
@@ -107,20 +107,20 @@ struct Decoded {
     image: DynamicImage,
     orientation: Orientation,
     format: Option<ImageFormat>,
-    /// Whether the file holds three channels, whatever they were decoded to, and is marked as whole.
+    /// `true` if the file holds three channels, whatever they were decoded to, and has an end marker.
     is_rgb: bool,
 }
 
-/// Where a PNG's header says what its pixels are made of.
+/// Offset of the colour type in the header of a PNG.
 const PNG_COLOUR_TYPE: usize = 25;
-/// Red, green and blue, without a palette.
+/// Colour type of red, green and blue, without a palette.
 const PNG_RGB: u8 = 2;
 
 fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
     let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
-    // A few bytes can claim any size.
+    // A file of a few bytes can claim any size.
     let limits = Limits::default();
     limits.check_dimensions(decoder.dimensions().0, decoder.dimensions().1).map_err(undecodable(file))?;
     if decoder.total_bytes() > limits.max_alloc.unwrap_or(u64::MAX) {
@@ -134,7 +134,7 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
                 |why| Error::input(file, "the image", format!("undecodable ({why})"), "a PNG or JPEG");
             let checked = check_jpeg(encoded).map_err(damaged)?;
             if !checked.is_marked {
-                // Without it the decoder leaves the last rows grey, though nothing of them is missing.
+                // Without the marker the decoder leaves the last rows grey, though none of their data is missing.
                 let decoded = decode(&[encoded, &END_MARKER].concat(), file)?;
                 return Ok(Decoded { is_rgb: false, ..decoded });
             }
@@ -143,9 +143,9 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
         Some(ImageFormat::Png) => encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB),
         _ => false,
     };
-    // EXIF that can't be read is no reason to refuse the pixels.
+    // Unreadable EXIF is no reason to refuse the pixels.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    // Decoders of some rare kinds panic.
+    // The decoders of some rare formats panic.
     let image = panic::catch_unwind(AssertUnwindSafe(|| DynamicImage::from_decoder(decoder)));
     let panicked = |why: Box<dyn Any + Send>| {
         let found = format!("undecodable (the decoder failed: {})", panic_message(&*why));
@@ -171,16 +171,16 @@ fn rgb_over_black(image: DynamicImage) -> RgbImage {
     })
 }
 
-/// [3, H, W] in [0, 1].
+/// Converts an image to a tensor [3, H, W] in [0, 1].
 pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
     let (width, height) = (i64::from(image.width()), i64::from(image.height()));
     Tensor::from_slice(image.as_raw()).view([height, width, 3]).permute([2, 0, 1]).to_kind(Kind::Float) / 255.
 }
 
-/// From [3, H, W] or [H, W] (grey); values are clamped to [0, 1] and rounded.
+/// Converts a tensor [3, H, W] or [H, W] (grey) to an image; values are clamped to [0, 1] and rounded.
 ///
 /// # Errors
-/// libtorch's refusal, as for another shape.
+/// Returns libtorch's error, for example for another shape.
 pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
     let planes = if picture.dim() == 2 {
         picture.unsqueeze(0).f_expand([3, -1, -1], false)?
@@ -195,15 +195,15 @@ pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
         .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
 }
 
-/// Whether the ending of `path` is a PNG's.
+/// Returns `true` if `path` has the extension of a PNG.
 pub fn is_png_name(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png"))
 }
 
-/// Whether a PNG could be written at `path`, as by [`check_writable_file`].
+/// Checks that a PNG could be written at `path`, like [`check_writable_file`].
 ///
 /// # Errors
-/// Another ending, and as there.
+/// Returns an error for another extension, and the errors of [`check_writable_file`].
 pub fn check_writable_png(path: &Path) -> Result<()> {
     if !is_png_name(path) {
         return Err(Error::input(path, "the picture's ending", "another", ".png"));
@@ -211,18 +211,18 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
     check_writable_file(path)
 }
 
-/// Writes [3, H, W] or [H, W] (grey), values in [0, 1].
+/// Writes a tensor [3, H, W] or [H, W] (grey) with values in [0, 1] as a PNG.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Returns an error if the file can't be written.
 pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
     write_picture(path, picture, false)
 }
 
-/// As [`write_png`], in fewer bytes and not quite the same.
+/// Writes a tensor like [`write_png`], but as a JPEG, which is smaller and lossy.
 ///
 /// # Errors
-/// As there.
+/// Returns the errors of [`write_png`].
 pub fn write_jpeg(path: &Path, picture: &Tensor) -> Result<()> {
     write_picture(path, picture, true)
 }
@@ -234,19 +234,19 @@ fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
 /// Writes an image as a JPEG, or as a PNG.
 ///
 /// # Errors
-/// The system's refusal to write, or a size that the format doesn't know.
+/// Returns an error if the format doesn't support the size, or if the file can't be written.
 pub(super) fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Result<()> {
     let bytes = encode_photo(image, as_jpeg)?;
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-/// `picture` [3, H, W] enlarged by a whole factor, pixels left as they are, until it is `height` high or a little less.
+/// Enlarges `picture` [3, H, W] by an integer factor, repeating its pixels, until it is `height` high or a little less.
 pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
     let factor = (height / picture.size()[1]).max(1);
     picture.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
 }
 
-/// Shrinks `picture` [3, H, W] by a whole factor: every pixel is the mean of `factor`² pixels.
+/// Shrinks `picture` [3, H, W] by an integer factor: every pixel is the mean of `factor`² pixels.
 pub fn shrink(picture: &Tensor, factor: i64) -> Tensor {
     match factor {
         1 => picture.shallow_clone(),
@@ -254,7 +254,7 @@ pub fn shrink(picture: &Tensor, factor: i64) -> Tensor {
     }
 }
 
-/// Takes every `factor`-th row and column of numbers [H, W] that have no mean, as many as [`shrink`] leaves.
+/// Returns every `factor`-th row and column of values [H, W] that can't be averaged, in the size that [`shrink`] returns.
 pub fn subsample(numbers: &Tensor, factor: i64) -> Tensor {
     let along = |t: Tensor, dim: i64| {
         let whole = t.size()[dim as usize] / factor * factor;
@@ -263,20 +263,20 @@ pub fn subsample(numbers: &Tensor, factor: i64) -> Tensor {
     along(along(numbers.shallow_clone(), 0), 1)
 }
 
-/// Pixels between pictures.
+/// Number of pixels between images.
 const GAP: i64 = 4;
 
-/// Pictures [3, H, W] side by side, with a white gap, and white below those that are lower than others.
+/// Tiles images [3, H, W] side by side, with a white gap, and white below those that are lower than others.
 pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 2)
 }
 
-/// Pictures [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
+/// Tiles images [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
 pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
     tile(pictures, 1)
 }
 
-/// Puts images below each other, or else side by side, as [`tile_vertically`] and [`tile_horizontally`] do it.
+/// Tiles images one below the other, or else side by side, like [`tile_vertically`] and [`tile_horizontally`].
 pub(super) fn tile_images(images: &[RgbImage], is_column: bool) -> RgbImage {
     let gap = GAP as u32;
     let largest = |side: fn(&RgbImage) -> u32| images.iter().map(side).max().unwrap_or(0);
@@ -297,7 +297,7 @@ pub(super) fn tile_images(images: &[RgbImage], is_column: bool) -> RgbImage {
     whole
 }
 
-/// How large `count` pictures of `size` are when [`tile_horizontally`] has put them side by side.
+/// Returns the size of `count` images of `size` that [`tile_horizontally`] has put side by side.
 pub fn tiled_size(size: ImageSize, count: u32) -> ImageSize {
     ImageSize { width: count * size.width + (count - 1) * GAP as u32, ..size }
 }
@@ -315,7 +315,7 @@ fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
     Tensor::cat(&parts, dim)
 }
 
-/// Pictures [3, H, W], as large as the largest of them along `dim` by white below or to the right.
+/// Pads images [3, H, W] with white below or to the right, to the size of the largest of them along `dim`.
 fn padded(pictures: &[Tensor], dim: i64) -> Vec<Tensor> {
     let largest = pictures.iter().map(|picture| picture.size()[dim as usize]).max().unwrap_or(0);
     let pad = |picture: &Tensor| {

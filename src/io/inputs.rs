@@ -1,4 +1,4 @@
-//! The files that a command reads, which nothing that it writes may replace.
+//! Files that a command reads, which its outputs must not replace.
 
 use super::splat::origin_file;
 use super::weights_file::weights_files;
@@ -7,12 +7,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-/// Files that a command reads. They are known by what they are, not by their names: by whatever path or link an output names one of
-/// them, it is refused.
+/// Files that a command reads. They are identified by the file itself, not by its name: an output is refused whatever path or link it uses
+/// to name one of them.
 #[derive(Debug, Clone, Default)]
 pub struct Inputs {
     files: BTreeMap<FileId, Kind>,
-    /// In which photos lie.
+    /// Folders that contain photos.
     photo_folders: BTreeSet<FileId>,
 }
 
@@ -22,30 +22,30 @@ enum Kind {
     Other,
 }
 
-/// What tells a file or folder from every other one.
+/// Identifier of a file or folder: device and inode on Unix, the canonical path elsewhere.
 #[cfg(unix)]
 type FileId = (u64, u64);
 #[cfg(not(unix))]
 type FileId = std::path::PathBuf;
 
 impl Inputs {
-    /// Adds `file`, if it is there.
+    /// Adds `file`, if it exists.
     pub fn add(&mut self, file: &Path) {
         self.files.extend(file_id(file).map(|id| (id, Kind::Other)));
     }
 
-    /// Adds the files that hold the weights at `path`: one, or an index and what it names.
+    /// Adds the files that hold the weights at `path`: one file, or an index and the files that it names.
     pub fn add_weights(&mut self, path: &Path) {
         weights_files(path).iter().for_each(|file| self.add(file));
     }
 
-    /// Adds the splat `file` and the file of its origin.
+    /// Adds the splat `file` and its origin file.
     pub fn add_splat(&mut self, file: &Path) {
         self.add(file);
         self.add(&origin_file(file));
     }
 
-    /// Adds every file in `folder`, and in folders below it.
+    /// Adds every file in `folder` and in its subfolders.
     pub fn add_folder(&mut self, folder: &Path) {
         for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
             match entry.file_type() {
@@ -55,23 +55,23 @@ impl Inputs {
         }
     }
 
-    /// Adds the photo `file`, if it is there, and its folder as one of photos.
+    /// Adds the photo `file`, if it exists, and its folder as a folder of photos.
     pub fn add_photo(&mut self, file: &Path) {
         self.files.extend(file_id(file).map(|id| (id, Kind::Photo)));
         let folder = file.parent().unwrap_or(file);
         self.photo_folders.extend(file_id(folder));
     }
 
-    /// Adds all that `others` has.
+    /// Adds all files and folders of `others`.
     pub fn extend(&mut self, others: Inputs) {
         self.files.extend(others.files);
         self.photo_folders.extend(others.photo_folders);
     }
 
-    /// Checks that a file that is to be written at `path` replaces none of them.
+    /// Checks that a file written at `path` would replace none of the inputs.
     ///
     /// # Errors
-    /// A request error that names the path.
+    /// Returns a request error that names the path.
     pub fn check_file(&self, path: &Path) -> Result<()> {
         match file_id(path).and_then(|id| self.files.get(&id)) {
             None => Ok(()),
@@ -84,10 +84,10 @@ impl Inputs {
         }
     }
 
-    /// Checks that a folder for whatever is written is none of photos.
+    /// Checks that the output folder `path` is not a folder of photos.
     ///
     /// # Errors
-    /// A request error that names the path.
+    /// Returns a request error that names the path.
     pub fn check_folder(&self, path: &Path) -> Result<()> {
         match file_id(path).is_some_and(|id| self.photo_folders.contains(&id)) {
             false => Ok(()),

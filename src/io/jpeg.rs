@@ -1,12 +1,12 @@
-//! Whether a JPEG holds all of its data (ITU-T T.81), which decoders don't say: they fill what is missing with grey.
+//! Detection of JPEGs that don't hold all of their data (ITU-T T.81). Decoders don't report missing data: they fill it with grey.
 
 use std::io::{BufRead, Seek};
 
-/// Bits of a code that are looked up at once.
+/// Number of bits of a code that are looked up at once.
 const LOOKUP_BITS: u32 = 9;
-/// Scans that are followed; decoders refuse more.
+/// Maximum number of scans that are checked; decoders refuse more.
 const MAX_SCANS: usize = 100;
-/// All 64 coefficients of a block.
+/// Bit mask of all 64 coefficients of a block.
 const ALL: u64 = u64::MAX;
 
 const SOI: u8 = 0xd8;
@@ -14,7 +14,7 @@ const EOI: u8 = 0xd9;
 const SOS: u8 = 0xda;
 const DHT: u8 = 0xc4;
 const DRI: u8 = 0xdd;
-/// Huffman coded: baseline, extended sequential, progressive.
+/// Markers of Huffman-coded frames: baseline, extended sequential, progressive.
 const HUFFMAN_FRAMES: [u8; 3] = [0xc0, 0xc1, PROGRESSIVE];
 const PROGRESSIVE: u8 = 0xc2;
 
@@ -26,7 +26,7 @@ fn is_standalone(marker: u8) -> bool {
     matches!(marker, 0x01 | 0xd0..=SOI)
 }
 
-/// Returns (width, height) from a JPEG's headers, without reading its data; none for what is no JPEG.
+/// Returns (width, height) from a JPEG's headers, without reading its data, or `None` if it isn't a JPEG.
 pub(super) fn jpeg_size(mut reader: impl BufRead + Seek) -> Option<(u32, u32)> {
     let mut pair = [0; 2];
     reader.read_exact(&mut pair).ok()?;
@@ -56,21 +56,21 @@ pub(super) fn jpeg_size(mut reader: impl BufRead + Seek) -> Option<(u32, u32)> {
     }
 }
 
-/// A JPEG that is whole.
+/// A JPEG that holds all of its data.
 pub(super) struct CheckedJpeg {
-    /// Planes of colour; none where the coding isn't Huffman's, which is left to the decoder.
+    /// Number of colour components; `None` if the file isn't Huffman-coded, so that the check is left to the decoder.
     pub components: Option<usize>,
-    /// Whether its end is marked.
+    /// `true` if the file has an end marker.
     pub is_marked: bool,
 }
 
-/// The marker that a JPEG ends with.
+/// Marker at the end of a JPEG.
 pub(super) const END_MARKER: [u8; 2] = [0xff, EOI];
 
-/// Follows the data of a JPEG from its first block to its last. The end marker may be missing where nothing else is.
+/// Walks through the data of a JPEG from its first block to its last. The end marker may be missing if nothing else is.
 ///
 /// # Errors
-/// What is missing.
+/// Returns a description of what is missing.
 pub(super) fn check_jpeg(bytes: &[u8]) -> Result<CheckedJpeg, String> {
     let mut walk = Walk { bytes, at: 2, frame: None, tables: Default::default(), restart_interval: 0 };
     let mut unread = false;
@@ -88,9 +88,9 @@ struct Walk<'a> {
     bytes: &'a [u8],
     at: usize,
     frame: Option<Frame>,
-    /// For DC and for AC coefficients.
+    /// Huffman tables for DC and for AC coefficients.
     tables: [[Option<Table>; 4]; 2],
-    /// In MCUs; 0 for none.
+    /// Restart interval in MCUs; 0 if there is none.
     restart_interval: usize,
 }
 
@@ -103,33 +103,33 @@ struct Frame {
 
 struct Component {
     id: u8,
-    /// Blocks in an MCU, across and down.
+    /// Number of blocks in an MCU, horizontally (`across`) and vertically (`down`).
     across: usize,
     down: usize,
-    /// Blocks of all MCUs in a row.
+    /// Number of blocks in a row, over all MCUs.
     stride: usize,
-    /// Of each block the coefficients that aren't 0, which progressive scans refine.
+    /// Bit mask of the nonzero coefficients of each block, which progressive scans refine.
     nonzero: Vec<u64>,
-    /// Whether a scan has been of it.
+    /// `true` if a scan has contained this component.
     is_begun: bool,
-    /// Coefficients whose last bit was sent.
+    /// Bit mask of the coefficients whose lowest bit has been transmitted.
     complete: u64,
 }
 
 struct Scan {
-    /// Component, and its tables for DC and AC coefficients.
+    /// Index of each component, and the indices of its tables for DC and AC coefficients.
     components: Vec<(usize, usize, usize)>,
     first: u32,
     last: u32,
-    /// Whether bits are added to coefficients that earlier scans began.
+    /// `true` if the scan adds bits to coefficients that earlier scans began.
     refines: bool,
-    /// Of the lowest bit.
+    /// Position of the lowest bit that the scan transmits.
     low: u8,
 }
 
 enum Next {
     Scan(Scan),
-    /// The end of the file, or a marker of it, and whether bytes before it belong to nothing.
+    /// End of the file or its end marker. `skipped` is `true` if bytes before it belong to no segment.
     End {
         marked: bool,
         skipped: bool,
@@ -138,7 +138,7 @@ enum Next {
 }
 
 impl Walk<'_> {
-    /// Reads segments up to the next scan's.
+    /// Reads segments up to the header of the next scan.
     fn next_scan(&mut self) -> Result<Next, String> {
         let mut skipped = false;
         loop {
@@ -228,7 +228,7 @@ impl Walk<'_> {
         let is_sound = first <= last
             && last < 64
             && !components.is_empty()
-            // Blocks of AC coefficients are of one component alone.
+            // A scan of AC coefficients contains a single component.
             && (!frame.is_progressive || if first == 0 { last == 0 } else { components.len() == 1 });
         is_sound.then_some(Scan {
             components,
@@ -239,7 +239,7 @@ impl Walk<'_> {
         })
     }
 
-    /// Follows the data of `scan` and returns whether bytes were left.
+    /// Walks through the data of `scan` and returns `true` if bytes are left over.
     fn scan(&mut self, scan: &Scan) -> Result<bool, String> {
         let Walk { bytes, frame, tables, restart_interval, .. } = self;
         let frame = frame.as_mut().expect("a scan is of a frame");
@@ -278,10 +278,11 @@ impl Walk<'_> {
         Ok(bits.count >= 8)
     }
 
-    /// What is known once all is read. `marked` tells whether there was an end marker.
+    /// Returns the result after the whole file has been read. `marked` is `true` if there was an end marker, `unread` if bytes are left
+    /// over.
     fn finish(&self, marked: bool, unread: bool) -> Result<CheckedJpeg, String> {
         let Some(frame) = &self.frame else { return Err("it has no data".into()) };
-        // A progressive file may end where its author wanted. Of a file that doesn't say that it ends, all has to be there.
+        // A progressive file may end after any scan, as its author chose. A file without an end marker must hold all of its data.
         let is_whole = |component: &Component| match marked {
             true => component.is_begun,
             false => component.complete == ALL && !unread,
@@ -327,19 +328,19 @@ impl Frame {
         Some(frame)
     }
 
-    /// The largest sampling factors of its components, across and down.
+    /// Returns the largest sampling factors of the components, across and down.
     fn sampling(&self) -> (usize, usize) {
         let largest = |side: fn(&Component) -> usize| self.components.iter().map(side).max().unwrap_or(1);
         (largest(|component| component.across), largest(|component| component.down))
     }
 
-    /// MCUs of all components, across and down.
+    /// Returns the number of MCUs of a scan of all components, across and down.
     fn mcus(&self) -> (usize, usize) {
         let (across, down) = self.sampling();
         (self.width.div_ceil(8 * across), self.height.div_ceil(8 * down))
     }
 
-    /// MCUs of `scan`, across and down; of one component, they are its blocks that show part of the image.
+    /// Returns the number of MCUs of `scan`, across and down. For a single component, they are the blocks that cover part of the image.
     fn grid(&self, scan: &Scan) -> (usize, usize) {
         let [(index, ..)] = scan.components.as_slice() else { return self.mcus() };
         let (component, (across, down)) = (&self.components[*index], self.sampling());
@@ -350,9 +351,10 @@ impl Frame {
 
 /// A Huffman code.
 struct Table {
-    /// By the next [`LOOKUP_BITS`]: a code's length and its symbol; length 0 where it is longer.
+    /// Length and symbol of a code, by the next [`LOOKUP_BITS`] bits; the length is 0 if the code is longer.
     lookup: Vec<(u8, u8)>,
-    /// Of each length, the first code beyond those of this length, at 16 bits, and what added to a code makes a symbol's index.
+    /// For each code length, the first code beyond those of this length, shifted to 16 bits, and the offset from a code to the index of its
+    /// symbol.
     ends: [(u32, i32); 17],
     symbols: Vec<u8>,
 }
@@ -382,17 +384,17 @@ impl Table {
     }
 }
 
-/// Data between two markers, bit by bit.
+/// Bit reader for the data between two markers.
 struct Bits<'a> {
     bytes: &'a [u8],
     at: usize,
-    /// Bits that are next, from the highest.
+    /// Unread bits; the highest bit is the next one.
     buffer: u64,
     count: u32,
 }
 
 impl Bits<'_> {
-    /// Until there are 32 bits at least, or none left before the next marker.
+    /// Fills the buffer until it has at least 32 bits, or all bits that are left before the next marker.
     #[inline]
     fn fill(&mut self) {
         if self.count >= 32 {
@@ -418,7 +420,7 @@ impl Bits<'_> {
         }
     }
 
-    /// Takes up to 16 bits, after [`Bits::fill`].
+    /// Takes up to 16 bits. [`Bits::fill`] must be called first.
     #[inline]
     fn take(&mut self, count: u32) -> Option<u32> {
         self.count = self.count.checked_sub(count)?;
@@ -427,7 +429,7 @@ impl Bits<'_> {
         Some(taken)
     }
 
-    /// The next symbol; at least 16 bits are there behind it, if the data go on so far.
+    /// Returns the next symbol. At least 16 bits remain in the buffer after it, unless the data end before.
     #[inline]
     fn symbol(&mut self, table: &Table) -> Option<u8> {
         self.fill();
@@ -443,7 +445,7 @@ impl Bits<'_> {
         table.symbols.get(usize::try_from(index).ok()?).copied()
     }
 
-    /// Goes on behind the next restart marker, which has to be there.
+    /// Continues after the next restart marker, or returns `None` if it is missing.
     fn restart(&mut self) -> Option<()> {
         let rest = self.bytes.get(self.at..)?;
         let offset = rest.windows(2).position(|pair| pair[0] == 0xff && !matches!(pair[1], 0 | 0xff))?;
@@ -452,7 +454,7 @@ impl Bits<'_> {
         Some(())
     }
 
-    /// Follows a block. `run` counts blocks to come that hold nothing new.
+    /// Walks through a block. `run` is the number of blocks that follow without new coefficients.
     #[inline]
     fn block(
         &mut self,
@@ -533,7 +535,7 @@ impl Bits<'_> {
             if size != 0 {
                 self.take(1)?;
             }
-            // A bit for each coefficient that isn't 0 already, up to the zero that is meant.
+            // Each coefficient that is nonzero already takes a bit, up to the zero coefficient that the symbol refers to.
             while k <= scan.last {
                 if *nonzero >> k & 1 == 1 {
                     self.fill();

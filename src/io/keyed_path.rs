@@ -1,11 +1,11 @@
-//! `FILE#KEY`: a file, and the key of something in it.
+//! Paths of the form `FILE#KEY`: a file, and the key of an entry in it.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
-/// Returns what `path` may mean, a file and a key, for each `#` in it from the first on: keys may have the sign, too, and so may
-/// folders. Keys are text; what isn't UTF-8 in them is replaced.
+/// Returns the possible splits of `path` into a file and a key, one for each `#` in it from the first on: keys and folders may contain the
+/// sign too. Keys are text; bytes that aren't UTF-8 are replaced.
 pub fn files_and_keys(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf, String)> {
     let bytes = path.as_os_str().as_bytes();
     let signs = (0..bytes.len()).filter(move |&at| bytes[at] == b'#');

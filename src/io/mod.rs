@@ -1,4 +1,5 @@
-//! Files: splats, weights (safetensors), images, films, arrays (NPY) and TensorBoard's events. Writing never leaves half a file.
+//! File formats: splats, weights (safetensors), images, videos, arrays (NPY) and TensorBoard event files. Writes never leave a partial
+//! file.
 
 mod append;
 mod atomic;

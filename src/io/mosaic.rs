@@ -1,4 +1,4 @@
-//! One picture of many, side by side or one below the other, made as they come.
+//! Mosaics: images that are added one at a time and tiled side by side, or one below the other, into a single image.
 
 use super::images::{rgb_from_tensor, shrink, tile_horizontally, tile_images, write_image};
 use crate::error::Result;
@@ -6,43 +6,43 @@ use image::RgbImage;
 use std::path::Path;
 use tch::Tensor;
 
-/// Pixels of a picture that programs still open, and that a person still looks at.
+/// Maximum number of pixels of a mosaic, chosen so that common programs can open it and people can view it.
 const MOST_PIXELS: i64 = 1 << 26;
 
-/// Pictures that become one, in 8 bits until then. Where they would have more pixels together than programs open, each is shrunk by a
-/// whole factor.
+/// Images that are tiled into one, stored as 8 bits until then. If they have more pixels together than programs open, each is shrunk by an
+/// integer factor.
 #[derive(Debug)]
 pub struct Mosaic {
     is_column: bool,
-    /// Of each of them.
+    /// Maximum number of pixels of each image.
     most_pixels: i64,
     images: Vec<RgbImage>,
     shrunk_by: i64,
 }
 
 impl Mosaic {
-    /// Begins a row of `count` pictures.
+    /// Creates a mosaic for a row of `count` images.
     pub fn row(count: usize) -> Self {
         let most_pixels = MOST_PIXELS / count.max(1) as i64;
         Mosaic { is_column: false, most_pixels, images: vec![], shrunk_by: 1 }
     }
 
-    /// Begins a column of `count` pictures.
+    /// Creates a mosaic for a column of `count` images.
     pub fn column(count: usize) -> Self {
         Mosaic { is_column: true, ..Mosaic::row(count) }
     }
 
-    /// Adds a picture that is made of `parts`, [3, H, W] in [0, 1] and of one size, side by side.
+    /// Adds an image that consists of `parts` side by side, each [3, H, W] in [0, 1] and all of the same size.
     ///
     /// # Errors
-    /// libtorch's refusal, as for another shape.
+    /// Returns libtorch's error, for example for another shape.
     pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
         let factor = self.factor(parts.len(), &parts[0]);
         let parts: Vec<Tensor> = parts.iter().map(|part| shrink(part, factor)).collect();
         self.add_shrunk(&parts)
     }
 
-    /// Returns by how much the sides of a picture have to be divided that is one of `parts` of `part`'s size, [.., H, W].
+    /// Returns the factor by which to divide the sides of an image that consists of `parts` tensors, each of the size of `part` [.., H, W].
     pub fn factor(&mut self, parts: usize, part: &Tensor) -> i64 {
         let [.., height, width] = part.size()[..] else { panic!("a picture has two sides") };
         let factor = shrink_factor(parts as i64 * height * width, self.most_pixels);
@@ -50,30 +50,30 @@ impl Mosaic {
         factor
     }
 
-    /// As [`Mosaic::add`], of parts that are shrunk by [`Mosaic::factor`].
+    /// Adds an image like [`Mosaic::add`], from parts that [`Mosaic::factor`] has already shrunk.
     ///
     /// # Errors
-    /// As there.
+    /// Returns libtorch's error, for example for another shape.
     pub fn add_shrunk(&mut self, parts: &[Tensor]) -> Result<()> {
         self.images.push(rgb_from_tensor(&tile_horizontally(parts))?);
         Ok(())
     }
 
-    /// Returns by how much the sides of the largest pictures were divided: 1 where nothing was shrunk.
+    /// Returns the largest factor by which the sides of an image were divided: 1 if nothing was shrunk.
     pub fn shrunk_by(&self) -> i64 {
         self.shrunk_by
     }
 
-    /// Writes the whole as a PNG.
+    /// Writes the mosaic as a PNG.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Returns an error if the file can't be written.
     pub fn write(self, path: &Path) -> Result<()> {
         write_image(path, &tile_images(&self.images, self.is_column), false)
     }
 }
 
-/// Returns the smallest whole number by which sides have to be divided so that of `pixels` no more than `most` are left.
+/// Returns the smallest integer by which both sides must be divided so that at most `most` of `pixels` remain.
 pub fn shrink_factor(pixels: i64, most: i64) -> i64 {
     (1..).find(|factor| pixels <= most.max(1) * factor * factor).expect("a whole number")
 }

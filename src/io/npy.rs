@@ -1,14 +1,14 @@
-//! Arrays as NumPy's .npy files.
+//! Arrays in NumPy's .npy format.
 
 use super::write_atomically;
 use crate::error::{Error, Result};
 use npyz::WriterBuilder;
 use std::path::Path;
 
-/// Writes `values`, row by row, as a float32 array of that shape.
+/// Writes `values`, in row-major order, as a float32 array of shape `shape`.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Returns an error if the file can't be written.
 pub fn write_npy(path: &Path, shape: &[u64], values: &[f32]) -> Result<()> {
     write_atomically(path, |writer| {
         let write = || {

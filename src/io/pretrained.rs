@@ -1,11 +1,11 @@
-//! Where networks that others trained are found.
+//! Locations of the pretrained weights of other networks.
 
 use std::path::PathBuf;
 
-/// Names the folder of pretrained weights; no other is looked at where it is set.
+/// Environment variable that names the folder of pretrained weights; if it is set, no other folder is searched.
 pub const WEIGHTS_VARIABLE: &str = "GLOBALSPLAT_WEIGHTS";
 
-/// Folders in which pretrained weights may be, the first choice first.
+/// Returns the folders that may contain pretrained weights, in order of preference.
 pub fn pretrained_folders() -> Vec<PathBuf> {
     match std::env::var_os(WEIGHTS_VARIABLE) {
         Some(folder) => vec![folder.into()],
@@ -13,8 +13,8 @@ pub fn pretrained_folders() -> Vec<PathBuf> {
     }
 }
 
-/// The file of that name in the first folder of pretrained weights that has it: the one that [`WEIGHTS_VARIABLE`] names, else
-/// `weights` here, else where `make weights` put them when this program was built.
+/// Returns the file `name` in the first folder of pretrained weights that has it: the one that [`WEIGHTS_VARIABLE`] names, or else
+/// `weights` in the current folder, or else the folder in which `make weights` put them when this program was built.
 pub fn find_pretrained(name: &str) -> Option<PathBuf> {
     pretrained_folders().into_iter().map(|folder| folder.join(name)).find(|path| path.is_file())
 }

@@ -1,5 +1,5 @@
-//! Weights too large for one file: several, and an index that says which tensor is where, as Hugging Face's libraries write and read
-//! them.
+//! Weights that are too large for one file: several files, and an index of which tensor is in which file, in the format of Hugging Face's
+//! libraries.
 
 use super::atomic::PartialFile;
 use super::weights::{Weights, write_weights, write_weights_partially};
@@ -10,20 +10,21 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
-/// The index of the shards that [`write_sharded`] writes for `path`; none where its name isn't one for shards.
+/// Returns the path of the index of the shards that [`write_sharded`] writes for `path`, or `None` if its name doesn't end in
+/// `.safetensors`.
 pub fn shard_index(path: &Path) -> Option<PathBuf> {
     let ending = path.extension()?;
     let stem = path.file_stem()?.to_string_lossy();
     ending.eq_ignore_ascii_case("safetensors").then(|| path.with_file_name(format!("{stem}{INDEX_ENDING}")))
 }
 
-/// Writes `weights` to `path`, a `*.safetensors`, or, where they have more bytes than `most`, to files of no more beside it
-/// (`*-00001-of-00003.safetensors`) and their index. A tensor that is larger by itself has a file of its own. What was written is
-/// returned: the file, or the index, which comes last.
+/// Writes `weights` to `path`, a `*.safetensors`. If they have more than `most` bytes, writes files of at most `most` bytes beside it
+/// (`*-00001-of-00003.safetensors`) and their index instead. A tensor that is larger by itself has its own file. Returns the path of what
+/// was written: the file, or the index, which is written last.
 ///
 /// # Errors
-/// A file that stands where the index would say there is none, a name that doesn't end in `.safetensors`, or the system's refusal to
-/// write.
+/// Returns an error if a file exists at `path` that would be taken for the shards, if a name for shards doesn't end in `.safetensors`, or
+/// if a file can't be written.
 pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBuf> {
     let bytes = |tensor: &Tensor| (tensor.numel() * tensor.kind().elt_size_in_bytes()) as u64;
     let total: u64 = weights.tensors.values().map(bytes).sum();
@@ -57,7 +58,7 @@ pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBu
         written.push(write_weights_partially(&path.with_file_name(&name), shard, metadata)?);
         weight_map.extend(shard.keys().map(|tensor| (tensor.clone(), name.clone())));
     }
-    // One of before would describe other files.
+    // An index from before would describe other files.
     if index.exists() {
         std::fs::remove_file(&index).map_err(Error::write(&index))?;
     }

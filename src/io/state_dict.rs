@@ -1,4 +1,4 @@
-//! Weights among what a checkpoint of torch.save holds: Lightning's, a plain state dict, or one under another customary name.
+//! Extraction of weights from a checkpoint of torch.save: a Lightning checkpoint, a plain state dict, or one under another customary key.
 
 use super::torch_file::{Array, TorchFile, Value};
 use crate::error::{Error, Result};
@@ -8,15 +8,17 @@ use std::path::Path;
 /// Arrays by name, and metadata.
 pub(super) type Contents = (BTreeMap<String, Array>, HashMap<String, String>);
 
-/// Where a checkpoint has its state dict; Lightning's have the first.
+/// Keys under which a checkpoint may hold its state dict. Lightning uses the first.
 const PLACES: [&str; 3] = ["state_dict", "model_state_dict", "model"];
-/// What shapes of weights don't tell, as settings call it. Wherever it stands in a checkpoint, it is taken if it is said alike.
+/// Names of settings that the shapes of weights don't determine. A setting is used wherever it occurs in a checkpoint, if all occurrences
+/// have the same value.
 const SETTINGS: [&str; 1] = ["num_heads"];
 
-/// The tensors of the state dict in `file`, which is `path`; and as metadata the strings beside it, and settings.
+/// Returns the tensors of the state dict in `file`, which was read from `path`. The metadata are the strings beside the state dict, and
+/// settings.
 ///
 /// # Errors
-/// No state dict, or a tensor that isn't whole.
+/// Returns an error if there is no state dict, or if a tensor is broken.
 pub(super) fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
     let TorchFile { values, storages } = file;
     let refuse = |found: &str| {

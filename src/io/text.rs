@@ -3,10 +3,10 @@
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// Reads a UTF-8 file without the byte order mark that programs for Windows put before it.
+/// Reads a UTF-8 file without the byte order mark that Windows programs put at its start.
 ///
 /// # Errors
-/// A file that can't be read or isn't UTF-8.
+/// Returns an error if the file can't be read or isn't UTF-8.
 pub fn read_text(path: &Path) -> Result<String> {
     let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
     Ok(match text.strip_prefix('\u{feff}') {

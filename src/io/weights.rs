@@ -1,4 +1,4 @@
-//! Weights as safetensors, with the configuration that rebuilds their model in the file's metadata.
+//! Weights in safetensors files, whose metadata hold the configuration that rebuilds their model.
 
 use super::atomic::{PartialFile, write_partially};
 use crate::error::{Error, Result};
@@ -7,19 +7,19 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn};
 
-/// The contents of a safetensors file.
+/// Contents of a safetensors file.
 #[derive(Debug)]
 pub struct Weights {
-    /// By name, on the host, as stored.
+    /// Tensors by name, on the host, in their stored type.
     pub tensors: BTreeMap<String, Tensor>,
-    /// The file's `__metadata__`.
+    /// Metadata of the file, its `__metadata__`.
     pub metadata: HashMap<String, String>,
 }
 
-/// Writes a safetensors file, whole or not at all.
+/// Writes a safetensors file atomically.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Returns an error if the file can't be written.
 pub fn write_weights(
     path: &Path,
     tensors: &BTreeMap<String, Tensor>,
@@ -28,10 +28,10 @@ pub fn write_weights(
     write_weights_partially(path, tensors, metadata)?.keep()
 }
 
-/// As [`write_weights`], but for the name, which the file gets when it is kept.
+/// Writes a file like [`write_weights`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
 ///
 /// # Errors
-/// As there.
+/// Returns the errors of [`write_weights`].
 pub(super) fn write_weights_partially(
     path: &Path,
     tensors: &BTreeMap<String, Tensor>,
@@ -47,19 +47,20 @@ pub(super) fn write_weights_partially(
     write_partially(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-/// The metadata come in the order of a hash map, another one in each process: sorted, the same weights are the same bytes.
+/// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give
+/// equal bytes.
 fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
     let (length, rest) = bytes.split_at_mut(8);
     let length = u64::from_le_bytes(length.try_into().expect("eight bytes")) as usize;
     let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
     let sorted = serde_json::to_vec(&header)?;
-    // What was padded with spaces stays so.
+    // The header keeps its length, which includes padding with spaces.
     rest[..sorted.len()].copy_from_slice(&sorted);
     rest[sorted.len()..length].fill(b' ');
     Ok(())
 }
 
-/// A tensor's bytes in row-major order.
+/// A tensor's bytes in row-major order, with its type and shape.
 pub(super) struct Stored {
     pub kind: Kind,
     pub shape: Vec<usize>,
@@ -95,14 +96,14 @@ impl Weights {
     /// Copies the weights into the variables of `vs`, which keep their type and device.
     ///
     /// # Errors
-    /// Names or shapes that don't fit, before anything is copied: the first is named and the rest counted.
+    /// Returns an error if names or shapes don't match, before anything is copied: it names the first mismatch and counts the others.
     pub fn load_into(&self, vs: &nn::VarStore, file: &Path) -> Result<()> {
         let shapes = self.tensors.iter().map(|(name, t)| (name.as_str(), t.size())).collect();
         fit(vs, &shapes, file, |name, variable| Ok(variable.f_copy_(&self.tensors[name])?))
     }
 }
 
-/// Fills every variable of `vs` by `copy`, if their names and shapes are those of `file`'s tensors.
+/// Fills every variable of `vs` with `copy`, if the names and shapes are those of the tensors in `file`.
 pub(super) fn fit(
     vs: &nn::VarStore,
     shapes: &BTreeMap<&str, Vec<i64>>,

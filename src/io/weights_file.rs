@@ -1,5 +1,5 @@
-//! Weights where they lie on disk: in one safetensors file, in several with an index, or in a checkpoint that torch.save wrote. The
-//! files are mapped, so a tensor is read when it is asked for, once, and straight to where it belongs.
+//! Memory-mapped weights: one safetensors file, several with an index, or a checkpoint that torch.save wrote. A tensor is read when it is
+//! needed, once, and directly into its destination.
 
 use super::state_dict::{Contents, state_dict};
 use super::text::read_text;
@@ -15,33 +15,33 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor, nn};
 
-/// How the name of an index of shards ends, as Hugging Face's libraries write it.
+/// Suffix of the name of an index of shards, as Hugging Face's libraries write it.
 pub(super) const INDEX_ENDING: &str = ".safetensors.index.json";
-/// That file.
+/// Contents of an index of shards.
 #[derive(Serialize, Deserialize)]
 pub(super) struct ShardIndex {
     #[serde(default)]
     pub metadata: serde_json::Map<String, serde_json::Value>,
-    /// In which file, beside the index, each tensor is.
+    /// File, beside the index, that contains each tensor.
     pub weight_map: BTreeMap<String, String>,
 }
 
-/// Reads a safetensors file of float32, bfloat16 or float16 tensors, or whatever else [`WeightsFile::open`] knows.
+/// Reads a safetensors file of float32, bfloat16 or float16 tensors, or another format that [`WeightsFile::open`] supports.
 ///
 /// # Errors
-/// As there.
+/// Returns the errors of [`WeightsFile::open`] and [`WeightsFile::read`].
 pub fn read_weights(path: &Path) -> Result<Weights> {
     WeightsFile::open(path)?.read()
 }
 
-/// Whether files of this name hold weights, as a rule.
+/// Returns `true` if `path` has an extension that is usual for weights.
 pub fn is_weights_name(path: &Path) -> bool {
     let name = path.to_string_lossy().to_ascii_lowercase();
     let endings = [INDEX_ENDING, ".safetensors", ".ckpt", ".pt", ".pth"];
     endings.iter().any(|ending| name.ends_with(ending))
 }
 
-/// The files that [`WeightsFile::open`] reads at `path`: one, or an index and what it names.
+/// Returns the files that [`WeightsFile::open`] reads at `path`: one file, or an index and the files that it names.
 pub fn weights_files(path: &Path) -> Vec<PathBuf> {
     let Some(index) = index_at(path) else { return vec![path.to_owned()] };
     let shards = read_index(&index).map(|index| index.weight_map.into_values().collect::<BTreeSet<_>>());
@@ -49,13 +49,13 @@ pub fn weights_files(path: &Path) -> Vec<PathBuf> {
     std::iter::once(index.clone()).chain(shards).collect()
 }
 
-/// The index of shards that `path` is, or that stands for it.
+/// Returns the index of shards that `path` is, or that takes the place of a missing file at `path`.
 fn index_at(path: &Path) -> Option<PathBuf> {
     let ends_in = |ending: &str| path.to_string_lossy().to_ascii_lowercase().ends_with(ending);
     if ends_in(INDEX_ENDING) {
         return Some(path.to_owned());
     }
-    // The name that shards were written under.
+    // `path` may be the name from which the names of the shards were derived.
     let index = path.with_extension(INDEX_ENDING.trim_start_matches('.'));
     (!path.exists() && ends_in(".safetensors") && index.exists()).then_some(index)
 }
@@ -65,7 +65,7 @@ fn read_index(path: &Path) -> Result<ShardIndex> {
         .map_err(|e| Error::input(path, "the index", format!("broken ({e})"), "a weight_map of names"))
 }
 
-/// Weights in one file or several, none of them read yet.
+/// Weights in one or several files, none of which have been read yet.
 #[derive(Debug)]
 pub struct WeightsFile {
     path: PathBuf,
@@ -76,13 +76,13 @@ pub struct WeightsFile {
     metadata: HashMap<String, String>,
 }
 
-/// A file's contents.
+/// Contents of a file.
 #[derive(Debug)]
 enum Bytes {
     Mapped(Mmap),
-    /// What is written there is the process' own.
+    /// Copy-on-write mapping: what is written there is private to the process.
     Lent(MmapMut),
-    /// By the program itself.
+    /// Bytes embedded in the program.
     Carried(&'static [u8]),
 }
 
@@ -94,7 +94,8 @@ impl Bytes {
             Ok((true, _)) => return Err(read(std::io::ErrorKind::IsADirectory.into())),
             Err(e) => return Err(read(e)),
         };
-        // SAFETY: ours are replaced as a whole, never changed in place. Whoever cuts off a file that is being read ends the program.
+        // SAFETY: our own files are replaced as a whole, never changed in place. If another program truncates a file that is being read,
+        // this process is killed.
         Ok(Bytes::Mapped(unsafe { MmapOptions::new().map_copy_read_only(&file) }.map_err(read)?))
     }
 
@@ -113,11 +114,11 @@ impl Bytes {
         }
     }
 
-    /// Says that nobody needs them again soon: a mapped file's pages don't stay beside what was copied from them. Whoever reads them
-    /// again gets what is in the file.
+    /// Advises the system that these pages aren't needed soon, so that pages of a mapped file don't stay in memory beside what was copied
+    /// from them. A later access reads them from the file again.
     fn let_go(&self, range: Range<usize>) {
         let (start, length) = (range.start, range.len());
-        // SAFETY: pages of a file that others read as numbers of any value.
+        // SAFETY: these are pages of a file, which are only read as numbers, for which every value is valid.
         let advised = unsafe {
             match self {
                 Bytes::Mapped(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
@@ -125,12 +126,12 @@ impl Bytes {
                 Bytes::Carried(_) => Ok(()),
             }
         };
-        // It is advice alone.
+        // An error is ignored: this is only advice.
         let _ = advised;
     }
 }
 
-/// A tensor's place in one of the files.
+/// Location of a tensor in one of the files.
 #[derive(Debug)]
 struct Place {
     part: usize,
@@ -138,11 +139,12 @@ struct Place {
 }
 
 impl WeightsFile {
-    /// Looks into a safetensors file, an index of such files (`*.safetensors.index.json`), or what torch.save wrote: a state dict, or
-    /// a checkpoint with one. Of a checkpoint nothing is run.
+    /// Opens a safetensors file, an index of such files (`*.safetensors.index.json`), or a file of torch.save: a state dict, or a
+    /// checkpoint with one. Nothing in a checkpoint is executed.
     ///
     /// # Errors
-    /// A file that can't be read, is damaged or is none of these, or has tensors of a type that no weights have.
+    /// Returns an error if a file can't be read, is damaged or has none of these formats, or if a tensor has a type that weights don't
+    /// have.
     pub fn open(path: &Path) -> Result<Self> {
         match index_at(path) {
             Some(index) => Self::open_shards(&index),
@@ -150,7 +152,7 @@ impl WeightsFile {
         }
     }
 
-    /// What the program carries; `path` is what errors call it.
+    /// Opens weights that are embedded in the program; errors call them `path`.
     pub(crate) fn carried(bytes: &'static [u8], path: &Path) -> Result<Self> {
         Self::of(Bytes::Carried(bytes), path)
     }
@@ -195,27 +197,27 @@ impl WeightsFile {
         }
     }
 
-    /// The file, or the index of files.
+    /// Returns the path of the file, or of the index of files.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the files that the weights are in: one, or an index and the shards that it names.
+    /// Returns the files that hold the weights: one file, or an index and the shards that it names.
     pub fn files(&self) -> &[PathBuf] {
         &self.files
     }
 
-    /// The file's `__metadata__`; of a checkpoint the strings beside its state dict, and settings that shapes don't tell.
+    /// Returns the file's `__metadata__`, or for a checkpoint the strings beside its state dict, and settings that shapes don't determine.
     pub fn metadata(&self) -> &HashMap<String, String> {
         &self.metadata
     }
 
-    /// Every tensor's name.
+    /// Returns the names of all tensors.
     pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
         self.tensors.keys().map(String::as_str)
     }
 
-    /// Every tensor's type and shape, by its name.
+    /// Returns the type and shape of every tensor, by name.
     pub fn shapes(&self) -> BTreeMap<String, (Kind, Vec<i64>)> {
         self.tensors
             .iter()
@@ -223,16 +225,16 @@ impl WeightsFile {
             .collect()
     }
 
-    /// Calls every tensor as `rename` says, and leaves out those of which it says nothing.
+    /// Renames every tensor with `rename`, and drops those for which it returns `None`.
     pub fn renamed(self, rename: impl Fn(&str) -> Option<String>) -> Self {
         let tensors = self.tensors.into_iter().filter_map(|(name, s)| Some((rename(&name)?, s))).collect();
         WeightsFile { tensors, ..self }
     }
 
-    /// All of it, in memory.
+    /// Reads all weights into memory.
     ///
     /// # Errors
-    /// libtorch's refusal.
+    /// Returns libtorch's error.
     pub fn read(&self) -> Result<Weights> {
         let tensors = self.tensors.iter().map(|(name, place)| Ok((name.clone(), self.copy(place)?)));
         Ok(Weights { tensors: tensors.collect::<Result<_>>()?, metadata: self.metadata.clone() })
@@ -241,16 +243,18 @@ impl WeightsFile {
     /// Copies the weights into the variables of `vs`, which keep their type and device.
     ///
     /// # Errors
-    /// Names, shapes or types that don't fit, before anything is copied: the first name or shape is told and the rest counted.
+    /// Returns an error if names, shapes or types don't match, before anything is copied: it reports the first name or shape and counts the
+    /// others.
     pub fn load_into(&self, vs: &nn::VarStore) -> Result<()> {
         self.fill(vs, |_, _| false)
     }
 
-    /// As [`WeightsFile::load_into`], but what variables on the host take as it is isn't copied: they lie in the file from now on, and
-    /// the process has the pages that are in use alone. Whoever writes to a variable gets a page of his own.
+    /// Loads the weights like [`WeightsFile::load_into`], but doesn't copy weights that variables on the host can use as they are: from now
+    /// on the data of these variables stay in the mapped file, and only pages in use take memory. Writing to a variable creates a private
+    /// copy of the page.
     ///
     /// # Errors
-    /// As there.
+    /// Returns the errors of [`WeightsFile::load_into`], and an error if a file can't be mapped.
     pub fn lend_to(mut self, vs: &nn::VarStore) -> Result<LentWeights> {
         let path = &self.path;
         self.parts = self.parts.into_iter().map(|bytes| bytes.lend(path)).collect::<Result<_>>()?;
@@ -259,11 +263,12 @@ impl WeightsFile {
             variable.device() == Device::Cpu && variable.kind() == view.kind() && view.is_contiguous()
         };
         self.fill(vs, |variable, view| are_files && takes(variable, view))?;
-        // Nobody knows how long variables will be held.
+        // The files stay mapped, because nothing limits how long the variables live.
         Ok(LentWeights(Box::leak(self.parts.into_boxed_slice())))
     }
 
-    /// With the variables that `lies_in_file` says, given what the file has for them, in the file; the others get a copy.
+    /// Fills the variables of `vs`. If `lies_in_file` returns `true` for a variable and the view of its weights in the file, the variable
+    /// takes the view; the others get a copy.
     fn fill(&self, vs: &nn::VarStore, lies_in_file: impl Fn(&Tensor, &Tensor) -> bool) -> Result<()> {
         let is_weight = |kind| matches!(kind, Kind::Float | Kind::Double | Kind::BFloat16 | Kind::Half);
         if let Some((name, place)) = self.tensors.iter().find(|(_, place)| !is_weight(place.array.dtype)) {
@@ -278,7 +283,7 @@ impl WeightsFile {
             let part = &self.parts[place.part].get()[bytes.clone()];
             match part.as_ptr().align_offset(dtype.elt_size_in_bytes()) {
                 0 if !part.is_empty() => {
-                    // SAFETY: the array lies inside the file, which stays mapped until it is copied, or else for ever.
+                    // SAFETY: the array lies inside the file, which stays mapped until the array is copied, or else forever.
                     let view = unsafe {
                         let (size, stride) = (dimensions(size), dimensions(stride));
                         Tensor::f_from_blob(part.as_ptr(), &size, &stride, *dtype, Device::Cpu)?
@@ -304,13 +309,13 @@ impl WeightsFile {
     }
 }
 
-/// Files that variables lie in ([`WeightsFile::lend_to`]), as long as the process lives.
+/// Mapped files that hold the data of variables ([`WeightsFile::lend_to`]), for the rest of the process.
 #[derive(Debug, Clone, Copy)]
 pub struct LentWeights(&'static [Bytes]);
 
 impl LentWeights {
-    /// Gives memory of what was read back to the system, until it is read again: as a rule from the system's own memory of files.
-    /// What was written to variables that lie there is lost.
+    /// Releases the memory of pages that were read, until they are read again, usually from the system's page cache. Values that were
+    /// written to these variables are lost.
     pub fn let_go(&self) {
         self.0.iter().for_each(|bytes| bytes.let_go(0..bytes.get().len()));
     }
@@ -320,13 +325,13 @@ fn dimensions(sizes: &[usize]) -> Vec<i64> {
     sizes.iter().map(|&size| size as i64).collect()
 }
 
-/// Where the tensors of a safetensors file lie in its `bytes`.
+/// Returns the locations of the tensors of a safetensors file in its `bytes`.
 fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
     let broken = |e: SafeTensorError| {
         Error::input(path, "the file", format!("broken ({e})"), "safetensors, or what torch.save writes")
     };
     let (header_length, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
-    /// Of the header's length.
+    /// Number of bytes of the header's length.
     const LENGTH: usize = 8;
     let mut arrays = BTreeMap::new();
     for (name, info) in header.tensors() {

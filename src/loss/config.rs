@@ -1,13 +1,13 @@
-//! Which terms the loss has, and what they count.
+//! Configuration of the loss: its terms and their weights.
 
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Which network compares.
+/// Network of the perceptual loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PerceptualKind {
-    /// None: L_perc is left out.
+    /// No network: L_perc is left out.
     None,
     /// Features of VGG-19.
     Vgg19,
@@ -17,40 +17,42 @@ pub enum PerceptualKind {
     LpipsAlex,
 }
 
-/// The factors of the loss (spec 7.1).
+/// Weights of the loss terms (spec 7.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
-    /// Mean squared error of the rendered colours.
+    /// Weight of the mean squared error of the rendered colours.
     pub mse: f64,
-    /// The network that compares pictures as people see them: `none`, `vgg19`, `lpips_vgg` or `lpips_alex`.
+    /// Network of the perceptual loss: `none`, `vgg19`, `lpips_vgg` or `lpips_alex`.
     pub perceptual: PerceptualKind,
-    /// What its difference counts.
+    /// Weight of the perceptual loss.
     pub perceptual_factor: f64,
-    /// The file of its weights; by default the network's own name in the folders where `make weights` puts them. `${NAME}` and `${NAME:-default}` stand for environment variables.
+    /// File of the network's weights. By default it has the network's own name and is looked up in the folders where `make weights` puts
+    /// them. `${NAME}` and `${NAME:-default}` stand for environment variables.
     pub perceptual_weights: String,
-    /// Difference of the two subsets' accumulated opacities. Without this and the next, all context views go together.
+    /// Weight of the difference of the two subsets' accumulated opacities. If this and `consistency_depth` are 0, all context views form
+    /// one set.
     pub consistency_alpha: f64,
-    /// Difference of the two subsets' depths.
+    /// Weight of the difference of the two subsets' depths.
     pub consistency_depth: f64,
-    /// Frustum constraint on the Gaussians' centres.
+    /// Weight of the frustum constraint on the Gaussians' centres.
     pub frustum: f64,
-    /// L_dec, which has its own 1e-2 inside.
+    /// Weight of L_dec, in addition to its own factor of 1e-2.
     pub decoder: f64,
-    /// Whether L_dec has its opacity term.
+    /// Includes the opacity term in L_dec if `true`.
     pub decoder_opacity: bool,
 }
 
 impl LossConfig {
-    /// Whether the context is split into two subsets that have to agree.
+    /// Returns `true` if the context is split into two subsets that have to agree.
     pub fn has_consistency(&self) -> bool {
         self.consistency_alpha > 0. || self.consistency_depth > 0.
     }
 
-    /// Whether the factors can be.
+    /// Checks that the weights are finite and at least 0.
     ///
     /// # Errors
-    /// Names the first that can't.
+    /// Names the first weight that isn't.
     pub fn check(&self) -> Result<()> {
         for (field, value) in [
             ("loss.mse", self.mse),

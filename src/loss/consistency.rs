@@ -1,27 +1,27 @@
-//! L_con: two subsets of the photos have to tell the same geometry (spec 7.7).
+//! L_con: the Gaussians of two subsets of the photos must agree in geometry (spec 7.7).
 
 use tch::{Kind, Tensor};
 
-/// What a forward pass is of a training step, which may go through the model in slices.
+/// Part of a training step that one forward pass covers: a step may run the model in slices.
 #[derive(Debug)]
 pub struct Share {
-    /// Of the step's scenes.
+    /// Fraction of the step's scenes.
     pub scenes: f64,
-    /// Pixels of the whole step whose depth L_con compares, a scalar; none where this pass is the whole step.
+    /// Number of pixels of the whole step whose depth L_con compares, a scalar; `None` if this pass is the whole step.
     pub depth_pixels: Option<Tensor>,
 }
 
 impl Share {
-    /// All of it.
+    /// Share of a pass that is the whole step.
     pub const WHOLE: Share = Share { scenes: 1., depth_pixels: None };
 }
 
-/// Depth is compared where both splats are at least this opaque.
+/// Minimum opacity of both splats at a pixel whose depth is compared.
 const MIN_ALPHA: f64 = 0.01;
 
-/// `alpha_factor` · L1(A_a, A_b) + `depth_factor` · L1(D_a, D_b), each ½|x − sg(y)| + ½|y − sg(x)|: either side learns
-/// from the other, which stands still. Accumulated opacities and depths [B, C, H, W] of `share` of a step; the result is a
-/// scalar, its part of the whole step's.
+/// Computes `alpha_factor` · L1(A_a, A_b) + `depth_factor` · L1(D_a, D_b), each ½|x − sg(y)| + ½|y − sg(x)|, where sg stops the gradient:
+/// either side learns from the other, which is fixed. Accumulated opacities and depths are [B, C, H, W] and those of `share` of a step; the
+/// result is a scalar, this share's part of the step's loss.
 pub fn consistency(
     alpha: [&Tensor; 2],
     depth: [&Tensor; 2],
@@ -39,7 +39,7 @@ pub fn consistency(
     opacity * alpha_factor + depth * depth_factor
 }
 
-/// Pixels whose depth is compared: how many they are, a scalar of `alpha`'s kind.
+/// Counts the pixels whose depth is compared; returns a scalar of `alpha`'s kind.
 pub fn depth_pixels(alpha: [&Tensor; 2]) -> Tensor {
     opaque_in_both(alpha).to_kind(alpha[0].kind()).sum(None::<Kind>)
 }

@@ -1,31 +1,31 @@
-//! L_dec: keeps the decoder's raw numbers in a range where they can be learned (spec 7.6).
+//! L_dec: keeps the decoder's raw outputs in a range where they can be learned (spec 7.6).
 
 use crate::model::RawOutputs;
 use tch::{Kind, Tensor};
 
-/// The term's own factor.
+/// Factor of the whole term.
 const FACTOR: f64 = 1e-2;
-/// Spherical harmonics beyond it are penalized, softly.
+/// Magnitude of spherical harmonics above which they are softly penalized.
 const SH_CAP: f64 = 5.;
-/// Opacities beyond it are penalized.
+/// Opacity above which opacities are penalized.
 const OPACITY_THRESHOLD: f64 = 0.2;
 
-/// L_dec and what it is made of, all scalars.
+/// L_dec and its parts, all scalars.
 #[derive(Debug)]
 pub struct DecoderRegularization {
-    /// 1e-2 times the sum of the others.
+    /// Total of L_dec: 1e-2 times the sum of the parts.
     pub total: Tensor,
-    /// L_opacity; 0 where it is left out.
+    /// Penalty on large opacities, L_opacity; 0 if it is left out.
     pub opacity: Tensor,
-    /// L_scale.
+    /// Penalty on large scales, L_scale.
     pub scale: Tensor,
-    /// L_rot.
+    /// Penalty on rotation residuals, L_rot.
     pub rotation: Tensor,
-    /// L_SH.
+    /// Penalty on large spherical harmonics, L_SH.
     pub sh: Tensor,
 }
 
-/// 1e-2 · (L_scale + L_rot + L_SH), and L_opacity in the sum when `opacity` is set.
+/// Computes 1e-2 · (L_scale + L_rot + L_SH), with L_opacity in the sum if `opacity` is set.
 pub fn decoder_regularization(raw: &RawOutputs, opacity: bool) -> DecoderRegularization {
     let mean = |t: Tensor| t.mean(None::<Kind>);
     let scale = mean((&raw.log_scales - crate::model::MAX_SCALE.ln()).relu().square());
@@ -42,7 +42,7 @@ pub fn decoder_regularization(raw: &RawOutputs, opacity: bool) -> DecoderRegular
     DecoderRegularization { total, opacity, scale, rotation, sh }
 }
 
-/// mean softplus(|c| − 5)².
+/// Computes mean softplus(|c| − 5)².
 pub fn sh_soft_cap(sh: &Tensor) -> Tensor {
     (sh.abs() - SH_CAP).softplus().square().mean(None::<Kind>)
 }

@@ -1,19 +1,19 @@
-//! How uneven depths are where a photo is even: what holds geometry together where photos are few (Godard et al. 2017, eq. 3).
+//! Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
 use crate::render::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
-/// `factor` times the mean over all pairs of neighbouring pixels, side by side or one above the other, with depths a and b and greys
-/// g and h of the photo there, of 2 |a − b| / (a + b) · exp(−10 |g − h|). Pairs of which one depth is 0, where nothing is seen, count
-/// for nothing. A scalar, differentiable with respect to the depths, [.., H, W], 0 or more; photos are [.., 3, H, W]. Float64 where
-/// the depths are, else float32.
+/// Computes `factor` times the mean of 2 |a − b| / (a + b) · exp(−10 |g − h|) over all pairs of horizontally or vertically neighbouring
+/// pixels, where a and b are the depths and g and h the photo's grey values at the two pixels. Pairs with a depth of 0, where nothing is
+/// visible, contribute 0. `depths` are [.., H, W], 0 or more; `photos` are [.., 3, H, W]. The result is a scalar, differentiable with
+/// respect to the depths; float64 if the depths are, and float32 otherwise.
 ///
 /// # Panics
-/// Shapes that don't fit.
+/// Panics if the shapes don't fit.
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
     let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+    // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
     let done = unsafe { handed_over(|out| fit::depth_smoothness(depths, photos, factor, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss

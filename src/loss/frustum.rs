@@ -1,19 +1,19 @@
-//! L_fru: pulls Gaussians that no input view can see back into some view's frustum (spec 7.5).
+//! L_fru: pulls Gaussians that no input view can see back into the frustum of some view (spec 7.5).
 
 use crate::data::ViewBatch;
 use tch::{Kind, Tensor};
 
-/// Divisors of the projection are at least this.
+/// Minimum divisor of the projection.
 const MIN_DIVISOR: f64 = 1e-6;
-/// A nearer Gaussian violates the frustum.
+/// Near plane: Gaussians with a smaller depth violate the frustum.
 const NEAR: f64 = 0.01;
-/// Pixels (or units of depth) of violation that count as one.
+/// Violation, in pixels or units of depth, that counts as one.
 const SOFTNESS: f64 = 10.;
 
-/// Mean over Gaussians and scenes of log(1 + v/10), v the smallest violation over the views: how far the projection lies
-/// outside of the image, in pixels, plus how far the depth lies outside of [0.01, far].
+/// Computes the mean over Gaussians and scenes of log(1 + v/10), where v is the smallest violation over the views. A violation is the
+/// distance of the projection from the image, in pixels, plus the distance of the depth from [0.01, far].
 ///
-/// `means` [B, N, 3], `far` `[B]`. A scalar.
+/// `means` is [B, N, 3] and `far` is `[B]`. The result is a scalar.
 pub fn frustum(means: &Tensor, views: &ViewBatch, far: &Tensor) -> Tensor {
     let (height, width) = (views.images.size()[3], views.images.size()[4]);
     let rotation = views.w2c.narrow(-2, 0, 3).narrow(-1, 0, 3);

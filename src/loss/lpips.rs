@@ -1,5 +1,5 @@
-//! LPIPS, a distance of pictures as people see it: Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
-//! Perceptual Metric", 2018, equation 1. Version 0.1 of its linear weights, with which published numbers are made.
+//! LPIPS, a perceptual image distance: Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", 2018,
+//! equation 1. It uses version 0.1 of the linear weights, as published results do.
 
 use crate::device::leave_out_tf32;
 use crate::error::Result;
@@ -8,49 +8,50 @@ use crate::model::{Precision, convolve};
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn};
 
-/// What the distance takes from pictures in [−1, 1], per channel, and divides them by: the mean and standard deviation of
-/// the photos that the networks were trained on.
+/// Values subtracted from images in [−1, 1], per channel: the mean of the photos that the networks were trained on. `SCALE`, their standard
+/// deviation, is the divisor.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
-/// Added to the norms that features are divided by.
+/// Constant added to the norms that features are divided by.
 const EPSILON: f64 = 1e-10;
-/// Pictures of more pixels are compared in tiles: VGG-16's first features take 256 bytes a pixel, several times over.
+/// Maximum number of pixels of an image that is compared as a whole. Larger images are compared in tiles: VGG-16's first features take 256
+/// bytes per pixel, several times over.
 const MOST_PIXELS: i64 = 1 << 20;
-/// Side of a tile in pixels, about.
+/// Approximate side of a tile in pixels.
 const TILE: i64 = 640;
-/// The pixels beside a tile that features inside depend on, at the most: 90 for VGG-16 and 80 for AlexNet, as a multiple of
-/// [`LARGEST_STRIDE`].
+/// Upper bound on the number of pixels beyond a tile that its features depend on: 90 for VGG-16 and 80 for AlexNet, rounded up to a
+/// multiple of [`LARGEST_STRIDE`].
 const HALO: i64 = 96;
-/// Pixels between the last layer's features, in either network. Every other layer's stride divides it.
+/// Stride of the last layer's features in pixels, for either network. The stride of every other layer divides it.
 const LARGEST_STRIDE: i64 = 16;
 
-/// The network whose features are compared.
+/// Backbone whose features LPIPS compares.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LpipsNetwork {
-    /// VGG-16 (Simonyan & Zisserman 2015), features after ReLU 1_2, 2_2, 3_3, 4_3 and 5_3.
+    /// VGG-16 (Simonyan & Zisserman 2015), with features after ReLU 1_2, 2_2, 3_3, 4_3 and 5_3.
     Vgg16,
-    /// AlexNet in its one-tower form (Krizhevsky 2014), features after each of the five ReLUs.
+    /// AlexNet in its one-tower form (Krizhevsky 2014), with features after each of the five ReLUs.
     AlexNet,
 }
 
-/// One convolution with its ReLU, and what stands before and after it.
+/// Convolution with its ReLU, an optional pooling before it, and an optional comparison after it.
 struct Layer {
     name: &'static str,
     channels: i64,
     kernel: i64,
     stride: i64,
     padding: i64,
-    /// A max pooling comes before.
+    /// Preceded by a max pooling.
     pooled: bool,
-    /// Its features are compared.
+    /// Included in the distance.
     compared: bool,
 }
 
 impl LpipsNetwork {
-    /// Both.
+    /// All networks.
     pub const ALL: [LpipsNetwork; 2] = [LpipsNetwork::Vgg16, LpipsNetwork::AlexNet];
 
-    /// What the distance is called in reports.
+    /// Returns the name of the metric in reports.
     pub fn metric(self) -> &'static str {
         match self {
             LpipsNetwork::Vgg16 => "lpips_vgg",
@@ -58,7 +59,7 @@ impl LpipsNetwork {
         }
     }
 
-    /// What `make weights` calls the file of the weights.
+    /// Returns the file name that `make weights` gives to the weights.
     pub fn file_name(self) -> &'static str {
         match self {
             LpipsNetwork::Vgg16 => "lpips_vgg.safetensors",
@@ -66,7 +67,7 @@ impl LpipsNetwork {
         }
     }
 
-    /// In pixels: of a smaller picture nothing would be left for the last layer.
+    /// Returns the smallest side of an image in pixels. In a smaller image the last layer would have no features.
     pub fn smallest_side(self) -> i64 {
         match self {
             LpipsNetwork::Vgg16 => 16,
@@ -74,7 +75,7 @@ impl LpipsNetwork {
         }
     }
 
-    /// Pixels between features, of every layer that is compared.
+    /// Returns the stride in pixels of the features of every layer that is compared.
     fn strides(self) -> Vec<i64> {
         let mut stride = 1;
         let layers = self.layers().into_iter().filter_map(|layer| {
@@ -84,7 +85,7 @@ impl LpipsNetwork {
         layers.collect()
     }
 
-    /// Side of the max poolings' windows, which are 2 apart.
+    /// Returns the side of the max poolings' windows, whose stride is 2.
     fn pool(self) -> i64 {
         match self {
             LpipsNetwork::Vgg16 => 2,
@@ -132,21 +133,21 @@ impl LpipsNetwork {
     }
 }
 
-/// A tile along one side of a picture, in pixels.
+/// Extent of a tile along one side of an image, in pixels.
 #[derive(Debug, Clone, Copy)]
 struct Tile {
-    /// The first pixel of the tile, a multiple of [`LARGEST_STRIDE`].
+    /// First pixel of the tile, a multiple of [`LARGEST_STRIDE`].
     first: i64,
-    /// The pixel after its last.
+    /// End of the tile: the pixel after its last.
     end: i64,
-    /// The first pixel that the network is shown.
+    /// First pixel of the network's input.
     shown: i64,
-    /// The pixel after the last one that it is shown.
+    /// End of the network's input: the pixel after its last.
     shown_end: i64,
 }
 
 impl Tile {
-    /// Divides `side` pixels into tiles of about `length`.
+    /// Divides `side` pixels into tiles of about `length` pixels.
     fn cover(side: i64, length: i64) -> impl Iterator<Item = Tile> + Clone {
         let count = (side + length - 1) / length;
         let step = (side / count / LARGEST_STRIDE + 1) * LARGEST_STRIDE;
@@ -156,13 +157,13 @@ impl Tile {
         })
     }
 
-    /// Cuts what the network is shown out of `pictures` along `dim`.
+    /// Returns the network's input for this tile: a slice of `pictures` along `dim`.
     fn cut(self, pictures: &Tensor, dim: i64) -> Tensor {
         pictures.narrow(dim, self.shown, self.shown_end - self.shown)
     }
 
-    /// Keeps the tile's own values of `features`, which are `stride` pixels apart along `dim`. At the picture's end a layer may have
-    /// fewer than the pixels have room for.
+    /// Returns the tile's own values of `features`, whose stride along `dim` is `stride` pixels. At the end of the image a layer may have
+    /// fewer features than the pixels and the stride suggest.
     fn keep(self, features: &Tensor, dim: i64, stride: i64) -> Tensor {
         let there = features.size()[dim as usize];
         let first = ((self.first - self.shown) / stride).min(there);
@@ -172,15 +173,15 @@ impl Tile {
     }
 }
 
-/// The distance, differentiable; in float32 unless something else is asked for.
+/// LPIPS distance, differentiable; in float32 by default.
 #[derive(Debug)]
 pub struct Lpips {
     network: LpipsNetwork,
-    /// Of the convolutions; features are normalized and compared in float32.
+    /// Precision of the convolutions; features are normalized and compared in float32.
     precision: Precision,
-    /// [1, 3, 1, 1].
+    /// Shift of the input, [1, 3, 1, 1].
     shift: Tensor,
-    /// [1, 3, 1, 1].
+    /// Divisor of the input, [1, 3, 1, 1].
     scale: Tensor,
     steps: Vec<Step>,
 }
@@ -190,13 +191,13 @@ pub struct Lpips {
 struct Step {
     pooled: bool,
     convolution: nn::Conv2D,
-    /// What a squared difference in each channel counts, [1, C, 1, 1], where features are compared.
+    /// Weights of the squared differences in each channel, [1, C, 1, 1]; `None` if the features aren't compared.
     linear: Option<Tensor>,
 }
 
 impl Lpips {
-    /// Builds the network under `vs`: `conv….weight` [O, I, k, k] and `.bias` [O], `lin0.weight` to `lin4.weight`
-    /// [1, C, 1, 1]. They are zero until they are loaded.
+    /// Builds the network under `vs`: `conv….weight` [O, I, k, k] and `.bias` [O], `lin0.weight` to `lin4.weight` [1, C, 1, 1]. They are
+    /// zero until they are loaded.
     pub(crate) fn new(vs: &nn::Path, network: LpipsNetwork) -> Self {
         leave_out_tf32();
         let zero = nn::Init::Const(0.);
@@ -223,10 +224,10 @@ impl Lpips {
         Lpips { network, precision, shift: per_channel(&SHIFT), scale: per_channel(&SCALE), steps }
     }
 
-    /// Reads the weights that `make weights` makes. They take no gradient; pictures do.
+    /// Loads the weights that `make weights` creates. They need no gradient; images may.
     ///
     /// # Errors
-    /// A file that can't be read or holds another network.
+    /// Returns an error if the file can't be read or holds another network.
     pub fn load(path: &Path, network: LpipsNetwork, device: Device) -> Result<Self> {
         let mut vs = nn::VarStore::new(device);
         let lpips = Lpips::new(&vs.root(), network);
@@ -235,28 +236,28 @@ impl Lpips {
         Ok(lpips)
     }
 
-    /// The distance, once its network has its weights, in `precision` from now on.
+    /// Converts the network, whose weights are loaded, to `precision`.
     pub fn with_precision(mut self, precision: Precision) -> Self {
         self.steps.iter_mut().for_each(|step| precision.convert(&mut step.convolution));
         Lpips { precision, ..self }
     }
 
-    /// Whose features are compared.
+    /// Returns the network whose features are compared.
     pub fn network(&self) -> LpipsNetwork {
         self.network
     }
 
-    /// Where the weights are, and pictures have to be.
+    /// Returns the device of the weights, on which images must be, too.
     pub fn device(&self) -> Device {
         self.shift.device()
     }
 
-    /// How differently two pictures look: 0 for equal ones. Both […, 3, H, W] in [0, 1], float32, H and W at least
-    /// [`LpipsNetwork::smallest_side`]; the result is […]. Large pictures go through the network in tiles that overlap by as much as
-    /// features look around, so the result is that of the whole but for the order of sums.
+    /// Computes the LPIPS distance of two images: 0 for equal ones. Both are […, 3, H, W] in [0, 1], float32, H and W at least
+    /// [`LpipsNetwork::smallest_side`]; the result is […]. Large images are processed in tiles that overlap by the network's receptive
+    /// field, so the result is that for the whole image except for the order of sums.
     ///
     /// # Panics
-    /// Pictures of another shape or a smaller size.
+    /// Panics if the images have another shape or a smaller size.
     pub fn distance(&self, picture: &Tensor, truth: &Tensor) -> Tensor {
         let size = picture.size();
         let [.., height, width] = size[..] else { panic!("a picture has shape {size:?}") };
@@ -267,14 +268,14 @@ impl Lpips {
         distance.view(&size[..size.len() - 3])
     }
 
-    /// Computes [`Lpips::distance`] of B pictures, `[B]`, in tiles of about `length` pixels a side.
+    /// Computes [`Lpips::distance`] of B images, `[B]`, in tiles with sides of about `length` pixels.
     fn distance_in_tiles(&self, picture: &Tensor, truth: &Tensor, length: i64) -> Tensor {
         let [.., height, width] = picture.size()[..] else { panic!("a picture has two sides") };
         let columns = Tile::cover(width, length);
         let tiles =
             Tile::cover(height, length).flat_map(|row| columns.clone().map(move |column| (row, column)));
         let strides = self.network.strides();
-        // Of every layer the sum over pixels, [B], and how many they are.
+        // For every layer: the sum over pixels, [B], and the number of pixels.
         let mut sums: Vec<Option<(Tensor, i64)>> = strides.iter().map(|_| None).collect();
         for (row, column) in tiles {
             let cut = |pictures: &Tensor| {
@@ -297,8 +298,8 @@ impl Lpips {
         means.reduce(|sum, mean| sum + mean).expect("five layers").to_kind(Kind::Float)
     }
 
-    /// What [`Lpips::compare`] compares, layer by layer: features that are divided by their norm over the channels,
-    /// [B, C, H', W']. Pictures as for [`Lpips::distance`], B of them. They are computed as they are asked for.
+    /// Computes the features that [`Lpips::compare`] compares, layer by layer and lazily: [B, C, H', W'], divided by their norm over the
+    /// channels. `pictures` are B images as in [`Lpips::distance`].
     pub fn features(&self, pictures: &Tensor) -> impl Iterator<Item = Tensor> {
         let size = pictures.size();
         let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
@@ -313,7 +314,8 @@ impl Lpips {
         })
     }
 
-    /// Σ over layers of the mean over pixels of Σ over channels of w (â − b̂)²: `[B]` of two times B pictures.
+    /// Computes Σ over layers of the mean over pixels of Σ over channels of w (â − b̂)², `[B]`, from the features of two batches of B
+    /// images.
     pub fn compare(&self, a: impl Iterator<Item = Tensor>, b: impl Iterator<Item = Tensor>) -> Tensor {
         self.differences(a, b)
             .map(|difference| difference.mean_dim([1i64, 2, 3].as_slice(), false, None::<Kind>))
@@ -321,7 +323,7 @@ impl Lpips {
             .expect("five layers")
     }
 
-    /// Σ over channels of w (â − b̂)², layer by layer, [B, 1, H', W'].
+    /// Computes Σ over channels of w (â − b̂)², layer by layer, [B, 1, H', W'].
     fn differences(
         &self,
         a: impl Iterator<Item = Tensor>,
@@ -334,8 +336,8 @@ impl Lpips {
     }
 }
 
-/// Features [B, C, H, W] divided by their norm over C. Where all channels are 0 the norm has no derivative, and the ReLU
-/// before lets none through.
+/// Divides features [B, C, H, W] by their norm over C. If all channels are 0 the norm has no derivative, but the preceding ReLU lets no
+/// gradient through.
 fn unit(features: &Tensor) -> Tensor {
     features / (features.norm_scalaropt_dim(2., [1i64].as_slice(), true) + EPSILON)
 }
@@ -350,19 +352,19 @@ mod tests {
         for network in LpipsNetwork::ALL {
             let vs = nn::VarStore::new(Device::Cpu);
             let lpips = Lpips::new(&vs.root(), network);
-            // As in trained networks, about half of the features are 0.
+            // About half of the features are 0, as in trained networks.
             tch::no_grad(|| {
                 for mut variable in vs.variables().into_values() {
                     let inputs = variable.size()[1..].iter().product::<i64>().max(1);
                     let _ = variable.normal_(0., (2. / inputs as f64).sqrt());
-                    // Differences count one way alone.
+                    // Weights of differences must not be negative.
                     if variable.size().first() == Some(&1) {
                         let _ = variable.abs_();
                     }
                 }
             });
             assert_eq!(network.strides().last(), Some(&LARGEST_STRIDE));
-            // Sides that the strides divide and don't, and one with a last tile that AlexNet has no feature for.
+            // Sides that the strides divide and sides that they don't, including a last tile for which AlexNet has no feature.
             for (height, width) in [(64, 288), (81, 241), (129, 193)] {
                 let picture = || Tensor::rand([1, 3, height, width], (Kind::Float, Device::Cpu));
                 let (a, b) = (picture(), picture());

@@ -23,7 +23,7 @@ pub use photometric::{photometric, ssim};
 pub use terms::{Losses, Term};
 pub use vgg19::Vgg19;
 
-// For training, which may go through the model in slices.
+// Used by training, which may run the model in slices.
 pub(crate) use consistency::{Share, consistency, depth_pixels};
 
 use crate::data::Sample;
@@ -31,8 +31,8 @@ use crate::model::Decoded;
 use crate::render::Pictures;
 use tch::Tensor;
 
-/// What `decoded` is worth, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
-/// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. Losses of all shares of a step add up to the step's.
+/// Computes the loss terms of `decoded`, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
+/// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. The losses of all shares of a step add up to the step's loss.
 pub(crate) fn losses(
     config: &LossConfig,
     perceptual: Option<&PerceptualLoss>,

@@ -1,4 +1,4 @@
-//! L_perc (spec 7.3 and 7.4): pictures look as their truth, to a network that was trained on photos.
+//! L_perc (spec 7.3 and 7.4): the difference between images and ground truth in the features of a network trained on photos.
 
 use super::config::{LossConfig, PerceptualKind};
 use super::lpips::{Lpips, LpipsNetwork};
@@ -10,10 +10,10 @@ use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
 
-/// Pictures of 256×256 that go through the network together on a GPU. Of each, VGG-19 keeps 0.2 GB in float32.
+/// Number of 256×256 images that go through the network together on a GPU. VGG-19 keeps 0.2 GB in float32 for each.
 const AT_ONCE_ON_A_GPU: i64 = 16;
 
-/// A network that compares, with its weights.
+/// Perceptual network with its weights.
 #[derive(Debug)]
 pub enum PerceptualLoss {
     /// Features of VGG-19.
@@ -23,10 +23,11 @@ pub enum PerceptualLoss {
 }
 
 impl PerceptualLoss {
-    /// The network that `config` asks for, if any, from the file that it names, for pictures of `size`.
+    /// Loads the network that `config` asks for, if any, from the configured file, for images of `size`.
     ///
     /// # Errors
-    /// A file that isn't there, and how to get it; one that holds another network; pictures too small for the network.
+    /// Returns an error if the file is missing (with instructions on how to get it), if it holds another network, or if the images are too
+    /// small for the network.
     pub fn load(config: &LossConfig, size: ImageSize, device: Device) -> Result<Option<Self>> {
         let file = &Self::weights_file(config)?;
         let (expected, how) = match config.perceptual {
@@ -62,8 +63,8 @@ impl PerceptualLoss {
         Ok(Some(loss))
     }
 
-    /// Bytes that the network of `config` takes at the most, with what its layers keep of those of `pictures` of `size` that go through it
-    /// at a time.
+    /// Returns an upper bound on the memory of the network in bytes: its weights, and the activations of those of `pictures` images of
+    /// `size` that go through it at a time.
     pub fn bytes_kept(
         config: &LossConfig,
         precision: Precision,
@@ -71,7 +72,7 @@ impl PerceptualLoss {
         pictures: usize,
         device: Device,
     ) -> u64 {
-        // Weights, and numbers for each pixel: what layers give, their gradients, and differences of what is compared.
+        // Number of weights, and number of elements per pixel: activations, their gradients, and differences of the compared features.
         let (weights, of_pixel) = match config.perceptual {
             PerceptualKind::None => return 0,
             PerceptualKind::Vgg19 => (20.0e6, 780.),
@@ -84,7 +85,7 @@ impl PerceptualLoss {
         (number * (weights + of_pixel * (at_once * pixels) as f64)) as u64
     }
 
-    /// How many pictures of so many pixels go through the network at a time.
+    /// Returns the number of images of `pixels` pixels each that go through the network at a time.
     fn at_once(pixels: i64, device: Device) -> i64 {
         match device {
             Device::Cpu => 1,
@@ -92,7 +93,7 @@ impl PerceptualLoss {
         }
     }
 
-    /// The network in `precision` from now on.
+    /// Converts the network to `precision`.
     pub fn with_precision(self, precision: Precision) -> Self {
         match self {
             PerceptualLoss::Vgg19(network) => PerceptualLoss::Vgg19(network.with_precision(precision)),
@@ -100,11 +101,11 @@ impl PerceptualLoss {
         }
     }
 
-    /// The file that `config` names, environment variables filled in; where it names none, the file that `make weights` makes, or
-    /// would be called.
+    /// Returns the configured weights file, with environment variables expanded. If none is configured, returns the file that `make
+    /// weights` created, or the path at which it would create it.
     ///
     /// # Errors
-    /// A variable that isn't set and has no default.
+    /// Returns an error if a variable isn't set and has no default.
     pub fn weights_file(config: &LossConfig) -> Result<PathBuf> {
         if !config.perceptual_weights.is_empty() {
             return expand_path(&config.perceptual_weights);
@@ -124,17 +125,17 @@ impl PerceptualLoss {
         }
     }
 
-    /// The mean over `rendered` [R·B, C, 3, H, W], R times `truth` [B, C, 3, H, W] along the batch: the truth's features are
-    /// computed once and serve every part. Where the gradient is followed, it is found at once: on a CPU picture by picture, on a GPU
-    /// for a few pictures at a time, as layers would keep nearly as much of all pictures as all else of a training step keeps. How many
-    /// pictures go together depends on their size alone, as the last bits of sums depend on it.
+    /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `truth` [B, C, 3, H, W] along the batch. The
+    /// features of the ground truth are computed once and used R times. If a gradient is needed, it is computed in the forward pass, one
+    /// image at a time on a CPU and a few at a time on a GPU: the activations of all images would take nearly as much memory as the rest of
+    /// a training step. The number of images that go together depends on their size alone, because the last bits of sums depend on it.
     pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
         let pixels = truth.size()[3..].iter().product();
         let at_once = Self::at_once(pixels, rendered.device());
         self.loss_by_chunks(rendered, truth, at_once)
     }
 
-    /// [`PerceptualLoss::loss`] with so many pictures `at_once`.
+    /// Computes [`PerceptualLoss::loss`] with `at_once` images at a time.
     fn loss_by_chunks(&self, rendered: &Tensor, truth: &Tensor, at_once: i64) -> Tensor {
         let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
@@ -158,7 +159,7 @@ impl PerceptualLoss {
             }
         }
         match gradient {
-            // Adds nothing but the way back.
+            // Adds 0 to the value, and the precomputed gradient to the backward pass.
             Some(gradient) => {
                 let way = (rendered * gradient.view_as(rendered)).sum(None::<Kind>);
                 sum + (&way - way.detach())
@@ -174,7 +175,7 @@ impl PerceptualLoss {
         }
     }
 
-    /// Mean over the pictures whose features these are.
+    /// Computes the mean loss over the images with these features.
     fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
         let each = |features: &[Tensor]| features.iter().map(Tensor::shallow_clone).collect::<Vec<_>>();
         match self {
@@ -200,7 +201,7 @@ mod tests {
             let _ = tch::no_grad(|| variable.uniform_(0., 0.05));
         });
         let loss = PerceptualLoss::Lpips(network);
-        // Twice five pictures.
+        // Two renderings of five images.
         let pictures = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
         let (rendered, truth) = (pictures(2), pictures(1));
         let of_chunks = |at_once: i64| {

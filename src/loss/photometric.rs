@@ -1,28 +1,29 @@
-//! How far a picture is from a photo: absolute differences, and structural similarity (Wang et al. 2004), as scikit-image's
-//! `structural_similarity` with Gaussian weights computes it. (Spec 9.4.)
+//! Photometric loss: absolute differences and structural similarity (SSIM, Wang et al. 2004), computed as by scikit-image's
+//! `structural_similarity` with Gaussian weights. (Spec 9.4.)
 
 use crate::render::handed_over;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
-/// `absolute` times the mean absolute difference plus `similar` times the mean SSIM, both over pictures and channels, and over
-/// pixels, or pixels whose window of 11×11 is inside. A scalar, differentiable with respect to the picture, in one pass over
-/// either on the CPU. Pictures [.., H, W] in [0, 1] of one shape, H and W at least 11; float64 where the picture is, else float32.
+/// Computes `absolute` times the mean absolute difference plus `similar` times the mean SSIM. Both are means over images and channels; the
+/// first is over all pixels, the second over pixels whose 11×11 window lies inside the image. The result is a scalar, differentiable with
+/// respect to `picture`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H and
+/// W at least 11; float64 if `picture` is, and float32 otherwise.
 ///
 /// # Panics
-/// Shapes that differ, or smaller pictures.
+/// Panics if the shapes differ or the images are smaller.
 pub fn photometric(picture: &Tensor, truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
     let (picture, truth) = (picture.as_ptr() as usize, truth.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+    // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
     let done = unsafe { handed_over(|out| fit::photometric(picture, truth, absolute, similar, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }
 
-/// The mean SSIM, with sample covariances; 1 for equal pictures. As [`photometric`].
+/// Computes the mean SSIM, with sample covariances; 1 for equal images. The requirements on the images are those of [`photometric`].
 ///
 /// # Panics
-/// As [`photometric`].
+/// Panics if the shapes differ or the images are smaller than 11×11.
 pub fn ssim(picture: &Tensor, truth: &Tensor) -> Tensor {
     photometric(picture, truth, 0., 1.)
 }

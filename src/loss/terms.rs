@@ -1,23 +1,23 @@
-//! The terms of the loss. Each is named in one list: sums, logs and TensorBoard go through [`Term::ALL`].
+//! The terms of the loss, declared in one list: sums, logs and TensorBoard iterate over [`Term::ALL`].
 
 use super::config::LossConfig;
 use std::ops::Index;
 use tch::{Kind, Tensor, no_grad};
 
-/// Declares [`Term`] from a list, so that each has its name and its place by being in it.
+/// Declares [`Term`] from a list, so that each entry defines a term's name and index.
 macro_rules! terms {
     ($($(#[$meta:meta])* $term:ident $name:literal)*) => {
-        /// A term of the loss, or a part of one that is told by itself.
+        /// Term of the loss, or a part of a term that is logged separately.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Term {
             $($(#[$meta])* $term),*
         }
 
         impl Term {
-            /// In the order in which they are summed and told.
+            /// All terms, in the order in which they are summed and logged.
             pub const ALL: [Term; [$($name),*].len()] = [$(Term::$term),*];
 
-            /// What logs call it.
+            /// Returns the term's name in logs.
             pub fn name(self) -> &'static str {
                 match self {
                     $(Term::$term => $name),*
@@ -30,26 +30,26 @@ macro_rules! terms {
 terms! {
     /// Mean squared error of the rendered colours.
     Mse "mse"
-    /// L_perc; 0 where it is left out.
+    /// Perceptual loss, L_perc; 0 if it is left out.
     Perceptual "perceptual"
-    /// L_con, with its factors; 0 where the sample isn't paired.
+    /// Consistency of the two subsets, L_con, with its factors; 0 if the sample isn't paired.
     Consistency "consistency"
-    /// L_fru.
+    /// Frustum constraint, L_fru.
     Frustum "frustum"
-    /// L_dec, the sum of the parts that follow, with its own factor.
+    /// Regularization of the decoder, L_dec: the sum of the following parts, with its own factor.
     Decoder "decoder"
-    /// L_opacity; 0 where it is left out.
+    /// Opacity part of L_dec, L_opacity; 0 if it is left out.
     DecoderOpacity "decoder_opacity"
-    /// L_scale.
+    /// Scale part of L_dec, L_scale.
     DecoderScale "decoder_scale"
-    /// L_rot.
+    /// Rotation part of L_dec, L_rot.
     DecoderRotation "decoder_rotation"
-    /// L_SH.
+    /// Spherical harmonics part of L_dec, L_SH.
     DecoderSh "decoder_sh"
 }
 
 impl Term {
-    /// What it counts in the sum; none for a part of another term.
+    /// Returns the term's weight in the sum; `None` for a part of another term.
     pub fn factor(self, config: &LossConfig) -> Option<f64> {
         match self {
             Term::Mse => Some(config.mse),
@@ -62,16 +62,16 @@ impl Term {
     }
 }
 
-/// The loss and its terms before their factors: scalar tensors, or numbers.
+/// Total loss and its terms without their weights: scalar tensors, or numbers.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Losses<T> {
-    /// What is minimized.
+    /// Weighted sum of the terms, which is minimized.
     pub total: T,
     terms: [T; Term::ALL.len()],
 }
 
 impl Losses<Tensor> {
-    /// What `term` gives for every term, and the sum of those that count by the factors of `config`.
+    /// Computes every term with `term`, and their sum weighted by `config`.
     pub fn weighted(config: &LossConfig, term: impl Fn(Term) -> Tensor) -> Self {
         let terms = Term::ALL.map(term);
         let counted = Term::ALL.iter().zip(&terms).filter_map(|(of, term)| Some(term * of.factor(config)?));
@@ -79,8 +79,8 @@ impl Losses<Tensor> {
         Losses { total, terms }
     }
 
-    /// Their values, the sum before the terms, in one tensor: to be added up over slices of a step, and read at once. In float64,
-    /// in which sums lose nothing.
+    /// Packs the values into one float64 tensor, the total first and then the terms, so that they can be summed over slices of a step
+    /// without losing precision and read in one transfer.
     pub fn packed(&self) -> Tensor {
         let all: Vec<&Tensor> = std::iter::once(&self.total).chain(&self.terms).collect();
         no_grad(|| Tensor::stack(&all, 0).to_kind(Kind::Double))
@@ -88,10 +88,10 @@ impl Losses<Tensor> {
 }
 
 impl Losses<f64> {
-    /// As many numbers as [`Losses::packed`] puts together.
+    /// Number of values in the tensor of [`Losses::packed`].
     pub const COUNT: usize = 1 + Term::ALL.len();
 
-    /// What [`Losses::packed`] put together.
+    /// Unpacks the values of [`Losses::packed`].
     pub fn unpacked(values: &[f64; Self::COUNT]) -> Self {
         Losses { total: values[0], terms: std::array::from_fn(|term| values[1 + term]) }
     }

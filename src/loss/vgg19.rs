@@ -1,5 +1,5 @@
-//! L_perc of kind `vgg19` (spec 7.3): how far apart a picture's and its truth's features are in VGG-19 (Simonyan &
-//! Zisserman 2015) with average pooling.
+//! L_perc of kind `vgg19` (spec 7.3): the distance of an image from the ground truth in the features of VGG-19 (Simonyan & Zisserman 2015)
+//! with average pooling.
 
 use crate::device::leave_out_tf32;
 use crate::error::Result;
@@ -8,11 +8,11 @@ use crate::model::{Precision, convolve};
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn};
 
-/// What the network takes from 255·x: the mean of the photos that it was trained on.
+/// Values subtracted from 255·x: the mean of the photos that the network was trained on.
 const MEANS: [f32; 3] = [123.68, 116.779, 103.939];
 
-/// Convolutions of 3×3 up to ReLU 5_2: number in torchvision's `features`, channels, whether a pooling comes before, and
-/// by what the mean absolute difference of its features is divided, where it counts.
+/// The 3×3 convolutions up to ReLU 5_2: index in torchvision's `features`, number of channels, whether a pooling precedes it, and the
+/// divisor of the mean absolute difference of its features if they are compared.
 const LAYERS: [(u32, i64, bool, Option<f64>); 14] = [
     (0, 64, false, None),
     (2, 64, false, Some(2.6)),
@@ -30,26 +30,26 @@ const LAYERS: [(u32, i64, bool, Option<f64>); 14] = [
     (30, 512, false, Some(1.5 / 10.)),
 ];
 
-/// What the sum of all differences is divided by.
+/// Divisor of the sum of all differences.
 const RANGE: f64 = 255.;
 
-/// The network, in float32 unless something else is asked for.
+/// VGG-19 for the perceptual loss; in float32 by default.
 #[derive(Debug)]
 pub struct Vgg19 {
-    /// Of the convolutions; features are compared in float32.
+    /// Precision of the convolutions; features are compared in float32.
     precision: Precision,
-    /// [1, 3, 1, 1].
+    /// Mean per channel, [1, 3, 1, 1].
     means: Tensor,
-    /// As in [`LAYERS`].
+    /// Convolutions, in the order of [`LAYERS`].
     convolutions: Vec<nn::Conv2D>,
 }
 
 impl Vgg19 {
-    /// Pictures have to be as large, for something to be left after four poolings.
+    /// Minimum side of an image, so that features remain after four poolings.
     pub const SMALLEST_SIDE: i64 = 16;
 
-    /// Builds the network under `vs`, with torchvision's names: `features.0.weight` [64, 3, 3, 3], `features.0.bias` [64], ….
-    /// They are zero until they are loaded.
+    /// Builds the network under `vs`, with torchvision's names: `features.0.weight` [64, 3, 3, 3], `features.0.bias` [64], …. They are zero
+    /// until they are loaded.
     pub(crate) fn new(vs: &nn::Path) -> Self {
         leave_out_tf32();
         let zero = nn::Init::Const(0.);
@@ -67,11 +67,11 @@ impl Vgg19 {
         }
     }
 
-    /// Reads torchvision's weights, its own file or a safetensors; what comes after ReLU 5_2 isn't looked at. They take no gradient;
-    /// pictures do.
+    /// Loads torchvision's weights from its own format or a safetensors file, and ignores layers after ReLU 5_2. The weights need no
+    /// gradient; images may.
     ///
     /// # Errors
-    /// A file that can't be read or holds another network.
+    /// Returns an error if the file can't be read or holds another network.
     pub fn load(path: &Path, device: Device) -> Result<Self> {
         let mut vs = nn::VarStore::new(device);
         let network = Vgg19::new(&vs.root());
@@ -82,17 +82,17 @@ impl Vgg19 {
         Ok(network)
     }
 
-    /// The network, once it has its weights, in `precision` from now on.
+    /// Converts the network, whose weights are loaded, to `precision`.
     pub fn with_precision(mut self, precision: Precision) -> Self {
         self.convolutions.iter_mut().for_each(|convolution| precision.convert(convolution));
         Vgg19 { precision, ..self }
     }
 
-    /// What [`Vgg19::compare`] compares: the input 255·x − mean, and the features after ReLU 1_2, 2_2, 3_2, 4_2 and 5_2.
-    /// Pictures […, 3, H, W] in [0, 1], H and W at least [`Vgg19::SMALLEST_SIDE`].
+    /// Computes the features that [`Vgg19::compare`] compares: the input 255·x − mean, and the features after ReLU 1_2, 2_2, 3_2, 4_2 and
+    /// 5_2. Images are […, 3, H, W] in [0, 1], H and W at least [`Vgg19::SMALLEST_SIDE`].
     ///
     /// # Panics
-    /// Pictures of another shape or a smaller size.
+    /// Panics if the images have another shape or a smaller size.
     pub fn features(&self, pictures: &Tensor) -> Vec<Tensor> {
         let size = pictures.size();
         let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
@@ -111,7 +111,7 @@ impl Vgg19 {
         features
     }
 
-    /// The loss of two lists of features: Σ of their mean absolute differences, each over its own divisor, over 255.
+    /// Computes the loss from two lists of features: Σ of their mean absolute differences, each divided by its own divisor, over 255.
     pub fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
         let divisors = std::iter::once(1.).chain(LAYERS.iter().filter_map(|(.., divisor)| *divisor));
         let differences = picture.iter().zip(truth).zip(divisors);

@@ -1,16 +1,16 @@
-//! Attention (spec 4.2): by our own kernel where it is the fastest, by libtorch's elsewhere.
+//! Attention (spec 4.2) by our own kernel where it is fastest, and by libtorch's kernels elsewhere.
 
 use super::parts::does;
 use globalsplat_csrc::attention as ours;
 use globalsplat_csrc::processor::{Bf16, bf16_of_cpu};
 use tch::{Device, Kind, Tensor};
 
-/// softmax(q kᵀ / √(d/h)) v over `heads` heads; q [B, n, d], k and v [B, m, d], result [B, n, d] of their kind.
+/// Computes softmax(q kᵀ / √(d/h)) v over `heads` heads. q is [B, n, d], k and v are [B, m, d]; the result is [B, n, d] and of their kind.
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let out = attend(q, k, v, heads);
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
-    // Scores again, and gradients of queries, keys, weights and values.
+    // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
     does(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
     out
 }
@@ -25,7 +25,7 @@ fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     match kind {
         Kind::Float if takes(false) => by_ours(all, heads),
         Kind::BFloat16 if takes(true) => by_ours(all, heads),
-        // Without products of them: libtorch's kernel needs tiles to be fast.
+        // Our kernel lacks bf16 products on this CPU, and libtorch's bf16 kernel is fast only with tiles (AMX): compute in float32.
         Kind::BFloat16 if bf16_of_cpu() != Bf16::Tiles && takes(false) => {
             by_ours(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
         }
@@ -40,14 +40,14 @@ fn by_ours(all: [&Tensor; 3], heads: i64) -> Tensor {
     unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
 }
 
-/// The same on any device, in any kind and width.
+/// Computes [`attention`] with libtorch, on any device and for any kind and width.
 pub(crate) fn by_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let split = |t: &Tensor| {
         let (b, n, d) = t.size3().expect("[B, n, d]");
         t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
     };
-    // Strided as the linear layers leave them, of one kind, without a mask: so libtorch's fused kernels take them as they are, as
-    // long as a head's width is a multiple of 8.
+    // The strides are those of the linear layers, the kinds agree and there is no mask. libtorch's fused kernels then take the tensors
+    // without a copy, provided that a head's width is a multiple of 8.
     Tensor::scaled_dot_product_attention(
         &split(q),
         &split(k),
@@ -71,11 +71,11 @@ mod tests {
 
     const NAMES: [&str; 3] = ["seen", "slots", "memory"];
 
-    /// What comes out, and the gradients of queries, keys and values, where all of them are shared out: parts of 516 queries and of
-    /// 384 keys, and what is left of both.
+    /// Returns the output and the gradients of queries, keys and values, for sizes that are split among threads: blocks of 516 queries and
+    /// of 384 keys, each with a remainder.
     fn answers() -> Vec<Tensor> {
         let of = |n: i64| {
-            // Uneven, and nobody else's: the generator is shared with other tests.
+            // Irregular values without the random generator, which other tests share.
             let numbers = Tensor::arange(2 * n * 3 * 64, (Kind::Double, Device::Cpu)).square().sin() * 1.5;
             numbers.to_kind(Kind::Float).view([2, n, 3 * 64]).set_requires_grad(true)
         };
@@ -104,7 +104,7 @@ mod tests {
             let numbers = Tensor::arange(2 * n * width, (Kind::Double, Device::Cpu)).square() + phase;
             (numbers.sin() * 1.5).to_kind(Kind::BFloat16).view([2, n, width])
         };
-        // What comes out of `attend`, and gradients.
+        // Returns the output of `attend`, and the gradients.
         let answers = |all: &[Tensor; 4], attend: &dyn Fn([&Tensor; 3]) -> Tensor| {
             let [q, k, v, slope] = all;
             let leaves = [q, k, v].map(|t| t.detach().set_requires_grad(true));
@@ -112,7 +112,7 @@ mod tests {
             (&seen * slope).sum(Kind::Float).backward();
             std::iter::once(seen.detach()).chain(leaves.iter().map(Tensor::grad)).collect::<Vec<_>>()
         };
-        // Whole blocks of keys and queries, and parts; a head that products have to fill up; more than one panel of columns.
+        // Whole and partial blocks of keys and queries, a head width that needs padding, and more than one panel of columns.
         for (queries, keys, heads, width) in
             [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128), (200, 131, 1, 72)]
         {
@@ -127,10 +127,10 @@ mod tests {
                 by_libtorch(q, k, v, heads)
             });
             for (name, (found, exact)) in ["seen", "dq", "dk", "dv"].iter().zip(found.iter().zip(&exact)) {
-                // Of one key, scores have no gradients.
+                // With a single key, the scores have zero gradients.
                 let size = exact.norm().double_value(&[]).max(1e-3);
                 let error = (found - exact).norm().double_value(&[]) / size;
-                // What comes out is rounded to 8 bits, and so are weights and gradients of scores.
+                // The output, the attention weights and the gradients of scores are rounded to 8 bits.
                 assert!(
                     error < 5e-3,
                     "{name}, {queries} queries, {keys} keys, {heads} heads of {width}: {error:.1e}"
@@ -143,7 +143,7 @@ mod tests {
                 set_threads(0);
                 assert!(same(alone), "{threads} threads change what is seen");
             }
-            // Rows that lie apart, as parts of what one layer gave.
+            // Rows with a stride, as in chunks of one layer's output.
             let apart = |t: &Tensor| Tensor::cat(&[t, t, t], -1).chunk(3, -1).swap_remove(1);
             let strided = answers(&all, &|[q, k, v]| attention(&apart(q), &apart(k), &apart(v), heads));
             assert!(same(strided), "strides change what is seen");
@@ -152,7 +152,8 @@ mod tests {
 
     #[test]
     fn instruction_sets_agree() {
-        // The choice is made once per process: this test runs itself again for every set, to compute and save.
+        // The instruction set is chosen once per process, so this test runs itself in a new process for every set, which computes and
+        // saves.
         const OUT: &str = "GLOBALSPLAT_TEST_OUT";
         const UNSUPPORTED: i32 = 77;
         if let Some(out) = std::env::var_os(OUT) {
@@ -202,7 +203,7 @@ mod tests {
         let double = of(3, 16).to_kind(Kind::Double);
         let said = refused(&double, &double, &double, 2);
         assert!(said.contains("must be float32 on the CPU"), "{said}");
-        // Nothing to look at is libtorch's matter.
+        // Attention to no keys is left to libtorch.
         let nothing = of(0, 16);
         let seen = no_grad(|| attention(&of(3, 16), &nothing, &nothing, 2));
         assert_eq!(seen.size(), [1, 3, 16]);

@@ -1,4 +1,4 @@
-//! The camera code: one vector per view that tells a Plücker ray's view from another's (spec 3.3).
+//! The camera code: one vector per view that distinguishes cameras beyond their Plücker rays (spec 3.3).
 
 use super::layers::{default_linear, gelu};
 use std::f64::consts::PI;
@@ -8,10 +8,10 @@ use tch::{Tensor, nn, nn::Module};
 const INTRINSICS_WIDTH: i64 = 64;
 /// Frequencies of the camera centre's encoding, in units of π.
 const FREQUENCIES: [f64; 4] = [1., 2., 4., 8.];
-/// The centre, its sines and its cosines.
+/// Width of the encoded camera centre: the centre, its sines and its cosines.
 const CENTRE_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
 
-/// Intrinsics through an MLP and the camera centre through sines, joined by one linear layer.
+/// Encoder of intrinsics by an MLP and of the camera centre by sines and cosines, joined by one linear layer.
 #[derive(Debug)]
 pub(crate) struct CameraCode {
     intrinsics_in: nn::Linear,
@@ -29,7 +29,7 @@ impl CameraCode {
         }
     }
 
-    /// `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels of a `height` × `width` image; result [B, V, width].
+    /// Computes the camera code, [B, V, width]. `c2w` is [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels of a `height` × `width` image.
     pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let entry = |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column);
         let (w, h) = (width as f64, height as f64);

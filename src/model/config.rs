@@ -1,25 +1,25 @@
-//! The model's shape.
+//! The configuration of the model's architecture.
 
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// One or two streams of scene tokens.
+/// Number of streams of scene tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Streams {
-    /// Geometry and appearance apart, joined by a mixer after every round: the full model.
+    /// Separate geometry and appearance streams, joined by a mixer after every round: the full model.
     Dual,
-    /// One stream, no mixer: an ablation.
+    /// One stream without a mixer: an ablation.
     Single,
 }
 
-/// The numbers of spec 3 to 5. The default is the main 16K model.
+/// Architecture parameters of spec 3 to 5. The default is the main 16K model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelConfig {
-    /// Patch edge in pixels, p.
+    /// Edge of a patch in pixels, p.
     pub patch_size: i64,
-    /// Scene tokens, M.
+    /// Number of scene tokens, M.
     pub latents: i64,
     /// Width of a scene token, d.
     pub width: i64,
@@ -27,19 +27,19 @@ pub struct ModelConfig {
     pub rgb_width: i64,
     /// Width of the ray half of an image token.
     pub ray_width: i64,
-    /// Encoder rounds.
+    /// Number of encoder rounds.
     pub rounds: i64,
-    /// Self-attention blocks in each stream and round.
+    /// Number of self-attention blocks in each stream and round.
     pub self_attention_blocks: i64,
-    /// Attention heads.
+    /// Number of attention heads.
     pub heads: i64,
-    /// Candidate Gaussians per scene token, K: a power of two.
+    /// Number of candidate Gaussians per scene token, K: a power of two.
     pub candidates: i64,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: i64,
-    /// Dual, or the single-stream ablation.
+    /// Number of streams: dual, or the single-stream ablation.
     pub streams: Streams,
-    /// Whether ray tokens carry the camera code; without it, the "Plücker only" ablation.
+    /// Adds the camera code to ray tokens if `true`; `false` is the "Plücker only" ablation.
     pub camera_code: bool,
 }
 
@@ -63,27 +63,27 @@ impl Default for ModelConfig {
 }
 
 impl ModelConfig {
-    /// Spherical harmonics per colour channel.
+    /// Returns the number of spherical harmonics per colour channel.
     pub fn sh_bases(&self) -> i64 {
         (self.sh_degree + 1).pow(2)
     }
 
-    /// Width of an image token.
+    /// Returns the width of an image token.
     pub fn token_width(&self) -> i64 {
         self.ray_width + self.rgb_width
     }
 
-    /// The last stage that the candidates allow: log2 K.
+    /// Returns the last stage that the number of candidates allows: log2 K.
     pub fn max_stage(&self) -> u32 {
         self.candidates.ilog2()
     }
 
-    /// Whether the numbers fit together.
+    /// Checks that the fields are in range and fit together.
     ///
     /// # Errors
-    /// Names the first field that doesn't.
+    /// Names the first field that is invalid.
     pub fn check(&self) -> Result<()> {
-        // The upper ends are far beyond any model: they keep products of the numbers from overflowing.
+        // The upper bounds are far beyond any model; they keep products of the fields from overflowing.
         let fields = [
             ("patch_size", self.patch_size, 1..=1 << 10),
             ("latents", self.latents, 1..=1 << 20),
@@ -120,17 +120,17 @@ impl ModelConfig {
         )
     }
 
-    /// Numbers that the weights of such a model have at least: a file with fewer can't hold it.
+    /// Returns a lower bound on the number of parameter values of this model: a file with fewer can't hold its weights.
     pub fn least_parameters(&self) -> i64 {
         let attention = self.rounds * (1 + self.self_attention_blocks) * self.width * self.width;
         let patches = 3 * self.patch_size * self.patch_size * self.rgb_width + self.ray_width;
         self.latents * self.width + attention + patches + self.candidates * self.width
     }
 
-    /// Whether images of this size can be cut into patches.
+    /// Checks that images of this size can be cut into patches.
     ///
     /// # Errors
-    /// Names the side that can't.
+    /// Names the side that isn't a positive multiple of the patch size.
     pub fn check_image(&self, height: i64, width: i64) -> Result<()> {
         for (name, size) in [("height", height), ("width", width)] {
             if size <= 0 || size % self.patch_size != 0 {

@@ -1,4 +1,4 @@
-//! Two linear heads, and what makes Gaussians of their numbers (spec 5.1, 5.2 and 5.5).
+//! The decoder: linear heads, and the activations that turn their outputs into Gaussians (spec 5.1, 5.2 and 5.5).
 
 use super::config::ModelConfig;
 use super::encoder::Encoded;
@@ -10,27 +10,27 @@ use crate::scene::{Gaussians, sigmoid};
 use std::f64::consts::LN_2;
 use tch::{Tensor, nn};
 
-/// Weights of the geometry heads at the start.
+/// Standard deviation of the initial weights of the geometry heads.
 const GEOMETRY_STD: f64 = 1e-2;
-/// Weights of the SH head at the start.
+/// Standard deviation of the initial weights of the SH head.
 const SH_STD: f64 = 1e-3;
-/// Numbers per candidate in the parameter head: 3 log-scales, 6 of rotation, 1 opacity logit.
+/// Number of outputs per candidate of the parameter head: 3 log-scales, 6 rotation values, 1 opacity logit.
 pub(super) const PARAMETERS: i64 = 10;
-/// Which of them is the opacity logit.
+/// Index of the opacity logit among these outputs.
 pub(super) const OPACITY: i64 = 9;
 
-/// Added to every position: the scene starts in front of the mean camera.
+/// Offset added to every position: initially the scene lies in front of the mean camera.
 const MEAN_OFFSET: [f32; 3] = [0., 0., 1.5];
 const LOG_SCALE_OFFSET: f64 = -2.;
 const OPACITY_OFFSET: f64 = -5.;
 const MAX_OPACITY: f64 = 0.99;
-/// Of opacity logits.
+/// Minimum and maximum of the opacity logits.
 const LOGIT_RANGE: [f64; 2] = [-13., 6.];
 const MIN_SCALE: f64 = 1e-4;
-/// Scales above it are penalized (the clamp lies further out).
+/// Scale above which scales are penalized (the clamp lies further out).
 pub(crate) const MAX_SCALE: f64 = 0.05;
 
-/// What the heads said before any clamp, for the regularizers of `loss`.
+/// Outputs of the heads before any clamp, for the regularizers of `loss`.
 #[derive(Debug)]
 pub struct RawOutputs {
     /// Log-scales with their offset, [B, M, K, 3].
@@ -39,11 +39,11 @@ pub struct RawOutputs {
     pub rotations: Tensor,
     /// Spherical harmonics, [B, M, K, bases · 3].
     pub sh: Tensor,
-    /// Logits of the opacities that are shown, [B, N].
+    /// Logits of the opacities after merging, [B, N].
     pub opacity_logits: Tensor,
 }
 
-/// What the heads say, per candidate.
+/// Outputs of the heads for each candidate.
 pub(crate) struct Heads {
     pub positions: Tensor,      // [B, M, K, 3]
     pub log_scales: Tensor,     // [B, M, K, 3], with their offset
@@ -53,14 +53,14 @@ pub(crate) struct Heads {
     pub sh: Tensor,             // [B, M, K, bases · 3]
 }
 
-/// Gaussians, and what the losses need beside them.
+/// Decoded Gaussians, and the other outputs that the losses need.
 #[derive(Debug)]
 pub struct Decoded {
-    /// N = M · 2^s of them.
+    /// The decoded Gaussians, N = M · 2^s per scene.
     pub gaussians: Gaussians,
-    /// The two normalized vectors that each quaternion came from, [B, N, 6].
+    /// Pairs of normalized vectors from which the quaternions are computed, [B, N, 6].
     pub rotations_6d: Tensor,
-    /// Before clamps.
+    /// Outputs of the heads before clamps.
     pub raw: RawOutputs,
 }
 
@@ -79,7 +79,7 @@ impl Decoded {
         }
     }
 
-    /// Every tensor beside the same of `other`.
+    /// Pairs every tensor with the corresponding one of `other`.
     pub(crate) fn beside<'a>(&'a self, other: &'a Decoded) -> [(&'a Tensor, &'a Tensor); 10] {
         let (ours, theirs) = (&self.gaussians, &other.gaussians);
         [
@@ -97,7 +97,7 @@ impl Decoded {
     }
 }
 
-/// Scene tokens to Gaussians.
+/// Decoder from scene tokens to Gaussians.
 #[derive(Debug)]
 pub struct Decoder {
     mean_offset: Tensor,
@@ -107,12 +107,12 @@ pub struct Decoder {
     sh: nn::Linear,
     candidates: i64,
     sh_bases: i64,
-    /// Of the product of the appearance head, the largest one. The others say where things are and stay in float32.
+    /// Precision of the appearance head, the largest product. The other heads determine positions and shapes and stay in float32.
     pub(super) precision: Precision,
 }
 
 impl Decoder {
-    /// `vs` is the decoder's own path.
+    /// Builds the decoder under `vs`, the decoder's own path.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         let (d, k) = (config.width, config.candidates);
         let mut mean_offset = vs.zeros_no_train("patch_center_bias", &[1, 1, 3]);
@@ -129,12 +129,12 @@ impl Decoder {
         }
     }
 
-    /// Layers that compute in the precision of products.
+    /// Returns the layers that compute in the configurable precision.
     pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
         std::iter::once(&self.sh)
     }
 
-    /// The linear heads alone.
+    /// Applies only the linear heads.
     pub(crate) fn heads(&self, encoded: &Encoded) -> Heads {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
@@ -151,10 +151,10 @@ impl Decoder {
         }
     }
 
-    /// The heads, then the Gaussians of `stage`.
+    /// Applies the heads and builds the Gaussians of `stage`.
     pub fn forward(&self, encoded: &Encoded, stage: Stage) -> Decoded {
         let Heads { positions, log_scales, rotations, opacity_logits, gate, sh } = self.heads(encoded);
-        // Half the opacity at the start of a transition, which doubles the number of Gaussians.
+        // A transition doubles the number of Gaussians, so it starts with half the opacity.
         let opacity_logits = opacity_logits + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
         let candidates = Candidates {
             positions,
@@ -179,7 +179,7 @@ impl Decoder {
         Decoded { gaussians, rotations_6d, raw }
     }
 
-    /// Residuals to two unit vectors, [B, N, 6].
+    /// Converts rotation residuals to pairs of unit vectors, [B, N, 6].
     fn activate_rotations(&self, residuals: &Tensor) -> Tensor {
         let identity = Tensor::eye_m(2, 3, (residuals.kind(), residuals.device()));
         normalize(&(residuals.unflatten(-1, [2, 3]) + identity)).flatten(-2, -1)

@@ -1,23 +1,23 @@
-//! Numbers next to 0, below 1.2e-38 in float32: they have fewer digits the smaller they are, and Intel's processors are many times as
-//! slow with them as with others.
+//! Flushing of denormal numbers, below 1.2e-38 in float32, to zero. Denormals lose digits towards 0, and Intel's processors compute many
+//! times as slowly with them as with other numbers.
 //!
-//! Most likely it is attention that makes them, which is sharp once it has learned, and its gradients: small models train on in half
-//! the time without them (docs/training.md). No result depends on them.
+//! They most likely come from attention, which is sharp after training, and from its gradients: without them, continued training of small
+//! models takes half the time (docs/training.md). No result depends on them.
 
 use globalsplat_csrc::processor as ffi;
 use std::hint::black_box;
 use std::thread;
 
-/// Has this thread take them for 0 from now on, and with it all threads that it starts, which on Linux inherit it. So it is for a
-/// program's first thread, before there are others. Where the processor can't, they stay.
+/// Makes this thread, and on Linux all threads that it starts later, treat denormal numbers as 0. Call it on a program's first thread,
+/// before there are others. A no-op on processors that don't support it.
 ///
-/// Rust takes for granted that nobody does this: what it computes as it compiles may still have such numbers in it. The same
-/// sum may therefore be 0 here and 1e-40 there; who cares about 1e-40 should leave it alone.
+/// Rust assumes that nobody changes this mode: values computed at compile time may still be denormal. The same sum may therefore be 0 at
+/// run time and 1e-40 at compile time. Don't call this if values near 1e-40 matter.
 pub fn flush_denormals() {
     ffi::flush_denormals();
 }
 
-/// Whether a thread that this one starts takes them for 0.
+/// Returns `true` if a thread started by this one treats denormal numbers as 0.
 pub fn are_denormals_flushed() -> bool {
     let started = thread::spawn(|| black_box(f32::MIN_POSITIVE) * black_box(0.5) == 0.);
     started.join().expect("a product")
@@ -30,7 +30,7 @@ mod tests {
 
     #[test]
     fn all_threads_take_them_for_0() {
-        // So many that libtorch shares them among threads, which it starts for each thread that has it compute.
+        // Enough elements for libtorch to split them among its threads, which it starts separately for each calling thread.
         const MANY: i64 = 1 << 20;
         let left = || {
             let halves = Tensor::from(f32::MIN_POSITIVE).repeat([MANY]) * 0.5;

@@ -1,4 +1,4 @@
-//! The encoder: a fixed set of scene tokens reads every view, in two streams (spec 4.1).
+//! The encoder: a fixed set of scene tokens attends to every view, in two streams (spec 4.1).
 
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
@@ -10,33 +10,33 @@ use super::precision::Precision;
 use super::stream::{REGISTERS, StreamRound};
 use tch::{Tensor, nn};
 
-/// Query tokens before the scene tokens; not decoded.
+/// Number of auxiliary query tokens before the scene tokens; they are not decoded.
 const AUXILIARIES: i64 = 4;
-/// Learned tokens at the head of the memory.
+/// Number of learned tokens at the start of the memory.
 const MEMORY_REGISTERS: i64 = 4;
 
-/// Scene tokens that have seen every view, [B, M, d] each. With a single stream both are the same tensor.
+/// Scene tokens that have attended to every view, [B, M, d] each. With a single stream both fields are the same tensor.
 #[derive(Debug)]
 pub struct Encoded {
-    /// For positions, scales, rotations, opacities and the gate.
+    /// Tokens from which positions, scales, rotations, opacities and the gate are decoded.
     pub geometry: Tensor,
-    /// For colour.
+    /// Tokens from which colours are decoded.
     pub appearance: Tensor,
 }
 
 impl Encoded {
-    /// Applies `f` to both.
+    /// Applies `f` to both tensors.
     pub(crate) fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
         Encoded { geometry: f(&self.geometry), appearance: f(&self.appearance) }
     }
 
-    /// Both, each beside the same of `other`.
+    /// Pairs both tensors with the corresponding ones of `other`.
     pub(crate) fn beside<'a>(&'a self, other: &'a Encoded) -> [(&'a Tensor, &'a Tensor); 2] {
         [(&self.geometry, &other.geometry), (&self.appearance, &other.appearance)]
     }
 }
 
-/// Slots, streams and mixers.
+/// Encoder with its learned slots, streams and mixers.
 #[derive(Debug)]
 pub struct Encoder {
     auxiliaries: Tensor,
@@ -47,11 +47,11 @@ pub struct Encoder {
     geometry_rounds: Vec<StreamRound>,
     appearance: Option<Appearance>,
     latents: i64,
-    /// Of the rounds' products.
+    /// Precision of the products of the rounds.
     pub(super) precision: Precision,
 }
 
-/// What the dual-branch encoder has beyond a single stream.
+/// Appearance stream and mixers, which the dual-stream encoder has in addition to the geometry stream.
 #[derive(Debug)]
 struct Appearance {
     start: StreamStart,
@@ -60,7 +60,7 @@ struct Appearance {
 }
 
 impl Encoder {
-    /// `vs` is the encoder's own path.
+    /// Builds the encoder under `vs`, the encoder's own path.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         let d = config.width;
         let tokens =
@@ -88,7 +88,7 @@ impl Encoder {
         }
     }
 
-    /// Layers that compute in the precision of products.
+    /// Returns the layers that compute in the configurable precision.
     pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
         let branch = self.appearance.iter();
         let rounds = self.geometry_rounds.iter().chain(branch.clone().flat_map(|branch| &branch.rounds));
@@ -96,30 +96,30 @@ impl Encoder {
         rounds.flat_map(StreamRound::products).chain(mixers.flat_map(Mixer::products))
     }
 
-    /// See [`StreamRound::fold_weights`].
+    /// Calls [`StreamRound::fold_weights`] for every round of every stream.
     pub(super) fn fold_weights(&mut self) {
         let appearance = self.appearance.iter_mut().flat_map(|branch| &mut branch.rounds);
         let rounds = self.geometry_rounds.iter_mut().chain(appearance);
         rounds.for_each(|round| round.fold_weights(self.precision));
     }
 
-    /// Whether gradients will come back to its weights from what is computed now.
+    /// Returns `true` if gradients will flow back to the encoder's weights from what is computed now.
     pub(super) fn is_followed(&self) -> bool {
         is_followed(&self.memory_registers)
     }
 
-    /// What all rounds read: learned tokens, then those of images, `tokens` [B, V·P, token width].
+    /// Computes the memory that all rounds read: learned tokens, then image tokens, `tokens` [B, V·P, token width].
     pub fn memory(&self, tokens: &Tensor) -> Memory {
         let registers = self.memory_registers.expand([tokens.size()[0], -1, -1], false);
         Memory::new(&Tensor::cat(&[&registers, tokens], 1))
     }
 
-    /// The same where nobody asks for gradients, of `views` views one after the other, as [`Memory::of_views`] asks for them.
+    /// Computes the memory without gradients from `views` views, one after the other, with [`Memory::of_views`].
     pub fn memory_of_views(&self, views: i64, view: impl Fn(i64) -> Tensor) -> Memory {
         Memory::of_views(&self.memory_registers, views, view, self.precision)
     }
 
-    /// `scene_tokens` [M, d], `memory` as [`Encoder::memory`] gives it.
+    /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`].
     pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory) -> Encoded {
         let mut slots = self.start(scene_tokens, memory.common.size()[0]);
         for round in 0..self.rounds() {
@@ -128,7 +128,7 @@ impl Encoder {
         self.decoded(&slots)
     }
 
-    /// Every stream's own view of the slots, for `batch` scenes.
+    /// Computes every stream's projection of the slots, for `batch` scenes.
     pub(super) fn start(&self, scene_tokens: &Tensor, batch: i64) -> Slots {
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
         let slots = Tensor::cat(&slots, 1).expand([batch, -1, -1], false); // [B, 4 + M + 1 + 4, d]
@@ -138,7 +138,7 @@ impl Encoder {
         }
     }
 
-    /// Both streams read and think, each by itself, then they meet.
+    /// Runs one round: each stream by itself, then the mixer.
     pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Memory) -> Slots {
         let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory, self.precision);
         match (&self.appearance, &slots.appearance) {
@@ -152,7 +152,7 @@ impl Encoder {
         }
     }
 
-    /// The scene tokens among the slots.
+    /// Returns the scene tokens among the slots.
     pub(super) fn decoded(&self, slots: &Slots) -> Encoded {
         let decoded = |slots: &Tensor| slots.narrow(1, AUXILIARIES, self.latents);
         Encoded {
@@ -166,7 +166,7 @@ impl Encoder {
     }
 }
 
-/// What goes from round to round: both streams, or the only one, [B, 4 + M + 1 + 4, d] each.
+/// State between rounds: both streams, or the only one, [B, 4 + M + 1 + 4, d] each.
 #[derive(Debug)]
 pub(super) struct Slots {
     geometry: Tensor,
@@ -179,14 +179,14 @@ impl Slots {
         Slots { geometry: f(&self.geometry), appearance: self.appearance.as_ref().map(f) }
     }
 
-    /// Every stream beside the same of `other`.
+    /// Pairs every stream with the corresponding one of `other`.
     pub fn beside<'a>(&'a self, other: &'a Slots) -> Vec<(&'a Tensor, &'a Tensor)> {
         let appearance = self.appearance.as_ref().zip(other.appearance.as_ref());
         std::iter::once((&self.geometry, &other.geometry)).chain(appearance).collect()
     }
 }
 
-/// Linear(LayerNorm(slots)): a stream's own view of the shared slots.
+/// Linear(LayerNorm(slots)): a stream's projection of the shared slots.
 #[derive(Debug)]
 struct StreamStart {
     norm: nn::LayerNorm,

@@ -1,25 +1,25 @@
-//! Weights of a smaller model as those of a larger one, for training to go on with (spec 3.4 and 4.7).
+//! Conversion of a smaller model's weights to those of a larger model, from which training continues (spec 3.4 and 4.7).
 
 use super::config::ModelConfig;
 use super::decoder::{OPACITY, PARAMETERS};
 use tch::{Kind, Tensor};
 
-/// How far the copies of a scene token are apart, in deviations of all scene tokens.
+/// Standard deviation of the noise between copies of a scene token, relative to that of all scene tokens.
 const SPREAD: f64 = 0.2;
 
-/// What a model outgrows another by.
+/// Differences by which one model is larger than another.
 #[derive(Debug)]
 pub(crate) struct Growth {
-    /// The smaller model.
+    /// Configuration of the smaller model.
     from: ModelConfig,
-    /// Edge of its patches over that of the larger model's.
+    /// Patch edge of the smaller model divided by that of the larger one.
     finer: i64,
-    /// Scene tokens of the larger model for each of its own.
+    /// Number of scene tokens in the larger model for each one of the smaller model.
     copies: i64,
 }
 
 impl Growth {
-    /// As much of the way from one model to the other as there is a rule for.
+    /// Returns the growth from `from` towards `to`, as far as there are rules for it. Other differences are ignored.
     pub fn between(from: &ModelConfig, to: &ModelConfig) -> Self {
         let times = |whole: i64, part: i64| if whole % part == 0 { whole / part } else { 1 };
         Growth {
@@ -29,7 +29,7 @@ impl Growth {
         }
     }
 
-    /// What the smaller model becomes.
+    /// Returns the configuration of the larger model.
     pub fn result(&self) -> ModelConfig {
         ModelConfig {
             patch_size: self.from.patch_size / self.finer,
@@ -38,7 +38,7 @@ impl Growth {
         }
     }
 
-    /// What `weights`, which are called `name` in the smaller model, become. Draws from libtorch's random numbers.
+    /// Converts `weights`, called `name` in the smaller model, to the larger model. Draws from libtorch's random generator.
     pub fn of(&self, name: &str, weights: &Tensor) -> Tensor {
         match name {
             "ray_patch_embeds.1.weight" | "rgb_patch_embeds.1.weight" => {
@@ -54,22 +54,22 @@ impl Growth {
     }
 }
 
-/// Of weights that look at patches of `patch` × `patch` pixels, [d, p·p·C], those that make of a patch of 1 / `times` the edge what these
-/// make of it enlarged (spec 3.4).
+/// Converts patch weights [d, p·p·C] for patches of `patch` × `patch` pixels to patches of 1 / `times` the edge. The result gives for a
+/// small patch what `weights` give for the same patch enlarged (spec 3.4).
 pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
     let (d, edge) = (weights.size()[0], patch / times);
     let pixels = weights.view([d, edge, times, edge, times, -1]);
     pixels.sum_dim_intlist([2i64, 4].as_slice(), false, None::<Kind>).view([d, -1])
 }
 
-/// Of scene tokens [M, d] and normal numbers [n·M, d], n·M tokens: each n times, a little apart (spec 4.7).
+/// Repeats each of the scene tokens [M, d] n times, and adds a little of the normal noise [n·M, d] (spec 4.7). The result is [n·M, d].
 pub(crate) fn more_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
     let copies = noise.size()[0] / tokens.size()[0];
     tokens.repeat_interleave_self_int(copies, 0, None) + noise * (SPREAD * tokens.std(false))
 }
 
-/// Of the parameter head's bias, [10·K], that by which `copies` Gaussians on one another, each half opaque before, cover half of what is
-/// behind them (spec 4.7).
+/// Shifts the opacity logits in the parameter head's bias, [10·K], so that `copies` overlapping Gaussians, of which each was half opaque,
+/// together cover half of what is behind them (spec 4.7).
 pub(crate) fn shared_opacities(bias: &Tensor, copies: i64) -> Tensor {
     let shift = bias.zeros_like();
     let shared = ((1. / copies as f64).exp2() - 1.).ln();
@@ -115,7 +115,7 @@ mod tests {
             let expected = if copies == 1 { 0. } else { 3. * SPREAD };
             assert!((apart - expected).abs() < 0.05 * expected + 1e-9, "{copies} copies: {apart}");
 
-            // Of two candidates that are half opaque.
+            // Bias of two candidates that are half opaque.
             let bias = Tensor::zeros([2 * PARAMETERS], (Kind::Double, Device::Cpu));
             let grown = growth.of("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
             let left = grown.select(1, OPACITY).sigmoid().neg() + 1.;

@@ -1,4 +1,4 @@
-//! The pieces that streams and mixer are made of, with the initializations of spec 4.4.
+//! Layers that streams and mixers are built from, with the initializations of spec 4.4.
 
 use super::parts::{does, part};
 use super::precision::Precision;
@@ -6,11 +6,11 @@ use globalsplat_csrc::room::expect_room_for_code;
 use std::cell::Cell;
 use tch::{Device, Tensor, nn, nn::Module};
 
-/// Of encoder linears and learnable tokens.
+/// Standard deviation of the initial weights of the encoder's linear layers and of learned tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
 
-/// Normal with mean 0. Where spec 4.4 truncates normals the cut is at ±2, as in torch's `trunc_normal_`: a hundred
-/// standard deviations away, so it is the plain normal.
+/// Returns a normal initialization with mean 0. Spec 4.4 truncates normals at ±2, as torch's `trunc_normal_` does. That is a hundred
+/// standard deviations away, so this is the plain normal distribution.
 pub(super) fn randn(stdev: f64) -> nn::Init {
     drawn(nn::Init::Randn { mean: 0., stdev })
 }
@@ -19,7 +19,7 @@ thread_local! {
     static DRAWS: Cell<bool> = const { Cell::new(true) };
 }
 
-/// Builds what `build` does, with zeros for random numbers. tch's paths, which every module is built from, have no room for this.
+/// Runs `build` with zeros in place of random initial weights. tch's `nn::Path`, from which every module is built, has no option for this.
 pub(super) fn without_drawing<M>(build: impl FnOnce() -> M) -> M {
     let before = DRAWS.replace(false);
     let built = build();
@@ -27,34 +27,34 @@ pub(super) fn without_drawing<M>(build: impl FnOnce() -> M) -> M {
     built
 }
 
-/// `init`, unless nothing is to be drawn.
+/// Returns `init`, or zeros within [`without_drawing`].
 pub(super) fn drawn(init: nn::Init) -> nn::Init {
     if DRAWS.get() { init } else { nn::Init::Const(0.) }
 }
 
-/// A linear layer with normal weights and zero bias.
+/// Creates a linear layer with normally distributed weights and zero bias.
 pub(super) fn linear(vs: nn::Path, inputs: i64, outputs: i64, stdev: f64) -> nn::Linear {
     let config = nn::LinearConfig { ws_init: randn(stdev), bs_init: Some(nn::Init::Const(0.)), bias: true };
     nn::linear(vs, inputs, outputs, config)
 }
 
-/// A linear layer with libtorch's own initialization, uniform in ±1/√inputs for weights and bias. (tch's default for
-/// weights is another one.)
+/// Creates a linear layer with libtorch's own initialization, uniform in ±1/√inputs for weights and bias. (tch's default for weights
+/// differs.)
 pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool) -> nn::Linear {
     let bound = 1. / (inputs as f64).sqrt();
     let uniform = drawn(nn::Init::Uniform { lo: -bound, up: bound });
     nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
 }
 
-/// Of layer normalization.
+/// Epsilon of layer normalization.
 pub(super) const LAYER_NORM_EPS: f64 = 1e-5;
 
-/// Layer normalization over the last dimension.
+/// Creates a layer normalization over the last dimension.
 pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
     nn::layer_norm(vs, vec![width], nn::LayerNormConfig { eps: LAYER_NORM_EPS, ..Default::default() })
 }
 
-/// `norm` of `xs`.
+/// Applies `norm` to `xs`.
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
     part("norms", || {
         let out = norm.forward(xs);
@@ -63,7 +63,7 @@ pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
     })
 }
 
-/// The gain γ, in float32, of what is added to a stream.
+/// Learned gain γ, in float32, of an update that is added to a stream.
 #[derive(Debug)]
 pub(super) struct LayerScale {
     gamma: Tensor,
@@ -74,7 +74,7 @@ impl LayerScale {
         LayerScale { gamma: vs.var("gamma", &[width], nn::Init::Const(init)) }
     }
 
-    /// xs + γ ⊙ `change`.
+    /// Returns xs + γ ⊙ `change`.
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
         part("residual sums", || {
             let out = xs.addcmul(change, &self.gamma);
@@ -84,7 +84,7 @@ impl LayerScale {
     }
 }
 
-/// W2 · GELU(W1 · x), the exact GELU.
+/// Two-layer perceptron W2 · GELU(W1 · x) with the exact GELU.
 #[derive(Debug)]
 pub(super) struct Mlp {
     expand: nn::Linear,
@@ -92,7 +92,7 @@ pub(super) struct Mlp {
 }
 
 impl Mlp {
-    /// `names` are those of the two layers in the published weights.
+    /// Creates both layers; `names` are their names in the published weights.
     pub fn new(vs: nn::Path, inputs: i64, hidden: i64, outputs: i64, names: [&str; 2]) -> Self {
         Mlp {
             expand: linear(&vs / names[0], inputs, hidden, ENCODER_STD),
@@ -100,7 +100,7 @@ impl Mlp {
         }
     }
 
-    /// Both layers.
+    /// Returns both linear layers.
     pub fn products(&self) -> [&nn::Linear; 2] {
         [&self.expand, &self.contract]
     }
@@ -114,10 +114,10 @@ impl Mlp {
     }
 }
 
-/// x Φ(x) with the normal distribution Φ, in place where nobody asks for gradients.
+/// Computes x Φ(x) with the cumulative normal distribution Φ, in place if no gradients are needed.
 ///
 /// # Panics
-/// Where the system has no memory for oneDNN's code, by which libtorch does it on a CPU.
+/// Panics if the system has no memory for oneDNN's generated code, which libtorch uses for this on a CPU.
 pub(super) fn gelu(mut xs: Tensor) -> Tensor {
     if xs.device() == Device::Cpu {
         expect_room_for_code(0).unwrap_or_else(|error| panic!("{error}"));

@@ -1,21 +1,21 @@
-//! The backward pass by hand: a forward pass in parts, with leaves between them that collect the gradients.
+//! A backward pass in several parts: the forward pass is cut at detached tensors that collect the gradients.
 
 use tch::{Kind, Tensor};
 
-/// The same values with no way back: what the part before handed on, where the next one's backward pass ends.
+/// Returns a detached copy of `output` that requires a gradient: the input of the next part, where that part's backward pass ends.
 pub(crate) fn leaf(output: &Tensor) -> Tensor {
     output.detach().set_requires_grad(true)
 }
 
-/// Whether gradients will come back to `t` from what is computed of it now. A leaf, and a view of one, would say what it asks for
-/// even where gradients are off.
+/// Returns `true` if gradients will flow back to `t` from what is computed from it now. `t.requires_grad()` is not enough: a leaf, and a
+/// view of one, report their own flag even where gradients are disabled.
 pub(crate) fn is_followed(t: &Tensor) -> bool {
     t.sum(Kind::Float).requires_grad()
 }
 
-/// Goes on with the backward pass from `outputs` of a part, whose gradients are those of the leaves beside them.
+/// Continues the backward pass from the `outputs` of a part, each paired with the detached copy that holds its gradient.
 ///
-/// tch can't begin with given gradients; with the sum of products it begins with just these.
+/// tch can't start a backward pass with given gradients. The sum of the products of outputs and gradients has exactly these gradients.
 pub(crate) fn pull_back(outputs: &[(&Tensor, &Tensor)]) {
     let products = outputs.iter().filter_map(|(output, leaf)| {
         let gradient = leaf.grad();

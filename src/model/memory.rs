@@ -1,4 +1,4 @@
-//! What slots look at: learned tokens and those of all images, normalized (spec 4.1), apart from what they have in common.
+//! The memory that slots attend to: learned tokens and the image tokens of all views, normalized (spec 4.1), without their common part.
 
 use super::layers::LAYER_NORM_EPS;
 use super::leaves::leaf;
@@ -6,22 +6,24 @@ use super::parts::{does, part};
 use super::precision::Precision;
 use tch::{Kind, Tensor};
 
-/// So many views tell what all have in common, where asking every one costs time.
+/// Maximum number of views from which the common part is estimated if views are computed one by one, where using all of them costs time.
 const VIEWS_OF_MEAN: usize = 4;
 
-/// Tokens are much alike: most of what a photo's patches say of their rays, and of their camera, all photos' do. With 8 bits for
-/// what they differ by alone, scores tell thousands of patches apart as they do in float32.
+/// Normalized tokens, split into a common part and the differences from it. Tokens are much alike: most of what a photo's patches encode of
+/// their rays and of their camera is the same for all photos. If only the differences are rounded to 8 bits, scores distinguish thousands
+/// of patches as they do in float32.
 #[derive(Debug)]
 pub struct Memory {
-    /// What each is beside what they have in common, [B, m, token width].
+    /// Difference of each token from the common part, [B, m, token width].
     pub tokens: Tensor,
-    /// Their mean, or nearly so, [B, 1, token width] in float32, whose gradients nobody follows: whatever is called common, the same
-    /// comes out.
+    /// Mean of the tokens, or an estimate of it, [B, 1, token width] in float32, without gradients: the result doesn't depend on what is
+    /// taken as the common part.
     pub common: Tensor,
 }
 
 impl Memory {
-    /// Of `tokens` [B, m, token width] in float32: every round's gradient comes back to them, and is added up in float32.
+    /// Builds the memory from `tokens` [B, m, token width] in float32. The gradients of all rounds flow back to them and are accumulated in
+    /// float32.
     pub(crate) fn new(tokens: &Tensor) -> Self {
         part("norms", || {
             let tokens = normalized(tokens);
@@ -30,9 +32,9 @@ impl Memory {
         })
     }
 
-    /// The same of `registers` [1, r, token width] and `views` views, of which `view` gives the tokens [B, P, token width], one after
-    /// the other, for products in `precision`. There is no room for all in float32, so a few are asked for twice: what these have in
-    /// common nearly is what all have.
+    /// Builds the memory from `registers` [1, r, token width] and `views` views, for products in `precision`. `view` computes the tokens of
+    /// one view, [B, P, token width], and is called for one view after the other. All tokens in float32 would not fit into memory, so a few
+    /// views are computed twice: their common part is close to that of all.
     pub(super) fn of_views(
         registers: &Tensor,
         views: i64,
@@ -57,18 +59,18 @@ impl Memory {
         Memory { tokens, common }
     }
 
-    /// The same with tokens of a `kind`.
+    /// Returns the memory with tokens converted to `kind`.
     pub(super) fn to_kind(&self, kind: Kind) -> Self {
         Memory { tokens: self.tokens.to_kind(kind), common: self.common.shallow_clone() }
     }
 
-    /// The same where a backward pass ends.
+    /// Returns the memory with detached tokens that collect gradients.
     pub(super) fn leaf(&self) -> Self {
         Memory { tokens: leaf(&self.tokens), common: self.common.shallow_clone() }
     }
 }
 
-/// What all rounds' norms of `tokens` have in common, before their γ and β.
+/// Normalizes `tokens` without γ and β: the part that the memory norms of all rounds share.
 fn normalized(tokens: &Tensor) -> Tensor {
     part("norms", || {
         let out =
@@ -83,13 +85,13 @@ pub(super) mod tests {
     use super::*;
     use tch::Device;
 
-    /// Numbers that nobody else draws, between −1 and 1; others for another `step`.
+    /// Returns irregular values between −1 and 1 without random numbers; each `step` gives other values.
     pub(in super::super) fn uneven(step: f64, size: &[i64]) -> Tensor {
         let numbers = Tensor::arange(size.iter().product::<i64>(), (Kind::Double, Device::Cpu));
         (numbers.square() * step).sin().to_kind(Kind::Float).view(size)
     }
 
-    /// [2, `count`, 24], all of them near one another.
+    /// Returns tokens [2, `count`, 24] that are close to one another.
     pub(in super::super) fn alike(count: i64) -> Tensor {
         uneven(0.7, &[24]) + 0.05 * uneven(1., &[2, count, 24])
     }
@@ -108,7 +110,7 @@ pub(super) mod tests {
             let (at_once, one_by_one) = of_views(views);
             let whole = |memory: &Memory| &memory.tokens + &memory.common;
             assert!(largest(whole(&at_once) - whole(&one_by_one)) < 1e-6, "{views} views");
-            // A twentieth of the tokens, as they are made, is their own.
+            // A twentieth of each token is its own, by construction of `alike`.
             let [own, apart] = [&at_once, &one_by_one].map(|memory| largest(memory.tokens.shallow_clone()));
             assert!(apart < 1.5 * own && apart < 0.2 * largest(whole(&at_once)), "{own} {apart}");
         }

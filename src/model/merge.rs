@@ -1,30 +1,29 @@
-//! From K candidates per scene token to the G = 2^s Gaussians of a stage, and from one stage to the next
-//! (spec 5.3 and 5.4).
+//! Merging of K candidates per scene token into the G = 2^s Gaussians of a stage, and transitions between stages (spec 5.3 and 5.4).
 
 use serde::{Deserialize, Serialize};
 use std::f64::consts::LN_2;
 use tch::{Kind, Tensor};
 
-/// log u = log(1 − α) is kept at or below it, so that an opacity of 0 still has a logit.
+/// Upper bound of log u = log(1 − α), so that an opacity of 0 still has a finite logit.
 const MAX_LOG_U: f64 = -1e-12;
 
-/// Where the coarse-to-fine curriculum stands.
+/// Position in the coarse-to-fine curriculum.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Stage {
-    /// s: every scene token shows 2^s Gaussians.
+    /// Stage index s: every scene token is decoded into 2^s Gaussians.
     pub index: u32,
-    /// λ in [0, 1]: how far the transition from stage s − 1 has come. 1 at stage 0.
+    /// Progress λ in [0, 1] of the transition from stage s − 1; 1 at stage 0.
     pub mix: f64,
 }
 
 impl Stage {
-    /// Stage `index` with its transition done.
+    /// Returns stage `index` with its transition completed.
     pub fn complete(index: u32) -> Self {
         Stage { index, mix: 1. }
     }
 }
 
-/// Candidates, [B, M, K, ..], or merged Gaussians, [B, M, G, ..]: the same five quantities before activation.
+/// Five quantities before activation, of candidates, [B, M, K, ..], or of merged Gaussians, [B, M, G, ..].
 #[derive(Debug)]
 pub(crate) struct Candidates {
     pub positions: Tensor,      // [.., 3]
@@ -35,7 +34,7 @@ pub(crate) struct Candidates {
 }
 
 impl Candidates {
-    /// Gaussians of `stage`, with the transition from the one before. `gate` [B, M, K].
+    /// Returns the Gaussians of `stage`, blended with those of the previous stage during a transition. `gate` is [B, M, K].
     pub fn at_stage(&self, gate: &Tensor, stage: Stage) -> Candidates {
         let merged = self.merge(gate, 1 << stage.index);
         if stage.index == 0 || stage.mix >= 1. {
@@ -52,12 +51,12 @@ impl Candidates {
         }
     }
 
-    /// Merges every b = K / `groups` consecutive candidates by weights w = softmax(gate): means of positions, rotations
-    /// and SH; scales grow by b^(1/3), as b volumes are put into one; log u = Σ w log(1 − α).
+    /// Merges every b = K / `groups` consecutive candidates with weights w = softmax(gate). Positions, rotations and SH are weighted means;
+    /// scales grow by b^(1/3), as b volumes are merged into one; log u = Σ w log(1 − α).
     fn merge(&self, gate: &Tensor, groups: i64) -> Candidates {
         let (b, m, k) = gate.size3().expect("[B, M, K]");
         let members = k / groups;
-        // Along the last dimension: along others, bits depend on the number of threads.
+        // Reduce along the last dimension: along others, the bits of the result depend on the number of threads.
         let weights = gate.view([b, m, groups, members]).softmax(-1, None::<Kind>).unsqueeze(-1);
         let weighted = |t: &Tensor| {
             let grouped = t.view([b, m, groups, members, -1]);
@@ -72,7 +71,7 @@ impl Candidates {
         }
     }
 
-    /// Every Gaussian twice, side by side, each with half of the volume and half of the optical depth log u.
+    /// Repeats every Gaussian twice, consecutively, each copy with half of the volume and half of the optical depth log u.
     fn expand(&self) -> Candidates {
         let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 2, None);
         Candidates {
@@ -85,12 +84,12 @@ impl Candidates {
     }
 }
 
-/// log(1 − sigmoid(x)) = log sigmoid(−x).
+/// Computes log(1 − sigmoid(x)) = log sigmoid(−x).
 fn log_u_from_logit(logit: &Tensor) -> Tensor {
     (-logit).log_sigmoid()
 }
 
-/// logit(1 − u) = log(1 − e^{log u}) − log u.
+/// Computes logit(1 − u) = log(1 − e^{log u}) − log u.
 fn logit_from_log_u(log_u: &Tensor) -> Tensor {
     let log_u = log_u.clamp_max(MAX_LOG_U);
     (-log_u.expm1()).log() - log_u

@@ -1,4 +1,4 @@
-//! Where the two streams meet, once per round (spec 4.3).
+//! The mixer, which exchanges information between the two streams once per round (spec 4.3).
 
 use super::layers::{LayerScale, Mlp, layer_norm, normalize};
 use super::parts::part;
@@ -7,7 +7,7 @@ use tch::{Tensor, nn};
 
 const MIXER_LAYER_SCALE: f64 = 1e-3;
 
-/// An MLP over both streams, side by side, whose halves are added to them.
+/// MLP over the concatenated streams; each half of its output is added to one stream.
 #[derive(Debug)]
 pub(crate) struct Mixer {
     geometry_norm: nn::LayerNorm,
@@ -28,12 +28,12 @@ impl Mixer {
         }
     }
 
-    /// Layers that compute in the precision of products.
+    /// Returns the layers that compute in the configurable precision.
     pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
         self.mlp.products().into_iter()
     }
 
-    /// Both streams [B, S, d], and so the results.
+    /// Mixes the two streams, [B, S, d] each; the results have the same shape.
     pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
         part("mixer", || {
             let both =

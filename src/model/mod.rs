@@ -1,7 +1,7 @@
-//! The network: posed images to Gaussians (spec 3 to 5, the paper's figure 2), in the order data flows.
+//! The network: posed images to Gaussians (spec 3 to 5, the paper's figure 2), with modules in the order of the data flow.
 //!
-//! Parameters carry the names of the published weights, so that a model trained here and one published by the authors
-//! are the same file after a change of container.
+//! Parameters have the names of the published weights. A model trained here and one published by the authors differ only in the file
+//! format.
 
 mod attention;
 mod camera_code;
@@ -35,12 +35,12 @@ pub use precision::Precision;
 pub(crate) use precision::convolve;
 pub use shapes::MODULES;
 
-// For training, which goes through the model in parts and from smaller models to larger ones.
+// Used by training, which runs the model in parts and grows smaller models into larger ones.
 pub(crate) use growth::Growth;
 pub(crate) use leaves::{is_followed, leaf, pull_back};
 pub(crate) use recompute::KeptRounds;
 
-// For the parity checks, which run every module by itself.
+// Used by the parity checks, which run every module by itself.
 pub(crate) use attention::{attention, by_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
@@ -57,7 +57,7 @@ use layers::{ENCODER_STD, drawn, randn, without_drawing};
 use std::collections::HashSet;
 use tch::{Device, Kind, Tensor, nn};
 
-/// The whole model.
+/// The complete model: tokenizer, encoder and decoder.
 #[derive(Debug)]
 pub struct GlobalSplat {
     config: ModelConfig,
@@ -68,10 +68,10 @@ pub struct GlobalSplat {
 }
 
 impl GlobalSplat {
-    /// Builds the model with fresh weights under `vs`.
+    /// Builds the model with freshly initialized weights under `vs`.
     ///
     /// # Errors
-    /// A configuration whose numbers don't fit together.
+    /// Returns an error if the fields of `config` don't fit together.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Result<Self> {
         config.check()?;
         Ok(GlobalSplat {
@@ -83,13 +83,14 @@ impl GlobalSplat {
         })
     }
 
-    /// The same under the root of `vs`, which is empty, for weights from a file and passes in `precision`: with zeros where weights
-    /// begin with random numbers, and weights of products in the kind that these take, so that nobody converts them at every use.
+    /// Builds the model under the root of the empty `vs` for weights that are loaded from a file, with passes in `precision`. Weights that
+    /// would be drawn at random are zero instead. Weights of the layers that compute in `precision` are stored in its kind, so that they
+    /// aren't converted at every use.
     ///
     /// # Errors
-    /// As [`GlobalSplat::new`].
+    /// Returns an error if the fields of `config` don't fit together.
     pub fn to_be_filled(vs: &mut nn::VarStore, config: &ModelConfig, precision: Precision) -> Result<Self> {
-        // All else is converted, as it is little.
+        // Creates every parameter in the kind of the products; the few others are converted to float32 below.
         vs.set_kind(precision.kind());
         let mut model = without_drawing(|| Self::new(&vs.root(), config))?;
         model.set_precision(precision);
@@ -106,34 +107,34 @@ impl GlobalSplat {
         Ok(model)
     }
 
-    /// One pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics`
-    /// [B, V, 3, 3] in pixels; H and W multiples of the patch size.
+    /// Runs one forward pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics` [B, V, 3, 3] in
+    /// pixels; H and W are multiples of the patch size.
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
         self.decode(&self.encode_memory(&self.memory(images, c2w, intrinsics)), stage)
     }
 
-    /// The first third of [`GlobalSplat::forward`]: [B, V, P, ray width + RGB width].
+    /// Computes the image tokens, [B, V, P, ray width + RGB width]: the first part of [`GlobalSplat::forward`].
     pub fn tokens(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
         part("tokens", || self.tokenizer.forward(images, c2w, intrinsics))
     }
 
-    /// The second third: scene tokens that have seen every view.
+    /// Encodes image tokens into scene tokens that have attended to every view: the second part of [`GlobalSplat::forward`].
     pub fn encode(&self, tokens: &Tensor) -> Encoded {
         self.encode_memory(&self.memory_of(tokens))
     }
 
-    /// What the encoder reads of image tokens [B, V, P, token width].
+    /// Computes the encoder's memory from image tokens [B, V, P, token width].
     fn memory_of(&self, tokens: &Tensor) -> Memory {
         self.encoder.memory(&tokens.flatten(1, 2))
     }
 
-    /// The first third and the beginning of the second. On a CPU, where nobody asks for gradients, it goes view by view: image tokens of
-    /// many views are large. A GPU has the memory, and would spend the time on launching small kernels.
+    /// Computes the encoder's memory from images and cameras. On a CPU without gradients it processes one view at a time, because the image
+    /// tokens of many views are large. A GPU has enough memory for all views, and would spend the time on launching small kernels.
     pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Memory {
         let is_followed = self.encoder.is_followed();
         if is_followed || images.device() != Device::Cpu {
             let memory = self.memory_of(&self.tokens(images, c2w, intrinsics));
-            // Once for all rounds; gradients are added up in float32.
+            // Converts once for all rounds. With gradients the memory stays in float32, in which they are accumulated.
             return if is_followed { memory } else { memory.to_kind(self.precision().kind()) };
         }
         let of_view = |view| {
@@ -143,46 +144,46 @@ impl GlobalSplat {
         self.encoder.memory_of_views(images.size()[1], of_view)
     }
 
-    /// The rest of the second third.
+    /// Encodes the memory into scene tokens: [`GlobalSplat::encode`] without the computation of the memory.
     pub fn encode_memory(&self, memory: &Memory) -> Encoded {
         self.encoder.forward(&self.scene_tokens, memory)
     }
 
-    /// As [`GlobalSplat::encode`], but every round is computed again in the backward pass.
+    /// Runs [`GlobalSplat::encode`] with activation checkpointing: the backward pass recomputes every round.
     pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (Encoded, KeptRounds<'_>) {
         self.encoder.forward_keeping_rounds(&self.scene_tokens, self.memory_of(tokens))
     }
 
-    /// The last third.
+    /// Decodes scene tokens into the Gaussians of `stage`: the last part of [`GlobalSplat::forward`].
     pub fn decode(&self, encoded: &Encoded, stage: Stage) -> Decoded {
         part("heads", || self.decoder.forward(encoded, stage))
     }
 
-    /// What matrix products are computed in from now on; float32 at first.
+    /// Sets the precision of matrix products; the default is float32.
     pub fn set_precision(&mut self, precision: Precision) {
         self.encoder.precision = precision;
         self.decoder.precision = precision;
     }
 
-    /// Computes once, from weights that don't change any more, what every pass would compute of them: fewer kernels for a GPU to launch,
-    /// for more memory. Afterwards weights that are changed or learned have no effect on that.
+    /// Precomputes everything that depends on weights alone, for weights that no longer change. A GPU then launches fewer kernels per pass,
+    /// at the cost of more memory. Later changes to these weights have no effect.
     pub fn fold_weights(&mut self) {
         tch::no_grad(|| self.encoder.fold_weights());
     }
 
-    /// What matrix products are computed in.
+    /// Returns the precision of matrix products.
     pub fn precision(&self) -> Precision {
         self.encoder.precision
     }
 
-    /// What the model was built from.
+    /// Returns the configuration that the model was built from.
     pub fn config(&self) -> &ModelConfig {
         &self.config
     }
 }
 
-/// The learned scene tokens, [M, d]. Orthogonal ones start as different from each other as they can be; that needs no more
-/// of them than dimensions.
+/// Creates the learned scene tokens, [M, d]. They are initially orthogonal, as different from each other as possible, if there are at most
+/// as many tokens as dimensions, and normally distributed otherwise.
 pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
     let init = match config.latents <= config.width {
         true => drawn(nn::Init::Orthogonal { gain: ENCODER_STD }),
@@ -196,11 +197,11 @@ mod tests {
     use super::*;
     use globalsplat_csrc::ops::{computing, outermost_ops_of, without_own_linear_layers};
 
-    /// A GPU computes a pass of the main model about as fast as the host tells it what to do.
+    /// A pass launches a bounded number of kernels, whatever the number of photos. On a GPU, a pass of the main model takes about as long
+    /// as the host needs to launch its kernels.
     #[test]
     fn a_pass_takes_few_kernels() {
-        // The main model's layers, narrow. In float64 and with an odd number of heads, the CPU takes the same code path
-        // as a GPU.
+        // The layers of the main model, but narrow. In float64 and with an odd number of heads, the CPU takes the same code path as a GPU.
         let config = ModelConfig {
             latents: 16,
             width: 24,
@@ -214,7 +215,7 @@ mod tests {
         let mut vs = nn::VarStore::new(Device::Cpu);
         let mut model = GlobalSplat::new(&vs.root(), &config).unwrap();
         vs.freeze();
-        // Rays are in float32, where linear layers are our own, in blocks, on any of libtorch's threads: they are counted apart.
+        // Rays are float32. There our own linear layers run in blocks on libtorch's threads, so they are counted separately.
         let of_tokens = |views: i64| {
             let options = (Kind::Float, Device::Cpu);
             let images = Tensor::rand([1, views, 3, 32, 32], options);

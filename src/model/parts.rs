@@ -1,22 +1,22 @@
-//! What a pass is doing, told to who wants to know: every product, norm and sum belongs to a part.
+//! Profiling events of a forward pass: named spans, and the floating-point operations and bytes recorded in them.
 
 use std::cell::RefCell;
 use tch::Tensor;
 
-/// A step of a pass.
+/// Profiling event of a forward pass.
 #[derive(Debug, Clone, Copy)]
 pub enum Event {
-    /// A part begins. Parts don't overlap: one within another is none of its own.
+    /// Start of a span. Spans don't nest: a span within another one reports no events of its own.
     Begins(&'static str),
-    /// It is over.
+    /// End of the current span.
     Ends,
-    /// What the part that is under way does.
+    /// Work done in the current span.
     Does {
-        /// In products.
+        /// Number of floating-point operations of matrix products in the forward pass.
         flops: f64,
-        /// In products of the backward pass, where it will be followed.
+        /// Number of floating-point operations of matrix products in the backward pass; 0 if no gradient is needed.
         owed: f64,
-        /// Of numbers that come in and go out.
+        /// Number of bytes of the input and output tensors.
         bytes: f64,
     },
 }
@@ -30,7 +30,7 @@ thread_local! {
     static LISTENER: RefCell<Option<Listener>> = const { RefCell::new(None) };
 }
 
-/// Does `pass`, of which this thread tells `listener` every event.
+/// Runs `pass` and calls `listener` for every profiling event of this thread.
 pub fn told<T>(listener: impl FnMut(Event) + 'static, pass: impl FnOnce() -> T) -> T {
     LISTENER.set(Some(Listener { tell: Box::new(listener), is_within: false }));
     let result = pass();
@@ -38,7 +38,7 @@ pub fn told<T>(listener: impl FnMut(Event) + 'static, pass: impl FnOnce() -> T) 
     result
 }
 
-/// Does `work`, which is a part.
+/// Runs `work` as a span called `name`.
 pub(crate) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
     let begins = LISTENER.with_borrow_mut(|listener| match listener {
         Some(listener) if !listener.is_within => {
@@ -60,7 +60,8 @@ pub(crate) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
     result
 }
 
-/// Tells of `flops` that are done on `tensors`, which come in or go out, and of those that their gradients will take.
+/// Records work on `tensors`, the inputs and outputs: `flops` in the forward pass and `owed` in the backward pass. A no-op outside of
+/// spans.
 pub(super) fn does(flops: i64, owed: i64, tensors: &[&Tensor]) {
     LISTENER.with_borrow_mut(|listener| {
         if let Some(listener) = listener.as_mut().filter(|listener| listener.is_within) {

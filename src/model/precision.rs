@@ -1,4 +1,4 @@
-//! What matrix products are computed in (spec 1.3).
+//! Precision of matrix products (spec 1.3).
 
 use super::parts::does;
 use globalsplat_csrc::linear::linear;
@@ -9,22 +9,22 @@ use std::str::FromStr;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
 
-/// Of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. All else is
-/// float32, whatever this says: weights and their gradients, norms, what values have in common, the sums inside of softmax and
-/// products, residual streams; tokens and geometry heads, whose products are few and which read and say where things are; geometry
-/// and rendering; the differences of features.
+/// Precision of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. Everything else
+/// is always float32: weights and their gradients, norms, the common part of values, accumulation within softmax and products, residual
+/// streams; tokens and geometry heads, whose products are few and which determine positions; geometry and rendering; the differences of
+/// features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
-    /// 24 bits of mantissa.
+    /// float32, with 24 bits of mantissa.
     #[default]
     F32,
-    /// 8 bits of mantissa, as with torch's autocast: faster where the machine has instructions for it (AMX, tensor cores).
+    /// bfloat16, with 8 bits of mantissa, as with torch's autocast: faster if the machine has instructions for it (AMX, tensor cores).
     Bf16,
 }
 
 impl Precision {
-    /// bf16 where `device` has instructions for its products, else float32.
+    /// Returns bf16 if `device` has instructions for bf16 products, and float32 otherwise.
     pub fn fastest_on(device: Device) -> Self {
         let has_bf16 = match device {
             Device::Cpu => bf16_of_cpu() != Bf16::None,
@@ -34,14 +34,15 @@ impl Precision {
         if has_bf16 { Precision::Bf16 } else { Precision::F32 }
     }
 
-    /// For tokens of `width` numbers: the fastest one on `device` where products are as large as the main model's. Smaller models are
-    /// quick anyway, and read many small patches: the one that comes with the program loses a tenth of a dB in bf16.
+    /// Returns the best precision for tokens of `width` elements: the fastest on `device` if the products are as large as the main model's,
+    /// and float32 otherwise. Smaller models are fast anyway and read many small patches: the model that comes with the program loses a
+    /// tenth of a dB in bf16.
     pub fn best_on(device: Device, width: i64) -> Self {
         const WIDE: i64 = 256;
         if width >= WIDE { Precision::fastest_on(device) } else { Precision::F32 }
     }
 
-    /// Of the numbers that products take.
+    /// Returns the kind of the operands of products.
     pub fn kind(self) -> Kind {
         match self {
             Precision::F32 => Kind::Float,
@@ -49,7 +50,7 @@ impl Precision {
         }
     }
 
-    /// `t` as products take it.
+    /// Converts `t` to the kind of the operands of products.
     pub(super) fn operand(self, t: &Tensor) -> Tensor {
         match self {
             Precision::F32 => t.shallow_clone(),
@@ -57,14 +58,14 @@ impl Precision {
         }
     }
 
-    /// `layer` applied to `xs`. In bf16 so is the result, whatever the kind of `xs`.
+    /// Applies `layer` to `xs`. In bf16 the result is bf16, whatever the kind of `xs`.
     pub(crate) fn linear(self, layer: &nn::Linear, xs: &Tensor) -> Tensor {
         let bias = layer.bs.as_ref().map(|bias| self.operand(bias));
         product(&self.operand(xs), &self.operand(&layer.ws), bias.as_ref())
     }
 }
 
-/// `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
+/// Computes `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let is_ours =
         xs.device() == Device::Cpu && xs.numel() > 0 && matches!(xs.kind(), Kind::Float | Kind::BFloat16);
@@ -74,7 +75,7 @@ fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     out
 }
 
-/// The same on the CPU, with the same bits for any number of threads.
+/// Computes [`product`] on the CPU, with the same bits for any number of threads.
 fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let address = |t: &Tensor| t.as_ptr() as usize;
     // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
@@ -83,7 +84,8 @@ fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tenso
     unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
 }
 
-/// Of `flops` that multiply both with each other: as many for the gradient of each, if that of what came `out` is followed.
+/// Returns the backward operations of a product that takes `flops` operations forward: `flops` for each factor that needs a gradient, and 0
+/// if `out` doesn't.
 fn owed(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
     match out.requires_grad() {
         true => flops * both.iter().filter(|t| t.requires_grad()).count() as i64,
@@ -91,7 +93,7 @@ fn owed(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
     }
 }
 
-/// ReLU of what `layer` makes of images, [B, C, H, W].
+/// Returns the ReLU of `layer` applied to `images`, [B, C, H, W].
 pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     let out = layer.forward(images).relu_();
     let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
@@ -99,10 +101,10 @@ pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     out
 }
 
-/// For networks of convolutions that learn nothing.
+/// Methods for convolutional networks without trainable weights.
 impl Precision {
-    /// Images [B, C, H, W], or kernels [O, I, k, k], as convolutions take them: in bf16 a pixel's channels lie side by side, as
-    /// tensor cores multiply them, and results do so, too. In float32 the same tensor.
+    /// Converts images [B, C, H, W] or kernels [O, I, k, k] for convolutions. In bf16 they become channels-last, the layout of tensor
+    /// cores, and so are the results. In float32 the tensor is returned unchanged.
     pub(crate) fn images(self, xs: &Tensor) -> Tensor {
         match self {
             Precision::F32 => xs.shallow_clone(),
@@ -113,7 +115,7 @@ impl Precision {
         }
     }
 
-    /// Makes of a layer in float32 what [`Precision::images`] can go through. Its weights are converted once and for all.
+    /// Converts a float32 layer, once, so that it takes the output of [`Precision::images`].
     pub(crate) fn convert(self, layer: &mut nn::Conv2D) {
         layer.ws = self.images(&layer.ws);
         if self == Precision::Bf16 {
@@ -148,7 +150,8 @@ mod tests {
     use super::*;
     use tch::no_grad;
 
-    /// Shapes of few and many rows and columns, whole blocks and parts of them; by which sums are split in libraries depends on each.
+    /// Products have the same bits for any number of threads. The shapes have few and many rows and columns, in whole and partial blocks,
+    /// because libraries split sums depending on each.
     #[test]
     fn products_have_the_same_bits_for_any_number_of_threads() {
         let numbers = |count: i64, phase: f64| {

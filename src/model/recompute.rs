@@ -1,26 +1,25 @@
-//! Activation checkpointing: an encoder pass that keeps of every round only what it began with, and computes the round again
-//! when its gradient is due.
+//! Activation checkpointing: an encoder pass that stores only the input of every round and recomputes the round in the backward pass.
 
 use super::encoder::{Encoded, Encoder, Slots};
 use super::leaves::{leaf, pull_back};
 use super::memory::Memory;
 use tch::{Tensor, no_grad};
 
-/// What is left of an encoder's forward pass for its backward pass.
+/// State that the backward pass needs from the encoder's forward pass.
 #[derive(Debug)]
 pub(crate) struct KeptRounds<'a> {
     encoder: &'a Encoder,
-    /// Before the first round, with their way back to scene tokens and image tokens.
+    /// Slots before the first round, attached to the graph of scene tokens and image tokens.
     slots: Slots,
     memory: Memory,
-    /// All rounds read the same memory, so its gradient is the sum of theirs.
+    /// Detached memory. All rounds read it, so it accumulates the sum of their gradients.
     memory_leaf: Memory,
-    /// Before every round, and after the last one.
+    /// Detached slots before every round, and after the last one.
     between: Vec<Slots>,
 }
 
 impl Encoder {
-    /// As [`Encoder::forward`]. The result's gradients are to be followed first, then [`KeptRounds::backward`].
+    /// Runs [`Encoder::forward`] with activation checkpointing. Run the backward pass of the result first, then [`KeptRounds::backward`].
     pub(crate) fn forward_keeping_rounds(
         &self,
         scene_tokens: &Tensor,
@@ -39,7 +38,7 @@ impl Encoder {
 }
 
 impl KeptRounds<'_> {
-    /// From the last round to the first, then into what they began with.
+    /// Runs the backward pass from the last round to the first, then through the initial slots and the memory.
     pub fn backward(mut self) {
         for round in (0..self.encoder.rounds()).rev() {
             let after = self.between.pop().expect("one more than rounds");

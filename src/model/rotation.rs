@@ -1,17 +1,17 @@
-//! Rotations from six numbers (Zhou et al. 2019), differentiable (spec 5.6).
+//! Differentiable rotations from six values (Zhou et al. 2019; spec 5.6).
 
 use tch::{Kind, Tensor};
 
-/// Norms below it count as it.
+/// Minimum norm that vectors are divided by.
 const EPS: f64 = 1e-8;
 
-/// Each of the last dimension's vectors divided by its length, at least 1e-8.
+/// Divides each vector along the last dimension by its length, clamped to at least 1e-8.
 pub(super) fn normalize(xs: &Tensor) -> Tensor {
     xs / xs.norm_scalaropt_dim(2, [-1i64], true).clamp_min(EPS)
 }
 
-/// b1 = normalize(first), b2 = normalize(second − (b1·second) b1), b3 = b1 × b2: the ROWS of the result.
-/// `rotations` [.., 6], result [.., 3, 3].
+/// Computes rotation matrices, [.., 3, 3], from `rotations` [.., 6]. b1 = normalize(first), b2 = normalize(second − (b1·second) b1), b3 =
+/// b1 × b2 are the ROWS of the result.
 pub fn rotation_matrix_from_6d(rotations: &Tensor) -> Tensor {
     let (first, second) = (rotations.narrow(-1, 0, 3), rotations.narrow(-1, 3, 3));
     let b1 = normalize(&first);
@@ -21,10 +21,10 @@ pub fn rotation_matrix_from_6d(rotations: &Tensor) -> Tensor {
     Tensor::stack(&[b1, b2, b3], -2)
 }
 
-/// The quaternion (w, x, y, z), w ≥ 0, of [`rotation_matrix_from_6d`]; result [.., 4].
+/// Computes the quaternion (w, x, y, z), w ≥ 0, of [`rotation_matrix_from_6d`]; the result is [.., 4].
 ///
-/// 4 q qᵀ is linear in the matrix, and each of its rows is a multiple of q. The row with the largest diagonal entry
-/// (at least 1) is far from zero, so that normalizing it loses nothing.
+/// 4 q qᵀ is linear in the matrix, and each of its rows is a multiple of q. The row with the largest diagonal entry (at least 1) is far
+/// from zero, so normalizing it loses no precision.
 pub fn quaternion_from_6d(rotations: &Tensor) -> Tensor {
     let matrix = rotation_matrix_from_6d(rotations).flatten(-2, -1).unbind(-1);
     let [m00, m01, m02, m10, m11, m12, m20, m21, m22] =

@@ -1,20 +1,20 @@
-//! The model's shape, read off the shapes of its parameters: published weights come without a configuration.
+//! Inference of the model configuration from parameter shapes: published weights come without a configuration.
 
 use super::config::{ModelConfig, Streams};
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What the names of all parameters begin with, up to the first dot.
+/// First components, up to the first dot, of all parameter names.
 pub const MODULES: [&str; 6] =
     ["scene_tokens", "rgb_patch_embeds", "ray_patch_embeds", "view_pe", "slot_encoder", "gaussian_decoder"];
 
 impl ModelConfig {
-    /// The model whose parameters have these shapes, by their published names. Shapes don't tell the number of heads, which stays
-    /// the default's.
+    /// Returns the configuration of the model whose parameters, by their published names, have these shapes. The number of heads can't be
+    /// inferred from shapes and keeps its default.
     ///
     /// # Errors
-    /// A parameter without which it can't be told, or one of a shape that no model has; `origin` is the file in the error.
+    /// Returns an error if a required parameter is missing or has a shape that no model has. `origin` is the file named in the error.
     pub fn of_shapes(shapes: &BTreeMap<String, Vec<i64>>, origin: &Path) -> Result<Self> {
         let refuse = |name: &str, found: String, expected: &str| {
             Error::input(origin, format!("tensor {name}"), found, expected)

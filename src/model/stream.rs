@@ -1,4 +1,4 @@
-//! One stream's part of an encoder round: look at the images, think, then talk among the scene tokens (spec 4.2).
+//! One stream's part of an encoder round: cross-attention to the images, an MLP, and self-attention among the slots (spec 4.2).
 
 use super::attention::attention;
 use super::config::ModelConfig;
@@ -8,15 +8,15 @@ use super::parts::{does, part};
 use super::precision::Precision;
 use tch::{Device, Tensor, nn};
 
-/// The last of the slots, which neither look at the images nor pass the first MLP.
+/// Number of registers, the last of the slots. They skip cross-attention and the first MLP.
 pub(super) const REGISTERS: i64 = 4;
 const MLP_RATIO: i64 = 4;
 const CROSS_LAYER_SCALE: f64 = 1e-3;
 const SELF_LAYER_SCALE: f64 = 1e-2;
-/// In so many parts heads look at the memory, one after the other.
+/// Number of groups of heads that attend to the memory one after the other on a CPU without gradients.
 const HEAD_GROUPS: i64 = 2;
 
-/// Cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
+/// One round of a stream: cross-attention from slots to memory, an MLP, and self-attention blocks over the slots.
 #[derive(Debug)]
 pub(crate) struct StreamRound {
     slots_norm: nn::LayerNorm,
@@ -34,12 +34,12 @@ pub(crate) struct StreamRound {
     folded: Option<FoldedWeights>,
 }
 
-/// How a round reads the memory, computed once from its weights.
+/// Precomputed weights with which a round reads the memory.
 #[derive(Debug)]
 struct FoldedWeights {
-    /// Keys beside values without what all tokens have in common.
+    /// Layer that computes keys and values, concatenated, without the part that is common to all tokens.
     keys_and_values: nn::Linear,
-    /// What all values have in common, in float32.
+    /// Layer that computes the part that is common to all values, in float32.
     common_value: nn::Linear,
 }
 
@@ -65,22 +65,22 @@ impl StreamRound {
         }
     }
 
-    /// Computes once what every pass would compute of the weights that the memory is read with, for products in `precision`.
+    /// Precomputes the weights with which every pass reads the memory, for products in `precision`.
     pub fn fold_weights(&mut self, precision: Precision) {
         let nn::Linear { ws, bs } = self.keys_and_values(0, self.query.ws.size()[0]);
         let keys_and_values = nn::Linear { ws: precision.operand(&ws), bs };
         self.folded = Some(FoldedWeights { keys_and_values, common_value: self.common_value() });
     }
 
-    /// Layers that compute in the precision of products.
+    /// Returns the layers that compute in the configurable precision.
     pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
         let own = [&self.query, &self.key, &self.value, &self.output].into_iter().chain(self.mlp.products());
         own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::products))
     }
 
-    /// `slots` [B, S, d] with the registers last; result [B, S, d].
+    /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d].
     pub fn forward(&self, slots: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
-        // Registers change in self-attention, and where streams are mixed.
+        // Registers change only in self-attention and in the mixer.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
@@ -97,12 +97,12 @@ impl StreamRound {
         self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
     }
 
-    /// Cross-attention of `query` [B, n, d]. Where nobody asks for gradients a CPU goes through some heads after the other: keys and
-    /// values of all of them are larger than the memory that they are made of.
+    /// Computes cross-attention of `query` [B, n, d] to the memory. On a CPU without gradients, groups of heads are processed one after the
+    /// other, because the keys and values of all heads are larger than the memory they are computed from.
     ///
-    /// The memory is γ ⊙ (y + c) + β, with y what tokens differ by and c what they have in common (spec 4.2). Softmax doesn't see what
-    /// is added to all keys alike, and weights of values add up to 1. So keys are W_k (γ ⊙ y) and values W_v (γ ⊙ y), and what c, β and
-    /// the values' bias add comes after attention. The keys' own bias does nothing.
+    /// The memory is γ ⊙ (y + c) + β, where y is what tokens differ by and c what they have in common (spec 4.2). Softmax is invariant to a
+    /// constant added to all keys, and attention weights sum to 1. So keys are W_k (γ ⊙ y) and values W_v (γ ⊙ y), and the contribution of
+    /// c, β and the values' bias is added after attention. The keys' own bias has no effect.
     fn look(&self, query: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
         let is_for_all =
             query.requires_grad() || query.device() != Device::Cpu || self.heads % HEAD_GROUPS != 0;
@@ -134,8 +134,8 @@ impl StreamRound {
         })
     }
 
-    /// Keys beside values without what all have in common, `width` numbers from `first` on of each: W (γ ⊙ y) = (W diag γ) y, so
-    /// all rounds share what their norms have in common, and read it in one product.
+    /// Returns the layer for keys and values, concatenated, without their common part, restricted to `width` channels from `first` on of
+    /// each: W (γ ⊙ y) = (W diag γ) y. All rounds thus share the part of the norm without γ and β, and read it with one product.
     fn keys_and_values(&self, first: i64, width: i64) -> nn::Linear {
         let [gamma, _] = self.memory_affine();
         let rows = [&self.key.ws, &self.value.ws].map(|ws| ws.narrow(0, first, width));
@@ -143,17 +143,17 @@ impl StreamRound {
         nn::Linear { ws: weights * gamma, bs: None }
     }
 
-    /// What all values have in common, W_v (γ ⊙ c + β) + b_v, [B, 1, d] in float32.
+    /// Computes the common part of all values, W_v (γ ⊙ c + β) + b_v, [B, 1, d] in float32.
     fn read_by_all(&self, memory: &Memory) -> Tensor {
         let [gamma, beta] = self.memory_affine();
         let exact = |t: &Tensor| t.to_kind(gamma.kind());
         let value = nn::Linear { ws: exact(&self.value.ws), bs: self.value.bs.as_ref().map(exact) };
         let of_values = Precision::F32.linear(&value, &(&memory.common * gamma + beta));
-        // A gradient of 0, where there would be none: everything that is learned has one.
+        // The key bias has no effect. This gives it a zero gradient rather than none, as every learned parameter must have one.
         of_values + self.key.bs.as_ref().map(exact).expect("a bias") * 0.
     }
 
-    /// The same as a layer of c: (W_v diag γ) c + (W_v β + b_v).
+    /// Returns [`StreamRound::read_by_all`] as a linear layer of c: (W_v diag γ) c + (W_v β + b_v).
     fn common_value(&self) -> nn::Linear {
         let [gamma, beta] = self.memory_affine();
         let exact = |t: &Tensor| t.to_kind(gamma.kind());
@@ -161,13 +161,13 @@ impl StreamRound {
         nn::Linear { bs: Some(value.mv(beta) + bias), ws: value * gamma }
     }
 
-    /// γ and β of the memory's norm, [token width] each.
+    /// Returns γ and β of the memory's norm, [token width] each.
     fn memory_affine(&self) -> [&Tensor; 2] {
         [&self.memory_norm.ws, &self.memory_norm.bs].map(|t| t.as_ref().expect("an affine norm"))
     }
 }
 
-/// A pre-norm transformer block.
+/// Pre-norm transformer block.
 #[derive(Debug)]
 pub(crate) struct SelfAttentionBlock {
     attention_norm: nn::LayerNorm,
@@ -198,7 +198,7 @@ impl SelfAttentionBlock {
         [&self.qkv, &self.project].into_iter().chain(self.mlp.products())
     }
 
-    /// [B, S, d], and so the result.
+    /// Applies the block to `xs` [B, S, d]; the result has the same shape.
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
         let normed = normalize(&self.attention_norm, xs);
         let qkv = part("queries and outputs", || precision.linear(&self.qkv, &normed)).chunk(3, -1);
@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn folded_weights_read_the_same() {
-        // An odd number of heads, which a CPU goes through together, as a GPU does with any number.
+        // With an odd number of heads a CPU processes all heads together, as a GPU does for any number.
         let config = ModelConfig { width: 32, heads: 1, rgb_width: 16, ray_width: 8, ..Default::default() };
         let vs = nn::VarStore::new(Device::Cpu);
         let mut round = StreamRound::new(&vs.root(), &config);
@@ -245,7 +245,7 @@ mod tests {
         let config = ModelConfig { width: 32, heads: 2, rgb_width: 16, ray_width: 8, ..Default::default() };
         let vs = nn::VarStore::new(Device::Cpu);
         let round = StreamRound::new(&vs.root(), &config);
-        // Scores that differ, and biases, as after training.
+        // Scores that differ, and nonzero biases, as after training.
         for (name, mut value) in vs.variables() {
             let trained = uneven(1.3, &value.size());
             if ["mem_k", "mem_v"].iter().any(|layer| name.starts_with(layer)) || name == "mem_ln.bias" {
@@ -260,10 +260,10 @@ mod tests {
             no_grad(|| round.look(&query, memory, precision))
         };
         let exact = seen(&memory, Precision::F32);
-        let size = (&exact - exact.mean_dim(1, true, None)).norm(); // of what queries see differently
+        let size = (&exact - exact.mean_dim(1, true, None)).norm(); // norm of the differences among queries
         let error = |found: Tensor| ((found - &exact).norm() / &size).double_value(&[]);
         let same = error(seen(&whole, Precision::F32));
-        // Scores of tokens as they are lose digits in float32, too.
+        // Scores of tokens with their common part lose digits in float32, too.
         assert!(same < 1e-3, "nothing depends on what is called common, but {same:.1e}");
         let [near, far] = [&memory, &whole].map(|memory| error(seen(memory, Precision::Bf16)));
         assert!(near < 3e-2 && far > 20. * near, "{near:.1e}, and {far:.1e} of tokens as they are");

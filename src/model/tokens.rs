@@ -1,4 +1,4 @@
-//! Image tokens: what a patch looks like, and along which rays (spec 3.1 and 3.2).
+//! Image tokens: the colours of a patch, and the rays along which it is seen (spec 3.1 and 3.2).
 
 use super::camera_code::CameraCode;
 use super::config::ModelConfig;
@@ -9,7 +9,7 @@ use tch::{Tensor, nn};
 
 const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
-/// Moment and direction.
+/// Number of values per ray: moment and direction.
 const RAY_CHANNELS: i64 = 6;
 
 /// Cuts [B, V, H, W, C] into [B, V, P, p·p·C]: patches row by row, each flattened as (row, column, channel).
@@ -24,7 +24,7 @@ pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
     ])
 }
 
-/// Images and cameras to tokens.
+/// Tokenizer of images and cameras.
 #[derive(Debug)]
 pub struct Tokenizer {
     rgb: RgbTokens,
@@ -32,13 +32,13 @@ pub struct Tokenizer {
 }
 
 impl Tokenizer {
-    /// `vs` is the model's root.
+    /// Builds the tokenizer; `vs` is the model's root.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
         Tokenizer { rgb: RgbTokens::new(vs, config), ray: RayTokens::new(vs, config) }
     }
 
-    /// `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is
-    /// [B, V, P, ray width + RGB width].
+    /// Computes image tokens, [B, V, P, ray width + RGB width], from `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] and
+    /// `intrinsics` [B, V, 3, 3] in pixels.
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
         let (height, width) = (images.size()[3], images.size()[4]);
         let rgb = self.rgb.forward(images);
@@ -47,11 +47,11 @@ impl Tokenizer {
     }
 }
 
-/// What patches look like.
+/// RGB half of image tokens.
 #[derive(Debug)]
 pub(crate) struct RgbTokens {
     patch_size: i64,
-    /// Of the photos that networks are mostly trained on, by channel, [3, 1, 1]; and their standard deviation.
+    /// Mean of ImageNet by channel, [3, 1, 1]; `deviation` is the standard deviation.
     mean: Tensor,
     deviation: Tensor,
     project: nn::Linear,
@@ -66,14 +66,14 @@ impl RgbTokens {
         RgbTokens { patch_size: config.patch_size, mean, deviation, project }
     }
 
-    /// `images` [B, V, 3, H, W] in [0, 1]; the result is [B, V, P, RGB width].
+    /// Computes RGB tokens, [B, V, P, RGB width], from `images` [B, V, 3, H, W] in [0, 1].
     pub fn forward(&self, images: &Tensor) -> Tensor {
         let normalized = (images - &self.mean) / &self.deviation;
         Precision::F32.linear(&self.project, &patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
     }
 }
 
-/// Along which rays patches are seen, and by which camera.
+/// Ray half of image tokens: rays of the patches, and the camera code.
 #[derive(Debug)]
 pub(crate) struct RayTokens {
     patch_size: i64,
@@ -91,7 +91,7 @@ impl RayTokens {
         }
     }
 
-    /// `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, P, ray width].
+    /// Computes ray tokens, [B, V, P, ray width], from `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels.
     pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let rays = plucker_rays(c2w, intrinsics, height, width);
         let tokens = Precision::F32.linear(&self.project, &patchify(&rays, self.patch_size));

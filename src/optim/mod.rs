@@ -1,5 +1,5 @@
-//! Optimizers over named tensors in groups: for a network's weights as for Gaussians (tch's own can't save their state); and where
-//! their time goes.
+//! Optimizers over groups of named tensors, used for network weights and for Gaussians (tch's own optimizers can't save their state), and
+//! a stopwatch for the sections of a step.
 
 mod address;
 mod muon;

@@ -1,5 +1,5 @@
-//! Muon (Jordan et al. 2024): a matrix goes along the nearest one to the running mean of its gradients whose singular values are alike,
-//! so that directions of which gradients say little are learned as fast as others (spec 8.5).
+//! Muon (Jordan et al. 2024). A matrix is updated along the nearest matrix to the running mean of its gradients whose singular values are
+//! all about equal. So directions with small gradients are learned as fast as others (spec 8.5).
 
 use super::address::addresses;
 use globalsplat_csrc::optim::{self as ffi, MuonNumbers};
@@ -7,14 +7,14 @@ use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, no_grad};
 
 const BETA: f64 = 0.95;
-/// Of a step's numbers, so that they are as large as those of AdamW (Liu et al. 2025).
+/// Root mean square of an update's elements, in units of the learning rate. It makes updates as large as AdamW's (Liu et al. 2025).
 const SIZE: f64 = 0.2;
-/// Of Newton's and Schulz's rounds.
+/// Number of Newton-Schulz iterations.
 const ROUNDS: usize = 5;
 const COEFFICIENTS: [f64; 3] = [3.4445, -4.7750, 2.0315];
 const NORM_EPS: f64 = 1e-7;
 
-/// Tensors [parts · rows, columns] that are updated, their gradients, and the running means of these.
+/// Tensors `[parts · rows, columns]` to update, their gradients, and the running means of the gradients.
 #[derive(Debug)]
 pub(super) struct Matrices<'a> {
     pub values: Vec<&'a Tensor>,
@@ -22,7 +22,7 @@ pub(super) struct Matrices<'a> {
     pub means: Vec<&'a Tensor>,
 }
 
-/// A step of all: on the CPU by our own kernel, elsewhere by libtorch.
+/// Updates all matrices: with our own kernel for float32 on the CPU, with libtorch otherwise.
 pub(super) fn update(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64) {
     let is_here = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float;
     if !of.values.iter().all(is_here) {
@@ -35,7 +35,7 @@ pub(super) fn update(of: &Matrices, parts: i64, learning_rate: f64, weight_decay
     done.expect("matrices, their gradients and running means are alike");
 }
 
-/// The same on any device, in any kind: matrices of one shape at a time.
+/// Updates all matrices with libtorch, on any device and in any kind. Matrices of one shape are processed together.
 fn by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64) {
     let mut alike: BTreeMap<Vec<i64>, Vec<usize>> = BTreeMap::new();
     for (i, value) in of.values.iter().enumerate() {
@@ -63,8 +63,8 @@ fn by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64)
     });
 }
 
-/// Of matrices [n, rows, columns] those that are nearest and whose singular values are all about 1: between 0.68 and 1.21 but for those
-/// that were below 0.0015 of the norm.
+/// Returns the matrices nearest to `matrices`, `[n, rows, columns]`, whose singular values are all about 1. They are between 0.68 and 1.21,
+/// except those that were below 0.0015 of the matrix's norm.
 fn level(matrices: &Tensor) -> Tensor {
     let is_upright = matrices.size()[1] > matrices.size()[2];
     let flat = if is_upright { matrices.transpose(1, 2) } else { matrices.shallow_clone() };
@@ -83,7 +83,7 @@ fn level(matrices: &Tensor) -> Tensor {
 mod tests {
     use super::*;
 
-    /// Values, which begin as small as a step is, and running means after three steps, of matrices of all shapes.
+    /// Returns the values and running means after three steps, for matrices of all shapes. The initial values are as small as a step.
     fn stepped(kind: Kind, update: fn(&Matrices, i64, f64, f64), parts: i64) -> Vec<Tensor> {
         let sizes = [(128, 128), (20, 33), (33, 20), (1, 7), (7, 1), (64, 130), (260, 65), (128, 512)];
         let numbers = |size: [i64; 2], phase: f64| {

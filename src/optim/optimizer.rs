@@ -13,55 +13,55 @@ use tch::{Device, Tensor};
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPS: f64 = 1e-8;
-/// Added to the norm that gradients are divided by, as in torch's `clip_grad_norm_`.
+/// Constant added to the gradient norm before dividing by it, as in torch's `clip_grad_norm_`.
 const CLIP_EPS: f64 = 1e-6;
 
-/// By which a group is updated.
+/// Update rule of a parameter group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rule {
-    /// Each number by running means of its gradient and of the square of that.
+    /// AdamW: each element is updated by running means of its gradient and of the gradient's square.
     AdamW,
-    /// Matrices as such, by a running mean of their gradients: along the nearest that turns and doesn't stretch.
+    /// Muon: each matrix is updated along the (semi-)orthogonal matrix nearest to the running mean of its gradients.
     Muon {
-        /// So many lie on one another in each of the group's tensors [parts · rows, columns], and are updated by themselves.
+        /// Number of matrices stacked in each tensor of the group, `[parts · rows, columns]`. Each matrix is updated by itself.
         parts: i64,
     },
 }
 
-/// Tensors that are updated alike.
+/// Group of tensors that share an update rule, a learning rate and a weight decay.
 #[derive(Debug)]
 pub struct ParameterGroup {
-    /// How.
+    /// Update rule.
     pub rule: Rule,
-    /// Leaves that take gradients, by names that no other group uses.
+    /// Leaf tensors that require gradients, with their names. No other group uses these names.
     pub parameters: Vec<(String, Tensor)>,
-    /// How far a step goes, about.
+    /// Learning rate: the approximate size of a step.
     pub learning_rate: f64,
-    /// Decoupled: a share of every parameter that a step takes away, times the learning rate.
+    /// Decoupled weight decay. A step shrinks every parameter by this share of it, times the learning rate.
     pub weight_decay: f64,
 }
 
-/// A tensor, its running moments and the group it is in.
+/// Tensor, its running moments and the index of its group.
 #[derive(Debug)]
 struct Parameter {
     name: String,
     value: Tensor,
-    /// No numbers where another part of the optimizer has them.
+    /// Running mean of the gradients. It is empty if another shard of the optimizer has it.
     first: Tensor,
-    /// Of the squares, which AdamW alone keeps.
+    /// Running mean of the squared gradients, which only AdamW keeps.
     second: Option<Tensor>,
     group: usize,
-    /// The part of the optimizer that updates it.
+    /// Index of the optimizer's shard that updates this parameter.
     part: usize,
 }
 
 impl Parameter {
-    /// What is kept of its gradients, by name.
+    /// Returns the running moments of the gradients, with their names.
     fn moments(&self) -> impl Iterator<Item = (&'static str, &Tensor)> {
         std::iter::once(("first", &self.first)).chain(self.second.iter().map(|second| ("second", second)))
     }
 
-    /// One update by AdamW on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, `root2` √(1 − β₂ᵗ).
+    /// Updates the parameter by AdamW on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, and `root2` is √(1 − β₂ᵗ).
     fn update(&self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
         let arguments = AdamArguments {
             value: address(&self.value),
@@ -81,13 +81,13 @@ impl Parameter {
     }
 }
 
-/// Forgets the gradients of `leaves`.
+/// Resets the gradients of `leaves` to undefined.
 pub(crate) fn forget_gradients<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
     // SAFETY: the tensors outlive the call.
     unsafe { ffi::forget_gradients(&addresses(leaves)) }.expect("leaves");
 }
 
-/// What a group's parameters have in common.
+/// Settings that the parameters of a group share.
 #[derive(Debug, Clone, Copy)]
 struct Settings {
     rule: Rule,
@@ -95,22 +95,22 @@ struct Settings {
     weight_decay: f64,
 }
 
-/// The optimizer. Whatever the groups, gradients are gone through in the order of their parameters' names.
+/// Optimizer over groups of named parameters. Gradients are iterated in the order of the parameters' names, whatever the groups.
 #[derive(Debug)]
 pub struct Optimizer {
     parameters: Vec<Parameter>,
     groups: Vec<Settings>,
     epsilon: f64,
     steps: i64,
-    /// The one of the parts that this is.
+    /// Index of the shard that this process updates.
     part: usize,
 }
 
 impl Optimizer {
-    /// For the parameters of `groups`, moments at zero.
+    /// Creates an optimizer for the parameters of `groups`, with moments of zero.
     ///
     /// # Panics
-    /// Two parameters of one name.
+    /// Panics if two parameters have the same name.
     pub fn new(groups: Vec<ParameterGroup>) -> Self {
         let (mut parameters, mut settings) = (BTreeMap::new(), vec![]);
         for (group, of) in groups.into_iter().enumerate() {
@@ -127,21 +127,21 @@ impl Optimizer {
         Optimizer { parameters, groups: settings, epsilon: EPS, steps: 0, part: 0 }
     }
 
-    /// With `epsilon` in place of 1e-8 added to the root of the second moments.
+    /// Sets the ε that is added to the root of the second moments, instead of 1e-8.
     pub fn with_epsilon(self, epsilon: f64) -> Self {
         Optimizer { epsilon, ..self }
     }
 
-    /// Of the groups, in their order, from the next step on.
+    /// Sets the learning rates of the groups, in their order, from the next step on.
     pub fn set_learning_rates(&mut self, learning_rates: &[f64]) {
         for (group, &learning_rate) in self.groups.iter_mut().zip(learning_rates) {
             group.learning_rate = learning_rate;
         }
     }
 
-    /// Makes this the part `part` of `parts`: it updates its share of the parameters, and forgets the others' moments. Parameters go
-    /// to parts whole, those with the largest moments first, each to the part that has least (ZeRO's first stage, Rajbhandari et al. 2020,
-    /// by tensors).
+    /// Makes this optimizer shard `part` of `parts`: it updates its share of the parameters and drops the moments of the others. Parameters
+    /// are not split. They are assigned in descending order of their moments' size, each to the shard that has least so far (ZeRO stage 1,
+    /// Rajbhandari et al. 2020, by tensors).
     pub fn become_part(&mut self, part: usize, parts: usize) {
         self.part = part;
         let mut order: Vec<usize> = (0..self.parameters.len()).collect();
@@ -160,48 +160,48 @@ impl Optimizer {
         }
     }
 
-    /// The parameters of part `part`, which it alone updates.
+    /// Returns the parameters of shard `part`, which only this shard updates.
     pub fn of_part(&self, part: usize) -> impl Iterator<Item = &Tensor> {
         self.parameters.iter().filter(move |p| p.part == part).map(|p| &p.value)
     }
 
-    /// Whether all parameters are updated here.
+    /// Returns `true` if this optimizer updates every parameter.
     pub fn is_whole(&self) -> bool {
         self.parameters.iter().all(|p| p.part == self.part)
     }
 
-    /// Running means of the gradients and of their squares, to be changed in place.
+    /// Returns the running means of the gradients and of their squares, which the caller may change in place.
     pub fn moments(&self) -> impl Iterator<Item = &Tensor> {
         self.parameters.iter().flat_map(Parameter::moments).map(|(_, moment)| moment)
     }
 
-    /// Of every group, from the next step on.
+    /// Sets the learning rate of every group, from the next step on.
     pub fn set_learning_rate(&mut self, learning_rate: f64) {
         self.groups.iter_mut().for_each(|group| group.learning_rate = learning_rate);
     }
 
-    /// The gradients that the last backward pass left, by the parameters' names and in their order. What is done to them in
-    /// place is done to what [`Optimizer::gradient_norm`] and [`Optimizer::step`] see.
+    /// Returns the gradients that the last backward pass left, with the parameters' names and in their order. [`Optimizer::gradient_norm`]
+    /// and [`Optimizer::step`] see changes that are made to them in place.
     pub fn gradients(&self) -> impl Iterator<Item = (&str, Tensor)> {
         let gradients = self.parameters.iter().map(|p| (p.name.as_str(), p.value.grad()));
         gradients.filter(|(_, gradient)| gradient.defined())
     }
 
-    /// Forgets the gradients: what the next backward pass leaves takes their place, with nothing to be added to.
+    /// Resets the gradients to undefined. The next backward pass stores its gradients instead of adding to earlier ones.
     pub fn zero_grad(&mut self) {
         forget_gradients(self.parameters.iter().map(|p| &p.value));
     }
 
-    /// The norm of all gradients together, a scalar where they are.
+    /// Returns the norm of all gradients together, a scalar on their device.
     pub fn gradient_norm(&self) -> Tensor {
         let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
-        // SAFETY: the tensors outlive the call, and on success the C++ side has put a new one there.
+        // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor at `out`.
         let done = unsafe { handed_over(|out| norm(&addresses(&gradients), out)) };
         let [norm] = done.expect("gradients of one device");
         norm
     }
 
-    /// Scales the gradients, whose common norm is `norm`, so that it is at most `largest`.
+    /// Scales the gradients, whose total norm is `norm`, so that the norm is at most `largest`.
     pub fn clip_gradients(&self, norm: f64, largest: f64) {
         if norm > largest {
             let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
@@ -211,8 +211,8 @@ impl Optimizer {
         }
     }
 
-    /// One update from the gradients that are there, by the groups' rules and learning rates: by AdamW on the CPU in one pass over memory,
-    /// on a GPU in one launch for many parameters.
+    /// Updates the parameters from their gradients, by the groups' rules and learning rates. On the CPU, AdamW takes one pass over memory;
+    /// on a GPU, one launch updates many parameters.
     pub fn step(&mut self) {
         self.steps += 1;
         let is_here = self.parameters.iter().all(|p| p.value.device() == Device::Cpu);
@@ -225,14 +225,14 @@ impl Optimizer {
         }
     }
 
-    /// Parameters of a group that are updated here and have gradients, and these.
+    /// Returns the parameters of a group that this shard updates and that have gradients, and these gradients.
     fn with_gradients(&self, group: usize) -> (Vec<&Parameter>, Vec<Tensor>) {
         let of_group = self.parameters.iter().filter(|p| p.group == group && p.part == self.part);
         let with_gradient = of_group.map(|p| (p, p.value.grad())).filter(|(_, gradient)| gradient.defined());
         with_gradient.map(|(p, gradient)| (p, gradient.contiguous())).unzip()
     }
 
-    /// The step that [`Optimizer::step`] has counted, of a group.
+    /// Updates a group by AdamW on the CPU, for the step that [`Optimizer::step`] has counted.
     fn update_on_the_cpu(&self, group: usize) {
         let correction1 = 1. - BETA1.powi(self.steps as i32);
         let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
@@ -244,7 +244,7 @@ impl Optimizer {
         }
     }
 
-    /// The same by libtorch's own kernel.
+    /// Updates a group by libtorch's fused AdamW kernel.
     fn update_fused(&self, group: usize) {
         let Settings { learning_rate, weight_decay, .. } = self.groups[group];
         let (parameters, gradients) = self.with_gradients(group);
@@ -264,7 +264,7 @@ impl Optimizer {
         done.expect("parameters, their gradients and their moments are alike");
     }
 
-    /// The step of a group of matrices.
+    /// Updates a group of matrices by Muon.
     fn update_matrices(&self, group: usize, parts: i64) {
         let Settings { learning_rate, weight_decay, .. } = self.groups[group];
         let (parameters, gradients) = self.with_gradients(group);
@@ -276,25 +276,26 @@ impl Optimizer {
         muon::update(&matrices, parts, learning_rate, weight_decay);
     }
 
-    /// Updates that were done.
+    /// Returns the number of updates done.
     pub fn steps(&self) -> i64 {
         self.steps
     }
 
-    /// As if so many updates had been done.
+    /// Sets the number of updates done.
     pub fn set_steps(&mut self, steps: i64) {
         self.steps = steps;
     }
 
-    /// Everything but the variables themselves.
+    /// Returns the optimizer's state: the number of updates and all moments, without the parameters themselves.
     pub fn state(&self) -> BTreeMap<String, Tensor> {
         self.state_by(|moment, _, _| Ok(moment.shallow_clone())).expect("all is here")
     }
 
-    /// The same with moments that `of` makes of those here, of the parameter's shape and of the part that has them.
+    /// Returns the state with every moment replaced by what `of` returns. `of` is called with the moment, the shape of its parameter, and
+    /// the index of the shard that has the moment.
     ///
     /// # Errors
-    /// Those of `of`.
+    /// Returns the first error of `of`.
     pub fn state_by(
         &self,
         of: impl Fn(&Tensor, &[i64], usize) -> Result<Tensor>,
@@ -308,10 +309,10 @@ impl Optimizer {
         Ok(state)
     }
 
-    /// Takes a state back that [`Optimizer::state`] gave for the same model and rules, and that `file` holds.
+    /// Loads a state that [`Optimizer::state`] returned for the same model and rules. `file` is the file that error messages name.
     ///
     /// # Errors
-    /// A moment that is missing or has another shape.
+    /// Returns an error if a moment is missing or has another shape.
     pub fn load_state(&mut self, file: &Path, state: &BTreeMap<String, Tensor>) -> Result<()> {
         let find = |key: String, shape: Vec<i64>| {
             let moment = state.get(&key);
@@ -345,7 +346,7 @@ mod tests {
         ParameterGroup { rule: Rule::AdamW, parameters, learning_rate, weight_decay }
     }
 
-    /// The two ways to make a step, of which a machine without a GPU takes the first.
+    /// Two implementations of a step: [`Optimizer::step`], which uses our own kernel for tensors on the CPU, and libtorch's fused kernel.
     const WAYS: [fn(&mut Optimizer); 2] = [Optimizer::step, |adamw| {
         adamw.steps += 1;
         (0..adamw.groups.len()).for_each(|group| adamw.update_fused(group));
@@ -376,7 +377,7 @@ mod tests {
         assert!((bias.double_value(&[0]) - expected[1]).abs() < 1e-6);
     }
 
-    /// Values and moments after steps with clipped gradients, one parameter having none at first.
+    /// Both implementations give the same values and moments after steps with clipped gradients. One parameter has no gradient at first.
     #[test]
     fn both_ways_to_make_a_step_agree() {
         let sizes = [("a", 7), ("b", 1000), ("c", 1), ("d", 64)];
@@ -418,7 +419,7 @@ mod tests {
         let mut adamw = Optimizer::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
         leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
         let (_, mut ops) = ops_of(|| WAYS[1](&mut adamw));
-        // On the CPU the op itself reads how many steps each parameter has done.
+        // On the CPU, the op itself reads the number of steps of each parameter.
         ops.retain(|op| op != "aten::item" && op != "aten::_local_scalar_dense");
         let fused = ops.iter().filter(|op| *op == "aten::_fused_adamw_").count();
         assert!(fused == 2 && ops.len() <= 8, "{ops:?}");
@@ -443,7 +444,7 @@ mod tests {
         let mut adamw = Optimizer::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
         (&a * 3. + &b * 0.).sum(Kind::Float).backward();
         for (name, mut gradient) in adamw.gradients() {
-            // As an all-reduce would: in place.
+            // In place, like an all-reduce.
             let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
         }
         assert!((adamw.gradient_norm().double_value(&[]) - 2.).abs() < 1e-6);

@@ -1,32 +1,34 @@
-//! Where time goes.
+//! Measurement of the time that sections of some work take.
 
 use crate::device::Moment;
 use std::time::Duration;
 use tch::Device;
 
-/// Adds up how long the parts of some work take, each under its name.
+/// Stopwatch that adds up the time of named sections of some work.
 #[derive(Debug)]
 pub struct Stopwatch {
     device: Device,
     sections: Vec<(&'static str, Duration)>,
-    /// Their beginnings and ends. When a GPU came by them isn't asked before somebody wants to know: it would be waited for.
+    /// Starts and ends of sections that are not added up yet. A GPU's events are read only when the times are requested: reading them waits
+    /// for the GPU.
     parts: Vec<(&'static str, Moment, Moment)>,
 }
 
 impl Default for Stopwatch {
-    /// By the host's clock: of work on a GPU it tells how long it took to hand out.
+    /// Returns a stopwatch on the host's clock. For work on a GPU, it measures the time to launch the work.
     fn default() -> Self {
         Stopwatch::of(Device::Cpu)
     }
 }
 
 impl Stopwatch {
-    /// By the clock of `device`, from when it was done with what was given to it before a part to when it is done with the part.
+    /// Returns a stopwatch on the clock of `device`. A section lasts from when the device has finished all earlier work to when it has
+    /// finished the section.
     pub fn of(device: Device) -> Self {
         Stopwatch { device, sections: vec![], parts: vec![] }
     }
 
-    /// Does `work` and counts its time to `section`.
+    /// Runs `work` and adds its time to `section`.
     pub fn time<T>(&mut self, section: &'static str, work: impl FnOnce() -> T) -> T {
         let start = Moment::now(self.device);
         let result = work();
@@ -37,7 +39,7 @@ impl Stopwatch {
         result
     }
 
-    /// Every section and its time, in the order in which they were first entered. A GPU is waited for.
+    /// Returns every section and its time, in the order in which they were first entered. Waits for a GPU to finish.
     pub fn sections(&mut self) -> &[(&'static str, Duration)] {
         self.add_up();
         &self.sections

@@ -1,4 +1,4 @@
-//! The cases: which code answers which name.
+//! Parity cases: the code that each case name runs.
 
 use super::{Answer, Request, Tensors};
 use crate::config::{CurriculumConfig, OptimizerKind, TrainConfig};
@@ -80,14 +80,14 @@ impl Request {
         self.inputs.get(name).ok_or_else(|| Error::Request(format!("{}: no input {name}", self.case)))
     }
 
-    /// A number or list of the configuration.
+    /// Returns the value of `key` in the case's configuration, such as a number or a list.
     fn number<T: DeserializeOwned>(&self, key: &str) -> Result<T> {
         serde_json::from_value(self.config[key].clone())
             .map_err(|e| Error::Request(format!("{}: config.{key}: {e}", self.case)))
     }
 
     fn model_config(&self) -> Result<ModelConfig> {
-        // The configuration's own keys may stand beside those of the case.
+        // The configuration may hold keys of the model next to keys of the case.
         let known = serde_json::to_value(ModelConfig::default()).expect("numbers and words");
         let known = known.as_object().expect("an object");
         let given = self.config.as_object().cloned().unwrap_or_default();
@@ -100,18 +100,18 @@ impl Request {
         Ok(Stage { index: self.number("stage")?, mix: self.number("mix")? })
     }
 
-    /// [height, width].
+    /// Returns the image size, `[height, width]`.
     fn image(&self) -> Result<[i64; 2]> {
         self.number("image")
     }
 
-    /// Builds a module and gives it the request's parameters, whose names must be its own.
+    /// Builds a module and loads the request's parameters into it, whose names must be those of the module.
     fn build<M>(&self, new: impl FnOnce(&nn::Path) -> M) -> Result<(M, Tensors)> {
         let vs = nn::VarStore::new(self.device);
         let module = new(&vs.root());
         let mut tensors =
             self.params.iter().map(|(name, t)| (name.clone(), t.shallow_clone())).collect::<Tensors>();
-        // What isn't trained isn't drawn.
+        // The request holds trainable parameters only. Constants keep the values of the module.
         for (name, constant) in vs.variables().into_iter().filter(|(_, t)| !t.requires_grad()) {
             tensors.entry(name).or_insert(constant);
         }
@@ -188,7 +188,7 @@ fn linear(request: &Request) -> Result<Answer> {
     outputs([("out", precision(request).linear(&layer, request.input("xs")?).to_kind(Kind::Float))])
 }
 
-/// What products take, which are of float32 numbers unless the case says otherwise.
+/// Returns the precision of matrix products: bfloat16 if the case has the key `bf16`, else float32.
 fn precision(request: &Request) -> Precision {
     if request.config.get("bf16").is_some() { Precision::Bf16 } else { Precision::F32 }
 }
@@ -407,7 +407,8 @@ fn vgg19(request: &Request) -> Result<Answer> {
     with_params([("loss", network.compare(&features("picture")?, &features("truth")?).view([1]))], params)
 }
 
-/// The loss of two renderings of the same targets, as training takes it: the network is what the other inputs say.
+/// Computes the loss between two renderings of the same targets, as training does. The network's weights are the inputs with a dot in their
+/// names.
 fn perceptual(request: &Request) -> Result<Answer> {
     let mut vs = nn::VarStore::new(request.device);
     let network = match request.number::<String>("kind")?.as_str() {

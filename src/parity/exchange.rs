@@ -1,4 +1,4 @@
-//! Tensors as `.npz` files, which numpy reads and writes.
+//! Tensors in `.npz` files, which numpy reads and writes.
 
 use crate::error::{Error, Result};
 use ndarray::ArrayD;
@@ -10,7 +10,7 @@ use std::path::Path;
 use tch::kind::Element;
 use tch::{Kind, Tensor};
 
-/// By the name of the array.
+/// Tensors by array name.
 pub type Arrays = BTreeMap<String, Tensor>;
 
 /// Reads float32, float64, int64 and uint8 arrays in C order.
@@ -41,7 +41,7 @@ fn tensor_of<T: Deserialize + Element>(array: NpyFile<impl Read>) -> std::io::Re
     Ok(Tensor::from_slice(&array.into_vec::<T>()?).view(shape.as_slice()))
 }
 
-/// Writes arrays that [`read_npz`] reads.
+/// Writes arrays that [`read_npz`] can read.
 pub fn write_npz(path: &Path, arrays: &Arrays) -> Result<()> {
     let mut writer = NpzWriter::create(path).map_err(Error::write(path))?;
     for (name, tensor) in arrays {

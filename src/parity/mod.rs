@@ -1,6 +1,6 @@
-//! The answering side of `parity/run.py`: runs any module on given weights and inputs and gives its outputs and gradients.
+//! Rust side of `parity/run.py`: runs any module on given weights and inputs, and returns its outputs and gradients.
 //!
-//! Nothing is computed here: every case calls the code that training runs.
+//! Nothing is implemented here: every case calls the code that training runs.
 
 mod cases;
 mod exchange;
@@ -12,10 +12,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
-/// Numbers by name.
+/// Tensors by name.
 type Tensors = BTreeMap<String, Tensor>;
 
-/// A case to answer.
+/// A parity case to run.
 struct Request {
     case: String,
     config: Value,
@@ -25,16 +25,16 @@ struct Request {
     device: Device,
 }
 
-/// A case's answer, before gradients: its outputs, and its parameters with those that training would follow.
+/// Result of a case, before the backward pass: its outputs, and the trainable parameters.
 struct Answer {
     outputs: Tensors,
     params: Tensors,
 }
 
-/// Answers every `*.npz` in `requests` with a file of the same name in `responses`, and returns how many there were.
+/// Runs every request `*.npz` in `requests` and writes a file of the same name to `responses`. Returns the number of requests.
 ///
 /// # Errors
-/// A folder or file that can't be read or written. A case that fails is answered with its error.
+/// Fails if a folder or file can't be read or written. If a case fails, its response holds the error message.
 pub fn answer_all(requests: &Path, responses: &Path, device: Device) -> Result<usize> {
     let mut files: Vec<PathBuf> = vec![];
     for entry in std::fs::read_dir(requests).map_err(Error::read(requests))? {

@@ -1,4 +1,4 @@
-//! Gradients that are added up over all ranks while the backward pass still goes on.
+//! Gradient buckets, which are summed over all ranks while the backward pass is still running.
 
 use super::group::Group;
 use crate::error::{Error, Result};
@@ -7,16 +7,16 @@ use globalsplat_csrc::ranks as ffi;
 use std::fmt;
 use tch::Tensor;
 
-/// Of a bucket at the most: as much as torch's DistributedDataParallel takes at a time.
+/// Maximum size of a bucket, in bytes: the bucket size of torch's DistributedDataParallel.
 const MOST_BYTES: i64 = 25 << 20;
-/// At the least: less takes longer to begin than to send.
+/// Minimum size of a bucket, in bytes. Smaller buckets take longer to start than to send.
 const LEAST_BYTES: i64 = 1 << 20;
-/// Buckets of a small network, so that all but the last can leave while the backward pass goes on.
+/// Number of buckets of a small network, so that all but the last can be sent while the backward pass is running.
 const FEW: i64 = 8;
 
-/// The buckets of a network's parameters.
+/// Buckets of a network's parameters.
 pub struct Buckets {
-    /// None for a rank that is alone.
+    /// C++ implementation, or `None` if the group has only one rank.
     inner: Option<UniquePtr<ffi::Buckets>>,
 }
 
@@ -27,11 +27,11 @@ impl fmt::Debug for Buckets {
 }
 
 impl Buckets {
-    /// Of `parameters`, leaves of one kind on one device, in the order in which the backward pass gives their gradients, about.
-    /// The order is the same on all ranks.
+    /// Creates the buckets of `parameters`, leaf tensors of one kind on one device. They are approximately in the order in which the
+    /// backward pass computes their gradients; the order must be the same on all ranks.
     ///
     /// # Panics
-    /// Parameters that aren't alike, or no leaves.
+    /// Panics if the parameters differ in kind or device, or aren't leaves that require gradients.
     pub fn new(group: &Group, parameters: &[Tensor]) -> Self {
         let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
         Buckets::of_bytes(group, parameters, (bytes as i64 / FEW).clamp(LEAST_BYTES, MOST_BYTES))
@@ -39,22 +39,22 @@ impl Buckets {
 
     pub(super) fn of_bytes(group: &Group, parameters: &[Tensor], bytes: i64) -> Self {
         let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
-        // SAFETY: the tensors outlive the call; the C++ side keeps what they refer to.
+        // SAFETY: the tensors outlive the call; the C++ side holds references of its own to what it keeps.
         let inner = group.inner().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });
         Buckets { inner: inner.transpose().expect("leaves of one kind") }
     }
 
-    /// What the backward pass gives from now on is the last of this step: each parameter's gradient comes once, or not at all.
+    /// Marks the start of the last backward pass of a step. From now on it computes each parameter's gradient once, or not at all.
     pub fn begin(&self) {
         if let Some(inner) = &self.inner {
             inner.begin();
         }
     }
 
-    /// Waits until the gradients are the sums over all ranks. Returns how many there are; it must be the same everywhere.
+    /// Waits until the gradients are the sums over all ranks. Returns the number of gradients, which must be the same on all ranks.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn finish(&self) -> Result<usize> {
         let Some(inner) = &self.inner else { return Ok(0) };
         inner.finish().map_err(|e| Error::Ranks(e.what().lines().next().unwrap_or_default().to_string()))

@@ -1,4 +1,4 @@
-//! What all ranks do together: c10d's collectives, in the same order on each of them.
+//! Collectives of all ranks, by c10d. Every rank calls them in the same order.
 
 use super::place::Place;
 use crate::error::{Error, Result};
@@ -10,19 +10,19 @@ use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// How long a collective waits for the other ranks: 20 days, practically as long as they live. One that is gone is noticed by
-/// [`super::Watch`]; one that has more to do, writes to a slow disk or waits for room on a full one is waited for. In milliseconds it
-/// fits 32 bits.
+/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watch`] notices a rank that is gone.
+/// The collective waits for a rank that has more to do, writes to a slow disk, or waits for free space on a full one. The timeout in
+/// milliseconds fits into 32 bits.
 pub(super) const PATIENCE_SECONDS: i64 = 20 * 24 * 60 * 60;
 
-/// All ranks, as one of them knows them.
+/// Group of all ranks, as seen by one of them.
 pub struct Group {
-    /// None for a rank that is alone.
+    /// C++ implementation, or `None` if the group has only one rank.
     inner: Option<UniquePtr<ffi::Group>>,
     rank: usize,
     ranks: usize,
     local_ranks: usize,
-    /// Where collectives work.
+    /// Device that collectives run on.
     device: Device,
 }
 
@@ -32,42 +32,42 @@ impl fmt::Debug for Group {
     }
 }
 
-/// What a collective failed with: almost always another rank, which is gone.
+/// Returns the error for a failed collective. The cause is almost always that another rank is gone.
 fn lost(why: cxx::Exception) -> Error {
     Error::Ranks(why.what().lines().next().unwrap_or_default().to_string())
 }
 
-/// By what ranks can work together in this build.
+/// Backends that this build has for communication between ranks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Backends {
-    /// On CPUs.
+    /// Gloo, for CPUs.
     pub gloo: bool,
-    /// On GPUs.
+    /// NCCL, for GPUs.
     pub nccl: bool,
 }
 
 impl Backends {
-    /// Those whose headers were there when the program was built.
+    /// Returns the backends whose headers were available when the program was built.
     pub fn built_in() -> Self {
         Backends { gloo: ffi::has_gloo(), nccl: ffi::has_nccl() }
     }
 }
 
 impl Group {
-    /// Of a process that has no others.
+    /// Returns the group of a process that runs alone.
     pub fn alone() -> Self {
         Group { inner: None, rank: 0, ranks: 1, local_ranks: 1, device: Device::Cpu }
     }
 
-    /// Meets the others at `store`, to work on `device`: by Gloo on CPUs, by NCCL on GPUs.
+    /// Joins the group of all ranks at `store`, for collectives on `device`: by Gloo on CPUs, by NCCL on GPUs.
     ///
     /// # Errors
-    /// A build without that, or others that don't come.
+    /// Returns an error if the build lacks this backend, or if other ranks don't join.
     pub fn join(place: &Place, store: &ffi::Store, device: Device) -> Result<Self> {
         Group::join_with_timeout(place, store, device, PATIENCE_SECONDS)
     }
 
-    /// As [`Group::join`]; collectives wait `seconds` for the others.
+    /// Joins a group like [`Group::join`], with a timeout of `seconds` for collectives.
     pub(super) fn join_with_timeout(
         place: &Place,
         store: &ffi::Store,
@@ -104,22 +104,22 @@ impl Group {
         Ok(Group { inner, rank: place.rank, ranks: place.ranks, local_ranks: place.local_ranks, device })
     }
 
-    /// From 0.
+    /// Returns the number of this rank, from 0.
     pub fn rank(&self) -> usize {
         self.rank
     }
 
-    /// How many there are.
+    /// Returns the number of ranks.
     pub fn ranks(&self) -> usize {
         self.ranks
     }
 
-    /// How many there are on this machine.
+    /// Returns the number of ranks on this machine.
     pub fn local_ranks(&self) -> usize {
         self.local_ranks
     }
 
-    /// Whether this is the rank that writes and speaks.
+    /// Returns `true` if this is the first rank, which writes files and prints messages.
     pub fn is_first(&self) -> bool {
         self.rank == 0
     }
@@ -128,42 +128,42 @@ impl Group {
         self.inner.as_deref()
     }
 
-    /// After all that ranks do together, where all went well.
+    /// Shuts the group down after the last collective, if there was no error. All ranks call this.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn leave(&self) -> Result<()> {
         self.inner.as_ref().map_or(Ok(()), |inner| inner.shut_down().map_err(lost))
     }
 
-    /// Puts the sum over all ranks in place of `tensor`, which has the same shape and kind everywhere.
+    /// Replaces `tensor` by its sum over all ranks, in place (an all-reduce). It has the same shape and kind on all ranks.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn sum(&self, tensor: &Tensor) -> Result<()> {
         match &self.inner {
-            // SAFETY: the tensor lives, and its holder waits.
+            // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
             Some(inner) => unsafe { inner.all_reduce(tensor.as_ptr() as usize) }.map_err(lost),
             None => Ok(()),
         }
     }
 
-    /// Puts what rank `from` has in place of `tensor`, which has the same shape and kind everywhere.
+    /// Replaces `tensor` by that of rank `from`, in place (a broadcast). It has the same shape and kind on all ranks.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn copy_from(&self, from: usize, tensor: &Tensor) -> Result<()> {
         match &self.inner {
-            // SAFETY: the tensor lives, and its holder waits.
+            // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
             Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(lost),
             None => Ok(()),
         }
     }
 
-    /// What every rank says, in their order.
+    /// Returns the values that all ranks pass, in the order of the ranks.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn gather<T: Serialize + DeserializeOwned>(&self, said: T) -> Result<Vec<T>> {
         if self.inner.is_none() {
             return Ok(vec![said]);
@@ -183,21 +183,21 @@ impl Group {
         said.collect()
     }
 
-    /// What the first rank says; the others have nothing to say.
+    /// Returns the value that the first rank passes. The other ranks pass `None`.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub fn from_first<T: Serialize + DeserializeOwned>(&self, said: Option<T>) -> Result<T> {
-        // A list, as what is said may itself be nothing.
+        // The value itself may be `None`, so every rank sends a list, which is empty on ranks that send no value.
         let said = self.gather(Vec::from_iter(said))?.into_iter().flatten().next();
         said.ok_or_else(|| Error::Failed("the first rank said nothing".into()))
     }
 
-    /// What every rank has, along a new first dimension, on the CPU.
+    /// Returns the tensors of all ranks, stacked along a new first dimension, on the CPU.
     fn all_gather(&self, tensor: &Tensor) -> Result<Tensor> {
         let inner = self.inner.as_deref().expect("other ranks");
         let tensor = tensor.to_device(self.device);
-        // SAFETY: the tensor lives, and on success the C++ side has put a new one there.
+        // SAFETY: the tensor is alive, and on success the C++ side has stored a new tensor at `out`.
         let [all] =
             unsafe { handed_over(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }.map_err(lost)?;
         Ok(all.to_device(Device::Cpu))

@@ -1,5 +1,5 @@
-//! Processes that work on the same thing, each a rank: started by `torchrun`, on one machine or on many, brought together by
-//! libtorch's c10d. A program that runs alone is the only rank of its group, and then nothing here does anything.
+//! Distributed processes (ranks) that work together, on one machine or on many. `torchrun` starts them, and libtorch's c10d connects them.
+//! A program that runs alone is the only rank of its group; all collectives are then no-ops.
 
 mod buckets;
 mod group;
@@ -17,7 +17,7 @@ pub(crate) mod tests {
     use globalsplat_csrc::ranks as ffi;
     use tch::{Device, Kind, Tensor};
 
-    /// What every one of `ranks` ranks makes of its group, each in a thread of its own.
+    /// Runs `work` on every rank of a group of `ranks` ranks, each in its own thread, and returns the results.
     pub(crate) fn together<T: Send>(ranks: usize, work: impl Fn(Group) -> T + Sync) -> Vec<T> {
         together_with_timeout(ranks, group::PATIENCE_SECONDS, work)
     }
@@ -28,7 +28,7 @@ pub(crate) mod tests {
         work: impl Fn(Group) -> T + Sync,
     ) -> Vec<T> {
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
-        // Who leaves before the others have met would be missed there, not in what is tested.
+        // A rank that leaves before all ranks have joined would fail the join, not the test.
         let have_met = std::sync::Barrier::new(ranks);
         std::thread::scope(|scope| {
             let rank = |rank| {
@@ -54,7 +54,7 @@ pub(crate) mod tests {
         })
     }
 
-    /// Whether ranks can meet in this build; tells what is skipped where they can't.
+    /// Returns `true` if ranks can communicate in this build. Otherwise prints that the test is skipped.
     pub(crate) fn can_meet() -> bool {
         if !ffi::has_gloo() {
             assert!(std::env::var_os("GLOBALSPLAT_NO_SKIPS").is_none(), "built without Gloo");
@@ -75,7 +75,7 @@ pub(crate) mod tests {
                 group.sum(&sum).expect("a sum");
                 let copy = Tensor::from_slice(&[number]);
                 group.copy_from(ranks - 1, &copy).expect("a copy");
-                // Longer from rank to rank, and what JSON has no words for.
+                // A list of a different length on each rank, a NaN, and a nested `None`, which JSON can't represent.
                 let said = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
                 let heard = group.gather(said).expect("words");
                 let first = group.from_first(group.is_first().then_some(None::<u64>)).expect("a word");
@@ -93,14 +93,14 @@ pub(crate) mod tests {
         }
     }
 
-    /// As in `eval --data`, where ranks gather what they found when each is done with its scenes.
+    /// Ranks wait for a slower rank, as in `eval --data`, where all ranks gather their results when each has processed its scenes.
     #[test]
     fn a_rank_that_works_longer_is_waited_for() {
         if !can_meet() {
             return;
         }
         const { assert!(group::PATIENCE_SECONDS > 7 * 24 * 60 * 60) };
-        // c10d itself gives up after its timeout, in which ranks also have to meet, on a busy machine, too.
+        // c10d fails after its timeout. Joining must also take less than the timeout, even on a busy machine.
         for (timeout, work, is_heard) in [(5, 7, false), (group::PATIENCE_SECONDS, 2, true)] {
             let found = together_with_timeout(2, timeout, |group| {
                 if group.rank() == 1 {
@@ -125,7 +125,7 @@ pub(crate) mod tests {
         assert!(error.to_string().starts_with("the processes have lost each other ("), "{error}");
     }
 
-    /// Gradients of leaves that are used once, in two backward passes of a step, or not at all.
+    /// Buckets sum the gradients of leaves that are used once, in two backward passes of a step, or not at all.
     #[test]
     fn gradients_are_added_up_in_buckets() {
         if !can_meet() {
@@ -134,7 +134,7 @@ pub(crate) mod tests {
         let found = together(3, |group| {
             let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
             let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
-            // A bucket for each of the first two, and one for the others.
+            // One bucket for each of the first two leaves, and one for the others.
             let buckets = Buckets::of_bytes(&group, &leaves, 4 * 5);
             let mut steps = vec![];
             for step in 1..3 {
@@ -143,10 +143,10 @@ pub(crate) mod tests {
                 }
                 let factor = (step * (group.rank() + 1)) as f64;
                 let pass = |leaf: &Tensor, factor: f64| (leaf * factor).sum(Kind::Float).backward();
-                // Of a slice before the last one: it stays here until the step's end.
+                // A backward pass of an earlier slice: its gradients stay local until the end of the step.
                 pass(&leaves[0], factor);
                 buckets.begin();
-                // The other way round than buckets leave.
+                // In a different order from that of the buckets.
                 pass(&leaves[1], 10. * factor);
                 pass(&leaves[0], factor);
                 pass(&leaves[2], 100. * factor);
@@ -183,7 +183,7 @@ pub(crate) mod tests {
 
     #[test]
     fn nccl_is_found_in_libtorch() {
-        // It is where libtorch's half for CUDA is, with or without a GPU.
+        // NCCL is in libtorch's CUDA library, with or without a GPU.
         // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
         let cuda = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
         let without = !cuda.is_null() && !ffi::has_nccl();
@@ -193,7 +193,7 @@ pub(crate) mod tests {
             return;
         }
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
-        // The constructor itself says so: it has been found and called, and what it throws comes through.
+        // The error comes from NCCL's constructor. So it was found and called, and its exception is passed through.
         let error = ffi::nccl(&store, 0, 1, 60).err().expect("no GPU").to_string();
         assert!(error.contains("no GPUs found"), "{error}");
     }

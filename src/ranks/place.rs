@@ -1,35 +1,35 @@
-//! Which of the processes this one is, as `torchrun` tells in the environment.
+//! Rank of this process among those that `torchrun` started, read from the environment.
 
 use crate::error::{Error, Result};
 use std::env;
 use std::str::FromStr;
 
-/// Where a process stands among those that were started together.
+/// Position of a process among the processes that were started together.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Place {
-    /// From 0, on all machines together.
+    /// Number of this process among all processes on all machines, from 0.
     pub rank: usize,
-    /// How many there are.
+    /// Number of processes on all machines.
     pub ranks: usize,
-    /// From 0, on this machine.
+    /// Number of this process among those on this machine, from 0.
     pub local_rank: usize,
-    /// How many there are on this machine.
+    /// Number of processes on this machine.
     pub local_ranks: usize,
-    /// How often all of them have been started again.
+    /// Number of times that all processes have been restarted.
     pub restarts: u64,
-    /// The machine of the store through which they meet.
+    /// Host of the store through which the processes connect.
     pub host: String,
-    /// Its port there.
+    /// Port of the store.
     pub port: u16,
-    /// Whether `torchrun` keeps the store; else the first rank does.
+    /// `true` if `torchrun` hosts the store; otherwise the first rank hosts it.
     pub store_is_kept: bool,
 }
 
 impl Place {
-    /// This process's; none where it was started alone.
+    /// Reads this process's position from the environment. Returns `None` if the process was started alone.
     ///
     /// # Errors
-    /// A variable that is missing, or isn't what `torchrun` sets.
+    /// Returns an error if a variable is missing or has a value that `torchrun` doesn't set.
     pub fn of_process() -> Result<Option<Self>> {
         Place::told_by(|name| env::var(name).ok())
     }
@@ -64,7 +64,7 @@ impl Place {
     }
 }
 
-/// The environment.
+/// Environment variables, read by a function.
 struct Variables<F>(F);
 
 impl<F: Fn(&str) -> Option<String>> Variables<F> {
@@ -76,7 +76,7 @@ impl<F: Fn(&str) -> Option<String>> Variables<F> {
         (self.0)(name).ok_or_else(absent)
     }
 
-    /// What is absent is as `otherwise` says, if that says anything.
+    /// Parses the variable `name`. If it is missing, returns `otherwise`, or an error if that is `None`.
     fn number<T: FromStr>(&self, name: &str, otherwise: Option<T>) -> Result<T> {
         let text = match (self.text(name), otherwise) {
             (Ok(text), _) => text,
@@ -124,7 +124,7 @@ mod tests {
             store_is_kept: true,
         };
         assert_eq!(found, expected);
-        // Whatever else starts processes sets the first five.
+        // Other launchers set at least these variables.
         let others = place(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap().unwrap();
         assert_eq!((others.local_rank, others.local_ranks, others.store_is_kept), (0, 1, false));
     }

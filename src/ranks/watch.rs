@@ -1,6 +1,6 @@
-//! Who is still there. A process that dies closes its connections, and the others' collectives fail at once; one that hangs, or
-//! whose machine is gone, closes nothing. So every rank gives a sign of life now and then, and one that gives none is told of.
-//! Whatever goes wrong, one rank says so for all.
+//! Detection of lost ranks. A process that dies closes its connections, and the collectives of the others fail at once. A process that
+//! hangs, or whose machine is gone, closes nothing. So every rank sends a heartbeat at regular intervals, and a rank that sends none is
+//! reported as lost. For any failure, one rank prints the message for all.
 
 use super::place::Place;
 use crate::error::{Error, Result};
@@ -10,31 +10,31 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// Between signs of life.
+/// Time between heartbeats.
 const BEAT: Duration = Duration::from_secs(2);
-/// After which a rank is taken for lost. Where torchrun sees one of its processes die it ends the others within 30 seconds, whatever a
-/// GPU keeps them waiting for; this comes before.
+/// Time without a heartbeat after which a rank counts as lost. If one of torchrun's processes dies, torchrun ends the others within 30
+/// seconds, even if they are waiting for a GPU; this timeout is shorter.
 const SILENCE: Duration = Duration::from_secs(25);
-/// For the others to come and meet at all.
+/// Timeout for all ranks to connect, in seconds.
 const MEETING_SECONDS: i64 = 300;
-/// A rank that fails says why before its connections close; who only sees them close gives it this much time.
+/// Time for a failing rank to print its error. It does so before its connections close; a rank that only sees them close waits this long.
 const GRACE: Duration = Duration::from_secs(2);
 
-/// Gives this rank's signs of life, listens for those of others, and speaks for all where nobody has yet.
+/// Watchdog of a rank: sends its heartbeats, checks those of others, and prints an error if no other rank has printed one.
 pub struct Watch {
     store: UniquePtr<ffi::Store>,
     place: Place,
-    /// Dropped, it ends what listens.
+    /// Channel that keeps the heartbeat thread running. Dropping it ends the thread.
     listening: Mutex<Option<Sender<()>>>,
 }
 
-/// The words that ranks leave for each other.
+/// Keys of the counters in the store, by which ranks communicate.
 mod key {
-    /// How often a rank wanted to say what went wrong.
+    /// Number of times that a rank wanted to print an error.
     pub const SPOKEN: &str = "spoken";
-    /// Ranks that have ended with a failure.
+    /// Number of ranks that have ended with a failure.
     pub const FAILED: &str = "failed";
-    /// The number of a rank that gives no sign of life, plus 1.
+    /// Number of a rank that sends no heartbeat, plus 1.
     pub const LOST: &str = "lost";
 
     pub fn beats(rank: usize) -> String {
@@ -47,14 +47,14 @@ mod key {
 }
 
 impl Watch {
-    /// Connects this rank with the others. `end` is called in another thread when the others can't be worked with any more, with a
-    /// sentence on why if this rank is to say it; it doesn't return.
+    /// Connects this rank to the others. If the others can't be reached any more, `end` is called in another thread, with an error message
+    /// if this rank is to print it. `end` doesn't return.
     ///
     /// # Errors
-    /// A store that can't be reached.
+    /// Returns an error if the store can't be reached.
     pub fn begin(place: &Place, end: fn(Option<String>)) -> Result<Self> {
         let serves = !place.store_is_kept && place.rank == 0;
-        // A store that torchrun keeps is the same after a restart.
+        // A store that torchrun hosts is the same after a restart.
         let round = if place.store_is_kept { place.restarts } else { 0 };
         let store =
             ffi::connect(&place.host, place.port, serves, &format!("globalsplat/{round}"), MEETING_SECONDS);
@@ -66,7 +66,7 @@ impl Watch {
         let (sender, receiver) = channel();
         let listening = Mutex::new(Some(sender));
         let own = Watch { store: store.another()?, place: place.clone(), listening: Mutex::default() };
-        // A store whose machine is gone leaves who asks it waiting, so another thread looks at when it last answered.
+        // Calls to a store whose machine is gone block, so another thread checks when the store last answered.
         let answered = Arc::new(Mutex::new(Some(Instant::now())));
         let last = answered.clone();
         let listen = move || {
@@ -104,12 +104,12 @@ impl Watch {
         Ok(Watch { store, place: place.clone(), listening })
     }
 
-    /// Through which ranks meet.
+    /// Returns the store through which the ranks connect.
     pub fn store(&self) -> &ffi::Store {
         &self.store
     }
 
-    /// What this rank should print of why it fails; nothing where another has spoken.
+    /// Returns the message that this rank should print for its failure, or `None` if another rank has printed one.
     pub fn tell(&self, error: &str, others_are_lost: bool) -> Option<String> {
         if others_are_lost {
             std::thread::sleep(GRACE);
@@ -120,7 +120,7 @@ impl Watch {
     fn speak(&self, why: &str) -> Option<String> {
         let speaks = match self.store.add(key::SPOKEN, 1) {
             Ok(times) => times == 1,
-            // A store that is gone can't tell who spoke.
+            // If the store is gone, nobody knows which rank has printed an error.
             Err(_) => self.place.local_rank == 0,
         };
         let who = match self.place.rank {
@@ -130,8 +130,8 @@ impl Watch {
         speaks.then(|| who + why)
     }
 
-    /// The last that this rank does: from here on its silence means nothing, or that it `failed`, and then the others end, too. Whoever
-    /// keeps the store waits until they have heard.
+    /// Ends the watch, as this rank's last action: a rank that has left isn't missed. If it `failed`, the other ranks end, too. A rank that
+    /// hosts the store waits until the others have seen this.
     pub fn leave(&self, failed: bool) {
         let Some(_listening) = self.listening.lock().expect("no thread panics here").take() else { return };
         let left = key::left(self.place.rank);
@@ -147,11 +147,11 @@ impl Watch {
     }
 }
 
-/// What a rank knows of those that it listens to: the first one to all, the others to that.
+/// Heartbeats of the ranks that this rank checks. The first rank checks all others, and the others check the first.
 struct Others {
     rank: usize,
     ranks: usize,
-    /// Rank, beats heard, and when the last one came.
+    /// Rank, number of heartbeats seen, and the time of the last one.
     heard: Vec<(usize, i64, Instant)>,
 }
 
@@ -162,7 +162,7 @@ impl Others {
         Others { rank: place.rank, ranks: place.ranks, heard }
     }
 
-    /// Gives a sign of life, and tells why the others can't be worked with any more, if so.
+    /// Sends a heartbeat. Returns the reason if the other ranks can't be reached any more.
     fn lost(&mut self, store: &ffi::Store) -> Option<String> {
         match self.listen(store) {
             Ok(found) => found,
@@ -173,7 +173,7 @@ impl Others {
     fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<String>, cxx::Exception> {
         store.add(&key::beats(self.rank), 1)?;
         if store.add(key::FAILED, 0)? > 0 {
-            // It has spoken before.
+            // That rank has printed its error before.
             return Ok(Some("another process has failed".into()));
         }
         let silent = |rank: usize| {

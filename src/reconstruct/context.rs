@@ -1,14 +1,15 @@
-//! Which of a capture's views a model sees.
+//! Selection of the context views of a capture that a model sees.
 
 use super::spread::spread_over_path;
 use crate::data::{Capture, Holdout, View};
 use crate::error::Result;
 use crate::scene::ImageSize;
 
-/// The views that `holdout` leaves, or so many of them, spread over the camera's path, fitted to `size`.
+/// Loads the context views of a capture, fitted to `size`: the views that `holdout` doesn't hold out. If `views` is given, at most so many
+/// of them are loaded, spread over the camera path.
 ///
 /// # Errors
-/// Photos that can't be read.
+/// Fails if a photo can't be read.
 pub fn load_context(
     capture: &Capture,
     holdout: Holdout,
@@ -18,7 +19,7 @@ pub fn load_context(
     capture.load(&context_views(capture, holdout, views), Some(size))
 }
 
-/// Returns the positions of the views that [`load_context`] loads.
+/// Returns the indices of the views that [`load_context`] loads.
 pub fn context_views(capture: &Capture, holdout: Holdout, views: Option<usize>) -> Vec<usize> {
     let (shown, _) = capture.split(holdout);
     match views {

@@ -1,4 +1,4 @@
-//! What a model sees of a photo: the photo at the size that it was trained with, or what more pixels become (spec 9.8).
+//! Conversion of photos to the views that a model sees: each photo at the training size, or several views of a larger photo (spec 9.8).
 
 use crate::data::{View, polyphase};
 use crate::error::{Error, Result};
@@ -7,20 +7,19 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Of a side, in pixels.
+/// Maximum length of a side in pixels.
 const MOST: u32 = 16_384;
 
-/// What a photo becomes that has `phase` times as many rows and columns as the images that a model was trained with.
+/// Conversion of a photo that has `phase` times as many rows and columns as the images that a model was trained with.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ViewsAs {
-    /// Phase² views of the size trained with, which share its pixels out among themselves.
+    /// Phase² views of the training size, which divide the pixels of the photo among themselves.
     #[default]
     Polyphase,
     /// One view, larger than any in training.
     Whole,
-    /// It is made as small as in training, and shown phase² times: as many image tokens as of [`ViewsAs::Polyphase`], and nothing
-    /// new in them.
+    /// The photo at the training size, repeated phase² times: as many image tokens as with [`ViewsAs::Polyphase`], without new information.
     Repeated,
 }
 
@@ -44,7 +43,7 @@ impl fmt::Display for ViewsAs {
     }
 }
 
-/// How photos become what a model sees.
+/// Conversion of photos to the views that a model sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Input {
     phase: u32,
@@ -52,13 +51,13 @@ pub struct Input {
 }
 
 impl Input {
-    /// A photo is a view, as in training.
+    /// Conversion of each photo to one view, as in training.
     pub const PLAIN: Self = Input { phase: 1, views_as: ViewsAs::Polyphase };
 
-    /// Of photos that are `height` pixels high, for a model that was trained with `trained`.
+    /// Creates the conversion of photos that are `height` pixels high, for a model that was trained with `trained`.
     ///
     /// # Errors
-    /// A height that isn't a multiple of the model's.
+    /// Fails if the height isn't a multiple of the model's, or if a side would be longer than 16,384 pixels.
     pub fn at(height: u32, views_as: ViewsAs, trained: ImageSize) -> Result<Self> {
         let side = trained.height;
         let phase = height / side.max(1);
@@ -73,17 +72,17 @@ impl Input {
         Ok(if phase == 1 { Input::PLAIN } else { Input { phase, views_as } })
     }
 
-    /// Whether a photo is a view, as in training.
+    /// Returns `true` if each photo becomes one view, as in training.
     pub fn is_plain(&self) -> bool {
         *self == Input::PLAIN
     }
 
-    /// How a photo becomes views.
+    /// Returns the way in which a photo becomes views.
     pub fn views_as(&self) -> ViewsAs {
         self.views_as
     }
 
-    /// What photos have to be fitted to, for a model that was trained with `trained`.
+    /// Returns the size that photos must have for a model that was trained with `trained`.
     pub fn photo_size(&self, trained: ImageSize) -> ImageSize {
         match self.views_as {
             ViewsAs::Polyphase | ViewsAs::Whole => {
@@ -93,7 +92,7 @@ impl Input {
         }
     }
 
-    /// How many views a photo becomes.
+    /// Returns the number of views that a photo becomes.
     pub fn views_of_photo(&self) -> usize {
         match self.views_as {
             ViewsAs::Polyphase | ViewsAs::Repeated => (self.phase * self.phase) as usize,
@@ -101,10 +100,10 @@ impl Input {
         }
     }
 
-    /// What `photo`, which has the size that [`Input::photo_size`] tells, becomes.
+    /// Converts `photo`, which has the size that [`Input::photo_size`] returns, to views.
     ///
     /// # Errors
-    /// A photo of another size that can't be divided.
+    /// Fails if the photo has another size that can't be divided.
     pub fn views(&self, photo: &View) -> Result<Vec<View>> {
         match self.views_as {
             ViewsAs::Polyphase => polyphase(photo, self.phase),
@@ -128,7 +127,7 @@ mod tests {
         assert_eq!((whole.photo_size(trained), whole.views_of_photo()), ([96, 144].into(), 1));
         let repeated = Input::at(96, ViewsAs::Repeated, trained).unwrap();
         assert_eq!((repeated.photo_size(trained), repeated.views_of_photo()), (trained, 9));
-        // Once its own size there is nothing to choose.
+        // At the training size, every choice gives the plain conversion.
         assert!(Input::at(32, ViewsAs::Whole, trained).unwrap().is_plain());
         for height in [0, 16, 48, 97, 12_288, u32::MAX] {
             let error = Input::at(height, ViewsAs::Polyphase, trained).unwrap_err().to_string();

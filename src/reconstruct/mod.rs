@@ -1,5 +1,5 @@
-//! Posed photos to a splat: a model from its file, views that are chosen and fitted, a forward pass, and the way back to the
-//! capture's world.
+//! Reconstruction of a splat from posed photos: loads a model from its file, selects and fits the views, runs a forward pass, and
+//! transforms the result to the capture's world.
 
 mod context;
 mod input;
@@ -29,20 +29,20 @@ use placing::best_placed;
 use std::time::Duration;
 use tch::Device;
 
-/// A model to be used: one from a file, or one that is being trained.
+/// Model for inference: one from a file, or one that is being trained.
 #[derive(Debug, Clone, Copy)]
 pub struct Model<'a> {
     /// The network.
     pub network: &'a GlobalSplat,
-    /// What it was built and trained from.
+    /// Configuration that it was built and trained from.
     pub config: &'a Config,
-    /// To which it was trained.
+    /// Curriculum stage that it was trained to.
     pub stage: Stage,
-    /// Where the weights are.
+    /// Device of the weights.
     pub device: Device,
-    /// What it sees of a photo.
+    /// Conversion of photos to the views that the model sees.
     pub input: Input,
-    /// What its weights lie in, if they weren't copied.
+    /// Mapped files that hold the weights, if these weren't copied.
     pub lent: Option<LentWeights>,
 }
 
@@ -53,34 +53,34 @@ impl<'a> From<&'a LoadedModel> for Model<'a> {
     }
 }
 
-/// A splat in the normalized world, and the way to the capture's own.
+/// Splat in the normalized world, and the transform to the capture's world.
 #[derive(Debug)]
 pub struct Reconstruction {
-    /// What the Gaussians were decoded from.
+    /// Tokens that the Gaussians were decoded from.
     pub tokens: Encoded,
-    /// One scene, in the normalized world.
+    /// Gaussians of one scene, in the normalized world.
     pub gaussians: Gaussians,
-    /// Where in the normalized world the cameras were.
+    /// Placement of the cameras in the normalized world.
     pub placement: Placement,
-    /// Normalized world to the capture's.
+    /// Transform from the normalized world to the capture's.
     pub world_from_normalized: Similarity,
-    /// The other cameras that were normalized along, camera-to-world.
+    /// Poses of the target cameras in the normalized world, camera-to-world.
     pub target_poses: Vec<DMat4>,
-    /// From views in memory to Gaussians, all passes together.
+    /// Time from views in memory to Gaussians, over all passes.
     pub forward_time: Duration,
 }
 
 impl Reconstruction {
-    /// Returns the Gaussians in the capture's own world, in float32; [`Reconstruction::to_splat`] keeps their detail far from the
-    /// world's origin.
+    /// Returns the Gaussians in the capture's world, in float32. [`Reconstruction::to_splat`] keeps more detail far from the world's
+    /// origin.
     pub fn in_world(&self) -> Gaussians {
         transform(&self.gaussians, &self.world_from_normalized)
     }
 
-    /// Returns the splat in the capture's own world, with the mean camera as the origin of its coordinates.
+    /// Returns the splat in the capture's world, with the mean camera as the origin of its coordinates.
     ///
     /// # Errors
-    /// More scenes than one.
+    /// Fails if there is more than one scene.
     pub fn to_splat(&self) -> Result<Splat> {
         let about_origin = Similarity { translation: DVec3::ZERO, ..self.world_from_normalized };
         let splat = Splat::of(&transform(&self.gaussians, &about_origin))?;
@@ -88,13 +88,14 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model over `photos`, which become the views that it sees ([`Input`]). Where its configuration has several
-/// `data.extents` it is shown the scene in each of these sizes, and nudged, and the splat that shows the photos best is kept.
-/// `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the
-/// paper's protocol. A photo does so once, whatever it becomes.
+/// Runs the model over `photos`, which are converted to the views that it sees ([`Input`]). If its configuration has several
+/// `data.extents`, the model runs on the scene at each of these sizes and at small changes of the best placement, and the splat that
+/// matches the photos best is kept. `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the
+/// normalization, as in the paper's protocol. Each photo takes part once, however many views it becomes.
 ///
 /// # Errors
-/// Fewer than two photos, images that the model's patches don't divide, photos that can't be rendered.
+/// Fails with fewer than two photos, with images whose sides aren't multiples of the model's patch size, or if rendering to the photos'
+/// cameras fails.
 pub fn reconstruct<'a>(
     model: impl Into<Model<'a>>,
     photos: &[View],
@@ -114,7 +115,7 @@ pub fn reconstruct<'a>(
     best_placed(model, photos, &views, &normalization)
 }
 
-/// What the model makes of `views`, those of each photo, seen from the photos' `poses` in a normalized world, on the model's device.
+/// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.
 fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, Gaussians)> {
     let Model { network, config, stage, device, lent, .. } = model;
     let posed =
@@ -131,7 +132,7 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, 
         (encoded, decoded)
     };
     let (encoded, decoded) = tch::no_grad(|| match lent {
-        // A pass needs nearly every weight once.
+        // A pass reads nearly every weight exactly once, so pages of weights can be released when the next part begins.
         Some(lent) => told(
             move |event| {
                 if let Event::Begins(_) = event {

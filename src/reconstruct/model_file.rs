@@ -1,4 +1,4 @@
-//! A model as one safetensors file that rebuilds it: the weights, and the configuration in the metadata (spec 10.10).
+//! Model stored in one safetensors file that rebuilds it: the weights, and the configuration in the metadata (spec 10.10).
 
 use super::published::{CHECKPOINT_PREFIX, assumed, configuration, is_ours, model_tensors};
 use crate::config::Config;
@@ -9,42 +9,42 @@ use std::collections::HashMap;
 use std::path::Path;
 use tch::{Device, Kind, nn};
 
-/// How the metadata's keys of this program begin.
+/// Prefix of this program's metadata keys.
 const OURS: &str = "globalsplat.";
-/// The metadata's key for the configuration, as TOML.
+/// Metadata key of the configuration, as TOML.
 pub const CONFIG_KEY: &str = "globalsplat.config";
-/// The metadata's key for the version of this program that wrote the file.
+/// Metadata key of the version of this program that wrote the file.
 const VERSION_KEY: &str = "globalsplat.version";
-/// The metadata's key for the stage that the weights were trained to, as JSON, where it isn't the final one.
+/// Metadata key of the stage that the weights were trained to, as JSON. Written only if it isn't the final stage.
 pub const STAGE_KEY: &str = "globalsplat.stage";
 
-/// How weights are stored.
+/// Data type of stored weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ModelDtype {
-    /// Exactly.
+    /// float32, which stores weights exactly.
     F32,
-    /// In half the bytes, with 8 bits of mantissa.
+    /// bfloat16, which takes half the bytes and has 8 bits of mantissa.
     BF16,
 }
 
-/// A model from a file.
+/// Model that was loaded from a file.
 #[derive(Debug)]
 pub struct LoadedModel {
-    /// Built as the file says.
+    /// Network, built from the file's configuration.
     pub model: GlobalSplat,
-    /// As the file says.
+    /// Configuration from the file.
     pub config: Config,
-    /// To which the weights were trained: the final one, unless the file says otherwise.
+    /// Stage that the weights were trained to: the final stage, unless the file has another.
     pub stage: Stage,
-    /// Holds the weights, those of products in the precision of passes.
+    /// Weights of the network. Those of linear layers are in the precision of passes.
     pub vs: nn::VarStore,
-    /// What weights lie in that weren't copied: nobody should write to these.
+    /// Mapped files that hold the weights that weren't copied. These weights must not be written to.
     pub lent: Option<LentWeights>,
-    /// For what a file without a configuration is taken.
+    /// Description of the assumed model, if the file has no configuration.
     pub assumed: Option<String>,
 }
 
-/// What a file of the model holds: the variables of `vs`, which were trained to `stage`, and `config`.
+/// Returns the content of a model file: the variables of `vs`, which were trained to `stage`, and `config`.
 pub fn model_weights(vs: &nn::VarStore, config: &Config, stage: Stage, dtype: ModelDtype) -> Weights {
     let kind = match dtype {
         ModelDtype::F32 => Kind::Float,
@@ -55,7 +55,7 @@ pub fn model_weights(vs: &nn::VarStore, config: &Config, stage: Stage, dtype: Mo
     let mut metadata = HashMap::from([
         text(CONFIG_KEY, &config.to_toml()),
         text(VERSION_KEY, env!("CARGO_PKG_VERSION")),
-        // Libraries of Hugging Face ask for it.
+        // Hugging Face libraries expect this key.
         text("format", "pt"),
     ]);
     if stage != config.curriculum.final_stage() {
@@ -64,10 +64,10 @@ pub fn model_weights(vs: &nn::VarStore, config: &Config, stage: Stage, dtype: Mo
     Weights { tensors, metadata }
 }
 
-/// Writes [`model_weights`] as one safetensors file, whole or not at all.
+/// Writes [`model_weights`] to one safetensors file atomically.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if the file can't be written.
 pub fn save_model(
     path: &Path,
     vs: &nn::VarStore,
@@ -79,11 +79,11 @@ pub fn save_model(
     write_weights(path, &tensors, metadata)
 }
 
-/// Writes `weights`, as [`model_weights`] has them, as a checkpoint of the layout that the authors' have, with their configuration
-/// beside them.
+/// Writes `weights`, as [`model_weights`] returns them, to a checkpoint with the layout of the authors' checkpoints. The configuration is
+/// stored beside the state dict.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if the file can't be written.
 pub fn save_checkpoint(path: &Path, weights: Weights) -> Result<()> {
     let named = |(name, tensor)| (format!("{CHECKPOINT_PREFIX}{name}"), tensor);
     let tensors = weights.tensors.into_iter().map(named).collect();
@@ -91,67 +91,67 @@ pub fn save_checkpoint(path: &Path, weights: Weights) -> Result<()> {
     write_checkpoint(path, &Weights { tensors, metadata })
 }
 
-/// The weights that come with this program, which it carries inside: the model of `configs/tiny.toml`, trained on made-up worlds
-/// alone. Their card is `models/README.md`.
+/// Path of the weights that are embedded in this program: the model of `configs/tiny.toml`, trained on synthetic scenes only. Its model
+/// card is `models/README.md`.
 pub const SHIPPED_MODEL: &str = "models/tiny.safetensors";
 const SHIPPED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
 
-/// The model that comes with this program, [`SHIPPED_MODEL`], in float32.
+/// Loads the model that is embedded in this program, [`SHIPPED_MODEL`], in float32.
 ///
 /// # Errors
-/// The device's refusal.
+/// Fails if the device reports an error.
 pub fn shipped_model(device: Device) -> Result<LoadedModel> {
     ModelFile::shipped()?.load(device, Precision::F32)
 }
 
-/// Rebuilds the model that [`save_model`] wrote, or whose weights alone are known, in float32.
+/// Loads a model in float32 from a file that [`save_model`] wrote or that holds only weights.
 ///
 /// # Errors
-/// A file that can't be read, or whose weights don't fit their configuration or any.
+/// Fails if the file can't be read, or if the weights don't fit their configuration or any model.
 pub fn load_model(path: &Path, device: Device) -> Result<LoadedModel> {
     ModelFile::open(path, &[])?.load(device, Precision::F32)
 }
 
-/// A file of a model's weights, of which none is read yet, and what it is a model of.
+/// Model file whose weights aren't read yet, and the model that it describes.
 #[derive(Debug)]
 pub struct ModelFile {
     weights: WeightsFile,
-    /// As the file says, or as shapes tell.
+    /// Configuration from the file, or inferred from the shapes of the weights.
     pub config: Config,
-    /// To which the weights were trained.
+    /// Stage that the weights were trained to.
     pub stage: Stage,
-    /// For what a file without a configuration is taken.
+    /// Description of the assumed model, if the file has no configuration.
     pub assumed: Option<String>,
-    /// Tensors in the file that are none of the model's.
+    /// Number of tensors in the file that aren't part of the model.
     pub left_out: usize,
 }
 
 impl ModelFile {
-    /// Looks into whatever [`WeightsFile::open`] knows. `overrides` are for its configuration, as for [`Config::read`].
+    /// Opens a file of any format that [`WeightsFile::open`] reads. `overrides` change its configuration, as in [`Config::read`].
     ///
     /// # Errors
-    /// A file that can't be read, or is of no model; overrides that don't fit.
+    /// Fails if the file can't be read or holds no model, or if overrides don't fit.
     pub fn open(path: &Path, overrides: &[String]) -> Result<Self> {
         Self::of(WeightsFile::open(path)?, overrides)
     }
 
-    /// Looks into the weights that come with this program, [`SHIPPED_MODEL`].
+    /// Opens the weights that are embedded in this program, [`SHIPPED_MODEL`].
     ///
     /// # Errors
-    /// None, unless they are damaged.
+    /// Fails only if the embedded weights are damaged.
     pub fn shipped() -> Result<Self> {
         Self::of(WeightsFile::carried(SHIPPED_BYTES, Path::new(SHIPPED_MODEL))?, &[])
     }
 
-    /// The same of a file that is open.
+    /// Reads the configuration and the stage of an open weights file. `overrides` change its configuration, as in [`Config::read`].
     ///
     /// # Errors
-    /// As there.
+    /// Fails if the file holds no model, or if overrides don't fit.
     pub fn of(weights: WeightsFile, overrides: &[String]) -> Result<Self> {
         let path = weights.path().to_owned();
         let text = weights.metadata().get(CONFIG_KEY).cloned();
         let stage = weights.metadata().get(STAGE_KEY).cloned();
-        // What `export` wrote as safetensors has the model's names and no others.
+        // Safetensors files that `export` wrote contain the model's tensors under their own names and no others.
         let (weights, left_out) = match text.is_some() && weights.names().any(is_ours) {
             true => (weights, 0),
             false => model_tensors(weights)?,
@@ -173,24 +173,25 @@ impl ModelFile {
     /// Copies the weights into the variables of `vs`.
     ///
     /// # Errors
-    /// Those of another model.
+    /// Fails if the weights are those of another model.
     pub fn load_into(&self, vs: &nn::VarStore) -> Result<()> {
         self.weights.load_into(vs)
     }
 
-    /// Builds the model for passes in `precision`.
+    /// Builds the model for passes in `precision` and copies the weights to `device`.
     ///
     /// # Errors
-    /// Weights that don't fit the configuration.
+    /// Fails if the weights don't fit the configuration.
     pub fn load(self, device: Device, precision: Precision) -> Result<LoadedModel> {
         self.build(device, precision, |weights, vs| weights.load_into(vs).map(|()| None))
     }
 
-    /// The same for passes alone: on the CPU, weights that products take as they are on disk stay there, and the system reads them as
-    /// they are needed. The file mustn't be changed in its place meanwhile.
+    /// Builds the model for inference only. On the CPU, weights that linear layers use in their stored type stay in the mapped file, and
+    /// the operating system reads them on demand. The file must not be changed in place meanwhile. On other devices this is
+    /// [`ModelFile::load`].
     ///
     /// # Errors
-    /// As there.
+    /// Fails if the weights don't fit the configuration.
     pub fn lend(self, device: Device, precision: Precision) -> Result<LoadedModel> {
         match device {
             Device::Cpu => self.build(device, precision, |weights, vs| weights.lend_to(vs).map(Some)),
@@ -204,7 +205,7 @@ impl ModelFile {
         precision: Precision,
         fill: impl FnOnce(WeightsFile, &nn::VarStore) -> Result<Option<LentWeights>>,
     ) -> Result<LoadedModel> {
-        // Before a model of whatever size is made.
+        // Checked before a model of the configured size is allocated.
         let numbers: i64 =
             self.weights.shapes().values().map(|(_, shape)| shape.iter().product::<i64>()).sum();
         let least = self.config.model.least_parameters();

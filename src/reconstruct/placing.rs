@@ -1,4 +1,4 @@
-//! In which size and place a model sees a scene: the best of several, judged by the photos that it is shown (spec 9.9).
+//! Search for the size and position at which a model sees a scene: the best of several by the error on the input photos (spec 9.9).
 
 use super::{Model, Reconstruction, pass};
 use crate::data::{View, cameras_at};
@@ -11,17 +11,17 @@ use glam::DMat4;
 use std::time::Instant;
 use tch::Device;
 
-/// What a placement is changed by: cameras are moved forward, and then the scene is enlarged, by a factor's logarithm.
+/// Changes of a placement that the search tries: forward shift of the cameras, and the logarithm of the factor that enlarges the scene.
 const NUDGES: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
 
-/// How far, one round after the other.
+/// Factors of the changes in each round.
 const ROUNDS: [f64; 2] = [1., 0.5];
 
-/// Of what the model makes of `views`, those of each photo, in each of `data.extents` and around the best of them, that which
-/// shows `photos` best. `normalization` has the poses of photos and then of targets.
+/// Runs the model over `views`, the views of each photo, at each of `data.extents` and at placements around the best of them. Returns the
+/// result that matches `photos` best. `normalization` has the poses of the photos, followed by those of the targets.
 ///
 /// # Errors
-/// Those of a pass and of rendering.
+/// Fails if a pass or rendering fails.
 pub(super) fn best_placed(
     model: Model,
     photos: &[View],
@@ -53,7 +53,7 @@ pub(super) fn best_placed(
         }
     }
     let Attempt { placement, tokens, gaussians, .. } = best;
-    // To be written to files. This waits for a GPU.
+    // The results are written to files later. This copy waits for a GPU.
     let gaussians = gaussians.to_device(Device::Cpu);
     let forward_time = start.elapsed();
     let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
@@ -61,9 +61,9 @@ pub(super) fn best_placed(
     Ok(Reconstruction { tokens, gaussians, placement, world_from_normalized, target_poses, forward_time })
 }
 
-/// What a pass made.
+/// Result of one pass.
 struct Attempt {
-    /// Of its pictures beside the photos; 0 where there is no other attempt.
+    /// Mean squared error of the rendered images against the photos; 0 if there is no other attempt.
     error: f64,
     placement: Placement,
     tokens: Encoded,
@@ -71,7 +71,7 @@ struct Attempt {
 }
 
 impl Attempt {
-    /// Becomes `other` if that is better, and tells whether. Any number is better than NaN.
+    /// Replaces this attempt by `other` if that is better, and returns `true` if it was. Any error is better than NaN.
     fn give_way(&mut self, other: Attempt) -> bool {
         let better = other.error < self.error || (self.error.is_nan() && !other.error.is_nan());
         if better {
@@ -81,7 +81,7 @@ impl Attempt {
     }
 }
 
-/// Of `gaussians` seen from the photos' `poses` beside the photos: the mean squared error.
+/// Returns the mean squared error of `gaussians`, rendered from the photos' `poses`, against the photos.
 fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
     let rendered = render_views(gaussians, &cameras_at(photos, poses))?;
     let error = |(made, photo): (&Rendered, &View)| {

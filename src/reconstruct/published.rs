@@ -1,4 +1,4 @@
-//! Weights that come without a configuration of ours: the authors' checkpoints, and anybody's state dicts (spec 10.16).
+//! Weights without a configuration of this program: the authors' checkpoints, and other state dicts (spec 10.16).
 
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -6,7 +6,7 @@ use crate::io::WeightsFile;
 use crate::model::{MODULES, ModelConfig};
 use std::collections::BTreeMap;
 
-/// The models of spec 8.9: what they are called, M, K, and the stage that they end in.
+/// Model variants of spec 8.9: name, M, K, and final stage.
 const VARIANTS: [(&str, i64, i64, u32); 5] = [
     ("2K", 2048, 2, 0),
     ("2K with few latents", 256, 16, 3),
@@ -14,25 +14,25 @@ const VARIANTS: [(&str, i64, i64, u32); 5] = [
     ("32K", 4096, 16, 3),
     ("32K with dense tokens", 2048, 16, 4),
 ];
-/// Steps between the stages behind the third, as in `configs/re10k_32k_dense.toml`.
+/// Number of steps between the stages after the third, as in `configs/re10k_32k_dense.toml`.
 const BOUNDARY: u64 = 30_000;
-/// What a checkpoint's names of the model's parameters begin with: Lightning's module calls the model so.
+/// Prefix of the model's parameters in a checkpoint, where the Lightning module has the model as an attribute of this name.
 pub(super) const CHECKPOINT_PREFIX: &str = "model.";
-/// A parameter that every model has, and its name alone.
+/// Name of a parameter that every model has. Its prefix in a file is that of the model.
 const ANCHOR: &str = "scene_tokens";
-/// Parts of names that torch's wrappers add: DistributedDataParallel and compile.
+/// Name components that torch's wrappers add: DistributedDataParallel and compile.
 const WRAPPERS: [&str; 2] = ["module", "_orig_mod"];
 
-/// Whether the model may have a parameter of this name.
+/// Returns `true` if the model may have a parameter of this name.
 pub(super) fn is_ours(name: &str) -> bool {
     name.split('.').next().is_some_and(|module| MODULES.contains(&module))
 }
 
-/// The model's tensors alone, by the names that the model gives them, and how many others there were. In a checkpoint they begin with
-/// `model.`, and other networks, such as those of a loss, are beside them.
+/// Returns the model's tensors under the model's own names, and the number of other tensors in the file. In a checkpoint the names begin
+/// with `model.`, and other networks, such as those of a loss, are stored beside them.
 ///
 /// # Errors
-/// No model.
+/// Fails if the file holds no model.
 pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
     let plain = |name: &str| {
         let parts: Vec<&str> = name.split('.').filter(|part| !WRAPPERS.contains(part)).collect();
@@ -41,7 +41,7 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
     let names: Vec<String> = file.names().map(plain).collect();
     let prefixes = names.iter().filter_map(|name| name.strip_suffix(ANCHOR));
     let prefixes = prefixes.filter(|prefix| prefix.is_empty() || prefix.ends_with('.'));
-    // Of several, such as a moving average's, the one that is trained.
+    // If there are several models, such as a moving average, this takes the trained one.
     let Some(prefix) =
         prefixes.min_by_key(|prefix| (!prefix.is_empty(), *prefix != CHECKPOINT_PREFIX, prefix.len()))
     else {
@@ -57,10 +57,10 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
     Ok((file, left_out))
 }
 
-/// The configuration of a model of which only the weights are known.
+/// Returns the configuration of a model, inferred from its weights.
 ///
 /// # Errors
-/// Shapes that fit no model.
+/// Fails if the shapes fit no model.
 pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
     let shapes: BTreeMap<_, _> = file.shapes().into_iter().map(|(name, (_, shape))| (name, shape)).collect();
     let mut model = ModelConfig::of_shapes(&shapes, file.path())?;
@@ -73,7 +73,7 @@ pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
 
     let ModelConfig { latents, candidates, .. } = config.model;
     let known = VARIANTS.iter().find(|&&(_, m, k, _)| (m, k) == (latents, candidates));
-    // The variants leave the last merge to the decoder, whatever K is.
+    // The published variants leave the last merge to the decoder, whatever K is.
     let stage = known.map_or(candidates.ilog2().saturating_sub(1), |&(.., stage)| stage);
     config.curriculum.final_stage = stage;
     let boundaries = &mut config.curriculum.boundaries;
@@ -87,7 +87,7 @@ fn said_heads(file: &WeightsFile) -> Option<i64> {
     file.metadata().get("num_heads").and_then(|heads| heads.parse().ok())
 }
 
-/// For what a file without a configuration is taken: what shapes tell, and what they don't.
+/// Describes the model that a file without a configuration is assumed to hold, and says which values the shapes don't determine.
 pub(super) fn assumed(file: &WeightsFile, config: &Config) -> String {
     let ModelConfig { latents, candidates, heads, .. } = config.model;
     let stage = config.curriculum.final_stage;

@@ -1,9 +1,9 @@
-//! Fewer views that still see everything (spec 9.7).
+//! Selection of fewer views that still cover the scene (spec 9.7).
 
 use crate::scene::Camera;
 
-/// `wanted` of `indices`, into `cameras`: first and last among them, the others at even distances along the path that the
-/// cameras take, so that a long look at one thing doesn't fill the choice. All of them when there are no more.
+/// Selects `wanted` of `indices` into `cameras`: the first, the last, and others at even distances along the camera path, so that a camera
+/// that stays in one position doesn't use up the selection. Returns all of them if there are no more than `wanted`.
 ///
 /// A path of length 1 crosses the scene's extent, or turns by one radian.
 pub fn spread_over_path(cameras: &[Camera], indices: &[usize], wanted: usize) -> Vec<usize> {
@@ -28,9 +28,9 @@ pub fn spread_over_path(cameras: &[Camera], indices: &[usize], wanted: usize) ->
     let length = position[count - 1];
     let mut chosen = vec![0];
     for k in 1..wanted {
-        // After the last choice, and leaving one for each choice still to come.
+        // Candidates come after the last selected index and leave one for each selection still to come.
         let open = chosen[k - 1] + 1..=count - (wanted - k);
-        // Cameras that don't move at all are spread by number.
+        // Cameras that don't move at all are spread by index.
         let off = |i: usize| match length > 0. {
             true => (position[i] - length * k as f64 / (wanted - 1) as f64).abs(),
             false => (i as f64 - ((count - 1) * k) as f64 / (wanted - 1) as f64).abs(),

@@ -1,4 +1,4 @@
-//! Gaussians to begin with where nothing is known but photos, or photos and points.
+//! Initial Gaussians from photos, or from photos and points.
 
 use super::sweep::{Swept, sweep};
 use super::view_selection::projection;
@@ -10,26 +10,27 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, Tensor};
 
-/// Standard deviation, in units of the distance between neighbours.
+/// Standard deviation of a Gaussian, in units of the distance between neighbouring Gaussians.
 const EXTENT: f64 = 0.5;
-/// Of the opacity.
+/// Initial logit of the opacity.
 const LOGIT: f32 = -1.;
-/// Of all Gaussians, those that lie at points at the most: points are exact, but lie where corners are.
+/// Divisor that limits the Gaussians at points: at most 1/`POINTS_SHARE` of all. Points are exact, but lie mostly at corners.
 const POINTS_SHARE: usize = 2;
-/// How far from the depth that the photos agree on a Gaussian may lie, of that depth.
+/// Maximum relative distance of a Gaussian from the depth that the photos agree on.
 const NEAR: f64 = 0.1;
 
-/// A round Gaussian.
+/// Isotropic Gaussian.
 struct Ball {
     mean: DVec3,
     scale: f64,
     colour: [f32; 3],
 }
 
-/// `count` Gaussians where the photos agree on what they show, and at `points` of the scene, where some are known. Each is as large
-/// as the part of the pictures that it stands for. Of `known` Gaussians, up to `count`, those stay that the photos don't speak
-/// against. Two views at least. `go_on` is asked before each photo, with how many are done; when it says no, Gaussians lie where the
-/// photos that are done show them, and where none is, nothing is returned. Depths are found on `device`, where the Gaussians then are.
+/// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
+/// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
+/// kept. At least two views are required. `go_on` is called before each photo with the number of photos that are done. If it returns
+/// `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. Depths are computed on `device`,
+/// and the Gaussians are returned there.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
@@ -49,7 +50,8 @@ pub fn gaussians_from_photos(
     Some(kept.and(&anew(&swept, points, left, seed).to_device(device)))
 }
 
-/// Those that are in front of nothing that a photo is sure of, and that at least one photo doesn't hide behind it.
+/// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
+/// least one photo must see it unoccluded or not be sure of the depth there.
 fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
@@ -78,19 +80,19 @@ fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
 fn anew(swept: &[Swept], points: &[Point], count: usize, seed: u64) -> RawGaussians {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let pixels: f64 = swept.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
-    let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of these small pictures
+    let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
     let chosen = sample(&mut random, points.len(), points.len().min(count / POINTS_SHARE));
     let mut balls: Vec<Ball> = chosen.iter().map(|i| at_point(&points[i], swept, spacing)).collect();
     let left = count - balls.len();
     for (index, of) in swept.iter().enumerate() {
-        // Shares that add up.
+        // Cumulative shares, so that the counts add up to `left`.
         let share = |i: usize| left * i / swept.len();
         in_picture(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
     }
     raw(&balls)
 }
 
-/// As large as if the camera that is nearest had seen it.
+/// Creates a Gaussian at a point, with the size that it would have if the nearest camera had seen it.
 fn at_point(point: &Point, swept: &[Swept], spacing: f64) -> Ball {
     let size =
         |of: &Swept| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
@@ -98,7 +100,7 @@ fn at_point(point: &Point, swept: &[Swept], spacing: f64) -> Ball {
     Ball { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
 }
 
-/// `count` Gaussians at pixels of `of`, anywhere.
+/// Appends `count` Gaussians at random pixels of `of` to `balls`.
 fn in_picture(of: &Swept, count: usize, spacing: f64, random: &mut impl Rng, balls: &mut Vec<Ball>) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
     let numbers = |t: &Tensor| Vec::<f32>::try_from(t.contiguous().view([-1])).expect("numbers");
@@ -135,7 +137,8 @@ mod tests {
     use crate::scene::{Camera, Intrinsics};
     use glam::DMat4;
 
-    /// Two cameras that are sure of a wall at depth 4, the second of its left half alone.
+    /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its
+    /// image.
     #[test]
     fn what_photos_speak_against_does_not_stay() {
         let camera = |x: f64| Camera {
@@ -164,13 +167,13 @@ mod tests {
             };
             supported(&raw, &swept)
         };
-        // On the wall, before it, behind it, beside what anybody sees.
+        // The Gaussians are on the wall, in front of it, behind it, and outside both images.
         assert_eq!(kept(&[[0., 0., 4.1], [0., 0., 2.], [0., 0., 9.], [30., 0., 4.]]), [0]);
-        // Behind the wall of one, where the other isn't sure: it stays.
+        // The first is behind the wall in one image, but the other camera isn't sure there, so it stays.
         assert_eq!(kept(&[[3., 0., 9.], [3., 0., 2.]]), [0]);
     }
 
-    /// As many as are asked for, those that stay first; none is dropped that there is room for.
+    /// Known Gaussians are filled up to the requested count. Those that are kept come first, and none is dropped below that count.
     #[test]
     fn what_is_known_is_filled_up() {
         let view = |x: f64| {
@@ -193,7 +196,7 @@ mod tests {
         let known = begun(None, 50, 1);
         let filled = begun(Some(&known), 80, 2);
         assert_eq!(filled.means.size(), [1, 80, 3]);
-        // Nobody is sure of black photos.
+        // No photo is sure of a depth, as all pixels are black, so all known Gaussians stay.
         assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
         assert_eq!(begun(Some(&known), 50, 2).means.size(), [1, 50, 3]);
         assert!(gaussians_from_photos(&views, &[], None, 50, 1, Device::Cpu, |_| false).is_none());

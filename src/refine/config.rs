@@ -1,56 +1,57 @@
-//! How a splat is refined. The defaults are what measurements chose: see docs/refine.md.
+//! Configuration of the refinement. The defaults were chosen by measurements: see docs/refine.md.
 
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Numbers of the optimization. Learning rates are those of Adam; lengths are in units of the scene's depth, see
+/// Hyperparameters of the optimization. Learning rates are those of Adam. Lengths are in units of the scene's depth, see
 /// [`super::scene_depth`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefineConfig {
-    /// Views in a step.
+    /// Number of views in a step.
     pub views: usize,
-    /// Parts of the way at which pictures become twice as wide and high; before the first of them they are smallest.
+    /// Fractions of the optimization at which images become twice as wide and high. Before the first of them, images have the smallest
+    /// size.
     pub sizes: Vec<f64>,
-    /// Of the spherical harmonics in the end.
+    /// Final degree of the spherical harmonics.
     pub sh_degree: i64,
-    /// Part of the way at which one degree more is learned, and again after the same part.
+    /// Fraction of the optimization after which the degree of the spherical harmonics increases by one, repeatedly.
     pub sh_every: f64,
-    /// Of means, at the beginning, in scene depths.
+    /// Initial learning rate of the means, in scene depths.
     pub means: f64,
-    /// What is left of it in the end.
+    /// Final factor of the means' learning rate.
     pub means_end: f64,
-    /// Of the logarithms of scales.
+    /// Learning rate of the logarithms of scales.
     pub log_scales: f64,
-    /// Of quaternions.
+    /// Learning rate of the quaternions.
     pub quaternions: f64,
-    /// Of logits of opacities.
+    /// Learning rate of the logits of opacities.
     pub opacity_logits: f64,
-    /// Of colours.
+    /// Learning rate of the colours, the spherical harmonics of degree 0.
     pub colours: f64,
-    /// Of higher spherical harmonics, beside that of colours.
+    /// Learning rate of the higher spherical harmonics, relative to that of the colours.
     pub harmonics: f64,
-    /// What is left of all of these in the end.
+    /// Final factor of all other learning rates except that of the tokens, which is constant.
     pub others_end: f64,
-    /// Of tokens.
+    /// Learning rate of the tokens.
     pub tokens: f64,
-    /// Of cameras' twists, in radians, and shifts, in scene depths, where poses are corrected.
+    /// Learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected.
     pub poses: f64,
-    /// Of logarithms of exposures, where photos have their own.
+    /// Learning rate of the logarithms of exposures, if exposures are corrected.
     pub exposures: f64,
-    /// What 1 − SSIM counts, beside absolute differences with one minus it.
+    /// Weight of 1 − SSIM. The weight of absolute differences is one minus this.
     pub similar: f64,
-    /// What the mean opacity counts.
+    /// Weight of the mean opacity.
     pub opacity: f64,
-    /// What the mean scale counts, in scene depths.
+    /// Weight of the mean scale in scene depths.
     pub scale: f64,
-    /// What the unevenness of depths counts, see [`crate::loss::depth_smoothness`].
+    /// Weight of the unevenness of depths, see [`crate::loss::depth_smoothness`].
     pub smooth: f64,
-    /// Steps between relocations of dead Gaussians; 0: never.
+    /// Number of steps between relocations of dead Gaussians; 0 disables relocation.
     pub relocate_every: u64,
     /// Opacity at or below which a Gaussian is dead.
     pub dead: f64,
-    /// Part of the way after which none is relocated.
+    /// Fraction of the optimization after which Gaussians are no longer relocated.
     pub relocate_until: f64,
 }
 
@@ -83,14 +84,14 @@ impl Default for RefineConfig {
     }
 }
 
-/// Sizes of the photos, beside the whole.
+/// Maximum number of photo sizes besides the full size.
 const MAX_SIZES: usize = 8;
 
 impl RefineConfig {
-    /// The defaults, from a splat or from nothing, with `overrides`, each `key=value` with a TOML value.
+    /// Returns the defaults, for a start from a splat or without one, changed by `overrides`, each `key=value` with a TOML value.
     ///
     /// # Errors
-    /// A key that isn't known, a value of another type, or one that makes no sense.
+    /// Fails if a key is unknown, or if a value has the wrong type or is out of range.
     pub fn with(overrides: &[String], from_splat: bool) -> Result<Self> {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
         let mut table = toml::Table::try_from(&defaults).expect("plain numbers");
@@ -108,10 +109,10 @@ impl RefineConfig {
         Ok(table.try_into().expect("what was just tried"))
     }
 
-    /// Checks that every number is one that the method can work with.
+    /// Checks that every value is in the range that the method supports.
     ///
     /// # Errors
-    /// What is expected in place of the first that isn't.
+    /// Returns the expected range of the first value that is out of range.
     pub fn check(&self) -> std::result::Result<(), &'static str> {
         let rates = [
             self.means,
@@ -126,7 +127,7 @@ impl RefineConfig {
         ];
         let weights = [self.opacity, self.scale, self.smooth];
         let is_size = |&part: &f64| 0. < part && part < 1.;
-        // NaN is in no range.
+        // NaN is in no range, so it fails every rule.
         let rules = [
             (self.views >= 1, "1 or more"),
             (self.sizes.len() <= MAX_SIZES, "8 sizes or fewer"),
@@ -144,12 +145,12 @@ impl RefineConfig {
         rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
     }
 
-    /// For a splat that is good already.
+    /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     fn from_splat() -> Self {
         RefineConfig { sizes: vec![], opacity: 0., ..Default::default() }
     }
 
-    /// Sizes of the photos.
+    /// Returns the number of photo sizes.
     pub fn levels(&self) -> usize {
         self.sizes.len() + 1
     }

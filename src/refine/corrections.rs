@@ -1,5 +1,5 @@
-//! What photos hide: cameras a little off from where they are said to be, and exposures of their own. Both are learned beside the
-//! splat, a few numbers a photo.
+//! Corrections of the photos: camera poses that are slightly off, and individual exposures. Both are learned together with the splat, with
+//! a few parameters per photo.
 
 use super::config::RefineConfig;
 use crate::data::{View, ViewBatch};
@@ -8,14 +8,14 @@ use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use tch::{Device, Kind, Tensor};
 
-/// Of every photo: how far its camera is from where it was said to be, and by what its colours are larger than the splat's. Over all
-/// photos either has the mean 0, as a scene that is moved or brightened as a whole is the same scene.
+/// Learned pose and exposure corrections of every photo. The mean over all photos is 0 for both, as a scene that is moved or brightened as
+/// a whole is the same scene.
 #[derive(Debug)]
 pub struct Corrections {
-    /// Twist about the camera's centre as a vector along its axis, radians, and shift of the centre in scene depths, both along the
-    /// world's axes: [V, 6].
+    /// Pose corrections, [V, 6]: rotation about the camera's centre as a vector along its axis, in radians, and translation of the centre
+    /// in scene depths, both along the world's axes.
     poses: Option<Tensor>,
-    /// Logarithms of factors of red, green and blue: [V, 3].
+    /// Logarithms of the gains of red, green and blue, [V, 3].
     exposures: Option<Tensor>,
     optimizer: Optimizer,
     rates: Vec<f64>,
@@ -23,26 +23,27 @@ pub struct Corrections {
     depth: f64,
 }
 
-/// What was learned of a photo.
+/// Learned correction of one photo.
 #[derive(Debug, Clone, Serialize)]
 pub struct Correction {
-    /// As the capture names it.
+    /// Name of the photo in the capture.
     pub photo: String,
-    /// By how much its camera turned.
+    /// Rotation angle of the camera, in degrees.
     pub degrees: f64,
-    /// By how much it moved, in scene depths.
+    /// Distance that the camera moved, in scene depths.
     pub depths: f64,
-    /// By what its red, green and blue are larger than the splat's.
+    /// Ratio of the photo's red, green and blue to those of the splat.
     pub exposure: [f64; 3],
 }
 
 impl Corrections {
-    /// None, ever.
+    /// Creates corrections without parameters, which learn nothing.
     pub fn none() -> Self {
         Corrections::new(0, false, false, 1., &RefineConfig::default(), Device::Cpu)
     }
 
-    /// None yet, of so many photos. Lengths are measured by `depth`, that of the scene; `device` is that of the photos.
+    /// Creates zero corrections of `photos` photos. `poses` and `exposures` select what is learned. `depth` is the depth of the scene, the
+    /// unit of lengths; `device` is the device of the photos.
     pub fn new(
         photos: usize,
         poses: bool,
@@ -68,19 +69,20 @@ impl Corrections {
         Corrections { poses, exposures, optimizer, rates, rates_end: config.others_end, depth }
     }
 
-    /// World-to-camera of the photos `which`, of which `views` says where they are; [1, C, 4, 4], differentiable.
+    /// Returns the corrected world-to-camera matrices of the photos `which`, [1, C, 4, 4], from their uncorrected poses in `views`;
+    /// differentiable.
     pub(super) fn w2c(&self, views: &ViewBatch, which: &[i64]) -> Tensor {
         let Some(poses) = &self.poses else { return views.w2c.shallow_clone() };
         let numbers = of(poses, which).unsqueeze(0);
         let (twist, shift) = (numbers.narrow(2, 0, 3), numbers.narrow(2, 3, 3) * self.depth);
-        // x_camera = W Tᵀ (x − o − s), with the camera's own W and o, the turn T and the shift s.
+        // x_camera = W Tᵀ (x − o − s), with the camera's rotation W and centre o, the correction's rotation T and translation s.
         let rotation = views.w2c.narrow(2, 0, 3).narrow(3, 0, 3).matmul(&turn(&twist).transpose(2, 3));
         let centre = views.c2w.narrow(2, 0, 3).narrow(3, 3, 1) + shift.unsqueeze(-1);
         let rows = Tensor::cat(&[&rotation, &-rotation.matmul(&centre)], 3);
         Tensor::cat(&[&rows, &views.w2c.narrow(2, 3, 1)], 2)
     }
 
-    /// Pictures of the splat, [1, C, 3, H, W], as the photos `which` were exposed.
+    /// Applies the exposures of the photos `which` to rendered images of the splat, [1, C, 3, H, W].
     pub(super) fn exposed(&self, rgb: Tensor, which: &[i64]) -> Tensor {
         match &self.exposures {
             Some(exposures) => rgb * of(exposures, which).exp().view([1, -1, 3, 1, 1]),
@@ -88,12 +90,12 @@ impl Corrections {
         }
     }
 
-    /// Forgets the gradients.
+    /// Clears the gradients.
     pub(super) fn zero_grad(&mut self) {
         self.optimizer.zero_grad();
     }
 
-    /// Follows the gradients.
+    /// Updates the corrections by their gradients. `progress` goes from 0 to 1.
     pub(super) fn step(&mut self, progress: f64) {
         let left = self.rates_end.powf(progress);
         let rates: Vec<f64> = self.rates.iter().map(|rate| rate * left).collect();
@@ -101,8 +103,7 @@ impl Corrections {
         self.optimizer.step();
     }
 
-    /// Returns photo number `index`, or a part of it, as the splat would have been photographed: from where it was taken, with the
-    /// splat's own exposure.
+    /// Returns photo `index`, or a crop of it, with the corrected camera and with the exposure of the splat.
     pub fn apply(&self, index: usize, view: &View) -> View {
         let numbers = self.numbers(index);
         let mut camera = view.camera;
@@ -113,7 +114,7 @@ impl Corrections {
         View { name: view.name.clone(), image: &view.image / gain, camera }
     }
 
-    /// What was learned of each of `photos`.
+    /// Returns the learned correction of each of `photos`.
     pub fn told(&self, photos: &[View]) -> Vec<Correction> {
         let told = |(index, view): (usize, &View)| {
             let numbers = self.numbers(index);
@@ -127,7 +128,7 @@ impl Corrections {
         photos.iter().enumerate().map(told).collect()
     }
 
-    /// Twist, shift and exposure of a photo; 0 where they aren't learned.
+    /// Returns rotation, translation and log exposure of a photo, 9 values; values that aren't learned are 0.
     fn numbers(&self, index: usize) -> Vec<f64> {
         let row = |t: &Option<Tensor>, width: usize| match t {
             Some(t) => Vec::<f64>::try_from(of(t, &[index as i64]).to_kind(Kind::Double).view([-1]))
@@ -138,14 +139,14 @@ impl Corrections {
     }
 }
 
-/// The rows `which` of a leaf, less the mean of all.
+/// Returns the rows `which` of a parameter, minus the mean of all rows.
 fn of(leaf: &Tensor, which: &[i64]) -> Tensor {
     let rows = leaf - leaf.mean_dim([0].as_slice(), true, None);
-    // Positions as a tensor would have to be sent to the device.
+    // An index tensor would have to be copied to the device.
     Tensor::stack(&which.iter().map(|&row| rows.select(0, row)).collect::<Vec<_>>(), 0)
 }
 
-/// Rotations [.., 3, 3] by 2 atan(|v|/2) about vectors v [.., 3] (Cayley): I + (K + K²/2) / (1 + |v|²/4), with K x = v × x.
+/// Returns rotations [.., 3, 3] by 2 atan(|v|/2) about vectors v [.., 3] (Cayley): I + (K + K²/2) / (1 + |v|²/4), with K x = v × x.
 fn turn(vectors: &Tensor) -> Tensor {
     let [x, y, z] = [0, 1, 2].map(|axis| vectors.select(-1, axis));
     let none = x.zeros_like();
@@ -156,7 +157,7 @@ fn turn(vectors: &Tensor) -> Tensor {
     Tensor::eye(3, (vectors.kind(), vectors.device())) + (&cross + cross.matmul(&cross) / 2.) * share
 }
 
-/// [`turn`] by the first three of a photo's numbers.
+/// Returns the rotation of [`turn`] by the first three of a photo's values, as a quaternion.
 fn quaternion(numbers: &[f64]) -> DQuat {
     DQuat::from_vec4((DVec3::from_slice(numbers) / 2.).extend(1.)).normalize()
 }
@@ -181,7 +182,7 @@ mod tests {
         }
     }
 
-    /// What is optimized with and what is told in the end are the same cameras and colours.
+    /// The optimization and the reported corrections use the same cameras and colours.
     #[test]
     fn what_is_applied_is_what_was_learned() {
         let views = [view(0), view(1), view(2)];
@@ -204,7 +205,7 @@ mod tests {
             let rows = Tensor::from_slice(&pose_to_rows(&view.camera.c2w.inverse())).view([4, 4]);
             let apart = (w2c.select(0, 0).select(0, index as i64) - rows).abs().max().double_value(&[]);
             assert!(apart < 1e-6, "camera {index} is {apart} off");
-            // Photo over exposure against picture, and picture times exposure against photo.
+            // The photo divided by its exposure, times the rendered image multiplied by the exposure.
             let product = &view.image * images.select(0, 0).select(0, index as i64);
             assert!((product - 0.25).abs().max().double_value(&[]) < 1e-6);
         }

@@ -1,27 +1,27 @@
-//! The numbers that are optimized.
+//! Parameters of the Gaussians that are optimized.
 
 use crate::scene::{Gaussians, RawGaussians};
 use tch::{Kind, Tensor};
 
-/// Gaussians of one scene before activation, colours apart from the higher spherical harmonics, which learn more slowly.
+/// Gaussians of one scene before activation. Colours are separate from the higher spherical harmonics, which have a smaller learning rate.
 #[derive(Debug)]
 pub struct Leaves {
-    /// [1, N, 3].
+    /// Means, [1, N, 3].
     pub means: Tensor,
-    /// [1, N, 3].
+    /// Logarithms of scales, [1, N, 3].
     pub log_scales: Tensor,
-    /// [1, N, 4].
+    /// Quaternions, [1, N, 4].
     pub quaternions: Tensor,
-    /// [1, N].
+    /// Logits of opacities, [1, N].
     pub opacity_logits: Tensor,
-    /// [1, N, 1, 3].
+    /// Spherical harmonics of degree 0, [1, N, 1, 3].
     pub colours: Tensor,
-    /// [1, N, (degree + 1)² − 1, 3].
+    /// Spherical harmonics of higher degrees, [1, N, (degree + 1)² − 1, 3].
     pub harmonics: Tensor,
 }
 
 impl Leaves {
-    /// Copies of `raw`, with spherical harmonics up to `degree`, which is no less than its own.
+    /// Copies `raw` to new parameters, with spherical harmonics up to `degree`, which is at least that of `raw`.
     pub fn of(raw: &RawGaussians, degree: i64) -> Self {
         let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
         let size = raw.sh.size();
@@ -39,7 +39,7 @@ impl Leaves {
         }
     }
 
-    /// By their names, in this order.
+    /// Returns the parameters with their names, in this order.
     pub fn named(&self) -> [(&'static str, &Tensor); 6] {
         [
             ("means", &self.means),
@@ -51,7 +51,7 @@ impl Leaves {
         ]
     }
 
-    /// The Gaussians, with spherical harmonics up to `degree`; differentiable.
+    /// Returns the activated Gaussians, with spherical harmonics up to `degree`; differentiable.
     pub fn activate(&self, degree: i64) -> Gaussians {
         self.raw(degree).activate()
     }

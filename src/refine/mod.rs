@@ -1,5 +1,6 @@
-//! A splat made better on the photos that it has to match, in seconds: as many Gaussians as there are, each optimized by itself, or
-//! all of them through the tokens that a model decodes them from. Without a splat it begins with what the photos agree on.
+//! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians. It optimizes each
+//! Gaussian by itself, or all of them through the tokens that a model decodes them from. Without a splat, refinement starts from the depths
+//! on which the photos agree.
 
 mod begin;
 mod config;
@@ -33,53 +34,53 @@ use rand_chacha::ChaCha8Rng;
 use std::time::{Duration, Instant};
 use tch::{Kind, Tensor};
 
-/// How long it goes on.
+/// Budget of an optimization.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Budget {
-    /// The same steps give the same bits.
+    /// Number of steps. The same number of steps gives bit-identical results.
     Steps(u64),
-    /// So long, whatever it is spent on.
+    /// Wall-clock time, including all other work.
     Time(Duration),
 }
 
-/// Where the work stands.
+/// State of the optimization after a step.
 pub struct RefineStep<'a> {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// From 0 to 1.
+    /// Progress from 0 to 1.
     pub progress: f64,
-    /// Time that the steps took, without what was done in between.
+    /// Time that the steps took, without the work between them.
     pub elapsed: Duration,
     space: &'a dyn Space,
 }
 
 impl RefineStep<'_> {
-    /// The Gaussians as they are now.
+    /// Returns a copy of the current Gaussians.
     pub fn gaussians(&self) -> Gaussians {
         tch::no_grad(|| self.space.gaussians(1.)).map(Tensor::copy)
     }
 }
 
-/// What is to be done.
+/// Inputs of an optimization.
 #[derive(Debug)]
 pub struct Task<'a> {
-    /// What has to be matched.
+    /// Photos that have to be matched.
     pub photos: &'a Photos,
-    /// The scene's, by which lengths are measured: see [`scene_depth`].
+    /// Depth of the scene, the unit of lengths: see [`scene_depth`].
     pub depth: f64,
-    /// How.
+    /// Hyperparameters.
     pub config: &'a RefineConfig,
-    /// How long.
+    /// Number of steps, or time.
     pub budget: Budget,
-    /// Of the random numbers.
+    /// Seed of the random numbers.
     pub seed: u64,
 }
 
-/// Optimizes `space`, and `corrections` of the photos. `watch` sees every step, and ends the work by false. Returns the Gaussians
-/// that it ended with.
+/// Optimizes `space` and the `corrections` of the photos. `watch` is called after every step and ends the work if it returns `false`.
+/// Returns the final Gaussians.
 ///
 /// # Errors
-/// What the rasterizer refuses.
+/// Fails if rendering fails.
 pub fn refine(
     space: &mut dyn Space,
     corrections: &mut Corrections,
@@ -89,7 +90,7 @@ pub fn refine(
     refine_timed(space, corrections, task, &mut Stopwatch::default(), watch)
 }
 
-/// As [`refine`]; `stopwatch` hears of every part of a step.
+/// Runs [`refine`] and records the time of each part of a step in `stopwatch`.
 pub(crate) fn refine_timed(
     space: &mut dyn Space,
     corrections: &mut Corrections,
@@ -107,7 +108,7 @@ pub(crate) fn refine_timed(
             Budget::Steps(steps) => (step as f64 / steps as f64, step >= steps),
             Budget::Time(time) => {
                 let gone = begun.elapsed();
-                // No step is begun that wouldn't end in time.
+                // A step that would not end in time is not started.
                 (gone.as_secs_f64() / time.as_secs_f64(), step > 0 && gone + last > time)
             }
         };
@@ -139,7 +140,7 @@ pub(crate) fn refine_timed(
     Ok(tch::no_grad(|| space.gaussians(1.)))
 }
 
-/// How far the pictures are from the photos, and the Gaussians from what they should be like.
+/// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians.
 fn loss(
     gaussians: &Gaussians,
     pictures: &Pictures,
@@ -160,13 +161,13 @@ fn loss(
     loss
 }
 
-/// Views that are rendered for the median depth, at most: time is better spent on steps.
+/// Maximum number of views that are rendered for the median depth, as the time is better spent on steps.
 const DEPTH_VIEWS: usize = 32;
 
-/// Returns the median depth of what the views, or some spread over all, show of a splat: what lengths are measured by.
+/// Returns the median depth of a splat in the views, or in some that are spread over all. It is the unit of lengths.
 ///
 /// # Errors
-/// Views that see nothing of it.
+/// Fails if the views see nothing of the splat.
 pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
     let every = views.len().div_ceil(DEPTH_VIEWS).max(1);
     let cameras: Vec<Camera> = views.iter().step_by(every).map(|view| view.camera).collect();
@@ -191,8 +192,8 @@ mod tests {
     use globalsplat_csrc::ops::{WAITING, computing, ops_of, outermost_ops_of};
     use tch::Device;
 
-    /// Photos, Gaussians and what is learned of the photos lie on the device. A step waits for it where memory is taken for pairs of
-    /// splats and tiles, and nowhere else.
+    /// A step copies nothing between devices beyond what is counted here: photos, Gaussians and corrections are on the device. It waits for
+    /// the device only where memory for (splat, tile) pairs is allocated.
     #[test]
     fn a_step_moves_nothing_but_what_is_told() {
         let (gaussians, cameras) = made_up_scene(40, 4, ImageSize { width: 32, height: 24 });
@@ -219,11 +220,11 @@ mod tests {
         let [two, five] = [2, 5].map(|number| ops_of(|| steps(number)).1);
         let of_a_step = |name: &str| (count(&five, name) - count(&two, name)) as f64 / 3.;
         let (_, of_a_render) = ops_of(|| render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap());
-        // Both losses bring pictures to photos, and their value back; be it where they are.
+        // Both losses move the images to the photos' device and move their value back, which counts even on one device.
         let sent = count(&of_a_render, "aten::to.device") + 2 * 3;
         assert_eq!(of_a_step("aten::to.device"), sent as f64);
         for op in WAITING {
-            // On the CPU, whether a loss is what was asked for, not a multiple.
+            // On the CPU, the backward pass of each loss reads its incoming gradient, to skip a multiplication by 1.
             let asked = if op == "aten::_local_scalar_dense" { 2. } else { 0. };
             assert_eq!(of_a_step(op), asked, "{op}");
         }

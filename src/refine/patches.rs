@@ -1,4 +1,4 @@
-//! Scores on few pixels, for a look on the way that costs next to nothing.
+//! Scores on a few pixels, cheap enough to compute during the optimization.
 
 use super::corrections::Corrections;
 use crate::data::View;
@@ -9,32 +9,33 @@ use crate::scene::{Camera, Gaussians};
 use serde::Serialize;
 use tch::{Device, Kind, Tensor};
 
-/// Views of which a patch is scored, at most.
+/// Maximum number of views with a scored patch.
 const MAX_VIEWS: usize = 8;
-/// Side of a patch, pixels.
+/// Side of a patch in pixels.
 const SIDE: u32 = 96;
-/// Where patches lie, as multiples of the part of a picture that is free: all over it, from view to view (Roberts 2018, "R2").
+/// Steps of the patch positions along x and y from view to view, as fractions of the free range, so that patches spread over the whole
+/// image (Roberts 2018, "R2").
 const STEPS: [f64; 2] = [0.754_877_666, 0.569_840_291];
 
-/// Patches of some views, each with the camera that shows it alone: its pixels are those of the whole picture.
+/// Patches of some views, each with a camera that renders only the patch; the pixels are those of the whole image.
 #[derive(Debug)]
 pub struct Patches {
-    /// Which of all views they are of.
+    /// Indices of the views that the patches are cut from.
     indices: Vec<usize>,
     views: Vec<View>,
 }
 
-/// Means over patches.
+/// Mean scores over patches.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PatchScores {
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
-    /// As scikit-image's.
+    /// SSIM, as scikit-image computes it.
     pub ssim: f64,
 }
 
 impl Patches {
-    /// Cuts a patch out of each of `views`, or of some spread over all.
+    /// Cuts a patch out of each of `views`, or, if there are more than `MAX_VIEWS`, of some that are spread over all.
     pub fn of(views: &[View]) -> Self {
         let every = views.len().div_ceil(MAX_VIEWS).max(1);
         let indices: Vec<usize> = (0..views.len()).step_by(every).collect();
@@ -43,16 +44,16 @@ impl Patches {
         Patches { views: patches.collect(), indices }
     }
 
-    /// Returns the patches as the splat would have been photographed, by what was learned of the photos that they are of.
+    /// Returns the patches with the learned corrections of their photos applied.
     pub(super) fn corrected(&self, corrections: &Corrections) -> Self {
         let views = self.indices.iter().zip(&self.views).map(|(&index, view)| corrections.apply(index, view));
         Patches { indices: self.indices.clone(), views: views.collect() }
     }
 
-    /// Scores a splat; none where there are no views.
+    /// Scores a splat; returns `None` if there are no views.
     ///
     /// # Errors
-    /// What the rasterizer refuses.
+    /// Fails if rendering fails.
     pub fn score(&self, gaussians: &Gaussians) -> Result<Option<PatchScores>> {
         let cameras: Vec<Camera> = self.views.iter().map(|view| view.camera).collect();
         let pictures = render_views(gaussians, &cameras)?;
@@ -68,7 +69,7 @@ impl Patches {
     }
 }
 
-/// The patch that lies at `place`, from 0 to 1 along x and y.
+/// Cuts out the patch at the relative position `place`, from 0 to 1 along x and y.
 fn patch(view: &View, place: [f64; 2]) -> View {
     let Camera { width, height, intrinsics, .. } = view.camera;
     let [wide, high] = [width, height].map(|side| side.min(SIDE));
@@ -86,7 +87,7 @@ mod tests {
     use crate::scene::Intrinsics;
     use glam::DMat4;
 
-    /// A picture that is scored against itself, patch by patch, has no error: patches show the pixels that the whole shows.
+    /// An image that is scored against itself, patch by patch, has no error: patches have the same pixels as the whole image.
     #[test]
     fn patches_are_parts_of_the_picture() {
         let options = (Kind::Float, Device::Cpu);

@@ -1,4 +1,4 @@
-//! The photos that a splat is refined on, small and large.
+//! Photos that a splat is refined on, at several sizes.
 
 use super::view_selection::are_near_duplicates;
 use crate::data::{Capture, View, ViewBatch, view_batch};
@@ -10,24 +10,26 @@ use rand::seq::index::sample;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
-/// A photo is resized so that its longer side is at most this, pixels: thousands of Gaussians can't show more, and pixels take time.
+/// Maximum length of a photo's longer side in pixels; larger photos are resized. Thousands of Gaussians can't show more detail, and more
+/// pixels take more time.
 const LONGEST_SIDE: f64 = 512.;
-/// A picture is made smaller only where its sides keep so many pixels.
+/// Minimum length of a photo's shorter side in pixels after downscaling.
 const LEAST_SIDE: u32 = 32;
-/// The smallest side of a photo, pixels: SSIM looks at so many at once (spec 9.4).
+/// Minimum side of a photo in pixels: the side of the SSIM window (spec 9.4).
 pub const MIN_SIDE: u32 = 11;
-/// Photos that are read between two looks at the watch.
+/// Number of photos that are read between two calls of `go_on`.
 const READ_AT_ONCE: usize = 8;
-/// Pixels along the longer side of the pictures by which photos are found to be nearly equal, and how far apart these are at most, as
-/// a mean squared difference: 40 dB.
+/// Longer side in pixels of the downscaled images by which near duplicates are found.
 const COMPARED_SIDE: f64 = 64.;
+/// Maximum mean squared difference of near duplicates: 40 dB.
 const NEARLY_EQUAL: f64 = 1e-4;
 
-/// Reads the photos of `indices`, cut and resized to `size`, or each as it is where that is small enough. `go_on` hears how many are
-/// read, and ends the work by false.
+/// Reads the photos of `indices`, cropped and resized to `size`. If `size` is `None`, photos keep their shape, and large ones are
+/// downscaled. `go_on` is called with the number of photos read so far, and ends the work if it returns `false`.
 ///
 /// # Errors
-/// Those of [`Capture::load`], a photo with fewer than [`MIN_SIDE`] pixels along a side, and an end before all are read.
+/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `go_on` ends the work before all photos
+/// are read.
 pub fn load_photos(
     capture: &Capture,
     indices: &[usize],
@@ -50,7 +52,7 @@ pub fn load_photos(
         if !go_on(views.len()) {
             return Err(Error::Failed("stopped before all photos were read: nothing is written".into()));
         }
-        // Those of one size share what their lens is undone by.
+        // Photos of one size are loaded together, as they share the lens undistortion.
         for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {
             views.extend(capture.load(group, size_of(group[0]))?);
         }
@@ -65,8 +67,8 @@ fn smaller(camera: &Camera) -> Option<ImageSize> {
     (scale < 1.).then(|| ImageSize { height: side(camera.height), width: side(camera.width) })
 }
 
-/// Returns the indices of the photos that aren't nearly equal to one before them. Nearly equal photos of a scene at `depth` show nearly
-/// the same pixels from nearly the same place: copies, or frames of a video that rests.
+/// Returns the indices of the photos that aren't near duplicates of a photo before them. Near duplicates of a scene at `depth` show nearly
+/// the same pixels from nearly the same position: copies, or frames of a video in which the camera rests.
 pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
     let small: Vec<Tensor> = photos
         .iter()
@@ -91,29 +93,29 @@ pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
     kept
 }
 
-/// Photos at several sizes, from the smallest to the whole; those of one size together.
+/// Photos at several sizes, from the smallest to the full size. Photos of one size are grouped.
 #[derive(Debug)]
 pub struct Photos {
     levels: Vec<Vec<Group>>,
 }
 
-/// Photos of one size.
+/// Group of photos of one size.
 #[derive(Debug)]
 struct Group {
-    /// Which of all photos they are.
+    /// Indices among all photos.
     indices: Vec<usize>,
     views: ViewBatch,
 }
 
 impl Photos {
-    /// `views` at their own size alone.
+    /// Creates photos from `views` at their own size only.
     pub(crate) fn of(views: ViewBatch) -> Self {
         let indices = (0..views.images.size()[1] as usize).collect();
         Photos { levels: vec![vec![Group { indices, views }]] }
     }
 
-    /// `views`, one at least, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world) stand for the
-    /// views' own.
+    /// Creates photos from `views`, at least one, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world)
+    /// replace the views' own.
     pub fn new(views: &[View], poses: &[DMat4], levels: usize, device: Device) -> Self {
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
         for (index, View { camera, .. }) in views.iter().enumerate() {
@@ -137,7 +139,7 @@ impl Photos {
         Photos { levels: sizes }
     }
 
-    /// So many photos of one size, each once, at level `level` from the smallest; and which they are.
+    /// Draws up to `views` different photos of one size, at level `level` from the smallest. Returns their indices and the photos.
     pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> (Vec<i64>, ViewBatch) {
         let groups = &self.levels[level.min(self.levels.len() - 1)];
         let count = |group: &Group| group.indices.len();
@@ -150,7 +152,7 @@ impl Photos {
     }
 }
 
-/// As wide and high as half of them, or as they are where that is too small.
+/// Halves the width and height of the photos, or returns them unchanged if they would become too small.
 fn halved(batch: &ViewBatch) -> ViewBatch {
     let size = batch.images.size();
     let (images, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(LEAST_SIDE) {

@@ -1,5 +1,4 @@
-//! Gaussians that nobody sees are put where more are needed (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
-//! Carlo").
+//! Relocation of dead Gaussians to where more are needed (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
 use super::leaves::Leaves;
 use rand::Rng;
@@ -7,13 +6,14 @@ use rand::distr::weighted::WeightedIndex;
 use rand::prelude::Distribution;
 use tch::{Kind, Tensor};
 
-/// Copies of one Gaussian that are counted at most.
+/// Maximum number of copies of one Gaussian that the correction takes into account.
 const MOST_COPIES: usize = 50;
-/// What opacities are kept above.
+/// Minimum opacity after relocation.
 const LEAST_OPACITY: f64 = 0.005;
 
-/// Moves every Gaussian whose opacity is at most `dead` onto one that is drawn by its opacity, and changes the opacities and
-/// scales of all that are then in one place such that together they look as the one did. Returns which were changed.
+/// Moves every Gaussian whose opacity is at most `dead` onto another one, drawn with probability proportional to its opacity. Changes the
+/// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Returns the indices of the
+/// changed Gaussians.
 pub fn relocate(leaves: &Leaves, dead: f64, random: &mut impl Rng) -> Vec<i64> {
     let opacities = Vec::<f64>::try_from(leaves.opacity_logits.sigmoid().view([-1]).to_kind(Kind::Double))
         .expect("numbers");
@@ -53,7 +53,8 @@ pub fn relocate(leaves: &Leaves, dead: f64, random: &mut impl Rng) -> Vec<i64> {
     changed.into_iter().map(|i| i as i64).collect()
 }
 
-/// What a line through the middle of n Gaussians of one opacity sees of them, in units of its own widths (eq. 9 there).
+/// Returns the integral of the opacity along a line through the centre of n coincident Gaussians of one opacity, in units of the standard
+/// deviation times √(2π) (eq. 9 of the paper).
 fn integral(opacity: f64, n: usize) -> f64 {
     let mut sum = 0.;
     for i in 1..=n {
@@ -74,7 +75,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    /// Several Gaussians in one place, as faint and small as they are made, hide as much along a line as the one did.
+    /// Several coincident Gaussians, with their reduced opacity and scale, occlude as much along a line as the original one.
     #[test]
     fn copies_look_like_the_one() {
         let hidden = |opacity: f64, extent: f64, copies: i32| {

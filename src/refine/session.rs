@@ -1,5 +1,5 @@
-//! A refinement from a capture to Gaussians: photos are read, Gaussians are begun with, optimized, and scored on few pixels on the
-//! way, all of it within one budget and in a frame of the capture's own (spec 2.5).
+//! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
+//! few pixels during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
 use super::begin::gaussians_from_photos;
 use super::config::RefineConfig;
@@ -18,123 +18,124 @@ use serde::Serialize;
 use std::time::{Duration, Instant};
 use tch::{Device, Tensor};
 
-/// Share of the time or the steps that goes to tokens where Gaussians follow.
+/// Fraction of the time or steps for the tokens if Gaussians are optimized afterwards.
 const TOKENS_SHARE: f64 = 0.2;
-/// Goes to the optimization, however long the start took.
+/// Minimum time for the optimization, however long the start took.
 const MIN_TIME: Duration = Duration::from_secs(1);
-/// Share of the time in which depths are looked for, at most, in more photos than a few.
+/// Maximum fraction of the time for computing depths, beyond the first `FEW_PHOTOS` photos.
 const MAX_START_SHARE: f64 = 0.5;
+/// Number of photos whose depths are computed regardless of the time budget.
 const FEW_PHOTOS: usize = 2;
-/// Share of the time that scoring on the way takes, at most.
+/// Maximum fraction of the time for scores during the optimization.
 const MAX_SCORING_SHARE: f64 = 0.03;
-/// Parts of a phase at which views held out are scored.
+/// Fractions of a phase at which the held-out views are scored.
 const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
-/// What is optimized.
+/// Parameter space of the optimization.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SpaceKind {
-    /// Gaussians, each by itself.
+    /// Individual Gaussians.
     Gaussians,
-    /// The tokens from which a model decodes them.
+    /// Tokens from which a model decodes the Gaussians.
     Tokens,
     /// Tokens first, then Gaussians.
     Both,
 }
 
-/// What a session does, and how long.
+/// Options of a session.
 #[derive(Debug, Clone)]
 pub struct RefineOptions {
-    /// Numbers of the method.
+    /// Hyperparameters.
     pub config: RefineConfig,
-    /// What is optimized.
+    /// Parameter space of the optimization.
     pub space: SpaceKind,
-    /// How long: a time counts from the clock that the session is given, reading and the start included.
+    /// Number of steps, or time. A time counts from the clock that the session is given, and includes reading photos and the start.
     pub budget: Budget,
-    /// How many Gaussians, where the splat that is begun with doesn't say.
+    /// Number of Gaussians if the initial splat doesn't determine it.
     pub gaussians: usize,
-    /// Of the random numbers.
+    /// Seed of the random numbers.
     pub seed: u64,
-    /// Also learn how far each camera is from where it was said to be.
+    /// Learns corrections of the camera poses if `true`.
     pub correct_poses: bool,
-    /// Also learn by what each photo is brighter than the others.
+    /// Learns the exposure of each photo relative to the others if `true`.
     pub correct_exposures: bool,
-    /// What photos are cut and resized to; where none is given, they keep their shape, and are made smaller where they are large.
+    /// Size to which photos are cropped and resized. If it is `None`, they keep their shape, and large ones are downscaled.
     pub size: Option<ImageSize>,
-    /// Where depths are found, and what is optimized lies.
+    /// Device of the depth estimation and the optimization.
     pub device: Device,
 }
 
-/// What is begun with.
+/// Source of the initial Gaussians.
 #[derive(Debug, Clone, Copy)]
 pub enum Initial<'a> {
-    /// Pixels, at depths on which the photos agree.
+    /// Pixels of the photos, at depths on which the photos agree.
     Photos,
-    /// A splat, in the capture's world, with means relative to an origin.
+    /// Splat in the capture's world, with means relative to an origin.
     Splat(&'a Gaussians, DVec3),
-    /// What a model makes of the photos.
+    /// Reconstruction of the photos by a model.
     Model {
-        /// The model.
+        /// Model that reconstructs the photos.
         loaded: &'a LoadedModel,
-        /// How many photos it sees at most; where none is given, as many as its configuration says.
+        /// Maximum number of photos that the model sees; if it is `None`, the number in its configuration.
         views: Option<usize>,
     },
 }
 
-/// What a session is doing.
+/// Progress event of a session.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum RefineEvent {
-    /// So many photos are read.
+    /// Photos are being read; the value is the number read so far.
     Loading(usize),
-    /// In so many photos depths are found.
+    /// Depths are being computed; the value is the number of photos that are done.
     Starting(usize),
-    /// Steps are done.
+    /// A step of the optimization is done.
     Optimizing {
-        /// How many, in all phases.
+        /// Number of steps done in all phases.
         steps: u64,
-        /// Of patches of the views held out, in dB, when they were last scored.
+        /// Most recent PSNR on patches of the held-out views, in dB.
         psnr: Option<f64>,
     },
 }
 
-/// Scores of the views held out, at one time of the work.
+/// Scores of the held-out views at one time during the optimization.
 #[derive(Debug, Clone, Serialize)]
 pub struct EvalPoint {
-    /// By the session's clock.
+    /// Time on the session's clock, in seconds.
     pub seconds: f64,
-    /// Steps done.
+    /// Number of steps done.
     pub steps: u64,
-    /// The scores.
+    /// Scores of the patches.
     #[serde(flatten)]
     pub scores: PatchScores,
 }
 
-/// What a session ends with.
+/// Result of a session.
 #[derive(Debug)]
 pub struct RefineResult {
-    /// The Gaussians, in the session's frame and on its device.
+    /// Gaussians in the session's frame, on its device.
     pub gaussians: Gaussians,
-    /// Whether these are the ones begun with, which showed the photos better.
+    /// `true` if these are the initial Gaussians, which matched the photos better than the optimized ones.
     pub is_initial: bool,
-    /// What was learned of each photo, where it was asked for.
+    /// Learned correction of each photo, if corrections were requested.
     pub corrections: Vec<Correction>,
-    /// Steps done.
+    /// Number of steps done.
     pub steps: u64,
-    /// When the optimization began and when it ended, by the session's clock.
+    /// Start and end of the optimization on the session's clock, in seconds.
     pub seconds: [f64; 2],
-    /// Of patches of the photos, before and after.
+    /// Scores on patches of the photos before and after the optimization.
     pub shown: [PatchScores; 2],
-    /// Of patches of the views held out, on the way.
+    /// Scores on patches of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
 }
 
-/// What was begun with.
+/// Initial state of the optimization.
 enum Start<'a> {
     Gaussians(RawGaussians),
     Model(&'a LoadedModel, Box<Reconstruction>),
 }
 
-/// Photos and what is made of them, in the local frame of the capture's cameras. First [`RefineSession::load`], then
-/// [`RefineSession::start`], then [`RefineSession::run`].
+/// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
+/// [`RefineSession::load`], then [`RefineSession::start`], then [`RefineSession::run`].
 pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
@@ -156,11 +157,11 @@ pub struct RefineSession<'a> {
 }
 
 impl<'a> RefineSession<'a> {
-    /// Reads the photos `shown` and `held_out`. `clock` is when the time of the budget began. `watch` sees what goes on, and ends the
-    /// work by false.
+    /// Reads the photos `shown` and `held_out`. `clock` is the start of the time budget. `watch` receives progress events and ends the work
+    /// if it returns `false`.
     ///
     /// # Errors
-    /// Those of [`load_photos`], and an end before all photos are read.
+    /// Fails like [`load_photos`], and if `watch` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
         shown: &[usize],
@@ -197,34 +198,33 @@ impl<'a> RefineSession<'a> {
         })
     }
 
-    /// Returns Gaussians of the session's frame in the capture's unit and along its axes, with means relative to the place that is
-    /// returned beside them.
+    /// Transforms Gaussians from the session's frame to the capture's unit and axes. Returns them with means relative to an origin, and
+    /// this origin in the capture's world.
     pub fn to_world(&self, gaussians: &Gaussians) -> (Gaussians, DVec3) {
         (self.frame.gaussians_from_local(gaussians), self.frame.origin)
     }
 
-    /// The photos that the splat has to match, in the session's frame: those that were read, without near duplicates once there is a start.
+    /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
     pub fn photos(&self) -> &[View] {
         &self.photos
     }
 
-    /// The views held out, in the session's frame.
+    /// Returns the held-out views, in the session's frame.
     pub fn held_out(&self) -> &[View] {
         &self.held_out
     }
 
-    /// What is to be told, a sentence each: what was left out, and what the photos don't tell.
+    /// Returns warnings to print, one sentence each: photos that were left out, and missing depth information.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// How many photos were left out, as they are nearly equal to others.
+    /// Returns the number of photos that were left out as near duplicates.
     pub fn near_duplicates(&self) -> usize {
         self.near_duplicates
     }
 
-    /// Returns a sentence where reading the photos and the start took so long that little of the time, or nothing, is left for the
-    /// optimization.
+    /// Returns a warning if reading the photos and the start left little or no time for the optimization.
     pub fn is_late(&self) -> Option<String> {
         let Budget::Time(time) = self.options.budget else { return None };
         let gone = self.clock.elapsed();
@@ -234,16 +234,15 @@ impl<'a> RefineSession<'a> {
         })
     }
 
-    /// Keeps so much of the time for what comes after the optimization.
+    /// Reserves part of the time budget for the work after the optimization.
     pub fn reserve(&mut self, time: Duration) {
         self.reserve = time;
     }
 
-    /// Makes what is begun with, and returns it, in the session's frame and on its device. Photos that are nearly equal to others are left
-    /// out from then on.
+    /// Creates the initial Gaussians, and returns them in the session's frame on its device. Near duplicates are removed from the photos.
     ///
     /// # Errors
-    /// What the model or the rasterizer refuses, a splat that no camera sees, and an end before there is anything.
+    /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `watch` ends the work before there are Gaussians.
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
         let start = match initial {
             Initial::Splat(gaussians, origin) => {
@@ -281,13 +280,13 @@ impl<'a> RefineSession<'a> {
         Ok(gaussians)
     }
 
-    /// Optimizes what [`RefineSession::start`] made, and scores patches of the photos before and after.
+    /// Optimizes the result of [`RefineSession::start`], and scores patches of the photos before and after.
     ///
     /// # Errors
-    /// What the rasterizer refuses.
+    /// Fails if rendering fails.
     ///
     /// # Panics
-    /// There is no start.
+    /// Panics if [`RefineSession::start`] was not called before.
     pub fn run(&mut self) -> Result<RefineResult> {
         let (start, initial, depth) = self.start.take().expect("a start");
         let patches = Patches::of(&self.photos);
@@ -347,8 +346,8 @@ impl<'a> RefineSession<'a> {
         ));
     }
 
-    /// As many Gaussians as were asked for, on the session's device; of `known` ones, those that can be where they are. None where the
-    /// work is ended before any photo has depths.
+    /// Creates the requested number of Gaussians on the session's device, and keeps those of the `known` Gaussians that don't contradict
+    /// the photos. Returns `None` if the work is ended before any photo has depths.
     fn gaussians_from_photos(&mut self, known: Option<&RawGaussians>) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
         let points: Vec<Point> = points_of(self.capture)?.into_iter().map(to_local).collect();
@@ -368,8 +367,8 @@ impl<'a> RefineSession<'a> {
         Ok(made)
     }
 
-    /// In one space, or in one after the other; photos are corrected with Gaussians alone. `initial` are those of `start`,
-    /// `depth` is theirs.
+    /// Optimizes in one parameter space, or in two of them in turn. Photos are corrected only while Gaussians are optimized. `initial` are
+    /// the Gaussians of `start`, and `depth` is their depth.
     fn optimize(
         &mut self,
         start: &Start,
@@ -407,7 +406,7 @@ impl<'a> RefineSession<'a> {
         Ok((self.run_phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
     }
 
-    /// What tokens become until `end` of the way. They know the normalized world alone.
+    /// Optimizes tokens until the fraction `end` of the optimization, in the normalized world that they are defined in.
     fn optimize_tokens(
         &mut self,
         loaded: &LoadedModel,
@@ -423,20 +422,20 @@ impl<'a> RefineSession<'a> {
         self.run_phase(&mut space, &mut Corrections::none(), &poses, depth, [0., end], Some(world))
     }
 
-    /// As many Gaussians as are to be, at the least: those that are missing lie where the photos agree, and in place of those that
-    /// can't be where they are.
+    /// Fills up to the requested number of Gaussians with new ones at the depths on which the photos agree. They also replace Gaussians
+    /// that contradict the photos.
     fn filled(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
         let mut raw = RawGaussians::of(gaussians);
         if self.photos.len() < 2 || gaussians.count() >= self.options.gaussians as i64 {
             return Ok(raw);
         }
-        // Spherical harmonics follow when they do for the others.
+        // Higher spherical harmonics are added later, for all Gaussians at the same time.
         raw.sh = raw.sh.narrow(2, 0, 1);
         Ok(self.gaussians_from_photos(Some(&raw))?.unwrap_or(raw))
     }
 
-    /// Optimizes from the part `from` of the way to `to`. `poses` are those of the photos in the world of `space`, `world` the way from
-    /// there to the session's frame, in which the Gaussians are returned.
+    /// Optimizes from the fraction `from` of the optimization to the fraction `to`. `poses` are those of the photos in the world of
+    /// `space`. `world` transforms from there to the session's frame, in which the Gaussians are returned.
     fn run_phase(
         &mut self,
         space: &mut dyn Space,
@@ -482,13 +481,13 @@ impl<'a> RefineSession<'a> {
         }
     }
 
-    /// Whether scores on the way are so cheap, beside what was done since the clock began, that another one hardly shows.
+    /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.
     fn may_score(&self) -> bool {
         let scoring = self.scoring + self.last_scoring;
         scoring.as_secs_f64() <= MAX_SCORING_SHARE * self.clock.elapsed().as_secs_f64()
     }
 
-    /// Scores patches of the views held out, if there are any.
+    /// Scores patches of the held-out views, if there are any, and appends the scores to the curve.
     fn add_eval_point(&mut self, gaussians: &Gaussians) -> Result<()> {
         let begun = Instant::now();
         if let Some(scores) = self.patches_held_out.score(gaussians)? {
@@ -501,12 +500,12 @@ impl<'a> RefineSession<'a> {
     }
 }
 
-/// The error of a session that is ended before there is anything to keep.
+/// Returns the error of a session that is ended before there is a result.
 fn stopped() -> Error {
     Error::Failed("stopped before there was a splat: nothing is written".into())
 }
 
-/// A few of the names, and how many there are more.
+/// Returns the first few names, and the number of the others.
 fn names(all: &[String]) -> String {
     const FEW: usize = 3;
     let few = all[..all.len().min(FEW)].join(", ");

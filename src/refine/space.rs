@@ -1,4 +1,4 @@
-//! What is optimized: Gaussians themselves, or the tokens that a model decodes them from.
+//! Parameter spaces of the optimization: the Gaussians themselves, or the tokens that a model decodes them from.
 
 use super::config::RefineConfig;
 use super::leaves::Leaves;
@@ -9,34 +9,34 @@ use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
-/// Added to the root of the second moments: gradients of single Gaussians are small.
+/// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
-/// Numbers that Gaussians follow from.
+/// Parameters from which Gaussians are computed.
 pub trait Space {
-    /// The Gaussians, differentiable with respect to the numbers. `progress` goes from 0 to 1.
+    /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
     fn gaussians(&self, progress: f64) -> Gaussians;
 
-    /// Forgets the gradients.
+    /// Clears the gradients.
     fn zero_grad(&mut self);
 
-    /// Follows the gradients; `step` of them were followed before.
+    /// Updates the parameters by their gradients; `step` is the number of earlier updates.
     fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng);
 }
 
-/// Gaussians, each by itself.
+/// Parameter space of individual Gaussians.
 #[derive(Debug)]
 pub struct GaussianSpace {
     leaves: Leaves,
     optimizer: Optimizer,
     config: RefineConfig,
     depth: f64,
-    /// Degrees of spherical harmonics, at the beginning and in the end.
+    /// Initial and final degree of the spherical harmonics.
     degrees: [i64; 2],
 }
 
 impl GaussianSpace {
-    /// Begins with `raw`; lengths are measured by `depth`, that of the scene.
+    /// Creates a space with the initial Gaussians `raw`. `depth` is the depth of the scene, the unit of lengths.
     pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
@@ -46,7 +46,7 @@ impl GaussianSpace {
     }
 }
 
-/// A group of its own, whose learning rate is set before each step.
+/// Returns a parameter group with one parameter, whose learning rate is set before each step.
 fn alone((name, t): (&str, &Tensor)) -> ParameterGroup {
     let parameters = vec![(name.into(), t.shallow_clone())];
     ParameterGroup { rule: Rule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
@@ -65,7 +65,7 @@ impl Space for GaussianSpace {
     fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) {
         let config = &self.config;
         let (means, others) = (config.means_end.powf(progress), config.others_end.powf(progress));
-        // In the order of `Leaves::named`.
+        // The order is that of `Leaves::named`.
         self.optimizer.set_learning_rates(&[
             config.means * self.depth * means,
             config.log_scales * others,
@@ -86,7 +86,7 @@ impl Space for GaussianSpace {
     }
 }
 
-/// What the encoder knows of a scene; the decoder stays as it is.
+/// Parameter space of the tokens of a scene. The decoder is frozen.
 #[derive(Debug)]
 pub struct TokenSpace<'a> {
     network: &'a GlobalSplat,
@@ -97,7 +97,7 @@ pub struct TokenSpace<'a> {
 }
 
 impl<'a> TokenSpace<'a> {
-    /// Begins with `tokens`, from which `network` decodes the Gaussians of `stage`.
+    /// Creates a space with the initial `tokens`, from which `network` decodes the Gaussians of `stage`.
     pub fn new(network: &'a GlobalSplat, stage: Stage, tokens: &Encoded, config: &RefineConfig) -> Self {
         let tokens = tokens.map(|t| t.detach().copy().set_requires_grad(true));
         let groups = [("geometry", &tokens.geometry), ("appearance", &tokens.appearance)].map(alone);

@@ -1,5 +1,5 @@
-//! Where the pixels of posed photos lie: for every pixel the depth at which its surroundings look alike in the photos taken
-//! from other places (a plane sweep; Collins 1996). No weights are needed, and no points.
+//! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
+//! taken from other positions. It needs no weights and no points.
 
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
@@ -9,69 +9,73 @@ use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
 use tch::{Device, Kind, Tensor};
 
-/// Pixels along the longer side of the pictures that are compared.
+/// Longer side in pixels of the images that are compared.
 const LONGEST_SIDE: f64 = 128.;
-/// Inverse depths that are tried, evenly from 0 to the nearest plane's.
+/// Number of inverse depths that are tried, evenly spaced from 0 to that of the nearest plane.
 const PLANES: i64 = 128;
-/// Pixels along the longer side, and inverse depths, where the depth of the scene is estimated.
+/// Longer side in pixels of the images that are compared to estimate the depth of the scene.
 const COARSE_SIDE: f64 = 64.;
+/// Number of inverse depths that are tried to estimate the depth of the scene.
 const COARSE_PLANES: i64 = 48;
-/// Of the picture's width: how far a pixel of the nearest plane moves in the photo taken nearest.
+/// Shift of a pixel of the nearest plane in the nearest photo, as a fraction of the image width.
 const LARGEST_MOVE: f64 = 0.7;
-/// How much nearer than the scene the nearest plane is, at most, where photos alone tell it.
+/// Maximum ratio of the scene's depth to that of the nearest plane, if it is estimated from photos alone.
 const NEAREST: f64 = 24.;
-/// The farthest that pixels are put, in units of the nearest plane's distance.
+/// Maximum depth of a pixel, in units of the nearest plane's depth.
 const FARTHEST: f64 = 500.;
-/// Photos whose pixels get depths, at the most: together they have seen what there is to see.
+/// Maximum number of photos whose pixels get depths. Together they cover the scene.
 const MOST: usize = 32;
-/// Distances at which the depth of the scene is looked for: the extent of the cameras, its half, its quarter, and so on.
+/// Number of distances that are tried for the depth of the scene: the extent of the cameras, its half, its quarter, and so on.
 const OCTAVES: i32 = 9;
-/// Planes that a pixel has to be away from infinity, in the median, for its depth to count as measured.
+/// Minimum distance from infinity, in planes, of the median pixel for its depth to count as measured.
 const RESOLVED: f64 = 2.;
-/// Pixels that have to agree on a depth, as a share of all.
+/// Minimum fraction of the pixels that must agree on a depth.
 const LEAST_SHARE: f64 = 0.05;
-/// Side of the surroundings that are compared, pixels.
+/// Side in pixels of the patches that are compared.
 const PATCH: i64 = 9;
-/// What is added to variances, so that noise is not taken for likeness.
+/// Constant that is added to variances, so that noise doesn't correlate.
 const LEAST_VARIANCE: f64 = 1e-4;
-/// Correlation at or below which a depth counts for nothing.
+/// Correlation at or below which a depth has no weight.
 const UNSURE: f64 = 0.5;
-/// Correlation above which a depth is right, most often.
+/// Correlation above which a depth is usually right.
 const SURE: f64 = 0.8;
-/// Times that what is known is spread to wider surroundings, and what it counts there, each time.
+/// Number of times that known depths are spread to larger neighbourhoods.
 const SPREADS: usize = 6;
+/// Factor of the weight of the spread depths, each time.
 const SPREAD_WEIGHT: f64 = 0.1;
-/// Points that a view has to see, or its depths are guessed from the photos alone.
+/// Minimum number of points that a view has to see. With fewer, its depths are estimated from the photos alone.
 const LEAST_POINTS: usize = 30;
-/// Of the points, those that may be nearer than the nearest plane, and how much nearer it is than the others.
+/// Fraction of the points that may be nearer than the nearest plane.
 const NEARER: f64 = 0.02;
+/// Ratio of the depth of the nearest remaining point to that of the nearest plane.
 const ROOM: f64 = 1.3;
 
-/// A photo with a depth for every pixel.
+/// Downscaled photo with a depth for every pixel.
 #[derive(Debug)]
 pub struct Swept {
-    /// At the size of the others, which is small.
+    /// Camera at the size of the downscaled photo.
     pub camera: Camera,
-    /// [3, h, w].
+    /// Downscaled photo, [3, h, w].
     pub image: Tensor,
-    /// Along the camera's axis, [h, w].
+    /// Depth along the camera's axis, [h, w].
     pub depth: Tensor,
-    /// Where photos agree on it, and not only what lies around, [h, w].
+    /// Mask of the pixels on whose depth the photos agree, [h, w]. Other depths come from pixels around them.
     pub sure: Tensor,
 }
 
-/// A small photo, on the device that compares it.
+/// Downscaled photo on the device of the computation.
 struct Small {
     camera: Camera,
-    /// [3, h, w].
+    /// Colours, [3, h, w].
     image: Tensor,
-    /// [h, w].
+    /// Mean over the colour channels, [h, w].
     grey: Tensor,
 }
 
-/// Finds depths for the pixels of the views, or where these are many, of some that together show what all of them show: near
-/// duplicates don't count. `points` of the scene, where some are known, tell where it begins. `go_on` is asked before each view, with
-/// how many are done; when it says no, these are all there is. The work is done on `device`, and its results are there.
+/// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
+/// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `go_on` is called before each view with
+/// the number of views that are done. If it returns `false`, the result has only these. The work is done on `device`, and the results are
+/// there.
 pub fn sweep(
     views: &[View],
     points: &[Point],
@@ -105,7 +109,7 @@ fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) 
     let nearest = match (nearest, others.first()) {
         (Some(nearest), _) => nearest,
         (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
-        // Nothing tells a depth: all of it lies at one.
+        // Without other photos no depth can be measured: all pixels get the same depth.
         (None, None) => 2. / depth,
     };
     let (inverse, likeness) = most_alike(this, others, nearest, PLANES);
@@ -117,18 +121,18 @@ fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) 
     }
 }
 
-/// How far the scene is from a photo, before its depths are looked for.
+/// Estimated distance of the scene from a photo, before depths per pixel are computed.
 struct SceneDepth {
-    /// Of what the photo shows, where anything tells.
+    /// Median depth of what the photo shows, if it can be estimated.
     median: Option<f64>,
-    /// Inverse depth of the nearest plane, where points tell it.
+    /// Inverse depth of the nearest plane, if points determine it.
     nearest: Option<f64>,
 }
 
 impl SceneDepth {
-    /// By the points that the photo shows, else by comparing it with one photo at each of several distances, which are powers of two
-    /// of the extent of all: too near ones show no parallax, too far ones something else. How many photos there are at a distance
-    /// makes no difference.
+    /// Estimates the depth from the points that the photo shows, else by comparing it with one photo at each of several distances, which
+    /// are the extent of all cameras times powers of ½. Photos that are too near show no parallax, and those that are too far show
+    /// something else. The number of photos at a distance makes no difference.
     fn of(index: usize, photos: &[Small], points: &[Point]) -> Self {
         let this = &photos[index];
         if let Some(inverse) = inverse_depths_of(points, &this.camera) {
@@ -140,19 +144,19 @@ impl SceneDepth {
         let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
         let agreed: Vec<Measured> = compared.filter(|of| of.share >= LEAST_SHARE).collect();
         let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
-        // The farthest photo is the first: what shows no parallax there is at least so far.
+        // The farthest photo comes first. A scene without parallax there is at least that far away.
         let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
         SceneDepth { median: best.map(|of| of.depth), nearest: None }
     }
 }
 
-/// What two photos agree on.
+/// Depth on which two photos agree.
 struct Measured {
-    /// Of the pixels that both are sure of, the median.
+    /// Median depth of the pixels whose correlation is above `SURE`.
     depth: f64,
-    /// How many planes from infinity it is.
+    /// Distance of the median from infinity, in planes.
     planes: f64,
-    /// Those pixels, of all.
+    /// Fraction of all pixels whose correlation is above `SURE`.
     share: f64,
 }
 
@@ -166,7 +170,7 @@ fn measured(this: &Small, other: &Small) -> Measured {
     Measured { depth: 1. / median.max(plane), planes: (median / plane).round(), share }
 }
 
-/// The median of the depths of other photos; where there are none, the extent of the cameras, or 1 where they don't move.
+/// Returns the median of the depths of other photos. Without any, returns the extent of the cameras, or 1 if they don't move.
 fn typical_depth(depths: &[f64], extent: f64) -> f64 {
     let mut sorted = depths.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -204,13 +208,13 @@ impl Small {
     }
 }
 
-/// The inverse depth of the nearest plane, such that nothing moves too far in the photo taken nearest.
+/// Returns the inverse depth of the nearest plane, chosen so that its pixels move by `LARGEST_MOVE` in the nearest photo.
 fn nearest_of_cameras(this: &Small, other: &Small) -> f64 {
     let baseline = other.centre().distance(this.centre());
     LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
 }
 
-/// Those of the points that the camera sees, sorted; none where it sees too few.
+/// Returns the sorted inverse depths of the points that the camera sees, or `None` if it sees too few.
 fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
     let project = projection(camera);
     let mut inverse: Vec<f64> =
@@ -219,8 +223,8 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
     (inverse.len() >= LEAST_POINTS).then_some(inverse)
 }
 
-/// The inverse depth of every pixel, of so many evenly from 0 to `nearest`, at which it looks most alike in the others, and the
-/// correlation there, both [h, w].
+/// Returns for every pixel the inverse depth at which it looks most alike in the other photos, and the correlation there, both [h, w]. The
+/// candidates are `planes` inverse depths, evenly spaced from 0 to `nearest`.
 fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Tensor, Tensor) {
     let (size, options) = (this.size(), (Kind::Float, this.grey.device()));
     if others.is_empty() {
@@ -243,13 +247,13 @@ fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Te
     (plane.to_kind(Kind::Float) * step, likeness)
 }
 
-/// What `other` shows where the pixels of `this` would be if they lay on each of the planes, and whether it shows them at all, both
-/// [planes, h, w].
+/// Returns the values of `other` at the positions of the pixels of `this` on each of the planes, and a mask of the positions that are
+/// inside the image of `other`, both [planes, h, w].
 fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     let [height, width] = this.size();
     let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
     let rows = to_other.transpose().to_cols_array_2d();
-    // In proportion to what the camera sees of a pixel at inverse depth w: rotation · ray + w · translation.
+    // A pixel at inverse depth w is at rotation · ray + w · translation in the other camera, up to a factor.
     let rays = rays(&this.camera.intrinsics, height, width, planes.device());
     let coordinate = |row: [f64; 4]| {
         let turned = &rays[0] * row[0] + &rays[1] * row[1] + &rays[2] * row[2]; // [h·w]
@@ -257,7 +261,7 @@ fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     };
     let [x, y, z] = [rows[0], rows[1], rows[2]].map(coordinate);
     let Intrinsics { fx, fy, cx, cy } = other.camera.intrinsics;
-    // From −1 to 1 across the picture.
+    // Coordinates range from −1 to 1 across the image.
     let u = (x / &z * fx + cx) * (2. / f64::from(other.camera.width)) - 1.;
     let v = (y / &z * fy + cy) * (2. / f64::from(other.camera.height)) - 1.;
     let count = planes.size()[0];
@@ -269,7 +273,7 @@ fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
     (seen.view(volume), inside)
 }
 
-/// x, y and z of the pixels' rays, z being 1, [h·w] each.
+/// Returns x, y and z of the pixels' rays with z = 1, [h·w] each.
 fn rays(intrinsics: &Intrinsics, height: i64, width: i64, device: Device) -> [Tensor; 3] {
     let options = (Kind::Float, device);
     let x = (Tensor::arange(width, options) + 0.5 - intrinsics.cx) / intrinsics.fx;
@@ -279,7 +283,7 @@ fn rays(intrinsics: &Intrinsics, height: i64, width: i64, device: Device) -> [Te
     [all(x, [1, width]), all(y, [height, 1]), Tensor::ones([height * width], options)]
 }
 
-/// Means over every pixel's surroundings, as far as these are inside: [.., h, w] of [.., h, w].
+/// Returns the mean over the neighbourhood of every pixel, without the part outside the image: [.., h, w] to [.., h, w].
 fn around(t: &Tensor) -> Tensor {
     let along = |t: &Tensor, window: [i64; 2]| {
         t.avg_pool2d(window, 1, window.map(|side| side / 2), false, false, None)
@@ -293,7 +297,7 @@ fn mean_and_variance(t: &Tensor) -> (Tensor, Tensor) {
     (mean, variance)
 }
 
-/// Where pixels look alike nowhere, the inverse depths around them, as near as some are known.
+/// Replaces inverse depths of low correlation by those of reliable pixels around them, the nearest weighted most.
 fn filled(inverse: &Tensor, likeness: &Tensor) -> Tensor {
     let size = inverse.size();
     let weight = (likeness - UNSURE).clamp_min(0.).square();
@@ -306,7 +310,7 @@ fn filled(inverse: &Tensor, likeness: &Tensor) -> Tensor {
         total += &sum * factor;
         total_weights += &weights * factor;
     }
-    // And where none is known far and wide, what is so in the middle.
+    // Pixels without any reliable pixel around them get the median.
     let (least, median) = (1e-9, inverse.median().double_value(&[]));
     ((total + least * median) / (total_weights + least)).view(size.as_slice())
 }
@@ -316,7 +320,7 @@ mod tests {
     use super::*;
     use glam::DMat4;
 
-    /// A wavy picture on a plane at depth 4, seen by three cameras in a row.
+    /// Depths of a plane are found: a wave pattern at depth 4, seen by three cameras in a row.
     #[test]
     fn a_plane_is_found_where_it_is() {
         let (side, depth) = (64u32, 4.);
@@ -336,14 +340,14 @@ mod tests {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
-        // Where points tell that the scene begins at 3, planes lie closer together.
+        // Points show that the scene begins at depth 3, so planes are closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
         let photos: Vec<Small> =
             views.iter().map(|view| Small::of(view, LONGEST_SIDE, Device::Cpu)).collect();
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
-        // One photo by itself tells nothing, and that is no NaN.
+        // A single photo has no measurable depth, and the result must not be NaN.
         let alone = sweep(&views[..1], &[], Device::Cpu, |_| true);
         assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
     }

@@ -1,29 +1,29 @@
-//! View selection: which photos are compared with which, and which say the same as others. Like multi-view stereo it goes by
-//! parallax and by overlap, at the depth of the scene (Yao et al. 2018, "MVSNet"); parallax is the distance of two cameras in units of
-//! that depth, in radians. How many photos were taken of a place changes nothing.
+//! View selection: determines which photos are compared with each other, and which are near duplicates. Like multi-view stereo, it uses
+//! parallax and overlap at the depth of the scene (Yao et al. 2018, "MVSNet"). Parallax is the distance of two cameras in units of that
+//! depth, in radians. The number of photos taken from one position makes no difference.
 
 use crate::scene::Camera;
 use glam::DVec3;
 use std::f64::consts::PI;
 
-/// Photos that each one is compared with, at most.
+/// Maximum number of photos that each one is compared with.
 const MAX_NEIGHBOURS: usize = 4;
-/// The parallax that is best for comparing, radians: depths are told apart, and both photos show the same.
+/// Best parallax for a comparison, in radians: depths can be distinguished, and both photos show the same part of the scene.
 const BEST_PARALLAX: f64 = 2.5 * PI / 180.;
-/// The smallest parallax of two photos that are compared with each other, radians. Smaller ones tell less of the depth.
+/// Minimum parallax of two photos that are compared, in radians. A smaller parallax gives less accurate depths.
 const MIN_PARALLAX: f64 = PI / 180.;
-/// The smallest share of one photo that another has to show, where the scene's depth is known.
+/// Minimum fraction of a photo that another must show, at the depth of the scene.
 const MIN_OVERLAP: f64 = 0.3;
-/// Halvings of the smallest parallax, where cameras hardly move.
+/// Maximum number of times that the minimum parallax is halved, if cameras hardly move.
 const MAX_HALVINGS: i32 = 16;
-/// Cosine of the largest angle between two cameras' axes that are compared.
+/// Cosine of the maximum angle between the axes of two cameras that are compared.
 const MIN_COSINE: f64 = 0.3;
-/// Photos whose parallax and turn together are at most this, radians, show the same.
+/// Maximum sum of parallax and rotation of near duplicates, in radians.
 const NEAR_DUPLICATE: f64 = PI / 180.;
-/// Pixels along a side of the grid at which overlap is looked at.
+/// Number of points along a side of the grid that overlap is measured on.
 const GRID: u32 = 5;
 
-/// Returns the function that maps a point to where `camera` sees it, if it does: u and v in pixels, and the depth along its axis.
+/// Returns the function that projects a point to `camera`: u and v in pixels and the depth along its axis, or `None` outside the image.
 pub fn projection(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<> {
     let (w2c, Camera { intrinsics: k, width, height, .. }) = (camera.c2w.inverse(), *camera);
     let inside = |pixel: f64, side: u32| pixel >= 0. && pixel < f64::from(side);
@@ -34,13 +34,13 @@ pub fn projection(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<>
     }
 }
 
-/// Returns the largest distance between the first camera and another, by which lengths are measured before a depth is known.
+/// Returns the maximum distance between the first camera and another. It is the unit of lengths before a depth is known.
 pub fn extent(cameras: &[Camera]) -> f64 {
     cameras.iter().map(|camera| distance(camera, &cameras[0])).fold(0., f64::max)
 }
 
-/// Returns up to `count` indices of `cameras`, spread: each is the one that is farthest from all before it, in units of the extent
-/// of all and radians of the axis. The first is 0.
+/// Returns up to `count` indices of `cameras` by farthest-point sampling. Distances are sums of the distance in units of the extent of all
+/// cameras and the angle between axes in radians. The first index is 0.
 pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
     let extent = extent(cameras);
     let apart = |a: &Camera, b: &Camera| {
@@ -50,7 +50,7 @@ pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
     let mut chosen = vec![];
     let mut nearest = vec![f64::INFINITY; cameras.len()];
     while chosen.len() < count.min(cameras.len()) {
-        // The first of equally far ones.
+        // Ties are resolved in favour of the first camera.
         let next = (0..cameras.len()).rev().max_by(|&a, &b| nearest[a].total_cmp(&nearest[b])).expect("one");
         chosen.push(next);
         for (camera, nearest) in cameras.iter().zip(&mut nearest) {
@@ -61,8 +61,9 @@ pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
     chosen
 }
 
-/// Returns the camera whose distance from camera `index` is nearest to each of `count` distances, the extent of all cameras and its
-/// powers of ½, the farthest first; none where all are farther off than by a factor of √2. They look in about the same direction.
+/// Returns, for each of `count` distances, the camera whose distance from camera `index` is nearest to it, the farthest first. The
+/// distances are the extent of all cameras times powers of ½. A distance is skipped if all cameras are off by more than a factor of √2.
+/// Only cameras that look in about the same direction are returned.
 pub fn at_octaves(index: usize, cameras: &[Camera], count: i32) -> Vec<usize> {
     let (this, extent) = (&cameras[index], extent(cameras));
     let comparable = |other: &usize| axis(&cameras[*other]).dot(axis(this)) > MIN_COSINE;
@@ -75,14 +76,15 @@ pub fn at_octaves(index: usize, cameras: &[Camera], count: i32) -> Vec<usize> {
     (0..count).filter_map(at).collect()
 }
 
-/// Whether two cameras show the same of a scene at `depth`: from nearly the same place, in nearly the same direction.
+/// Returns `true` if two cameras show nearly the same image of a scene at `depth`, from nearly the same position in nearly the same
+/// direction.
 pub fn are_near_duplicates(a: &Camera, b: &Camera, depth: f64) -> bool {
     distance(a, b) / depth + turn(a, b) <= NEAR_DUPLICATE
 }
 
-/// Returns the indices of the cameras whose photos tell most of the depths in photo `index`, the nearest first: those with the best
-/// parallax at `depth`, and enough of it to the photo and to each other, and enough overlap. Where all have less, the most that there is
-/// counts as enough. Cameras in the same place tell nothing: where all are, there are none.
+/// Returns the indices of the cameras that are best for measuring depths in photo `index`, the nearest first: those with the best parallax
+/// at `depth`, with at least the minimum parallax to the photo and to each other, and enough overlap. If all have less, the limits are
+/// lowered. Cameras in the same position are useless: if all are, the result is empty.
 pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
     let this = &cameras[index];
     let points = grid(this, depth);
@@ -94,7 +96,7 @@ pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
     let off = |other: &Neighbour| (other.parallax / BEST_PARALLAX).ln().abs();
     others.sort_by(|a, b| off(a).total_cmp(&off(b)));
     for min_overlap in [MIN_OVERLAP, 0.] {
-        // Two are better than one, unless they are much nearer to each other.
+        // Two cameras are better than one, unless the minimum parallax has to be halved more than once.
         for count in [2, 1] {
             let halvings = if count == 2 { 1 } else { MAX_HALVINGS };
             for halving in 0..=halvings {
@@ -106,16 +108,16 @@ pub fn neighbours(index: usize, cameras: &[Camera], depth: f64) -> Vec<usize> {
             }
         }
     }
-    // So little parallax that it can't be measured.
+    // The parallax is too small to be measured.
     others.first().map(|other| other.index).into_iter().collect()
 }
 
 struct Neighbour {
     index: usize,
     distance: f64,
-    /// By its distance, radians.
+    /// Distance divided by the depth of the scene, in radians.
     parallax: f64,
-    /// Share of the grid that it sees.
+    /// Fraction of the grid points that it sees.
     overlap: f64,
 }
 
@@ -129,7 +131,7 @@ impl Neighbour {
     }
 }
 
-/// The first of `others` that are apart from the photo and from each other, the nearest first.
+/// Returns the indices of the first `MAX_NEIGHBOURS` of `others` that are far enough from the photo and from each other, the nearest first.
 fn spaced(others: &[Neighbour], cameras: &[Camera], min_distance: f64, min_overlap: f64) -> Vec<usize> {
     let mut chosen: Vec<&Neighbour> = vec![];
     for other in others.iter().filter(|other| other.distance >= min_distance && other.overlap >= min_overlap)
@@ -146,7 +148,7 @@ fn spaced(others: &[Neighbour], cameras: &[Camera], min_distance: f64, min_overl
     chosen.into_iter().map(|other| other.index).collect()
 }
 
-/// Points at `depth` in front of a camera, spread over its picture.
+/// Returns points at `depth` in front of a camera, spread over its image.
 fn grid(camera: &Camera, depth: f64) -> Vec<DVec3> {
     let k = camera.intrinsics;
     let along = |side: u32| (0..GRID).map(move |i| (f64::from(i) + 0.5) / f64::from(GRID) * f64::from(side));
@@ -168,7 +170,7 @@ fn distance(a: &Camera, b: &Camera) -> f64 {
     centre(a).distance(centre(b))
 }
 
-/// The angle between two cameras' axes, radians.
+/// Returns the angle between two cameras' axes, in radians.
 fn turn(a: &Camera, b: &Camera) -> f64 {
     axis(a).cross(axis(b)).length().atan2(axis(a).dot(axis(b)))
 }
@@ -190,13 +192,13 @@ mod tests {
 
     #[test]
     fn neighbours_have_parallax() {
-        // At depth 4, parallax of 1° is 0.07, and of 2.5° 0.17.
+        // At depth 4, parallax of 1° is a distance of 0.07, and 2.5° is 0.17.
         let even = along(&[0., 0.25, 0.5, 0.75, 1., 1.25]);
         assert_eq!(neighbours(2, &even, 4.), [1, 3, 0, 4]);
-        // Photos of the same place, or nearly, count once, however near they are.
+        // Photos from the same or nearly the same position count once, however near they are.
         let paused = along(&[0., 0.25, 0.2501, 0.5, 0.5 + 1e-7, 0.49999, 0.75, 1.00001, 1.]);
         assert_eq!(neighbours(3, &paused, 4.), [2, 6, 0, 8]);
-        // Of a dense video, some frames away.
+        // Neighbours in a dense video are some frames apart.
         let dense = along(&(0..240).map(|i| f64::from(i) / 240.).collect::<Vec<_>>());
         let chosen = neighbours(120, &dense, 4.);
         assert_eq!(chosen.len(), 4);
@@ -215,7 +217,7 @@ mod tests {
 
     #[test]
     fn neighbours_see_the_same() {
-        // The nearer ones look away.
+        // The nearer cameras look away.
         let turned = |x: f64| camera(DMat4::from_translation(DVec3::X * x) * DMat4::from_rotation_y(1.1));
         let cameras = [along(&[0.]), vec![turned(0.2), turned(0.4)], along(&[0.6, 0.8])].concat();
         assert_eq!(neighbours(0, &cameras, 4.), [3, 4]);

@@ -1,4 +1,4 @@
-//! What only a CPU has: measurements of its rasterizer, and its instruction set.
+//! CPU-only functions: measurements of the CPU rasterizer and its instruction set.
 
 use super::{Cameras, arguments};
 use crate::error::Result;
@@ -7,23 +7,23 @@ use globalsplat_csrc::render as ffi;
 
 pub use ffi::{PairCounts, StageTimes};
 
-/// The instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
+/// Returns the instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
 ///
 /// # Errors
-/// A `GLOBALSPLAT_SIMD` that names one which this machine doesn't have.
+/// Fails if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have.
 pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
 }
 
-/// How long the stages of this thread's last [`render()`](super::render()) on the CPU and of its backward pass took.
+/// Returns the wall-clock time of each stage of this thread's last [`render()`](super::render()) on the CPU and of its backward pass.
 pub fn stage_times() -> StageTimes {
     ffi::stage_times()
 }
 
-/// How much a call of [`render()`](super::render()) with float32 Gaussians has to blend.
+/// Counts the tile entries and (pixel, splat) pairs that a call of [`render()`](super::render()) with float32 Gaussians has to blend.
 ///
 /// # Errors
-/// As [`render()`](super::render()).
+/// Fails like [`render()`](super::render()).
 pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
     // SAFETY: the tensors outlive the call.
     Ok(unsafe { ffi::count_pairs(&arguments(gaussians, cameras, eps2d)) }?)
@@ -34,14 +34,14 @@ pub fn libtorch_simd_level() -> String {
     globalsplat_csrc::processor::libtorch_simd_level()
 }
 
-/// Floating-point operations per second that multiply-adds alone reach here, measured for so many seconds on every thread.
+/// Measures the peak floating-point operations per second of multiply-adds on every thread for `seconds` seconds.
 pub fn multiply_add_peak(seconds: f64) -> f64 {
     ffi::multiply_add_peak(seconds)
 }
 
-/// While it lives, libtorch works on one thread, and the kernels of this program on as many as libtorch did before. Where kernels and
-/// small tensor operations take turns this is much faster: libtorch's threads don't sleep after an operation, but wait for the next
-/// one, and take the cores that the kernels need.
+/// Guard that limits libtorch to one thread while it lives. The kernels of this program use as many threads as libtorch did before. This is
+/// much faster where kernels and small tensor operations alternate: after an operation, libtorch's threads don't sleep but spin until the
+/// next one, and so occupy the cores that the kernels need.
 #[derive(Debug)]
 pub struct KernelThreads {
     libtorch: i32,
@@ -49,7 +49,7 @@ pub struct KernelThreads {
 }
 
 impl KernelThreads {
-    /// Begins.
+    /// Limits libtorch to one thread until the guard is dropped.
     pub fn take() -> Self {
         let (libtorch, own) = (tch::get_num_threads(), ffi::threads());
         ffi::set_threads(own);

@@ -1,4 +1,4 @@
-//! What only GPUs have: a driver, and kernels that are compiled when they are first needed.
+//! GPU-only functions: the driver, and kernels that are compiled at first use.
 
 pub use globalsplat_csrc::cuda::{
     Driver, Form, Gpu, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage,
@@ -10,7 +10,7 @@ pub use globalsplat_csrc::render::{KernelTime, measure_kernels};
 /// Waits for the GPU.
 ///
 /// # Errors
-/// A GPU that fails.
+/// Fails if the GPU reports an error.
 pub fn kernel_times() -> crate::error::Result<Vec<KernelTime>> {
     Ok(globalsplat_csrc::render::kernel_times()?)
 }

@@ -1,19 +1,20 @@
-//! Tensors that the C++ side makes.
+//! Tensors that the C++ side allocates and the Rust side owns.
 
 use tch::Tensor;
 
-/// The tensors that `op` leaves to its caller. Op puts their addresses, as of tch's `C_tensor`, in the places that it is given.
+/// Calls `op` and returns the tensors that it hands over to its caller. `op` writes one address per tensor, that of tch's `C_tensor`, to
+/// the slice that it is given.
 ///
 /// # Safety
-/// Where `op` succeeds, it has put the address of a new tensor, which nobody else owns, in every place.
+/// If `op` succeeds, it must have written the address of a new tensor that nothing else owns to every element of the slice.
 ///
 /// # Errors
-/// Those of `op`.
+/// Returns the exception of `op`.
 pub(crate) unsafe fn handed_over<const N: usize>(
     op: impl FnOnce(&mut [usize]) -> Result<(), cxx::Exception>,
 ) -> Result<[Tensor; N], cxx::Exception> {
     let mut out = [0usize; N];
     op(&mut out)?;
-    // SAFETY: the caller's promise.
+    // SAFETY: the caller guarantees that every address is that of a new tensor that nothing else owns.
     Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
 }

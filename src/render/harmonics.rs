@@ -1,7 +1,8 @@
-//! Spherical harmonics within bounds, or of fewer degrees, that show a capture's cameras what they saw before (spec 10.15).
+//! Fits spherical harmonics to limits on their values or degree, so that a capture's cameras see the same colours as before (spec 10.15).
 //!
-//! Files that keep a byte for a coefficient hold none beyond a bound. Cutting off what is beyond changes colours everywhere, though
-//! cameras look at a Gaussian from few sides, from which other coefficients would show the same.
+//! File formats that store a coefficient in one byte can't hold values beyond a bound. Clamping the values changes colours in every
+//! direction. But cameras see a Gaussian from few directions, and other coefficients within the bound show the same colours in those
+//! directions.
 
 use crate::scene::{Camera, Gaussians, SH_C0};
 use glam::{DMat4, DVec3};
@@ -10,46 +11,48 @@ use rayon::prelude::*;
 use std::ops::RangeInclusive;
 use tch::Tensor;
 
-/// Spherical harmonics of a colour channel, up to degree 3.
+/// Number of spherical harmonics of a colour channel, up to degree 3.
 const BASES: usize = 16;
-/// What counts from all sides, beside what cameras see.
+/// Weight of a change in all directions, relative to the cameras' total weight of 1.
 const ELSEWHERE: f64 = 1e-5;
-/// Rounds through the coefficients; they hardly change after half as many.
+/// Number of rounds of coordinate descent over the coefficients. They hardly change after half as many.
 const ROUNDS: usize = 40;
-/// How much too dark a Gaussian may be before it is made more opaque, and how opaque at most.
+/// Factor by which a Gaussian may be too dark before its opacity is raised.
 const TOO_DARK: f64 = 1.05;
+/// Maximum opacity that a Gaussian is raised to.
 const MAX_OPACITY: f64 = 0.98;
-/// Standard deviations that a Gaussian reaches, and what a picture counts for that it doesn't reach, beside one that it does.
+/// Radius of a Gaussian, in standard deviations, that decides whether it reaches into an image.
 const REACH: f64 = 2.;
+/// Weight factor of an image that a Gaussian doesn't reach, relative to one that it reaches.
 const OUTSIDE: f64 = 1e-6;
-/// Nearer than this, in local units, nothing is drawn (spec 6.2).
+/// Camera depth in local units at or below which nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
-/// Coefficients that a file, or who shows it, can hold.
+/// Range of coefficients that a file format or a viewer supports.
 #[derive(Debug, Clone)]
 pub struct HarmonicLimits {
-    /// Of the spherical harmonics, at most.
+    /// Maximum degree of the spherical harmonics.
     pub degree: i64,
-    /// Of degree 0.
+    /// Range of the coefficient of degree 0.
     pub constant: RangeInclusive<f64>,
-    /// Of the others.
+    /// Range of the coefficients of all higher degrees.
     pub others: RangeInclusive<f64>,
 }
 
 impl HarmonicLimits {
-    /// Up to `degree`, of any size.
+    /// Returns limits that allow any value up to `degree`.
     pub fn up_to(degree: i64) -> Self {
         HarmonicLimits { degree, constant: f64::MIN..=f64::MAX, others: f64::MIN..=f64::MAX }
     }
 
-    /// Those that viewers for browsers show, whatever the file holds: Spark and Babylon.js keep a Gaussian's own colour in
-    /// [0, 1] and the others within ±1, in a byte each.
+    /// Returns the limits of browser viewers, which apply to any file format: Spark and Babylon.js store the view-independent colour of a
+    /// Gaussian in [0, 1] and the other coefficients within ±1, one byte each.
     pub fn of_viewers(degree: i64) -> Self {
         let constant = 0.5 / SH_C0;
         HarmonicLimits { degree, constant: -constant..=constant, others: -1. ..=127. / 128. }
     }
 
-    /// What both hold.
+    /// Returns the intersection of both limits.
     pub fn and(&self, other: &Self) -> Self {
         let both = |a: &RangeInclusive<f64>, b: &RangeInclusive<f64>| {
             a.start().max(*b.start())..=a.end().min(*b.end())
@@ -75,8 +78,9 @@ impl HarmonicLimits {
     }
 }
 
-/// The same Gaussians, [1, N, ..] in float32 on the host and in the cameras' local frame (spec 2.5), with coefficients within `limits`: the nearest, or where `cameras` see a
-/// Gaussian whose coefficients aren't, those that show them its colours best. One that would be too dark becomes more opaque.
+/// Returns the Gaussians with coefficients within `limits`. `gaussians` are [1, N, ..], float32 on the host, in the cameras' local frame
+/// (spec 2.5). Coefficients within the limits stay. Others are clamped, or, if any of `cameras` sees the Gaussian, fitted so that the
+/// cameras see its colours as closely as possible. The opacity of a Gaussian that would be too dark is raised.
 pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &HarmonicLimits) -> Gaussians {
     let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
     let (means, scales) = (numbers(&gaussians.means), numbers(&gaussians.scales));
@@ -114,12 +118,12 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
 
 type Coefficients = [[f64; 3]; BASES];
 
-/// What is asked of the coefficients of one Gaussian.
+/// Least-squares problem for the coefficients of one Gaussian.
 struct Fit<'a> {
     original: Coefficients,
-    /// The functions' values towards each camera that sees it, and the camera's weight; weights add up to 1.
+    /// Values of the basis functions towards each camera that sees the Gaussian, and the camera's weight; weights add up to 1.
     seen: Vec<([f64; BASES], f64)>,
-    /// Σ weight·Y·Yᵀ over cameras, and a little of the identity: what a change of coefficients costs.
+    /// Quadratic cost of a change of the coefficients: Σ weight·Y·Yᵀ over cameras, plus a small multiple of the identity.
     cost: [[f64; BASES]; BASES],
     limits: &'a HarmonicLimits,
 }
@@ -150,7 +154,7 @@ impl<'a> Fit<'a> {
         Fit { original, seen, cost, limits }
     }
 
-    /// The coefficients, and the opacity.
+    /// Returns the fitted coefficients and the opacity.
     fn best(mut self, opacity: f64) -> (Coefficients, f64) {
         if self.seen.is_empty() {
             return (self.limits.clamped(&self.original), opacity);
@@ -160,7 +164,7 @@ impl<'a> Fit<'a> {
         if dark <= TOO_DARK || opacity >= MAX_OPACITY {
             return (fitted, opacity);
         }
-        // The product of colour and opacity stays; ½ belongs to the colour.
+        // The product of colour and opacity stays the same. The colour includes the offset of ½.
         let raised = (opacity * dark).min(MAX_OPACITY);
         let factor = opacity / raised;
         self.original.iter_mut().flatten().for_each(|coefficient| *coefficient *= factor);
@@ -174,7 +178,7 @@ impl<'a> Fit<'a> {
         solution
     }
 
-    /// The least Δᵀ·cost·Δ, Δ what the coefficients change by, within the limits: one coefficient after the other, round by round.
+    /// Minimizes Δᵀ·cost·Δ within the limits, where Δ is the change of the coefficients, by cyclic coordinate descent.
     fn solve_channel(&self, channel: usize, solution: &mut Coefficients) {
         let mut slope: [f64; BASES] = std::array::from_fn(|row| {
             let change = |basis: usize| solution[basis][channel] - self.original[basis][channel];
@@ -191,7 +195,7 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// By what the colours of `fitted` would have to be multiplied, to be nearest to the original's.
+    /// Returns the factor that brings the colours of `fitted` nearest to those of the original coefficients, in the least-squares sense.
     fn darkness(&self, fitted: &Coefficients) -> f64 {
         let colour = |coefficients: &Coefficients, basis: &[f64; BASES], channel: usize| {
             let sum: f64 = basis.iter().zip(coefficients).map(|(y, of_basis)| y * of_basis[channel]).sum();
@@ -209,7 +213,7 @@ impl<'a> Fit<'a> {
     }
 }
 
-/// The functions' values in the direction in which `camera` sees what is at `mean`.
+/// Returns the values of the basis functions in the direction in which `camera` sees `mean`.
 fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
     let direction = (mean - camera.c2w.w_axis.truncate()).normalize_or_zero();
     let mut basis = [0.; BASES];
@@ -217,8 +221,8 @@ fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
     basis
 }
 
-/// As many pixels as a Gaussian covers in the picture of `camera`, but for a factor, where its `radius` reaches into the picture;
-/// none where its middle is behind.
+/// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE` if its
+/// `radius` doesn't reach into the image. Returns `None` if its mean is nearer than `NEAR` or behind the camera.
 fn weight(camera: &Camera, w2c: &DMat4, mean: DVec3, radius: f64) -> Option<f64> {
     let seen = w2c.transform_point3(mean);
     let (k, width, height) = (camera.intrinsics, f64::from(camera.width), f64::from(camera.height));
@@ -242,7 +246,7 @@ mod tests {
         (0..count).map(|i| Camera { intrinsics, c2w: c2w(i), width: 32, height: 32 }).collect()
     }
 
-    /// A Gaussian in front of the cameras, one behind them, and one whose coefficients need no change.
+    /// Returns a Gaussian in front of the cameras, one behind them, and one whose coefficients need no change.
     fn gaussians(coefficient: f64) -> Gaussians {
         let options = (Kind::Float, Device::Cpu);
         let sh = Tensor::zeros([1, 3, 16, 3], options);
@@ -273,7 +277,7 @@ mod tests {
         assert!(
             fitted.sh.abs().max().double_value(&[]) <= 3. && clamped.sh.abs().max().double_value(&[]) <= 1.
         );
-        // Between and beside the cameras, too.
+        // The images must also match from camera positions outside the range that was fitted.
         let (fit, clamp) = (loss(&original, &fitted, &cameras(9)), loss(&original, &clamped, &cameras(9)));
         assert!(fit < 0.003 && clamp > 0.02, "{fit} fitted, {clamp} clamped");
         assert!(fitted.sh.narrow(1, 1, 1).equal(&clamped.sh.narrow(1, 1, 1)), "seen by nobody");
@@ -285,7 +289,7 @@ mod tests {
         let limits = HarmonicLimits { degree: 0, constant: -1.77..=1.77, others: 0. ..=0. };
         let mut original = gaussians(0.);
         original.sh = Tensor::zeros_like(&original.sh);
-        let _ = original.sh.narrow(2, 0, 1).fill_(3.5 / SH_C0); // 4 times what a screen shows
+        let _ = original.sh.narrow(2, 0, 1).fill_(3.5 / SH_C0); // 4 times the maximum that a screen shows
         let fitted = fit_harmonics(&original, &cameras(5), &limits);
         assert_eq!(fitted.sh.size(), [1, 3, 1, 3]);
         let opacities = Vec::<f32>::try_from(fitted.opacities.flatten(0, 1)).unwrap();

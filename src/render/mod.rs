@@ -1,4 +1,4 @@
-//! The differentiable splat op (spec 6), safe and typed.
+//! Safe, typed bindings to the differentiable splat op (spec 6).
 
 pub mod cpu;
 pub mod cuda;
@@ -17,24 +17,24 @@ use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Device, Kind, Tensor};
 
-/// Pixels² added to the diagonal of every projected covariance.
+/// Default value added to the diagonal of every projected covariance, in pixels².
 pub const DEFAULT_EPS2D: f64 = 0.05;
 
-/// Cameras to render from: C for each of B scenes.
+/// Cameras to render from: C cameras for each of B scenes.
 #[derive(Debug)]
 pub struct Cameras {
-    /// World to camera, OpenCV axes, [B, C, 4, 4].
+    /// World-to-camera matrices with OpenCV axes, [B, C, 4, 4].
     pub w2c: Tensor,
-    /// In pixels of the picture, [B, C, 3, 3].
+    /// Intrinsic matrices in pixels of the image, [B, C, 3, 3].
     pub intrinsics: Tensor,
-    /// Picture width in pixels.
+    /// Image width in pixels.
     pub width: i64,
-    /// Picture height in pixels.
+    /// Image height in pixels.
     pub height: i64,
 }
 
 impl Cameras {
-    /// One camera of one scene, B = C = 1.
+    /// Returns one camera of one scene, B = C = 1.
     pub fn single(camera: &Camera) -> Self {
         let matrix = |rows: &[f64], n: i64| Tensor::from_slice(rows).view([1, 1, n, n]).to_kind(Kind::Float);
         Cameras {
@@ -45,17 +45,17 @@ impl Cameras {
         }
     }
 
-    /// The same on `device`.
+    /// Returns the cameras on `device`.
     pub fn to_device(&self, device: Device) -> Self {
         let to = |t: &Tensor| t.to_device(device);
         Cameras { w2c: to(&self.w2c), intrinsics: to(&self.intrinsics), ..*self }
     }
 }
 
-/// What the cameras see.
+/// Rendered images of all cameras.
 #[derive(Debug)]
 pub struct Pictures {
-    /// Colour over black, [B, C, 3, H, W]; not clamped above.
+    /// Colour over a black background, [B, C, 3, H, W]; not clamped above.
     pub rgb: Tensor,
     /// Accumulated opacity in [0, 1], [B, C, H, W].
     pub alpha: Tensor,
@@ -63,51 +63,52 @@ pub struct Pictures {
     pub depth: Tensor,
 }
 
-/// Renders every scene from its cameras, where the Gaussians are: on the CPU or a CUDA device, to the same bits. Differentiable with
-/// respect to the Gaussians and to `w2c`, its entries taken as free numbers. float64 tensors are rendered in float64, on the host
-/// wherever they are, and all others in float32.
+/// Renders every scene from its cameras on the device of the Gaussians, the CPU or a CUDA device, with bit-identical results.
+/// Differentiable with respect to the Gaussians and to `w2c`, whose entries are treated as independent values. float64 tensors are rendered
+/// in float64, on the host wherever they are, and all others in float32.
 ///
 /// # Errors
-/// Shapes that don't fit together, a `GLOBALSPLAT_SIMD` that this machine doesn't have, and GPUs without what compiles for them.
+/// Fails if shapes don't match, if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have, or if kernels can't be
+/// compiled for the GPU.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pictures> {
     let [rgb, alpha, depth] = call(ffi::splat, gaussians, cameras, eps2d)?;
     Ok(Pictures { rgb, alpha, depth })
 }
 
-/// What projection makes of every Gaussian for every camera: the rasterizer's first step by itself. Zeros where a Gaussian
-/// isn't visible.
+/// Projection of every Gaussian for every camera: the first step of the rasterizer on its own. Values are zero where a Gaussian isn't
+/// visible.
 #[derive(Debug)]
 pub struct Projected {
-    /// 1 where the Gaussian isn't dropped, int64 [B, C, N].
+    /// Visibility, int64 [B, C, N]: 1 where the Gaussian isn't dropped, else 0.
     pub visible: Tensor,
-    /// Pixels, [B, C, N, 2].
+    /// Projected means in pixels, [B, C, N, 2].
     pub mean2d: Tensor,
-    /// xx, xy and yy of the inverse 2D covariance, pixels⁻², [B, C, N, 3].
+    /// Elements xx, xy and yy of the inverse 2D covariance in pixels⁻², [B, C, N, 3].
     pub conic: Tensor,
-    /// Camera z, [B, C, N].
+    /// Depth along the camera's z axis, [B, C, N].
     pub depth: Tensor,
-    /// RGB as seen from the camera, [B, C, N, 3].
+    /// RGB colour as seen from the camera, [B, C, N, 3].
     pub colour: Tensor,
 }
 
-/// Projects as [`render()`] does. Differentiable with respect to means, scales, quaternions, SH and `w2c`.
+/// Projects every Gaussian as [`render()`] does. Differentiable with respect to means, scales, quaternions, SH and `w2c`.
 ///
 /// # Errors
-/// As [`render()`].
+/// Fails like [`render()`].
 pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Projected> {
     let [visible, mean2d, conic, depth, colour] = call(ffi::project, gaussians, cameras, eps2d)?;
     Ok(Projected { visible, mean2d, conic, depth, colour })
 }
 
-/// The C++ side's ops take a place for new tensors, as addresses.
+/// Op of the C++ side. It writes the addresses of new tensors to the slice.
 type Op = unsafe fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
 
 fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
-    // SAFETY: the tensors outlive the call, and on success the C++ side has put new ones there.
+    // SAFETY: the tensors outlive the call, and on success the C++ side has written the addresses of new tensors.
     Ok(unsafe { handed_over(|out| op(&arguments(gaussians, cameras, eps2d), out)) }?)
 }
 
-/// Valid as long as what they are made of.
+/// Returns the arguments of an op. They are valid as long as `gaussians` and `cameras` live.
 fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArguments {
     let address = |t: &Tensor| t.as_ptr() as usize;
     SplatArguments {
@@ -124,7 +125,7 @@ fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArgum
     }
 }
 
-/// The version of the libtorch that this program was built with.
+/// Returns the version of libtorch that this program was built with.
 pub fn libtorch_version() -> String {
     ffi::libtorch_version()
 }

@@ -1,12 +1,12 @@
-//! Moving a splat from one world to another, colours included (spec 2.4).
+//! Transforms a splat from one world to another, colours included (spec 2.4).
 
 use crate::scene::{Gaussians, Similarity};
 use glam::{DMat3, DQuat, DVec3};
 use globalsplat_csrc::render::sh_basis;
 use tch::Tensor;
 
-/// The same splat after every point x has gone to `to(x)`: pictures from cameras that moved along are the same, and depth
-/// is scaled.
+/// Returns the splat with every point x moved to `to(x)`. Images from cameras that are moved along stay the same, and their depth is
+/// scaled.
 pub fn transform(gaussians: &Gaussians, to: &Similarity) -> Gaussians {
     let on = |t: Tensor, like: &Tensor| t.to_kind(like.kind()).to_device(like.device());
     let rotation =
@@ -21,7 +21,7 @@ pub fn transform(gaussians: &Gaussians, to: &Similarity) -> Gaussians {
     }
 }
 
-/// `by` · q for every q in [.., 4], (w, x, y, z).
+/// Returns `by` · q for every quaternion q in [.., 4], (w, x, y, z).
 fn rotate_quaternions(quaternions: &Tensor, by: DQuat) -> Tensor {
     let [x, y, z, w] = by.to_array();
     // Left multiplication by a quaternion is linear.
@@ -31,10 +31,10 @@ fn rotate_quaternions(quaternions: &Tensor, by: DQuat) -> Tensor {
     quaternions.matmul(&matrix.tr())
 }
 
-/// Coefficients [.., bases, 3] of the functions d ↦ f(Rᵀd).
+/// Rotates spherical harmonics: returns the coefficients [.., bases, 3] of the functions d ↦ f(Rᵀd).
 ///
-/// A rotation mixes the 2l + 1 functions of one degree among themselves. For directions dᵢ, with A = Y(dᵢ) and B = Y(R dᵢ),
-/// the new coefficients c' meet B c' = A c, so c' = B⁺A c; a few more directions than functions make B well conditioned.
+/// A rotation mixes the 2l + 1 functions of one degree among themselves. For directions dᵢ, with A = Y(dᵢ) and B = Y(R dᵢ), the new
+/// coefficients c' satisfy B c' = A c, so c' = B⁺A c. More directions than functions make B well conditioned.
 fn rotate_sh(sh: &Tensor, rotation: &DMat3) -> Tensor {
     const DIRECTIONS: usize = 32;
     let bases = sh.size()[sh.dim() - 2] as usize;
@@ -58,7 +58,7 @@ fn rotate_sh(sh: &Tensor, rotation: &DMat3) -> Tensor {
     Tensor::cat(&parts, -2)
 }
 
-/// The `i`th of `count` directions spread evenly over the sphere.
+/// Returns the `i`th of `count` directions that are spread evenly over the sphere.
 fn fibonacci_direction(i: usize, count: usize) -> DVec3 {
     let golden_angle = std::f64::consts::PI * (3. - 5f64.sqrt());
     let z = 1. - (2 * i + 1) as f64 / count as f64;

@@ -1,4 +1,4 @@
-//! One splat from cameras of any sizes, one by one: pictures to look at and to judge.
+//! Renders one splat from cameras of any sizes, one by one, for display and evaluation.
 
 use super::{Cameras, DEFAULT_EPS2D, render};
 use crate::error::Result;
@@ -6,22 +6,22 @@ use crate::scene::{Camera, Gaussians, LocalFrame};
 use glam::DVec3;
 use tch::{Device, Tensor};
 
-/// What a camera saw of a splat.
+/// Rendered image of one camera.
 #[derive(Debug)]
 pub struct Rendered {
-    /// [3, H, W].
+    /// Colour, [3, H, W].
     pub rgb: Tensor,
-    /// [H, W].
+    /// Accumulated opacity, [H, W].
     pub alpha: Tensor,
-    /// [H, W].
+    /// Expected depth, [H, W].
     pub depth: Tensor,
 }
 
-/// Renders Gaussians from each camera, which may differ in size; both are in the unit that the near plane of spec 6.2 is for.
+/// Renders Gaussians from each camera; cameras may differ in size. Gaussians and cameras are in the unit of the near plane of spec 6.2.
 /// [`SplatRenderer`] renders from cameras of any world.
 ///
 /// # Errors
-/// Those of [`render`].
+/// Fails like [`render`].
 pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Rendered>> {
     cameras
         .iter()
@@ -37,7 +37,7 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
         .collect()
 }
 
-/// A splat in a local frame (spec 2.5), to be rendered from cameras of the world.
+/// Splat in a local frame (spec 2.5) that is rendered from cameras in world coordinates.
 #[derive(Debug)]
 pub struct SplatRenderer {
     gaussians: Gaussians,
@@ -45,7 +45,7 @@ pub struct SplatRenderer {
 }
 
 impl Rendered {
-    /// The same in the memory of the host.
+    /// Returns the rendered image in host memory.
     pub fn to_host(&self) -> Self {
         let to_host = |t: &Tensor| t.to_device(Device::Cpu);
         Rendered { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
@@ -53,12 +53,12 @@ impl Rendered {
 }
 
 impl SplatRenderer {
-    /// Renders `gaussians` of one scene, whose means are relative to `origin`, in `frame`.
+    /// Creates a renderer in `frame` for `gaussians` of one scene, whose means are relative to `origin`.
     pub fn new(gaussians: &Gaussians, origin: DVec3, frame: LocalFrame) -> Self {
         SplatRenderer { gaussians: frame.gaussians_to_local(gaussians, origin), frame }
     }
 
-    /// Renders on `device` from now on.
+    /// Moves the splat to `device`, which then renders it.
     pub fn to_device(self, device: Device) -> Self {
         SplatRenderer { gaussians: self.gaussians.to_device(device), frame: self.frame }
     }
@@ -68,11 +68,11 @@ impl SplatRenderer {
         self.frame
     }
 
-    /// Renders the splat from each camera, which may differ in size. Pictures are on the host, whatever the device; depth is in world
+    /// Renders the splat from each camera; cameras may differ in size. The images are on the host, whatever the device. Depth is in world
     /// units.
     ///
     /// # Errors
-    /// Those of [`render`].
+    /// Fails like [`render`].
     pub fn render(&self, cameras: &[Camera]) -> Result<Vec<Rendered>> {
         let rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
         let finish = |view: Rendered| {

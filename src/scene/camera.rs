@@ -1,15 +1,15 @@
-//! Intrinsics and poses.
+//! Camera intrinsics and poses.
 
 use glam::{DMat3, DMat4, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// How far RᵀR may be from the identity, per entry: captures store poses with 3 to 7 digits.
+/// Maximum deviation of RᵀR from the identity, per entry: captures store poses with 3 to 7 digits.
 const RIGID_TOLERANCE: f64 = 5e-3;
 
-/// How far a pose's 3×3 part may be from the nearest rotation, per entry, where a file holds more digits than that.
+/// Maximum deviation of a pose's 3×3 part from the nearest rotation, per entry, for files with more digits.
 const ROUNDING_TOLERANCE: f64 = 1e-3;
 
-/// A pinhole camera's intrinsics, in pixels of the image they travel with. Pixel (i, j) has its centre at (j + ½, i + ½).
+/// Intrinsics of a pinhole camera, in pixels of its image. The centre of pixel (i, j) is at (j + ½, i + ½).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
     /// Focal length along x.
@@ -23,34 +23,35 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// After resizing the image by the factors `x` and `y`.
+    /// Returns the intrinsics after resizing the image by the factors `x` and `y`.
     pub fn resized(&self, x: f64, y: f64) -> Self {
         Intrinsics { fx: self.fx * x, fy: self.fy * y, cx: self.cx * x, cy: self.cy * y }
     }
 
-    /// After cutting `left` columns and `top` rows away.
+    /// Returns the intrinsics after cutting `left` columns and `top` rows off the image.
     pub fn cropped(&self, left: f64, top: f64) -> Self {
         Intrinsics { cx: self.cx - left, cy: self.cy - top, ..*self }
     }
 
-    /// Of the image that every `step`-th column and row make, from `column` and `row` on: its pixels keep their rays.
+    /// Returns the intrinsics of the image made of every `step`-th column and row, starting at `column` and `row`. Its pixels keep
+    /// their rays.
     pub fn strided(&self, step: f64, column: f64, row: f64) -> Self {
-        // What had its centre at column + step·j + ½ has it at j + ½ then.
+        // A pixel centre at column + step·j + ½ moves to j + ½.
         let moved = |point: f64, first: f64| (point - first - 0.5) / step + 0.5;
         let (cx, cy) = (moved(self.cx, column), moved(self.cy, row));
         Intrinsics { fx: self.fx / step, fy: self.fy / step, cx, cy }
     }
 
-    /// The 3×3 matrix, row by row.
+    /// Returns the 3×3 matrix, row by row.
     pub fn to_rows(&self) -> [f64; 9] {
         [self.fx, 0., self.cx, 0., self.fy, self.cy, 0., 0., 1.]
     }
 
-    /// Checks them against an image of `width` × `height`: positive focal lengths, and a principal point that is at most
-    /// one pixel outside the image.
+    /// Checks the intrinsics against an image of `width` × `height`: focal lengths must be positive, and the principal point at
+    /// most one pixel outside the image.
     ///
     /// # Errors
-    /// (field, what was found, what was expected).
+    /// Returns (field, what was found, what was expected).
     pub fn check(&self, width: u32, height: u32) -> Result<(), (String, String, String)> {
         for (name, focal) in [("fx", self.fx), ("fy", self.fy)] {
             if !(focal > 0. && focal.is_finite()) {
@@ -67,13 +68,13 @@ impl Intrinsics {
     }
 }
 
-/// Height and width in pixels, written [H, W].
+/// Height and width of an image in pixels, serialized as [H, W].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "[u32; 2]", into = "[u32; 2]")]
 pub struct ImageSize {
-    /// Rows.
+    /// Number of rows.
     pub height: u32,
-    /// Columns.
+    /// Number of columns.
     pub width: u32,
 }
 
@@ -89,21 +90,22 @@ impl From<ImageSize> for [u32; 2] {
     }
 }
 
-/// Where a picture is taken from, and how.
+/// A pinhole camera: intrinsics, pose and image size.
 #[derive(Debug, Clone, Copy)]
 pub struct Camera {
-    /// In pixels of `width` × `height`.
+    /// Intrinsics in pixels of an image of `width` × `height`.
     pub intrinsics: Intrinsics,
-    /// Camera-to-world.
+    /// Camera-to-world matrix.
     pub c2w: DMat4,
-    /// Picture width in pixels.
+    /// Image width in pixels.
     pub width: u32,
-    /// Picture height in pixels.
+    /// Image height in pixels.
     pub height: u32,
 }
 
 impl Camera {
-    /// The same view in a picture of another size: as much to see along the side that has fewer pixels for it.
+    /// Returns the camera for an image of another size. The field of view stays the same along the side whose pixel count has the
+    /// smaller ratio of new to old.
     pub fn with_size(&self, ImageSize { width, height }: ImageSize) -> Self {
         let (x, y) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         let (factor, k) = (x.min(y), self.intrinsics);
@@ -112,10 +114,10 @@ impl Camera {
     }
 }
 
-/// Checks that `c2w` is a rigid motion: finite, last row (0, 0, 0, 1), an orthonormal right-handed rotation.
+/// Checks that `c2w` is a rigid motion: finite, with last row (0, 0, 0, 1) and an orthonormal right-handed rotation.
 ///
 /// # Errors
-/// (what was found, what was expected).
+/// Returns (what was found, what was expected).
 pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
     if !c2w.is_finite() {
         return Err(("a matrix with NaN or infinite entries".into(), "finite numbers".into()));
@@ -142,15 +144,15 @@ pub fn check_pose(c2w: &DMat4) -> Result<(), (String, String)> {
     Ok(())
 }
 
-/// The rigid motion that `c2w` is up to rounding: its 3×3 part A becomes the rotation R nearest to it, the orthogonal factor
-/// of A = R·S with S symmetric and positive, and its last row (0, 0, 0, 1).
+/// Returns the rigid motion that equals `c2w` up to rounding. The 3×3 part A is replaced by the nearest rotation R, the orthogonal
+/// factor of A = R·S with S symmetric and positive, and the last row by (0, 0, 0, 1).
 ///
 /// # Errors
-/// As [`check_pose`], and where an entry of A is more than 1e-3 off R's: (what was found, what was expected).
+/// Fails like [`check_pose`], and if an entry of A differs from R's by more than 1e-3: (what was found, what was expected).
 fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
     check_pose(c2w)?;
     let given = DMat3::from_mat4(*c2w);
-    // Newton's iteration X ← (X + X⁻ᵀ)/2 squares the error, which is 5e-3 at most, in every round.
+    // Newton's iteration X ← (X + X⁻ᵀ)/2 squares the error, initially at most 5e-3, in every iteration.
     let rotation = (0..4).fold(given, |x, _| (x + x.inverse().transpose()) * 0.5);
     let off = (rotation - given).to_cols_array().iter().fold(0f64, |m, v| m.max(v.abs()));
     if off > ROUNDING_TOLERANCE {
@@ -161,11 +163,11 @@ fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
     Ok(DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis.truncate().extend(1.)))
 }
 
-/// Returns [`nearest_rigid`] of a pose whose 3×3 part may be a rotation times a factor above 0, and the factor: poses that a
-/// similarity was applied to are of that kind. The position stays.
+/// Returns [`nearest_rigid`] of a pose whose 3×3 part may be a rotation times a factor above 0, and that factor. Applying a
+/// similarity to poses produces such factors. The position is unchanged.
 ///
 /// # Errors
-/// As [`nearest_rigid`].
+/// Fails like [`nearest_rigid`].
 pub fn nearest_rigid_of_scaled(c2w: &DMat4) -> Result<(DMat4, f64), (String, String)> {
     nearest_rigid(c2w).map(|rigid| (rigid, 1.)).or_else(|why| {
         let scale = DMat3::from_mat4(*c2w).determinant().cbrt();
@@ -174,17 +176,17 @@ pub fn nearest_rigid_of_scaled(c2w: &DMat4) -> Result<(DMat4, f64), (String, Str
         }
         let column = |i: usize| c2w.col(i) / scale;
         let unscaled = DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis);
-        // What isn't that is refused as it stands.
+        // For any other matrix, report the error of the matrix as given.
         nearest_rigid(&unscaled).map(|rigid| (rigid, scale)).map_err(|_| why)
     })
 }
 
-/// The 4×4 matrix, row by row.
+/// Returns the 4×4 matrix, row by row.
 pub fn pose_to_rows(pose: &DMat4) -> [f64; 16] {
     pose.transpose().to_cols_array()
 }
 
-/// A camera at `eye` that looks at `target`, with `down` as near to its y axis as can be.
+/// Returns the camera-to-world pose of a camera at `eye` that looks at `target`, with its y axis as close to `down` as possible.
 pub(super) fn look_at(eye: DVec3, target: DVec3, down: DVec3) -> DMat4 {
     let forward = (target - eye).normalize();
     let right = down.cross(forward).normalize();

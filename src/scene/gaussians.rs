@@ -1,32 +1,32 @@
-//! 3D Gaussians: what the model makes and the rasterizer draws, and the same as numbers without bounds.
+//! 3D Gaussians as the model outputs them and the rasterizer renders them, and their unconstrained parameters.
 
 use tch::{Device, Kind, Tensor};
 
-/// Opacities are kept this far from 0 and 1, whose logits are infinite.
+/// Distance of opacities from 0 and 1, whose logits are infinite.
 const OPACITY_MARGIN: f64 = 1e-6;
-/// Y_0, by which a colour becomes an SH coefficient.
+/// Spherical harmonic Y_0, which converts between a colour and an SH coefficient.
 pub(crate) const SH_C0: f64 = 0.28209479177387814;
 
-/// Scales are at least this, whose logarithm is finite.
+/// Minimum scale, so that logarithms are finite.
 pub(crate) const MIN_SCALE: f64 = 1e-30;
 
-/// 3D Gaussians of B scenes with N each.
+/// 3D Gaussians of B scenes with N Gaussians each.
 #[derive(Debug)]
 pub struct Gaussians {
-    /// Centres, [B, N, 3].
+    /// Centres, `[B, N, 3]`.
     pub means: Tensor,
-    /// Standard deviations along the own axes, linear, [B, N, 3].
+    /// Standard deviations along the Gaussians' own axes, linear, `[B, N, 3]`.
     pub scales: Tensor,
-    /// (w, x, y, z), [B, N, 4].
+    /// Rotations as quaternions (w, x, y, z), `[B, N, 4]`.
     pub quaternions: Tensor,
-    /// In [0, 1], [B, N].
+    /// Opacities in [0, 1], `[B, N]`.
     pub opacities: Tensor,
-    /// Spherical harmonics, [B, N, (degree + 1)², 3].
+    /// Spherical harmonics coefficients, `[B, N, (degree + 1)², 3]`.
     pub sh: Tensor,
 }
 
 impl Gaussians {
-    /// N.
+    /// Returns N, the number of Gaussians per scene.
     pub fn count(&self) -> i64 {
         self.means.size()[1]
     }
@@ -42,29 +42,29 @@ impl Gaussians {
         }
     }
 
-    /// A copy on `device`, or the same tensors where they are there already.
+    /// Returns a copy on `device`, or shallow clones of tensors that are already there.
     pub fn to_device(&self, device: Device) -> Self {
         self.map(|t| t.to_device(device))
     }
 }
 
-/// Gaussians before activation, as 3DGS stores and optimizes them: any number is a valid one.
+/// Gaussians before activation, as 3DGS stores and optimizes them: every real value is valid.
 #[derive(Debug)]
 pub struct RawGaussians {
-    /// As [`Gaussians::means`].
+    /// Centres, like [`Gaussians::means`].
     pub means: Tensor,
-    /// Natural logarithms of the scales, [B, N, 3].
+    /// Natural logarithms of the scales, `[B, N, 3]`.
     pub log_scales: Tensor,
-    /// As [`Gaussians::quaternions`], of any length.
+    /// Quaternions of any length, like [`Gaussians::quaternions`].
     pub quaternions: Tensor,
-    /// Logits of the opacities, [B, N].
+    /// Logits of the opacities, `[B, N]`.
     pub opacity_logits: Tensor,
-    /// As [`Gaussians::sh`].
+    /// Spherical harmonics coefficients, like [`Gaussians::sh`].
     pub sh: Tensor,
 }
 
 impl RawGaussians {
-    /// What activates to `gaussians`: opacities up to 1e-6, all else up to rounding.
+    /// Returns the parameters that activate to `gaussians`: opacities up to 1e-6, everything else up to rounding.
     pub fn of(gaussians: &Gaussians) -> Self {
         let Gaussians { means, scales, quaternions, opacities, sh } = gaussians;
         RawGaussians {
@@ -76,7 +76,7 @@ impl RawGaussians {
         }
     }
 
-    /// The Gaussians; differentiable.
+    /// Returns the activated Gaussians. Differentiable.
     pub fn activate(&self) -> Gaussians {
         Gaussians {
             means: self.means.shallow_clone(),
@@ -87,7 +87,7 @@ impl RawGaussians {
         }
     }
 
-    /// The same for every tensor.
+    /// Applies `f` to every tensor.
     fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
         RawGaussians {
             means: f(&self.means),
@@ -98,23 +98,24 @@ impl RawGaussians {
         }
     }
 
-    /// The same tensors.
+    /// Returns shallow clones of all tensors.
     pub fn shallow_clone(&self) -> Self {
         self.map(Tensor::shallow_clone)
     }
 
-    /// A copy on `device`, or the same tensors where they are there already.
+    /// Returns a copy on `device`, or shallow clones of tensors that are already there.
     pub fn to_device(&self, device: Device) -> Self {
         self.map(|t| t.to_device(device))
     }
 
-    /// Those of `indices`, of every scene.
+    /// Returns the Gaussians `indices` of every scene.
     pub fn select(&self, indices: &[i64]) -> Self {
         let indices = Tensor::from_slice(indices).to_device(self.means.device());
         self.map(|t| t.index_select(1, &indices))
     }
 
-    /// These Gaussians and then `others`, of the same scenes, with spherical harmonics up to the higher degree of both.
+    /// Concatenates these Gaussians and `others` of the same scenes. The result has the higher of both degrees of spherical
+    /// harmonics.
     pub fn and(&self, others: &RawGaussians) -> Self {
         let joined = |a: &Tensor, b: &Tensor| Tensor::cat(&[a, b], 1);
         let bases = self.sh.size()[2].max(others.sh.size()[2]);
@@ -128,7 +129,7 @@ impl RawGaussians {
         }
     }
 
-    /// Every tensor by its name, as an optimizer takes them.
+    /// Returns every tensor with its name, as optimizers take them.
     pub fn named(&self) -> [(&'static str, &Tensor); 5] {
         [
             ("means", &self.means),
@@ -140,8 +141,9 @@ impl RawGaussians {
     }
 }
 
-/// Returns the sigmoid of every number, with the same bits for any number of threads; differentiable. Libtorch computes the last numbers
-/// of each thread's share by another formula than the others, so it is given fewer at a time than it shares out.
+/// Returns the sigmoid of every element, bit-identical for any number of threads. Differentiable. Libtorch computes the last
+/// elements of each thread's share by a different formula, so this function calls it on parts that are too small to be divided
+/// among threads.
 pub(crate) fn sigmoid(logits: &Tensor) -> Tensor {
     const AT_ONCE: i64 = 1 << 14;
     if logits.device() != Device::Cpu || logits.numel() <= AT_ONCE as usize {
@@ -176,7 +178,7 @@ mod tests {
         );
     }
 
-    /// d exp(s) = exp(s) and d sigmoid(o) = α (1 − α), by which raw numbers learn.
+    /// Activation has the gradients d exp(s) = exp(s) and d sigmoid(o) = α (1 − α).
     #[test]
     fn activation_has_its_gradients() {
         let leaf =

@@ -1,44 +1,45 @@
-//! The local frame of a capture or a splat (spec 2.5): an origin near the scene and a unit that fits its size.
+//! Local frame of a capture or a splat (spec 2.5): an origin near the scene and a unit that fits its size.
 //!
-//! Positions far from the world's origin, or in a unit that is large or small for the scene, don't fit float32 and absolute
-//! thresholds such as the near plane. World coordinates are float64; they become float32 in a local frame only.
+//! Positions far from the world's origin, or in a unit that is too large or too small for the scene, lose precision in float32 and
+//! don't suit absolute thresholds such as the near plane. World coordinates are float64. Only local coordinates are converted to
+//! float32.
 
 use super::{Camera, Gaussians, Similarity};
 use glam::{DMat4, DVec3};
 use tch::{Kind, Tensor};
 
-/// Distances below this share of the largest coordinate are rounding errors of float64.
+/// Relative rounding error of float64: smaller distances, relative to the largest coordinate, are ignored.
 const ROUNDING: f64 = 1e-14;
 
-/// A frame with the axes of the world: local = (world − origin) / scale.
+/// A coordinate frame with the axes of the world: local = (world − origin) / scale.
 ///
-/// The frame of a scene that is scaled by a power of two has exactly the scaled origin and scale, so that local coordinates
-/// have the same bits.
+/// If a scene is scaled by a power of two, the origin and scale of its frame are scaled exactly, so that local coordinates are
+/// bit-identical.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalFrame {
-    /// The local origin, in world coordinates.
+    /// Local origin, in world coordinates.
     pub origin: DVec3,
-    /// The length of a local unit in world units, above 0.
+    /// Length of a local unit in world units, above 0.
     pub scale: f64,
 }
 
 impl LocalFrame {
-    /// The typical distance from the origin in local units: the near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
+    /// Typical distance from the origin in local units. The near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
     const TYPICAL_DISTANCE: f64 = 16.;
 
-    /// Returns the frame of a capture, by its camera centres: the origin is their median along each axis, and the median
-    /// distance of the others from it is 16 local units. Where all cameras are in one place, a local unit is a world unit.
+    /// Returns the frame of a capture, computed from its camera centres. The origin is their median along each axis, and the median
+    /// distance of the others from it is 16 local units. If all cameras are at one position, a local unit is a world unit.
     pub fn from_cameras(cameras: &[Camera]) -> Self {
         let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
         Self::from_reaches(&centres, &vec![0.; centres.len()])
     }
 
-    /// Returns the frame of a splat of one scene, whose means are relative to `origin`: the local origin is their median along
-    /// each axis, and 16 local units are the median of a mean's distance from it plus the Gaussian's largest scale. The frame
-    /// of Gaussians without any extent, or of none, has the world's unit.
+    /// Returns the frame of a splat of one scene, whose means are relative to `origin`. The local origin is the median of the means
+    /// along each axis. 16 local units are the median of a mean's distance from it plus the Gaussian's largest scale. If the
+    /// Gaussians have no extent, or there are none, a local unit is a world unit.
     ///
     /// # Panics
-    /// More scenes than one.
+    /// Panics if there is more than one scene.
     pub fn from_gaussians(gaussians: &Gaussians, origin: DVec3) -> Self {
         let means: Vec<DVec3> = values(&gaussians.means).chunks_exact(3).map(DVec3::from_slice).collect();
         let largest = values(&gaussians.scales.amax([-1i64].as_slice(), false));
@@ -61,37 +62,37 @@ impl LocalFrame {
         Self::TYPICAL_DISTANCE * self.scale
     }
 
-    /// Returns a world point in local coordinates.
+    /// Converts a world point to local coordinates.
     pub fn point_to_local(&self, point: DVec3) -> DVec3 {
         (point - self.origin) / self.scale
     }
 
-    /// Returns a local point in world coordinates.
+    /// Converts a local point to world coordinates.
     pub fn point_to_world(&self, point: DVec3) -> DVec3 {
         point * self.scale + self.origin
     }
 
-    /// Returns a camera-to-world pose as camera-to-local.
+    /// Converts a camera-to-world pose to camera-to-local.
     pub fn pose_to_local(&self, c2w: &DMat4) -> DMat4 {
         with_centre(c2w, self.point_to_local(c2w.w_axis.truncate()))
     }
 
-    /// Returns a camera-to-local pose as camera-to-world.
+    /// Converts a camera-to-local pose to camera-to-world.
     pub fn pose_to_world(&self, c2l: &DMat4) -> DMat4 {
         with_centre(c2l, self.point_to_world(c2l.w_axis.truncate()))
     }
 
-    /// Returns a camera of the world as one of the local frame.
+    /// Converts a camera in world coordinates to local coordinates.
     pub fn camera_to_local(&self, camera: &Camera) -> Camera {
         Camera { c2w: self.pose_to_local(&camera.c2w), ..*camera }
     }
 
-    /// Returns cameras of the world as ones of the local frame.
+    /// Converts cameras in world coordinates to local coordinates.
     pub fn cameras_to_local(&self, cameras: &[Camera]) -> Vec<Camera> {
         cameras.iter().map(|camera| self.camera_to_local(camera)).collect()
     }
 
-    /// Returns a similarity to the world as one to the local frame.
+    /// Converts a similarity that maps to the world to one that maps to the local frame.
     pub fn similarity_to_local(&self, to_world: &Similarity) -> Similarity {
         Similarity {
             translation: self.point_to_local(to_world.translation),
@@ -100,18 +101,18 @@ impl LocalFrame {
         }
     }
 
-    /// Returns `gaussians` in local coordinates, of the same kind. Their means are relative to `origin`, in world units; the
-    /// change of coordinates is in float64.
+    /// Converts `gaussians` to local coordinates, keeping the dtype. Their means are relative to `origin`, in world units. The
+    /// conversion is computed in float64.
     pub fn gaussians_to_local(&self, gaussians: &Gaussians, origin: DVec3) -> Gaussians {
         self.resized(gaussians, origin - self.origin, 1. / self.scale)
     }
 
-    /// Returns local `gaussians` in world units, of the same kind, with means relative to this frame's origin.
+    /// Converts local `gaussians` to world units, keeping the dtype. The resulting means are relative to this frame's origin.
     pub fn gaussians_from_local(&self, gaussians: &Gaussians) -> Gaussians {
         self.resized(gaussians, DVec3::ZERO, self.scale)
     }
 
-    /// Returns `gaussians` moved by `by` and then scaled about zero.
+    /// Returns `gaussians` translated by `by` and then scaled about zero by `factor`.
     fn resized(&self, gaussians: &Gaussians, by: DVec3, factor: f64) -> Gaussians {
         let double = |t: &Tensor| t.to_kind(Kind::Double);
         let by = Tensor::from_slice(&by.to_array()).to_device(gaussians.means.device());
@@ -129,7 +130,7 @@ fn values(tensor: &Tensor) -> Vec<f64> {
     Vec::try_from(tensor.detach().to_kind(Kind::Double).flatten(0, -1)).expect("numbers of one scene")
 }
 
-/// Returns the lower median; none of no numbers.
+/// Returns the lower median, or `None` if there are no values.
 fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len().checked_sub(1)? / 2;
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
@@ -211,7 +212,7 @@ mod tests {
         assert!(off(&back.means, &expected) < 1e-6 && off(&back.scales, &splat.scales) < 1e-6);
     }
 
-    /// Neither a long rest, in exactly one place or with jitter, nor a camera that was placed wrongly decides on the unit.
+    /// The unit is independent of long rests, at exactly one position or with jitter, and of a misplaced camera.
     #[test]
     fn rests_and_outliers_do_not_set_the_scale() {
         let plain = cameras(1., DVec3::ZERO);

@@ -1,6 +1,6 @@
-//! What a scene is made of, cameras and Gaussians, and camera maths: intrinsics and poses, normalization, rays, trajectories.
+//! Scene representation (cameras and Gaussians) and camera maths: intrinsics and poses, normalization, rays, trajectories.
 //!
-//! OpenCV axes everywhere: x right, y down, z forward. Poses are camera-to-world.
+//! All cameras use OpenCV axes: x right, y down, z forward. Poses are camera-to-world.
 
 mod camera;
 mod gaussians;

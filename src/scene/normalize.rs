@@ -1,28 +1,29 @@
-//! Scene normalization (spec 2.1 and 2.2): one similarity per scene gives all scenes the same place, direction and size.
+//! Scene normalization (spec 2.1 and 2.2): one similarity per scene gives all scenes the same position, orientation and size.
 
 use crate::error::{Error, Result};
 use glam::{DMat3, DMat4, DVec3};
 
-/// Cameras whose spread is no more than this share of the largest coordinate (or not finite) differ by rounding alone, and the
-/// scene keeps its size.
+/// Relative rounding error of float64. If the spread of the cameras is at most this share of the largest coordinate (or not
+/// finite), they differ by rounding alone, and the scene keeps its size.
 const ROUNDING: f64 = 1e-14;
 
-/// A sum of unit vectors shorter than it points nowhere.
+/// Minimum length of a sum of unit vectors that still defines a direction.
 const MIN_DIRECTION: f64 = 1e-6;
 
-/// x ↦ scale · rotation · x + translation.
+/// A similarity transform x ↦ scale · rotation · x + translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Similarity {
-    /// A rotation matrix.
+    /// Rotation matrix.
     pub rotation: DMat3,
-    /// Applied last.
+    /// Translation, applied last.
     pub translation: DVec3,
-    /// Uniform, above 0.
+    /// Uniform scale factor, above 0.
     pub scale: f64,
 }
 
 impl Similarity {
-    /// The pose, camera-to-world, that becomes `c2w` when the similarity moves the world: its camera sees there what `c2w` sees here.
+    /// Returns the camera-to-world pose that the similarity transforms into `c2w`: its camera sees the original world as `c2w` sees
+    /// the transformed one.
     pub fn pose_before(&self, c2w: &DMat4) -> DMat4 {
         let rotation = self.rotation.transpose();
         let centre = rotation * (c2w.w_axis.truncate() - self.translation) / self.scale;
@@ -30,33 +31,34 @@ impl Similarity {
     }
 }
 
-/// What [`normalize`] finds.
+/// Result of [`normalize`].
 #[derive(Debug, Clone)]
 pub struct Normalization {
-    /// The poses in the normalized world, camera-to-world, in the order given.
+    /// Camera-to-world poses in the normalized world, in the order of the input.
     pub c2w: Vec<DMat4>,
-    /// Normalized world to the capture's own; its scale is the largest distance between two camera centres there, by the extent here.
+    /// Similarity from the normalized world to the capture's world. Its scale is the largest distance between two camera centres in
+    /// the capture divided by the extent in the normalized world.
     pub world_from_normalized: Similarity,
 }
 
-/// Where in a normalized world a scene's cameras are, and how far apart (spec 9.9). That of spec 2.1 and 2.2 has the extent 1.
+/// Position and spread of a scene's cameras in the normalized world (spec 9.9). The normalization of spec 2.1 and 2.2 has extent 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
-    /// The largest distance between two camera centres, above 0.
+    /// Largest distance between two camera centres, above 0.
     pub extent: f64,
-    /// The mean camera's place on the z axis, along which it looks.
+    /// Position of the mean camera on the z axis, along which it looks.
     pub forward: f64,
 }
 
 impl Placement {
-    /// So much further forward, and larger by a factor that has this logarithm.
+    /// Returns the placement moved forward by `forward`, with the extent multiplied by exp(`larger`).
     pub fn nudged(&self, [forward, larger]: [f64; 2]) -> Self {
         Placement { extent: self.extent * larger.exp(), forward: self.forward + forward }
     }
 }
 
 impl Normalization {
-    /// The same cameras, placed otherwise; these here have an extent of 1 and stand at 0.
+    /// Returns the same cameras with another placement. The placement of `self` must have extent 1 and position 0.
     pub fn placed(&self, Placement { extent, forward }: Placement) -> Self {
         let offset = DVec3::Z * forward;
         let moved = |pose: &DMat4| {
@@ -74,11 +76,11 @@ impl Normalization {
     }
 }
 
-/// Moves the mean camera to the origin, looking along z, and makes the largest distance between two camera centres 1. Where directions
-/// cancel out, as of cameras all around a thing, the first camera's stand for the mean's.
+/// Moves the mean camera to the origin, looking along z, and scales the largest distance between two camera centres to 1. If the
+/// viewing directions cancel out, as for cameras all around an object, the axes of the first camera are used instead.
 ///
 /// # Errors
-/// No cameras.
+/// Fails if there are no cameras.
 pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     if c2w.is_empty() {
         return Err(Error::Request("a scene without cameras can't be normalized".into()));
@@ -94,7 +96,7 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
 
     let (origin, inverse) = (mean(3), axes.inverse());
     let centre = |pose: &DMat4| pose.w_axis.truncate();
-    // The origin is subtracted before anything is multiplied: far away, products would lose the digits that centres differ in.
+    // Subtract the origin before multiplying: far from the world's origin, products would lose the digits in which centres differ.
     let align = |pose: &DMat4| {
         DMat4::from_mat3_translation(inverse * DMat3::from_mat4(*pose), inverse * (centre(pose) - origin))
     };
@@ -128,7 +130,7 @@ mod tests {
     #[test]
     fn cameras_all_around_a_thing_have_the_first_ones_axes() {
         for (count, tilt) in [(2, 0.), (8, 0.), (8, 0.6)] {
-            // Looking at the origin, level or from above.
+            // The cameras look at the origin, horizontally or from above.
             let ring: Vec<DMat4> = (0..count)
                 .map(|i| {
                     DMat4::from_rotation_y(0.3 + TAU * f64::from(i) / f64::from(count))
@@ -145,7 +147,8 @@ mod tests {
         }
     }
 
-    /// In millimetres, kilometres or UTM coordinates, the normalized cameras are the same; scaled by a power of two, in every bit.
+    /// Normalized cameras are the same in millimetres, kilometres or UTM coordinates, and bit-identical if the scene is scaled by a
+    /// power of two.
     #[test]
     fn unit_and_origin_do_not_matter() {
         let pose =

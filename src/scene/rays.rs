@@ -2,15 +2,15 @@
 
 use tch::{Kind, Tensor};
 
-/// One ray per pixel as [o × d ; d], moment first: d the unit direction in the world, o the camera centre.
+/// Returns one ray per pixel as [o × d ; d], moment first, where d is the unit direction in the world and o the camera centre.
 ///
-/// `c2w` [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, H, W, 6], float32.
+/// The inputs are `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, H, W, 6], float32.
 pub fn plucker_rays(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
     let (c2w, intrinsics) = (c2w.to_kind(Kind::Float), intrinsics.to_kind(Kind::Float));
     let options = (Kind::Float, c2w.device());
     let entry =
         |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column).unsqueeze(-1).unsqueeze(-1);
-    // (j + ½ − cx) / fx along a row, (i + ½ − cy) / fy down a column, each [B, V, H, W].
+    // x = (j + ½ − cx) / fx along a row, y = (i + ½ − cy) / fy down a column, each [B, V, H, W].
     let j = (Tensor::arange(width, options) + 0.5).view([1, 1, 1, width]);
     let i = (Tensor::arange(height, options) + 0.5).view([1, 1, height, 1]);
     let x = ((j - entry(0, 2)) / entry(0, 0)).expand([-1, -1, height, -1], false);

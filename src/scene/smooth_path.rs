@@ -1,47 +1,48 @@
 //! A smooth camera path through given views.
 //!
-//! All of a camera but its rotation is a point x in seven dimensions, each a length: the position, and Z·ln f and Z·c/f along
-//! both axes of the picture, where Z is how far away the scene is. A step from one camera to the next, which turns by the
-//! angle θ, has the length
+//! The parameters of a camera other than its rotation form a point x in seven dimensions, each a length: the position, and Z·ln f
+//! and Z·c/f along both axes of the image, where Z is the distance of the scene. A step from one camera to the next, which turns by
+//! the angle θ, has the length
 //!
 //! ```text
 //! d = √(|Δx|² + Z²θ²),
 //! ```
 //!
-//! so that a way, a turn and a zoom count by how far they move the picture. Knots are √d apart: the centripetal parametrization,
-//! which neither loops nor overshoots where views are unevenly spaced (Yuksel, Schaefer, Keyser: Parameterization and applications
-//! of Catmull–Rom curves, 2011). In between:
+//! so that translation, rotation and zoom count by how far they move the image. Knots are √d apart: the centripetal
+//! parametrization, which neither loops nor overshoots if views are unevenly spaced (Yuksel, Schaefer, Keyser: Parameterization and
+//! applications of Catmull–Rom curves, 2011). Between the knots:
 //!
-//! - x is a cubic in Hermite form, whose velocity at a view is that of the parabola through it and its neighbours: a
-//!   Catmull–Rom spline (Catmull, Rom: A class of local interpolating splines, 1974; uneven knots as by Barry, Goldman, 1988);
-//! - the rotation is the same for unit quaternions, in cumulative Bézier form (Kim, Kim, Shin: A general construction scheme for
-//!   unit quaternion curves with simple high order derivatives, 1995): with u from 0 to 1 over a step of h, and the angular
+//! - x is a cubic in Hermite form, whose velocity at a view is that of the parabola through it and its neighbours: a Catmull–Rom
+//!   spline (Catmull, Rom: A class of local interpolating splines, 1974; uneven knots as in Barry, Goldman, 1988);
+//! - the rotation is the analogue for unit quaternions, in cumulative Bézier form (Kim, Kim, Shin: A general construction scheme
+//!   for unit quaternion curves with simple high order derivatives, 1995). With u from 0 to 1 over a step of h, and the angular
 //!   velocities ω₀ and ω₁ at its ends, in the camera's own axes,
 //!
 //! ```text
 //! q(u) = q₀ · exp(a (1 − (1−u)³)) · exp(b (3u² − 2u³)) · exp(c u³),   a = ω₀h/3,  c = ω₁h/3,  exp(b) = exp(−a) q₀⁻¹ q₁ exp(−c).
 //! ```
 //!
-//! Both pass through every view and have no kink there. Frames are equally far apart by the length d.
+//! Both curves pass through every view with continuous velocity. Frames are equally spaced by the length d.
 
 use super::camera::{Camera, ImageSize, Intrinsics};
 use crate::error::{Error, Result};
 use glam::{DMat4, DQuat, DVec3};
 
-/// Steps that are shorter than this share of the whole way are no steps: the view was there already.
+/// Minimum length of a step relative to the whole path. A view at a shorter distance counts as equal to the previous one.
 const SAME: f64 = 1e-9;
 
-/// Pieces of a step by whose chords its length is measured.
+/// Number of chords of a step that its length is measured with.
 const PIECES: usize = 256;
 
-/// Position, Z·ln fx, Z·ln fy, Z·cx/fx, Z·cy/fy.
+/// Point in seven dimensions: position, Z·ln fx, Z·ln fy, Z·cx/fx, Z·cy/fy.
 type Point = [f64; 7];
 
-/// `frames` cameras on a smooth path through `cameras`, in their order, from the first to the last, at constant speed. `distance`
-/// is how far away the scene is: a turn by θ counts as much as a way of θ·`distance`. Pictures have the first camera's size.
+/// Returns `frames` cameras on a smooth path through `cameras`, in their order, from the first to the last, at constant speed.
+/// `distance` is the distance of the scene: a rotation by θ counts as much as a translation by θ·`distance`. Images have the first
+/// camera's size.
 ///
 /// # Errors
-/// No cameras.
+/// Fails if there are no cameras.
 pub fn smooth_path(cameras: &[Camera], distance: f64, frames: usize) -> Result<Vec<Camera>> {
     let first = cameras.first().ok_or_else(|| Error::Request("a path needs a camera".into()))?;
     let size = ImageSize { width: first.width, height: first.height };
@@ -51,7 +52,7 @@ pub fn smooth_path(cameras: &[Camera], distance: f64, frames: usize) -> Result<V
     Ok((0..frames).map(|i| curve.at(i as f64 / last as f64).camera(size, distance)).collect())
 }
 
-/// A camera, taken apart.
+/// A camera split into the point x and the rotation.
 #[derive(Debug, Clone, Copy)]
 struct View {
     point: Point,
@@ -75,21 +76,21 @@ impl View {
         Camera { intrinsics, c2w, width, height }
     }
 
-    /// d.
+    /// Returns the length d of a step from this view to `other`.
     fn distance_to(&self, other: &View, distance: f64) -> f64 {
         let way: f64 = self.point.iter().zip(&other.point).map(|(a, b)| (b - a).powi(2)).sum();
         (way + (distance * turn(self.rotation, other.rotation).length()).powi(2)).sqrt()
     }
 }
 
-/// How to turn from `a` to `b`, in the axes of `a`: axis times angle, by the shorter way. A quaternion and its negative are one
-/// rotation.
+/// Returns the rotation from `a` to `b` in the axes of `a`, as axis times angle, the shorter way around. A quaternion and its
+/// negative are the same rotation.
 fn turn(a: DQuat, b: DQuat) -> DVec3 {
     let turn = a.conjugate() * b;
     (if turn.w < 0. { -turn } else { turn }).normalize().to_scaled_axis()
 }
 
-/// A change of all that a view is, per unit of the parameter.
+/// Rate of change of all parameters of a view, per unit of the curve parameter.
 #[derive(Debug, Clone, Copy)]
 struct Velocity {
     point: Point,
@@ -104,7 +105,7 @@ impl Velocity {
         }
     }
 
-    /// (1−t) of itself and t of `other`.
+    /// Returns the weighted mean of this velocity (weight 1−t) and `other` (weight t).
     fn mixed(&self, other: &Self, t: f64) -> Self {
         Velocity {
             point: std::array::from_fn(|i| self.point[i] + t * (other.point[i] - self.point[i])),
@@ -113,20 +114,20 @@ impl Velocity {
     }
 }
 
-/// From one view to the next.
+/// Curve segment from one view to the next.
 #[derive(Debug)]
 struct Step {
     from: View,
     to: View,
-    /// Velocities at both ends.
+    /// Velocity at the start; `ends` is the velocity at the end.
     starts: Velocity,
     ends: Velocity,
-    /// Of the parameter.
+    /// Length of the segment in the curve parameter.
     h: f64,
 }
 
 impl Step {
-    /// `u` from 0 to 1.
+    /// Returns the view at `u`, from 0 to 1.
     fn at(&self, u: f64) -> View {
         let Step { from, to, starts, ends, h } = self;
         let (square, cube) = (u * u, u * u * u);
@@ -144,10 +145,10 @@ impl Step {
     }
 }
 
-/// The whole way.
+/// The whole path.
 struct Curve {
     steps: Vec<Step>,
-    /// Length of the way to the end of each of [`PIECES`] of each step.
+    /// Path length up to the end of each of the [`PIECES`] pieces of each step.
     lengths: Vec<f64>,
     first: View,
 }
@@ -162,7 +163,7 @@ impl Curve {
         let knots: Vec<f64> = apart(&views).iter().map(|d| d.sqrt()).collect();
         let chords: Vec<Velocity> =
             views.windows(2).zip(&knots).map(|(pair, &h)| Velocity::between(&pair[0], &pair[1], h)).collect();
-        // At view i, between chords i−1 and i: the shorter step tells more. At both ends there is one chord alone.
+        // View i lies between chords i−1 and i, of which the shorter one has more weight. Each end has only one chord.
         let velocity = |i: usize| match (i.checked_sub(1), chords.get(i)) {
             (Some(before), Some(after)) => {
                 chords[before].mixed(after, knots[before] / (knots[before] + knots[i]))
@@ -190,7 +191,7 @@ impl Curve {
         Curve { steps, lengths, first: views[0] }
     }
 
-    /// After this share of the way.
+    /// Returns the view at the fraction `share` of the path length.
     fn at(&self, share: f64) -> View {
         let Some(whole) = self.lengths.last() else { return self.first };
         let wanted = share * whole;
@@ -216,7 +217,7 @@ mod tests {
         Camera { intrinsics, c2w, width: 64, height: 48 }
     }
 
-    /// Unevenly spread, turning every way, with a zoom.
+    /// Returns unevenly spaced cameras that turn in all directions and zoom.
     fn cameras() -> Vec<Camera> {
         let turned = |x, y, z| DQuat::from_euler(EulerRot::XYZ, x, y, z);
         vec![
@@ -255,7 +256,7 @@ mod tests {
         let mut at = 0;
         let step = apart(&path[500], &path[501]);
         for camera in &cameras {
-            // In their order.
+            // The cameras are reached in their order.
             let rest = path[at..].iter().map(|frame| apart(frame, camera)).enumerate();
             let (next, nearest) = rest.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
             assert!(nearest <= 0.51 * step, "{nearest} of a step of {step}");
@@ -283,7 +284,7 @@ mod tests {
             }
             assert!(arriving.turn.distance(leaving.turn) < 1e-4 * (1. + leaving.turn.length()));
         }
-        // And at constant speed, but for what a chord is shorter than its arc.
+        // The speed is constant, except that chords are shorter than their arcs.
         let path = smooth_path(&cameras(), DISTANCE, 10_001).unwrap();
         let steps: Vec<f64> = path.windows(2).map(|pair| apart(&pair[0], &pair[1])).collect();
         let mean = steps.iter().sum::<f64>() / steps.len() as f64;
@@ -303,7 +304,7 @@ mod tests {
             assert!(frame.c2w.w_axis.abs_diff_eq(expected, 1e-9), "{i}");
             let rotation = View::of(frame, DISTANCE).rotation;
             assert!(turn(rotation, from.rotation.slerp(to.rotation, share)).length() < 1e-7, "{i}");
-            // A zoom goes by factors.
+            // A zoom interpolates the focal length geometrically.
             let focal = a.intrinsics.fx * (b.intrinsics.fx / a.intrinsics.fx).powf(share);
             assert!((frame.intrinsics.fx - focal).abs() < 1e-9);
         }
@@ -324,7 +325,7 @@ mod tests {
     #[test]
     fn cameras_that_stand_turn_and_zoom() {
         let turned = |angle| camera([1., 2., 3.], DQuat::from_rotation_y(angle), 60.);
-        // One of them twice.
+        // One of the views occurs twice.
         let path = smooth_path(&[turned(0.), turned(0.5), turned(0.5), turned(1.5)], DISTANCE, 101).unwrap();
         assert_rigid(&path);
         for pair in path.windows(2) {

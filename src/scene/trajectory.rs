@@ -1,15 +1,15 @@
-//! Camera paths for looking at a result.
+//! Camera paths for viewing a result.
 
 use super::camera::{Camera, look_at};
 use crate::error::{Error, Result};
 use glam::{DMat4, DVec3};
 use std::f64::consts::TAU;
 
-/// `frames` cameras on an ellipse around the mean of `cameras`, as wide and high as their own spread, all looking at the
-/// point that the mean camera looks at in `distance`. For captures taken by walking: the path stays where photos were.
+/// Returns `frames` cameras on an ellipse around the mean of `cameras`, as wide and high as their own spread. All look at the point
+/// at `distance` in front of the mean camera. It suits captures taken by walking, because the path stays close to the photos.
 ///
 /// # Errors
-/// No cameras.
+/// Fails if there are no cameras.
 pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) -> Result<Vec<Camera>> {
     let poses: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
     let normalization = super::normalize(&poses)?;
@@ -19,7 +19,7 @@ pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) ->
         (normalization.c2w.iter().map(|pose| pose.w_axis[axis].powi(2)).sum::<f64>() / n).sqrt()
             * to_world.scale
     };
-    // A camera that only moved forward still gives a look around: a tenth of the way to the target at least.
+    // At least a tenth of the distance to the target, so that cameras that only moved forward still give an orbit.
     let (x, y) = (spread(0).max(0.1 * distance), spread(1).max(0.05 * distance));
     let [right, down, forward] =
         [to_world.rotation.x_axis, to_world.rotation.y_axis, to_world.rotation.z_axis];
@@ -33,8 +33,8 @@ pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) ->
     Ok((0..frames).map(camera).collect())
 }
 
-/// `frames` cameras on a circle of `radius` around `target`, a little above it (y points down), like `reference` in
-/// everything but the pose.
+/// Returns `frames` cameras on a circle of `radius` around `target`, slightly above it (y points down). Everything but the pose is
+/// copied from `reference`.
 pub fn orbit_around_point(target: DVec3, radius: f64, reference: &Camera, frames: usize) -> Vec<Camera> {
     let camera = |frame: usize| {
         let angle = TAU * frame as f64 / frames as f64;

@@ -1,5 +1,5 @@
-//! A small room made of Gaussians, and a walk through it: a scene whose splat is known. It lets everything be tested where no
-//! photos are at hand.
+//! A small room made of Gaussians, and a camera path through it. The splat of this scene is known exactly, which allows testing
+//! everything without photos.
 
 use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics, SH_C0};
 use glam::{DMat4, DQuat, DVec3};
@@ -10,17 +10,17 @@ use tch::{Kind, Tensor};
 /// Distance between the Gaussians of a surface, in metres.
 const SPACING: f64 = 0.06;
 
-/// A room, and a walk through it.
+/// A room and a camera path through it.
 #[derive(Debug)]
 pub struct Room {
-    /// Its surfaces.
+    /// Gaussians of the room's surfaces.
     pub gaussians: Gaussians,
-    /// Where photos are taken from.
+    /// Cameras that photos are rendered from.
     pub cameras: Vec<Camera>,
 }
 
 impl Room {
-    /// The room of `seed`, with so many cameras for pictures of `size`.
+    /// Creates the room of `seed` with `frames` cameras for images of `size`.
     pub fn new(seed: u64, frames: usize, size: ImageSize) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let gaussians = surfaces(&mut random);
@@ -28,7 +28,7 @@ impl Room {
     }
 }
 
-/// A step to the right with a slight turn, looking into the room.
+/// Returns cameras on a path to the right with a slight turn, looking into the room.
 fn walk(random: &mut impl Rng, frames: usize, size: ImageSize) -> Vec<Camera> {
     let (width, height) = (f64::from(size.width), f64::from(size.height));
     let focal = 0.9 * width.max(height);
@@ -45,7 +45,7 @@ fn walk(random: &mut impl Rng, frames: usize, size: ImageSize) -> Vec<Camera> {
         .collect()
 }
 
-/// A patch of the room's surface while it is built: a flat, opaque, coloured Gaussian.
+/// A patch of the room's surface during construction: a flat, opaque, coloured Gaussian.
 struct Patch {
     mean: DVec3,
     normal: DVec3,
@@ -61,7 +61,7 @@ fn surfaces(random: &mut impl Rng) -> Gaussians {
             random.random_range(0.2..0.9),
         )
     };
-    // Back wall, floor, ceiling and two side walls, each a checkerboard of two colours.
+    // The back wall, floor, ceiling and two side walls, each a checkerboard of two colours.
     let walls = [
         (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
         (DVec3::new(-2., 1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),

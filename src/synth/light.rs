@@ -1,32 +1,33 @@
-//! What shines, and what is behind everything.
+//! Light sources and the sky.
 
 use super::noise::Noise;
 use glam::{Vec2, Vec3};
 
-/// A lamp, or the sun. Light is linear RGB; 1 is what a white wall sends back where it is well lit.
+/// A light source. Light is linear RGB, where 1 is the light reflected by a well-lit white wall.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Lamp {
-    /// Infinitely far, `towards` it (unit), as wide as `spread` radians; `colour` is irradiance across it.
+    /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians. `colour` is the
+    /// irradiance perpendicular to it.
     Sun { towards: Vec3, spread: f32, colour: Vec3 },
-    /// A ball at `at`, which may be seen and never blocks its own light; `colour` is irradiance at a metre.
+    /// A ball at `at`, which may be visible and never blocks its own light. `colour` is the irradiance at a distance of one metre.
     Ball { at: Vec3, radius: f32, colour: Vec3 },
-    /// A parallelogram of half sides `right` and `up` about `at`, shining along `facing` (unit); `colour` is what a metre from
-    /// its middle gets.
+    /// A parallelogram with half sides `right` and `up` around `at`, facing `facing` (unit). `colour` is the irradiance at a
+    /// distance of one metre from its centre.
     Panel { at: Vec3, right: Vec3, up: Vec3, facing: Vec3, colour: Vec3 },
 }
 
-/// Light on its way to a point.
+/// Light that arrives at a point.
 pub(super) struct Arriving {
-    /// Unit, towards the lamp.
+    /// Unit direction towards the lamp.
     pub towards: Vec3,
-    /// To where it left the lamp, in metres.
+    /// Distance to the point where the light left the lamp, in metres.
     pub distance: f32,
-    /// Irradiance across the ray, if nothing is in between.
+    /// Irradiance perpendicular to the ray, if nothing blocks it.
     pub colour: Vec3,
 }
 
 impl Lamp {
-    /// With `factor` times the light.
+    /// Returns the lamp with its light multiplied by `factor`.
     pub fn dimmed(self, factor: f32) -> Lamp {
         match self {
             Lamp::Sun { towards, spread, colour } => Lamp::Sun { towards, spread, colour: factor * colour },
@@ -37,7 +38,7 @@ impl Lamp {
         }
     }
 
-    /// What reaches `point` from the place on the lamp that `at` in [0, 1)² says.
+    /// Returns the light that reaches `point` from the position on the lamp given by `at` in [0, 1)².
     pub fn arriving(&self, point: Vec3, at: Vec2) -> Arriving {
         match *self {
             Lamp::Sun { towards, spread, colour } => {
@@ -51,7 +52,7 @@ impl Lamp {
                 let offset = radius * (at - 0.5);
                 let way = centre + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
-                // Nothing gets closer than a quarter metre's worth: pictures would burn out there.
+                // Limit the irradiance to that at about a quarter of a metre, to avoid overexposure.
                 let colour = colour / (distance * distance).max(0.06);
                 Arriving { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), colour }
             }
@@ -67,19 +68,19 @@ impl Lamp {
     }
 }
 
-/// What is seen where nothing is: a gradient from the horizon to the zenith, ground below, clouds.
+/// Background of a scene: a gradient from the horizon to the zenith, ground below, and clouds.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sky {
     pub zenith: Vec3,
     pub horizon: Vec3,
     pub ground: Vec3,
-    /// How much of the sky clouds cover, 0 to 1.
+    /// Fraction of the sky covered by clouds, 0 to 1.
     pub clouds: f32,
     pub noise: Noise,
 }
 
 impl Sky {
-    /// Radiance from the unit direction `towards`.
+    /// Returns the radiance from the unit direction `towards`.
     pub fn seen(&self, towards: Vec3) -> Vec3 {
         let up = towards.y;
         if up < 0. {
@@ -89,14 +90,14 @@ impl Sky {
         if self.clouds <= 0. {
             return clear;
         }
-        // On a flat layer, and finer towards the horizon for that.
+        // The clouds lie on a flat layer, and therefore look finer towards the horizon.
         let layer = Vec3::new(towards.x, 0., towards.z) / (up + 0.15);
         let density = 0.5 + 0.5 * self.noise.fractal(2. * layer, 4);
         let cover = ((density - 1. + self.clouds) * 4.).clamp(0., 1.) * (up * 6.).min(1.);
         clear.lerp(Vec3::splat(self.horizon.max_element()), 0.85 * cover)
     }
 
-    /// Mean radiance over the half space about `normal`, without the clouds' shapes.
+    /// Returns the mean radiance over the hemisphere around `normal`, without the shapes of the clouds.
     pub fn around(&self, normal: Vec3) -> Vec3 {
         let above = self.zenith.lerp(self.horizon, 0.5 + 0.3 * self.clouds);
         self.ground.lerp(above, 0.5 + 0.5 * normal.y)

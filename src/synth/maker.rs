@@ -1,4 +1,4 @@
-//! A world while it is made: what is in it so far, and the dice.
+//! Builder of synthetic scenes: their contents so far, and the random number generator.
 
 use super::material::Material;
 use super::mesh::Mesh;
@@ -12,14 +12,14 @@ use rand_chacha::ChaCha8Rng;
 use std::f32::consts::TAU;
 use std::sync::Arc;
 
-/// Textures of one purpose in a world; things share them, as they do in a home.
+/// Number of textures per purpose in a scene. Objects share them, as they do in a home.
 const SHARED: usize = 6;
 
-/// Puts things into a world.
+/// Builder that adds objects to a scene.
 pub(super) struct Maker {
     pub random: ChaCha8Rng,
     pub parts: Parts,
-    /// Pictures that a user wants to see on things.
+    /// Images that the user wants to appear on surfaces.
     pub pictures: Vec<Arc<Texture>>,
     textures: Vec<(Purpose, Arc<Texture>)>,
 }
@@ -33,7 +33,7 @@ impl Maker {
         self.random.random_range(range)
     }
 
-    /// Between `least` and `most`, small ones more often: each doubling is as likely as another.
+    /// Returns a random value between `least` and `most` on a logarithmic scale: each doubling is equally likely.
     pub fn scaled(&mut self, least: f32, most: f32) -> f32 {
         least * (most / least).powf(self.within(0. ..1.))
     }
@@ -50,7 +50,7 @@ impl Maker {
         self.within(0. ..TAU)
     }
 
-    /// A unit vector of any direction.
+    /// Returns a unit vector in a uniformly random direction.
     pub fn direction(&mut self) -> Vec3 {
         let (y, angle) = (self.within(-1f32..1.), self.turn());
         let ring = (1. - y * y).sqrt();
@@ -78,7 +78,7 @@ impl Maker {
         texture
     }
 
-    /// Anything that covers `purpose`: its own size and direction, matte or not.
+    /// Returns a random material for `purpose` with its own texture size and orientation, matte or glossy.
     pub fn material(&mut self, purpose: Purpose) -> Material {
         let texture = self.texture(purpose);
         let mut material = Material::matte(texture);
@@ -90,7 +90,7 @@ impl Maker {
         let larger = Affine2::from_scale(Vec2::splat(scale / material.texture.repeat_metres));
         material.repeats = Affine2::from_angle_translation(angle, offset) * larger;
         if purpose == Purpose::Thing && self.chance(0.5) {
-            // The same cloth in another colour.
+            // The same texture in another colour.
             material.tint = Vec3::new(self.within(0.4..1.), self.within(0.4..1.), self.within(0.4..1.));
         }
         let glossy = match purpose {
@@ -107,12 +107,12 @@ impl Maker {
         material
     }
 
-    /// One whole picture on a surface of `size` metres.
+    /// Returns a material that shows one whole image on a surface of `size` metres.
     pub fn picture(&mut self, size: Vec2) -> Material {
         let mut material = Material::matte(self.texture(Purpose::Poster));
         material.repeats = Affine2::from_scale(1. / size);
         if self.pictures.iter().any(|picture| Arc::ptr_eq(picture, &material.texture)) {
-            // A user's is the upper left quarter of its texture.
+            // A user's image occupies the upper left quarter of its texture.
             material.repeats = Affine2::from_scale_angle_translation(0.5 / size, 0., Vec2::new(0., 0.5));
         }
         material
@@ -123,7 +123,7 @@ impl Maker {
     }
 }
 
-/// Upright at `spot`, turned by `turn` about y.
+/// Returns the transform of an upright object at `spot`, rotated by `turn` about y.
 pub(super) fn standing(spot: Vec3, turn: f32) -> Affine3A {
     Affine3A::from_rotation_translation(Quat::from_rotation_y(turn), spot)
 }
@@ -145,7 +145,7 @@ mod tests {
         let hung =
             (0..32).map(|_| make.picture(size)).find(|material| Arc::ptr_eq(&material.texture, &picture));
         let seen = |x: f32, y: f32| hung.as_ref().unwrap().reflectance(Vec2::new(x, y) * size, 0.01).round();
-        // From below to above, as surfaces are measured.
+        // Surface coordinates go from bottom to top.
         assert_eq!(seen(0.2, 0.9), Vec3::new(1., 1., 0.));
         assert_eq!(seen(0.8, 0.9), Vec3::new(0., 1., 0.));
         assert_eq!(seen(0.2, 0.1), Vec3::new(1., 0., 0.));

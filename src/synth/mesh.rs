@@ -1,20 +1,20 @@
-//! Triangles with a place on the texture that covers them.
+//! Triangle meshes with texture coordinates.
 
 use glam::{Affine3A, Vec2, Vec3};
 
-/// A surface, or several. Lengths are in metres.
+/// A triangle mesh of one or more surfaces. Lengths are in metres.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Mesh {
     pub positions: Vec<Vec3>,
-    /// Along the surface, in metres.
+    /// Texture coordinates of the vertices, in metres along the surface.
     pub uvs: Vec<Vec2>,
-    /// Of vertices, counter-clockwise as seen from outside.
+    /// Vertex indices of each triangle, counter-clockwise when seen from outside.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl Mesh {
-    /// The surface `at(u, v)` over the unit square, in `columns` × `rows` cells, `size` metres of texture wide and high. Its
-    /// outside is where ∂at/∂u × ∂at/∂v points.
+    /// Creates the surface `at(u, v)` over the unit square, in `columns` × `rows` cells. The texture is `size` metres wide and
+    /// high. The outside is in the direction of ∂at/∂u × ∂at/∂v.
     pub fn grid(columns: usize, rows: usize, size: Vec2, at: impl Fn(f32, f32) -> Vec3) -> Mesh {
         let mut mesh = Mesh::default();
         for row in 0..=rows {
@@ -35,8 +35,8 @@ impl Mesh {
         mesh
     }
 
-    /// The rectangle at `corner` along two sides, in cells of `cell` metres or somewhat less. Its outside is where
-    /// `along` × `up` points.
+    /// Creates the rectangle at `corner` along two sides, in cells of at most `cell` metres. The outside is in the direction of
+    /// `along` × `up`.
     pub fn rectangle(corner: Vec3, along: Vec3, up: Vec3, cell: f32) -> Mesh {
         let size = Vec2::new(along.length(), up.length());
         let cells = (size / cell).ceil().clamp(Vec2::ONE, Vec2::splat(64.));
@@ -50,25 +50,25 @@ impl Mesh {
         self.triangles.extend(other.triangles.iter().map(|corners| corners.map(|vertex| first + vertex)));
     }
 
-    /// Moved, turned and scaled; the texture keeps its size.
+    /// Returns the mesh transformed by `by`. The texture keeps its size.
     pub fn moved(self, by: Affine3A) -> Mesh {
         self.warped(|position| by.transform_point3(position))
     }
 
-    /// With every vertex where `to` takes it.
+    /// Returns the mesh with every vertex mapped by `to`.
     pub fn warped(mut self, to: impl Fn(Vec3) -> Vec3) -> Mesh {
         self.positions.iter_mut().for_each(|position| *position = to(*position));
         self
     }
 
-    /// The smallest box around it: its least and its greatest corner.
+    /// Returns the bounding box: its minimum and maximum corners.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         let none = (Vec3::INFINITY, Vec3::NEG_INFINITY);
         self.positions.iter().fold(none, |(least, most), &p| (least.min(p), most.max(p)))
     }
 
-    /// For every vertex a place on its triangles, a fifth of the way to their middle: on the edge of a surface that of the next
-    /// one begins, and behind that may be anything.
+    /// Returns for every vertex a point on its triangles, a fifth of the way to their centres. A vertex itself may lie on the edge
+    /// where another surface begins, with anything behind it.
     pub fn insides(&self) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.); self.positions.len()];
         for corners in &self.triangles {
@@ -82,7 +82,8 @@ impl Mesh {
         self.positions.iter().zip(&sums).map(inside).collect()
     }
 
-    /// A unit normal a vertex, the mean of its triangles' by their areas: smooth within a grid, sharp where grids meet.
+    /// Returns a unit normal per vertex, the area-weighted mean of its triangles' normals: smooth within a grid, sharp between
+    /// grids.
     pub fn normals(&self) -> Vec<Vec3> {
         let mut normals = vec![Vec3::ZERO; self.positions.len()];
         for corners in &self.triangles {

@@ -1,8 +1,8 @@
-//! Made-up worlds and videos taken in them: endless posed photos for where there are none, or too few.
+//! Synthetic scenes and videos of them: unlimited posed photos for training without enough real ones.
 //!
-//! A world is made of plain shapes (`shapes`), which make things (`things`), which stand in rooms (`room`) and under the sky
-//! (`open`); textures of many families cover them. A [`Video`] looks at it along a path through its free space (`walk`), by
-//! rays through triangles (`tracer`), and a sensor makes bytes of that.
+//! A scene consists of plain shapes (`shapes`), which form objects (`things`), which are placed in rooms (`room`) and outdoors
+//! (`open`). Textures of many families cover them. A [`Video`] views the scene along a path through its free space (`walk`) by ray
+//! tracing triangles (`tracer`), and a sensor model converts the light to bytes.
 
 mod gaussian_room;
 mod light;

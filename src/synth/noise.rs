@@ -2,7 +2,7 @@
 
 use glam::{IVec3, Vec3};
 
-/// Value noise: random numbers on the integer lattice, smooth in between.
+/// Value noise: random values on the integer lattice, smoothly interpolated.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Noise {
     seed: u32,
@@ -13,7 +13,7 @@ impl Noise {
         Noise { seed }
     }
 
-    /// In [-1, 1].
+    /// Returns the noise at `place`, in [-1, 1].
     pub fn at(&self, place: Vec3) -> f32 {
         let floor = place.floor();
         let fraction = place - floor;
@@ -27,7 +27,7 @@ impl Noise {
         face(0) + weight.z * (face(1) - face(0))
     }
 
-    /// The sum of `octaves`, each twice as fine and half as strong; in [-1, 1].
+    /// Returns the sum of `octaves`, each with twice the frequency and half the amplitude of the previous one, in [-1, 1].
     pub fn fractal(&self, place: Vec3, octaves: u32) -> f32 {
         let terms = (0..octaves).map(|octave| {
             let scale = (1 << octave) as f32;
@@ -39,7 +39,7 @@ impl Noise {
 
     fn corner(&self, cell: IVec3) -> f32 {
         let [x, y, z] = cell.to_array().map(|i| i as u32);
-        // Multiply and fold until every bit of the cell has reached every bit of the number.
+        // Multiply and fold until every bit of the cell affects every bit of the result.
         let mut bits = self.seed
             ^ x.wrapping_mul(0x8da6_b343)
             ^ y.wrapping_mul(0xd816_3841)

@@ -1,4 +1,4 @@
-//! Open scenes: ground, and what stands on it under the sky.
+//! Outdoor scenes: ground, and objects on it under the sky.
 
 use super::light::{Lamp, Sky};
 use super::maker::{Maker, standing};
@@ -9,7 +9,7 @@ use super::things;
 use super::walk::Place;
 use glam::{Affine3A, Vec3, vec2, vec3};
 
-/// Any sky: clear, hazy, overcast, at noon or in the evening.
+/// Returns a random sky: clear, hazy or overcast, at noon or in the evening.
 pub(super) fn sky(make: &mut Maker) -> Sky {
     let evening = make.within(0. ..1f32).powi(2);
     let overcast = make.within(0. ..1.);
@@ -26,7 +26,7 @@ pub(super) fn sky(make: &mut Maker) -> Sky {
     }
 }
 
-/// A landscape or a street. Returns where cameras may be.
+/// Builds a landscape or a street. Returns the space where cameras may be.
 pub(super) fn landscape(make: &mut Maker, sky: &Sky) -> Place {
     let noise = make.noise();
     let (hills, wide) = (make.within(0. ..1f32).powi(3) * 2.5, make.within(6. ..24.));
@@ -38,7 +38,7 @@ pub(super) fn landscape(make: &mut Maker, sky: &Sky) -> Place {
     let ground = make.material(Purpose::Ground);
     make.put(height_field(vec2(160., 160.), 100, height), &ground, Affine3A::IDENTITY);
     if make.chance(0.5) {
-        // A path or a street, and what goes along it.
+        // A path or a street.
         let paving = make.material(Purpose::Ground);
         let half = make.within(0.5..3.);
         let (bend, phase) = (make.within(0. ..3.), make.turn());
@@ -96,7 +96,7 @@ pub(super) fn landscape(make: &mut Maker, sky: &Sky) -> Place {
     }
 }
 
-/// What is seen through the windows of a room of `size`.
+/// Builds the surroundings that are visible through the windows of a room of `size`.
 pub(super) fn outside(make: &mut Maker, size: Vec3) {
     let below = make.within(0. ..1f32).powi(2) * 8. + 0.1;
     let middle = vec3(0.5 * size.x, -below, 0.5 * size.z);

@@ -1,4 +1,4 @@
-//! Rooms: floor, ceiling, walls with openings, and what people put there.
+//! Rooms: floor, ceiling, walls with openings, and furnishings.
 
 use super::light::{Lamp, Sky};
 use super::maker::{Maker, standing};
@@ -12,10 +12,10 @@ use super::walk::Place;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3, vec2, vec3};
 use std::f32::consts::FRAC_PI_2;
 
-/// Largest side of a wall's triangles in metres: indirect light is known at their corners.
+/// Maximum side of a wall's triangles in metres. Indirect light is computed at their corners.
 const CELL: f32 = 0.35;
 
-/// A hole in a wall, in metres along it and up.
+/// A hole in a wall, in metres along the wall and up.
 #[derive(Clone, Copy)]
 struct Opening {
     from: Vec2,
@@ -23,7 +23,7 @@ struct Opening {
     is_door: bool,
 }
 
-/// A wall seen from the room: it begins at `corner`, and its inside is to the left of `along`, as seen from above.
+/// A wall seen from the room. It begins at `corner`, and its inside is to the left of `along` when seen from above.
 struct Wall {
     corner: Vec3,
     along: Vec3,
@@ -32,7 +32,7 @@ struct Wall {
 }
 
 impl Wall {
-    /// From coordinates of the wall (along, up, into the room) to the room's.
+    /// Returns the transform from wall coordinates (along, up, into the room) to room coordinates.
     fn place(&self) -> Affine3A {
         let into = self.along.cross(Vec3::Y);
         let rotation = Mat3::from_cols(self.along, Vec3::Y, into);
@@ -44,7 +44,7 @@ impl Wall {
     }
 }
 
-/// Furnishes a room. Returns where cameras may be.
+/// Builds a furnished room. Returns the space where cameras may be.
 pub(super) fn room(make: &mut Maker, sky: &mut Sky) -> Place {
     let size = vec3(make.scaled(2.6, 9.), make.within(2.3..3.6), make.scaled(2.6, 9.));
     let (wall, floor, ceiling) =
@@ -85,7 +85,7 @@ pub(super) fn room(make: &mut Maker, sky: &mut Sky) -> Place {
     }
 }
 
-/// Windows and doors.
+/// Adds windows and doors to the wall.
 fn open_up(make: &mut Maker, wall: &mut Wall, height: f32) {
     for _ in 0..make.one_of(&[0, 0, 1, 1, 2, 3]) {
         let is_door = make.chance(0.3);
@@ -106,7 +106,7 @@ fn open_up(make: &mut Maker, wall: &mut Wall, height: f32) {
     wall.openings.sort_by(|a, b| a.from.x.total_cmp(&b.from.x));
 }
 
-/// The wall around its openings, their reveals and frames, a skirting board.
+/// Builds the wall around its openings, their reveals and frames, and a skirting board.
 fn build(make: &mut Maker, wall: &Wall, height: f32, material: &Material) {
     let place = wall.place();
     let panel = |make: &mut Maker, from: Vec2, to: Vec2| {
@@ -153,7 +153,7 @@ fn build(make: &mut Maker, wall: &Wall, height: f32, material: &Material) {
         }
         if is_door {
             if make.chance(0.4) {
-                // Its leaf, open by some angle.
+                // The leaf of the door, opened by a random angle.
                 let leaf = cuboid(vec3(size.x, size.y, 0.04), 0.);
                 let wood = make.material(Purpose::Thing);
                 let hinge = Affine3A::from_translation(vec3(from.x, 0., 0.))
@@ -163,7 +163,7 @@ fn build(make: &mut Maker, wall: &Wall, height: f32, material: &Material) {
             }
             continue;
         }
-        // Bars that part the panes, and a sill.
+        // Glazing bars between the panes.
         let (columns, rows) = (make.within(1..4), make.within(1..4));
         for i in 1..columns {
             let bar = cuboid(vec3(0.04, size.y, 0.04), 0.);
@@ -194,7 +194,7 @@ fn build(make: &mut Maker, wall: &Wall, height: f32, material: &Material) {
     }
 }
 
-/// Beams under the ceiling, or columns.
+/// Adds beams under the ceiling, or columns.
 fn beams(make: &mut Maker, size: Vec3) {
     let wood = make.material(Purpose::Thing);
     let thick = make.within(0.08..0.3);
@@ -233,7 +233,7 @@ fn furnish(make: &mut Maker, size: Vec3, walls: &[Wall]) {
     }
     for wall in walls {
         let place = wall.place();
-        // Along the wall, backs to it.
+        // Furniture along the wall, with its back to it.
         let mut reached = make.within(0.3..1.2);
         while reached < wall.length - 0.6 {
             let spot = vec3(reached, 0., 0.5);
@@ -245,7 +245,7 @@ fn furnish(make: &mut Maker, size: Vec3, walls: &[Wall]) {
             }
             reached += make.within(0.9..2.4);
         }
-        // On the wall.
+        // Pictures and mirrors on the wall.
         let mut reached = make.within(0.4..1.4);
         while reached < wall.length - 0.4 {
             if wall.is_free(reached - 0.4, reached + 0.4) && make.chance(0.6) {
@@ -258,7 +258,7 @@ fn furnish(make: &mut Maker, size: Vec3, walls: &[Wall]) {
             reached += make.within(0.7..2.2);
         }
     }
-    // In the middle.
+    // Furniture in the middle of the room.
     let area = size.x * size.z;
     for _ in 0..make.within(0..=(0.12 * area) as usize + 1) {
         let spot = vec3(make.within(0.25..0.75) * size.x, 0., make.within(0.25..0.75) * size.z);
@@ -269,7 +269,7 @@ fn furnish(make: &mut Maker, size: Vec3, walls: &[Wall]) {
     things::clutter(make, 0.9 * vec2(size.x, size.z), floor, 8);
 }
 
-/// Lamps that hang or stick to the ceiling, in one tone, and the sun where it can come in.
+/// Adds ceiling and hanging lamps of one colour tone, and the sun if it can shine in.
 fn light(make: &mut Maker, size: Vec3, sky: &mut Sky, has_openings: bool) {
     let warmth = make.within(0. ..1.);
     let tone = vec3(1., 1. - 0.25 * warmth, 1. - 0.55 * warmth);
@@ -315,19 +315,19 @@ fn light(make: &mut Maker, size: Vec3, sky: &mut Sky, has_openings: bool) {
         make.parts.lamps.push(Lamp::Sun { towards, spread: 0.02, colour: 8. * vec3(1., 0.93, 0.82) });
     }
     if has_openings {
-        // Days are brighter than rooms.
+        // The outdoors is brighter than rooms in daytime.
         let brighter = make.within(1. ..2.5);
         (sky.zenith, sky.horizon, sky.ground) =
             (brighter * sky.zenith, brighter * sky.horizon, brighter * sky.ground);
     } else {
-        // What a closed room's lamps send around more than once.
+        // Approximates the light of a closed room's lamps after more than one bounce.
         let rest = make.within(0.1..0.5) * tone;
         (sky.zenith, sky.horizon, sky.ground) = (rest, rest, rest);
     }
 }
 
-/// A closed box full of plain shapes in mid-air and on the floor, covered with anything: nothing in it is known, all of it
-/// is to be seen.
+/// Builds a closed box full of plain shapes in mid-air and on the floor, with random textures. It contains no recognizable objects,
+/// and everything in it may be visible.
 pub(super) fn box_of_shapes(make: &mut Maker, sky: &mut Sky) -> Place {
     let size = vec3(make.scaled(3., 10.), make.within(2.4..5.), make.scaled(3., 10.));
     let purposes = [Purpose::Wall, Purpose::Floor, Purpose::Thing, Purpose::Ground];

@@ -1,35 +1,35 @@
-//! From light to bytes: exposure, white balance, a tone curve, vignetting, noise.
+//! Camera sensor model from radiance to bytes: exposure, white balance, tone curve, vignetting, noise.
 
 use super::maker::Maker;
 use super::noise::Noise;
 use glam::{Vec2, Vec3, vec3};
 
-/// A camera's way with light, the same for a whole video but for what exposure does by itself.
+/// Response of a camera to light, constant over a video except for automatic exposure.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sensor {
     /// Factors on radiance.
     gain: Vec3,
-    /// How softly bright light ends: 0 cuts it off.
+    /// Softness of the highlight rolloff: 0 clips.
     shoulder: f32,
-    /// Exponent on what is shown.
+    /// Exponent on encoded values.
     contrast: f32,
     saturation: f32,
-    /// Share of the light that corners lose.
+    /// Share of the light that is lost in the corners.
     vignette: f32,
-    /// Standard deviation of noise in shares of white, in the dark and from light itself.
+    /// Standard deviation of the noise relative to white: in the dark, and the part that depends on the light.
     noise: (f32, f32),
-    /// How much exposure wanders, in doublings.
+    /// Maximum variation of the exposure, in stops.
     wandering: f32,
     wander: Noise,
     seed: u32,
 }
 
 impl Sensor {
-    /// For pictures that mean `seen` without it.
+    /// Draws a random sensor for images with the mean radiance `seen`.
     pub fn draw(make: &mut Maker, seen: Vec3) -> Sensor {
         let brightness = seen.element_sum() / 3.;
         let target = 0.2 * make.scaled(0.6, 2.);
-        // Cameras take most of the light's colour away.
+        // Automatic white balance removes most of the light's colour.
         let neutral = brightness / seen.max(Vec3::splat(0.2 * brightness)).max(Vec3::splat(1e-6));
         let white = Vec3::ONE.lerp(neutral, make.within(0.2..0.8));
         let tint = vec3(make.within(0.94..1.06), 1., make.within(0.94..1.06));
@@ -47,12 +47,13 @@ impl Sensor {
         }
     }
 
-    /// The factor on light that a picture taken at `time` in [0, 1] of the video has.
+    /// Returns the exposure factor of an image taken at `time` in [0, 1] of the video.
     pub fn exposure(&self, time: f32) -> f32 {
         (self.wandering * self.wander.at(vec3(4. * time, 0.5, 0.5))).exp2()
     }
 
-    /// sRGB bytes of radiance at `place` in [-1, 1]² of a picture of that `exposure`: of its pixel `pixel`, in frame `frame`.
+    /// Converts radiance to sRGB bytes for pixel `pixel` of frame `frame`. `place` in [-1, 1]² is the position in the image, and
+    /// `exposure` the image's exposure.
     pub fn bytes(&self, radiance: Vec3, exposure: f32, place: Vec2, frame: u32, pixel: u32) -> [u8; 3] {
         let corner = 1. - self.vignette * place.length_squared() / 2.;
         let light = radiance * self.gain * exposure * corner;
@@ -67,7 +68,7 @@ impl Sensor {
         })
     }
 
-    /// Linear up to a half, then towards 1.
+    /// Applies the tone curve: linear up to the knee (at least a half), then approaching 1.
     fn tone(&self, x: f32) -> f32 {
         let knee = 1. - 0.5 * self.shoulder;
         if x <= knee {
@@ -78,12 +79,12 @@ impl Sensor {
     }
 }
 
-/// sRGB's transfer function (IEC 61966-2-1).
+/// Applies the sRGB transfer function (IEC 61966-2-1).
 fn encode(x: f32) -> f32 {
     if x <= 0.003_130_8 { 12.92 * x } else { 1.055 * x.min(1.).powf(1. / 2.4) - 0.055 }
 }
 
-/// Random numbers of a pixel, the same on every thread.
+/// Random number generator of a pixel, which doesn't depend on the thread.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hash {
     state: u32,
@@ -98,19 +99,19 @@ impl Hash {
         hash
     }
 
-    /// The permuted congruential generator of O'Neill (2014), 32 bits.
+    /// Returns the next value of the permuted congruential generator of O'Neill (2014), 32 bits.
     fn next(&mut self) -> u32 {
         self.state = self.state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
         let word = ((self.state >> ((self.state >> 28) + 4)) ^ self.state).wrapping_mul(277_803_737);
         (word >> 22) ^ word
     }
 
-    /// In [0, 1).
+    /// Returns a uniform random value in [0, 1).
     pub fn uniform(&mut self) -> f32 {
         (self.next() >> 8) as f32 / (1 << 24) as f32
     }
 
-    /// About normal: the sum of four uniform numbers, of variance 1.
+    /// Returns an approximately normal random value of variance 1: the scaled sum of four uniform values.
     fn normal(&mut self) -> f32 {
         let sum: f32 = (0..4).map(|_| self.uniform()).sum();
         (sum - 2.) * 3f32.sqrt()

@@ -1,11 +1,12 @@
-//! The plain shapes that everything is made of, and what bends them. Each is centred or stands on y = 0 as it says; y is up.
+//! Plain shapes that all objects are made of, and deformations. The y axis points up. Each shape is centred or stands on y = 0, as
+//! documented.
 
 use super::mesh::Mesh;
 use super::noise::Noise;
 use glam::{Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
 
-/// A box of `size`, standing on y = 0, its edges rounded by `round` metres.
+/// Creates a box of `size`, standing on y = 0, with edges rounded by `round` metres.
 pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
     let half = size / 2.;
     let round = round.min(half.min_element());
@@ -19,7 +20,7 @@ pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
             right[(axis + 1) % 3] = sign;
             let up = normal.cross(right);
             let (along, across) = ((right * size).length(), (up * size).length());
-            // Cells are finer where the edges turn.
+            // Cells are finer at the rounded edges.
             let place = |t: f32| if round > 0. { 2. * smooth(t) - 1. } else { 2. * t - 1. };
             mesh.join(Mesh::grid(cells, cells, Vec2::new(along, across), |u, v| {
                 let flat = (normal + place(u) * right + place(v) * up) * half;
@@ -31,7 +32,7 @@ pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
     mesh.warped(|p| p + Vec3::Y * half.y)
 }
 
-/// A superellipsoid of `size`, centred: with exponents of 1 an ellipsoid, towards 0 a box or a cylinder, above 1 a star.
+/// Creates a centred superellipsoid of `size`. Exponents of 1 give an ellipsoid, towards 0 a box or a cylinder, above 1 a star.
 pub(super) fn superellipsoid(size: Vec3, [polar, around]: [f32; 2], cells: usize) -> Mesh {
     let power = |x: f32, e: f32| x.signum() * x.abs().powf(e);
     let texture = Vec2::new(PI * size.x.max(size.z), PI / 2. * size.y);
@@ -44,13 +45,13 @@ pub(super) fn superellipsoid(size: Vec3, [polar, around]: [f32; 2], cells: usize
     })
 }
 
-/// A surface of revolution about y through `profile`, (radius, height) from below to above.
+/// Creates a surface of revolution about y through `profile`, (radius, height) from bottom to top.
 pub(super) fn lathe(profile: &[Vec2], cells: usize) -> Mesh {
     let widest = profile.iter().fold(0f32, |widest, p| widest.max(p.x));
     let lengths: Vec<f32> = profile.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
     let mut mesh = Mesh::default();
     let mut above = 0.;
-    // A grid a piece: profiles have corners.
+    // Each piece has its own grid, because profiles have corners.
     for (pair, &length) in profile.windows(2).zip(&lengths) {
         let mut piece = Mesh::grid(cells, 1, Vec2::new(TAU * widest, length), |u, v| {
             let at = pair[0].lerp(pair[1], v);
@@ -64,13 +65,13 @@ pub(super) fn lathe(profile: &[Vec2], cells: usize) -> Mesh {
     mesh
 }
 
-/// A cylinder or cone on y = 0, with its lids.
+/// Creates a cylinder or cone on y = 0, including its caps.
 pub(super) fn cone(below: f32, above: f32, height: f32, cells: usize) -> Mesh {
     let rim = |radius: f32, y: f32| Vec2::new(radius, y);
     lathe(&[rim(0., 0.), rim(below, 0.), rim(above, height), rim(0., height)], cells)
 }
 
-/// A tube of `radius(t)` about the curve `at(t)`, t from 0 to 1; a torus where the curve is closed.
+/// Creates a tube of `radius(t)` around the curve `at(t)`, t from 0 to 1. A closed curve gives a torus.
 pub(super) fn tube(
     at: impl Fn(f32) -> Vec3,
     radius: impl Fn(f32) -> f32,
@@ -79,7 +80,7 @@ pub(super) fn tube(
     let step = 1e-2;
     let points: Vec<Vec3> = (0..=along).map(|i| at(i as f32 / along as f32)).collect();
     let length: f32 = points.windows(2).map(|pair| pair[0].distance(pair[1])).sum();
-    // The side is carried along the curve, so that the tube doesn't twist.
+    // The side vector is transported along the curve, so that the tube doesn't twist.
     let mut side = (at(step) - at(0.)).normalize_or(Vec3::Y).any_orthonormal_vector();
     let sides: Vec<(Vec3, Vec3)> = (0..=along)
         .map(|i| {
@@ -98,7 +99,7 @@ pub(super) fn tube(
     })
 }
 
-/// A sheet of `size` about the origin, `height(x, z)` above y = 0.
+/// Creates a sheet of `size` around the origin, at `height(x, z)` above y = 0.
 pub(super) fn height_field(size: Vec2, cells: usize, height: impl Fn(f32, f32) -> f32) -> Mesh {
     Mesh::grid(cells, cells, size, |u, v| {
         let (x, z) = ((u - 0.5) * size.x, (0.5 - v) * size.y);
@@ -106,7 +107,7 @@ pub(super) fn height_field(size: Vec2, cells: usize, height: impl Fn(f32, f32) -
     })
 }
 
-/// A piece of cloth that hangs from y = 0, `width` × `height`, in `folds` waves of `depth` metres.
+/// Creates a piece of cloth that hangs from y = 0, `width` × `height`, in `folds` waves of `depth` metres.
 pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
     Mesh::grid((6. * folds) as usize + 2, 4, Vec2::new(1.3 * width, height), |u, v| {
         let wave = (TAU * folds * u).sin() + 0.3 * (3.1 * folds * u).sin();
@@ -114,7 +115,7 @@ pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
     })
 }
 
-/// Moves every point by up to `strength` metres, in waves of `1 / frequency`.
+/// Moves every point by up to `strength` metres, with wavelengths of `1 / frequency`.
 pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) -> Mesh {
     mesh.warped(|p| {
         let q = p * frequency;
@@ -123,7 +124,7 @@ pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) 
     })
 }
 
-/// Turns about y by `turns` a metre of height.
+/// Twists the mesh about y by `turns` full turns per metre of height.
 pub(super) fn twist(mesh: Mesh, turns: f32) -> Mesh {
     mesh.warped(|p| {
         let (sin, cos) = (TAU * turns * p.y).sin_cos();
@@ -131,7 +132,7 @@ pub(super) fn twist(mesh: Mesh, turns: f32) -> Mesh {
     })
 }
 
-/// Scales across y by 1 + `slope` · y.
+/// Scales the mesh perpendicular to y by 1 + `slope` · y.
 pub(super) fn taper(mesh: Mesh, slope: f32) -> Mesh {
     mesh.warped(|p| {
         let scale = (1. + slope * p.y).max(0.05);
@@ -148,7 +149,7 @@ mod tests {
     use super::*;
     use glam::vec3;
 
-    /// By the divergence theorem: negative where the inside is out.
+    /// Returns the volume by the divergence theorem. It is negative if the surface is inside out.
     fn volume(mesh: &Mesh) -> f32 {
         let tetrahedron = |corners: &[u32; 3]| {
             let [a, b, c] = corners.map(|vertex| mesh.positions[vertex as usize]);

@@ -1,4 +1,4 @@
-//! Things that stand about: each is made of plain shapes, stands on y = 0 about the origin, and faces +z.
+//! Objects made of plain shapes. Each stands on y = 0 around the origin and faces +z.
 
 use super::maker::{Maker, standing};
 use super::material::Material;
@@ -19,7 +19,7 @@ fn turned(angle: f32) -> Affine3A {
     Affine3A::from_rotation_y(angle)
 }
 
-/// Any plain shape, stretched, bent and rough at random, within `size`, standing on y = 0.
+/// Creates a random plain shape within `size`, possibly stretched, bent and roughened, standing on y = 0.
 pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
     let half = size / 2.;
     let mut mesh = match make.within(0..9) {
@@ -81,7 +81,7 @@ pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
     mesh.moved(at(0., -least.y, 0.))
 }
 
-/// A heap of plain shapes on and beside each other, `size` metres wide and high.
+/// Adds a heap of plain shapes on and beside each other, of about `size` in metres.
 pub(super) fn heap(make: &mut Maker, size: Vec3, place: Affine3A, count: usize) {
     for _ in 0..count {
         let part = size * vec3(make.within(0.2..0.6), make.within(0.2..0.6), make.within(0.2..0.6));
@@ -97,7 +97,7 @@ pub(super) fn heap(make: &mut Maker, size: Vec3, place: Affine3A, count: usize) 
     }
 }
 
-/// A table: a top on legs, on a foot or on sides, and things on it.
+/// Adds a table: a top on legs or on a central foot, with objects on it.
 pub(super) fn table(make: &mut Maker, place: Affine3A) {
     let size = vec3(make.within(0.5..2.), make.within(0.4..0.85), make.within(0.5..1.1));
     let (top, legs) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
@@ -121,7 +121,7 @@ pub(super) fn table(make: &mut Maker, place: Affine3A) {
     clutter(make, vec2(0.8 * size.x, 0.8 * size.z), surface, 6);
 }
 
-/// Small things on a surface of `size`: boxes, vessels, books, heaps.
+/// Adds small objects on a surface of `size`: books, vessels, lamps, plain shapes.
 pub(super) fn clutter(make: &mut Maker, size: Vec2, place: Affine3A, most: usize) {
     for _ in 0..make.within(0..=most) {
         let spot =
@@ -139,7 +139,7 @@ pub(super) fn clutter(make: &mut Maker, size: Vec2, place: Affine3A, most: usize
     }
 }
 
-/// A bowl, cup, bottle or vase, and now and then a plant in it.
+/// Adds a bowl, cup, bottle or vase, sometimes with a plant in it.
 pub(super) fn vessel(make: &mut Maker, place: Affine3A) {
     let (radius, height) = (make.within(0.03..0.14), make.within(0.06..0.4));
     let material = make.material(Purpose::Thing);
@@ -153,7 +153,7 @@ pub(super) fn vessel(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// A row of books, or a pile, `length` metres long.
+/// Adds a row or a pile of books, `length` metres long.
 pub(super) fn books(make: &mut Maker, place: Affine3A, length: f32) {
     let mut reached = 0.;
     let piled = make.chance(0.3);
@@ -182,7 +182,7 @@ pub(super) fn books(make: &mut Maker, place: Affine3A, length: f32) {
     }
 }
 
-/// Shelves with things on them, a cupboard with doors, or a chest of drawers.
+/// Adds shelves with objects on them, a cupboard with doors, or a chest of drawers.
 pub(super) fn cabinet(make: &mut Maker, place: Affine3A) {
     let size = vec3(make.within(0.5..2.2), make.within(0.6..2.3), make.within(0.25..0.6));
     let (body, front) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
@@ -225,7 +225,7 @@ pub(super) fn cabinet(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// A chair or stool.
+/// Adds a chair or stool.
 pub(super) fn chair(make: &mut Maker, place: Affine3A) {
     let (wide, deep, seat) = (make.within(0.38..0.6), make.within(0.38..0.6), make.within(0.38..0.5));
     let (cloth, wood) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
@@ -252,7 +252,7 @@ pub(super) fn chair(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// A sofa or armchair with cushions.
+/// Adds a sofa or armchair with cushions.
 pub(super) fn sofa(make: &mut Maker, place: Affine3A) {
     let (wide, deep) = (make.within(0.8..2.4), make.within(0.75..1.));
     let cloth = make.material(Purpose::Thing);
@@ -271,7 +271,7 @@ pub(super) fn sofa(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// A bed with bedding.
+/// Adds a bed with bedding.
 pub(super) fn bed(make: &mut Maker, place: Affine3A) {
     let (wide, long, high) = (make.within(0.9..2.), 2.1, make.within(0.35..0.6));
     let (wood, sheet, cover) =
@@ -291,7 +291,7 @@ pub(super) fn bed(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// A shade on a stand, `height` metres high, that glows when it is on.
+/// Adds a lamp of `height` metres: a shade on a stand, which glows if the lamp is on.
 pub(super) fn lamp(make: &mut Maker, place: Affine3A, height: f32) {
     let (stand, mut shade) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
     shade.glow = if make.chance(0.6) { make.within(0.5..2.5) } else { 0. };
@@ -305,7 +305,7 @@ pub(super) fn lamp(make: &mut Maker, place: Affine3A, height: f32) {
     make.put(lathe(&rims, 18), &shade, place);
 }
 
-/// Leaves on arching stems, up to `reach` metres.
+/// Adds leaves on arching stems, up to `reach` metres long.
 pub(super) fn leaves(make: &mut Maker, place: Affine3A, reach: f32, count: usize) {
     let mut material = make.material(Purpose::Foliage);
     material.mirror = 0.;
@@ -325,7 +325,7 @@ pub(super) fn leaves(make: &mut Maker, place: Affine3A, reach: f32, count: usize
     make.put(all, &material, place);
 }
 
-/// A plant in a pot on the floor.
+/// Adds a plant in a pot on the floor.
 pub(super) fn plant(make: &mut Maker, place: Affine3A) {
     let (radius, height) = (make.within(0.1..0.25), make.within(0.15..0.5));
     let pot = make.material(Purpose::Thing);
@@ -339,7 +339,7 @@ pub(super) fn plant(make: &mut Maker, place: Affine3A) {
     leaves(make, place * at(0., 0.9 * height, 0.), reach, count);
 }
 
-/// A picture in a frame on a wall: its back at z = 0, its middle at the origin.
+/// Adds a framed picture on a wall, with its back at z = 0 and its centre at the origin.
 pub(super) fn picture(make: &mut Maker, place: Affine3A) {
     let size = vec2(make.scaled(0.2, 1.4), make.scaled(0.2, 1.2));
     let poster = make.picture(size);
@@ -351,7 +351,7 @@ pub(super) fn picture(make: &mut Maker, place: Affine3A) {
     make.put(sheet, &poster, place);
 }
 
-/// A mirror in a frame, placed as a picture.
+/// Adds a framed mirror, placed like a picture.
 pub(super) fn mirror(make: &mut Maker, place: Affine3A) {
     let size = vec2(make.within(0.4..1.2), make.within(0.5..1.6));
     let frame = make.material(Purpose::Thing);
@@ -366,7 +366,7 @@ pub(super) fn mirror(make: &mut Maker, place: Affine3A) {
     make.put(sheet, &glass, place);
 }
 
-/// Curtains on both sides of a window of `size`, its middle at the origin.
+/// Adds curtains on both sides of a window of `size` whose centre is at the origin.
 pub(super) fn curtains(make: &mut Maker, place: Affine3A, size: Vec2) {
     let cloth = make.material(Purpose::Thing);
     let (wide, folds) = (size.x * make.within(0.2..0.4), make.within(3. ..7.));
@@ -377,7 +377,7 @@ pub(super) fn curtains(make: &mut Maker, place: Affine3A, size: Vec2) {
     }
 }
 
-/// A tree: a bent trunk, branches, and a crown of leaves or of clouds of green.
+/// Adds a tree: a bent trunk, branches, and a crown of leaves or of green clouds.
 pub(super) fn tree(make: &mut Maker, place: Affine3A, height: f32) {
     let bark = make.material(Purpose::Thing);
     let (bend_x, bend_z) = (make.within(-0.15..0.15) * height, make.within(-0.15..0.15) * height);
@@ -420,7 +420,7 @@ pub(super) fn tree(make: &mut Maker, place: Affine3A, height: f32) {
     }
 }
 
-/// A bush or a tuft of grass.
+/// Adds a bush or a tuft of grass.
 pub(super) fn bush(make: &mut Maker, place: Affine3A) {
     let size = vec3(make.within(0.4..1.6), make.within(0.3..1.2), make.within(0.4..1.6));
     if make.chance(0.5) {
@@ -432,7 +432,7 @@ pub(super) fn bush(make: &mut Maker, place: Affine3A) {
     make.put(ball, &crown, place * at(0., 0.4 * size.y, 0.));
 }
 
-/// A rock.
+/// Adds a rock.
 pub(super) fn rock(make: &mut Maker, place: Affine3A, size: f32) {
     let (stone, noise) = (make.material(Purpose::Ground), make.noise());
     let size = size * vec3(make.within(0.6..1.4), make.within(0.4..1.), make.within(0.6..1.4));
@@ -441,7 +441,7 @@ pub(super) fn rock(make: &mut Maker, place: Affine3A, size: f32) {
     make.put(rough, &stone, place * at(0., 0.3 * size.y, 0.));
 }
 
-/// A house: walls with windows and a door, under a roof.
+/// Adds a house: walls with windows and doors, under a roof.
 pub(super) fn house(make: &mut Maker, place: Affine3A) {
     let size = vec3(make.within(4. ..10.), make.within(2.6..7.), make.within(4. ..9.));
     let (wall, roof) = (make.material(Purpose::Facade), make.material(Purpose::Facade));
@@ -483,7 +483,7 @@ pub(super) fn house(make: &mut Maker, place: Affine3A) {
     }
 }
 
-/// Panes of a house seen from outside: dark, and they mirror.
+/// Returns the material of window panes seen from outside: dark and reflecting.
 fn window_glass(make: &mut Maker) -> Material {
     let mut glass = make.material(Purpose::Ceiling);
     glass.tint = Vec3::splat(make.within(0.03..0.25));
@@ -491,7 +491,7 @@ fn window_glass(make: &mut Maker) -> Material {
     glass
 }
 
-/// A fence of posts and boards or rails, `length` metres along x.
+/// Adds a fence of boards and rails, `length` metres along x.
 pub(super) fn fence(make: &mut Maker, place: Affine3A, length: f32) {
     let wood = make.material(Purpose::Thing);
     let (height, gap) = (make.within(0.7..1.8), make.within(0.08..0.5f32));
@@ -508,12 +508,12 @@ pub(super) fn fence(make: &mut Maker, place: Affine3A, length: f32) {
     }
 }
 
-/// Something by itself, on the ground at `spot` or on a block there, to be looked at from all sides.
+/// Adds a single object, on the ground at `spot` or on a block there, to be viewed from all sides.
 pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
     let size = vec3(make.scaled(0.3, 1.5), make.scaled(0.3, 1.5), make.scaled(0.3, 1.5));
     let below = if make.chance(0.3) { 0. } else { make.within(0.2..1.1) };
     if below > 0. {
-        // Deep enough for uneven ground.
+        // The block reaches below the ground, which may be uneven.
         let (foot, broad) = (0.5, make.within(0.6..1.6));
         let material = make.material(Purpose::Thing);
         let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), make.within(0. ..0.05));
@@ -524,16 +524,16 @@ pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
     Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length(), front: None }
 }
 
-/// Something on a wall at `spot`, to be looked at from where `front` points to.
+/// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
 pub(super) fn hung(make: &mut Maker, spot: Vec3, front: Vec3) -> Exhibit {
     let size = vec3(make.scaled(0.3, 1.2), make.scaled(0.2, 1.), make.scaled(0.3, 1.2));
-    // What is up where it stands is off the wall here.
+    // The object's up axis points away from the wall.
     let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(make.turn());
     to_be_looked_at(make, size, Affine3A::from_rotation_translation(off_the_wall, spot));
     Exhibit { middle: spot + 0.4 * size.y * front, radius: 0.5 * size.length(), front: Some(front) }
 }
 
-/// What is worth a video of its own, of `size` metres more or less: where `place` has its origin, and up from there.
+/// Adds an object that merits its own video, about `size` metres large, standing at the origin of `place`.
 fn to_be_looked_at(make: &mut Maker, size: Vec3, place: Affine3A) {
     match make.within(0..6) {
         0 => {
@@ -552,7 +552,7 @@ fn to_be_looked_at(make: &mut Maker, size: Vec3, place: Affine3A) {
     }
 }
 
-/// Anything that stands in a room, along a wall or in the open floor.
+/// Adds a random piece of furniture, for placement along a wall or in the open.
 pub(super) fn furniture(make: &mut Maker, place: Affine3A) {
     match make.within(0..12) {
         0 | 1 => table(make, place),

@@ -1,4 +1,4 @@
-//! Rays through triangles.
+//! Ray tracing of triangles.
 
 use super::light::{Lamp, Sky};
 use super::material::Material;
@@ -9,37 +9,37 @@ use obvhs::triangle::Triangle;
 use rayon::prelude::*;
 use std::f32::consts::{PI, TAU};
 
-/// Directions in which a vertex looks for the light that other surfaces send it.
+/// Number of directions in which a vertex gathers light from other surfaces.
 const GATHERED: usize = 24;
-/// How far rays begin from the surface that they leave, in metres.
+/// Offset of the start of a ray from the surface that it leaves, in metres.
 const LIFT: f32 = 1e-3;
-/// Mirrors in mirrors that are followed.
+/// Maximum number of mirror reflections along a ray.
 const DEPTH: u32 = 3;
 
-/// Surfaces with their materials, and what lights them.
+/// Meshes with their materials, and the lamps.
 #[derive(Default)]
 pub(super) struct Parts {
     pub meshes: Vec<(Mesh, Material)>,
     pub lamps: Vec<Lamp>,
 }
 
-/// A world that can be looked at.
+/// A scene prepared for ray tracing.
 pub(super) struct Tracer {
     tree: Tree,
-    /// How many there are.
+    /// Number of triangles.
     triangles: usize,
-    /// By places in the tree: neighbours in space are neighbours in memory.
+    /// Faces ordered by their positions in the tree, so that neighbours in space are neighbours in memory.
     faces: Vec<Face>,
     normals: Vec<Vec3>,
     uvs: Vec<Vec2>,
-    /// Indirect irradiance at each vertex, over π: what reaches it by way of one other surface, or from the sky.
+    /// Indirect irradiance at each vertex, divided by π: light from the sky, and light reflected by one other surface.
     indirect: Vec<Vec3>,
     materials: Vec<Material>,
     lamps: Vec<Lamp>,
     sky: Sky,
 }
 
-/// A triangle, its vertices and its material.
+/// A triangle, the indices of its vertices, and its material.
 #[derive(Clone, Copy)]
 struct Face {
     triangle: Triangle,
@@ -47,29 +47,29 @@ struct Face {
     material: u32,
 }
 
-/// Where a ray arrived.
+/// Intersection of a ray with a surface.
 struct Surface<'a> {
     point: Vec3,
-    /// Against the ray.
+    /// Interpolated normal, facing against the ray.
     normal: Vec3,
-    /// Of the triangle, against the ray.
+    /// Normal of the triangle, facing against the ray.
     flat: Vec3,
     reflectance: Vec3,
     indirect: Vec3,
     material: &'a Material,
 }
 
-/// What one sample of a pixel may depend on besides its ray.
+/// Random choices of one sample of a pixel, besides its ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SampleChoice {
-    /// Which of the lamps is asked; a pixel's four samples take turns.
+    /// Index of the sampled lamp. The four samples of a pixel take turns.
     pub turn: usize,
-    /// Where on it, in [0, 1)².
+    /// Position on the lamp, in [0, 1)².
     pub on_lamp: Vec2,
 }
 
 impl Tracer {
-    /// Gathers indirect light, which takes most of the time, on all threads.
+    /// Builds the tree and gathers indirect light on all threads. The latter takes most of the time.
     pub fn new(parts: Parts, sky: Sky) -> Tracer {
         let mut whole = Mesh::default();
         let (mut owners, mut materials, mut normals) = (vec![], vec![], vec![]);
@@ -87,7 +87,7 @@ impl Tracer {
         let faces: Vec<Face> = whole.triangles.iter().zip(&owners).map(face).collect();
         let triangles: Vec<Triangle> = faces.iter().map(|face| face.triangle).collect();
         let (tree, places) = Tree::new(&triangles);
-        // In places without a triangle, which no ray finds, is any.
+        // Positions without a triangle, which no ray hits, get an arbitrary face.
         let faces = places.iter().map(|place| faces[place.unwrap_or(0)]).collect();
         let insides = whole.insides();
         let uvs = whole.uvs;
@@ -97,12 +97,12 @@ impl Tracer {
         tracer
     }
 
-    /// Radiance from `towards` (unit), at `origin`, seen by a pixel `spread` radians wide.
+    /// Returns the radiance that arrives at `origin` from `towards` (unit), for a pixel `spread` radians wide.
     pub fn look(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> Vec3 {
         self.radiance(origin, towards, spread, choice, DEPTH)
     }
 
-    /// The distance to what is towards there, at most `limit`.
+    /// Returns the distance to the nearest surface in the direction `towards`, at most `limit`.
     pub fn free(&self, origin: Vec3, towards: Vec3, limit: f32) -> f32 {
         self.tree.nearest(origin, towards, limit).map_or(limit, |hit| hit.distance)
     }
@@ -119,7 +119,7 @@ impl Tracer {
         let material = surface.material;
         let (direct, highlight) = self.direct(&surface, towards, choice);
         let mut radiance = surface.reflectance * (surface.indirect + direct + material.glow) + highlight;
-        // Schlick: surfaces mirror more at a flat angle.
+        // Schlick's approximation: surfaces reflect more at grazing angles.
         let flatness = 1. + towards.dot(surface.normal);
         let mirror = material.mirror + (1. - material.mirror) * material.mirror.sqrt() * flatness.powi(5);
         if mirror > 0.02 && depth > 0 {
@@ -131,7 +131,7 @@ impl Tracer {
         radiance
     }
 
-    /// Irradiance over π from the lamp whose turn it is, times the number of lamps, and its highlight.
+    /// Returns the irradiance, divided by π, from the lamp whose turn it is, times the number of lamps, and its highlight.
     fn direct(&self, surface: &Surface, towards: Vec3, choice: SampleChoice) -> (Vec3, Vec3) {
         if self.lamps.is_empty() {
             return (Vec3::ZERO, Vec3::ZERO);
@@ -148,7 +148,7 @@ impl Tracer {
         let colour = self.lamps.len() as f32 * light.colour;
         let Material { gloss, polish, .. } = *surface.material;
         let highlight = if gloss > 0. {
-            // Blinn and Phong, normalized.
+            // Normalized Blinn–Phong lobe.
             let half = (light.towards - towards).normalize_or(surface.normal);
             let lobe = (polish + 8.) / (8. * PI) * half.dot(surface.normal).max(0.).powf(polish);
             gloss * lobe * facing * colour
@@ -189,12 +189,12 @@ impl Tracer {
         Surface { point, normal, flat, reflectance, indirect, material }
     }
 
-    /// Light by way of one other surface, or from the sky, at every vertex, for which `insides` stand. The same directions about each normal make errors
-    /// smooth.
+    /// Gathers light from the sky and from one other surface at every vertex, starting at the points `insides`. Using the same
+    /// directions around each normal makes the errors smooth.
     fn gathered(&self, insides: &[Vec3]) -> Vec<Vec3> {
         let directions: Vec<Vec3> = (0..GATHERED)
             .map(|i| {
-                // Cosine-weighted, on a spiral.
+                // Cosine-weighted directions, on a spiral.
                 let height = (1. - (i as f32 + 0.5) / GATHERED as f32).sqrt();
                 let angle = TAU * 0.618_034 * i as f32;
                 let ring = (1. - height * height).sqrt();
@@ -212,7 +212,7 @@ impl Tracer {
                 let surface = self.surface(start, towards, hit, 0.3);
                 let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
                 let (direct, _) = self.direct(&surface, towards, choice);
-                // What surfaces send each other over and over is taken for a part of the sky's light.
+                // Approximate further bounces by a share of the sky's light.
                 let rest = 0.12 * self.sky.around(surface.normal);
                 surface.reflectance * (direct + surface.material.glow + rest)
             };
@@ -222,8 +222,8 @@ impl Tracer {
     }
 }
 
-/// One, two or four lamps, which a pixel's four samples ask equally often: one of three becomes two of half its light, and more
-/// than four are too many.
+/// Reduces the lamps to one, two or four, which the four samples of a pixel use equally often. The third of three lamps becomes two
+/// with half its light. Lamps beyond the fourth are dropped.
 fn taking_turns(mut lamps: Vec<Lamp>) -> Vec<Lamp> {
     lamps.truncate(4);
     if lamps.len() == 3 {
@@ -245,12 +245,12 @@ mod tests {
     const DARK: Sky =
         Sky { zenith: Vec3::ZERO, horizon: Vec3::ZERO, ground: Vec3::ZERO, clouds: 0., noise: Noise::new(0) };
 
-    /// A floor of reflectance `grey`, five metres each way, and whatever `more` adds.
+    /// Returns a scene with a floor of reflectance `grey`, five metres in each direction, and anything that `more` adds.
     fn world(grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
         under(DARK, grey, more)
     }
 
-    /// The same under a sky.
+    /// Returns a scene like [`world`], under a sky.
     fn under(sky: Sky, grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
         let texture =
             Arc::new(Texture::of_picture(&image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]))));
@@ -269,12 +269,12 @@ mod tests {
         (0..4).map(look).sum::<f32>() / 4.
     }
 
-    /// What an sRGB byte reflects, linear.
+    /// Returns the linear reflectance of an sRGB byte.
     fn reflectance(grey: u8) -> f32 {
         ((f32::from(grey) / 255. + 0.055) / 1.055).powf(2.4)
     }
 
-    /// Lambert: radiance is reflectance · irradiance · cos / π, whatever the number of lamps.
+    /// Radiance follows Lambert's law: reflectance · irradiance · cos / π, whatever the number of lamps.
     #[test]
     fn matte_floors_are_as_bright_as_light_and_angle_say() {
         for lamps in 1..=4 {
@@ -298,7 +298,7 @@ mod tests {
         });
         let (below, aside) =
             (seen(&tracer, Vec3::new(0.02, 0., 0.01)), seen(&tracer, Vec3::new(2., 0., 0.01)));
-        // Twice the squared distance, and the angle's cosine.
+        // Factors: twice the squared distance, and the cosine of the angle.
         assert!((below / aside - 2. * 2f32.sqrt()).abs() < 0.05, "{below} {aside}");
     }
 
@@ -316,11 +316,11 @@ mod tests {
         });
         let (below, aside) =
             (seen(&tracer, Vec3::new(0.02, 0., 0.01)), seen(&tracer, Vec3::new(2., 0., 0.01)));
-        // Twice the squared distance, and both angles' cosines.
+        // Factors: twice the squared distance, and the cosines of both angles.
         assert!((below / aside - 4.).abs() < 0.08, "{below} {aside}");
     }
 
-    /// Nothing is brighter or darker than a sky that is the same everywhere, but for what it swallows.
+    /// Under a uniform sky, a surface is as bright as the sky times its reflectance.
     #[test]
     fn floors_under_an_even_sky_are_as_bright_as_they_are_white() {
         let light = Vec3::splat(0.7);
@@ -339,14 +339,14 @@ mod tests {
             parts.meshes.push((mirror, Material { mirror: 1., tint: Vec3::ZERO, ..material.clone() }));
         });
         let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
-        // By way of the mirror down to the floor.
+        // The ray goes from the mirror down to the floor.
         let mirrored =
             tracer.look(Vec3::new(0., 1., 0.3), Vec3::new(2., -0.5, 0.).normalize(), 1e-3, choice).x;
         let floor = seen(&tracer, Vec3::new(0., 0., 0.3));
         assert!(floor > 0.1 && (mirrored / floor - 1.).abs() < 0.02, "{mirrored} {floor}");
     }
 
-    /// Blinn and Phong's lobe, where the eye is where a mirror would show the sun.
+    /// Highlights follow the Blinn–Phong lobe, for an eye in the mirror direction of the sun.
     #[test]
     fn glossy_things_have_highlights() {
         let towards = Vec3::new(1., 1., 0.).normalize();
@@ -377,7 +377,7 @@ mod tests {
         });
         let (shadow, lit) = (seen(&tracer, Vec3::new(0.1, 0., 0.1)), seen(&tracer, Vec3::new(2., 0., 2.)));
         assert!(shadow < 0.3 * lit, "{shadow} {lit}");
-        // From below, the ball is lit by the floor alone.
+        // The lower side of the ball is lit by the floor alone.
         let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
         let below = tracer.look(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).x;
         assert!(below > 0.1 * lit && below < lit, "{below} {lit}");

@@ -1,4 +1,4 @@
-//! Which triangle a ray meets first: a tree of boxes, four to a node, that a ray is held against at once.
+//! Bounding volume hierarchy that finds the nearest triangle along a ray. Each node has four boxes, which are tested at once.
 
 use glam::{Vec3, Vec3A, Vec4};
 use obvhs::BvhBuildParams;
@@ -8,58 +8,58 @@ use obvhs::bvh2::{Bvh2, Bvh2Node};
 use obvhs::triangle::Triangle;
 use std::time::Duration;
 
-/// Boxes of a node, and triangles of a leaf: what a vector holds.
+/// Number of boxes per node and of triangles per leaf: the width of a vector.
 const WIDTH: usize = 4;
-/// Levels of the largest tree that rays find their way through; a hundred thousand triangles have a dozen.
+/// Maximum number of levels of a tree. A hundred thousand triangles need about a dozen.
 const LEVELS: usize = 32;
-/// What stays behind on every level, and the root.
+/// Maximum size of the traversal stack: the children left on every level, and the root.
 const STACK: usize = (WIDTH - 1) * LEVELS + 1;
 
-/// Triangles that rays are shot at.
+/// Bounding volume hierarchy of triangles.
 pub(super) struct Tree {
     nodes: Vec<Node>,
     leaves: Vec<Leaf>,
     root: Child,
 }
 
-/// What a ray found.
+/// Intersection of a ray with a triangle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hit {
-    /// Of the triangle in the tree.
+    /// Position of the triangle in the tree.
     pub place: usize,
     pub distance: f32,
 }
 
-/// Four boxes side by side, x of them, y of them and z of them.
+/// Four boxes in structure-of-arrays layout.
 struct Node {
-    /// The least and the greatest corners: what a ray that goes down an axis, or up, enters by is chosen by its sign.
+    /// Minimum and maximum corners. The sign of a ray's direction along an axis selects the corner by which it enters.
     corners: [[Vec4; 3]; 2],
     children: [Child; WIDTH],
 }
 
-/// Four triangles side by side: a corner, and the ways from it to the other two.
+/// Four triangles in structure-of-arrays layout: one corner, and the vectors from it to the other two.
 struct Leaf {
     corner: [Vec4; 3],
     right: [Vec4; 3],
     up: [Vec4; 3],
 }
 
-/// What is in a box: a node's number, or a leaf's and [`LEAF`].
+/// Content of a box: the index of a node, or the index of a leaf combined with [`LEAF`].
 type Child = u32;
 const LEAF: Child = 1 << 31;
 
-/// A ray as boxes are held against it.
+/// A ray, prepared for tests against boxes.
 struct Ray {
     origin: [Vec4; 3],
     towards: [Vec4; 3],
     inverse: [Vec4; 3],
-    /// Of the corners by which it enters, axis by axis.
+    /// Index of the corner by which the ray enters, for each axis.
     enters: [usize; 3],
 }
 
 impl Tree {
-    /// Of triangles, and where in the tree each of them is: for every place the triangle's number, or none. Places are more than
-    /// triangles.
+    /// Builds the tree. Also returns, for every position in the tree, the index of its triangle, or `None`. There may be more
+    /// positions than triangles.
     pub fn new(triangles: &[Triangle]) -> (Tree, Vec<Option<usize>>) {
         let settings = BvhBuildParams { max_prims_per_leaf: WIDTH as u32, ..BvhBuildParams::fast_build() };
         let tree = build_bvh2_from_tris(triangles, settings, &mut Duration::default());
@@ -69,7 +69,7 @@ impl Tree {
         (Tree { nodes, leaves, root }, places)
     }
 
-    /// The first triangle from `origin` towards there (unit) that is nearer than `limit`.
+    /// Returns the first triangle from `origin` in the direction `towards` (unit) that is nearer than `limit`.
     pub fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
         let ray = Ray::new(origin, towards);
         let mut found = Hit { place: usize::MAX, distance: limit };
@@ -95,7 +95,7 @@ impl Tree {
             let (entries, mask) = node.meet(&ray, found.distance);
             let first = count;
             for lane in lanes(mask) {
-                // The nearest last, as it is taken first.
+                // Keep the stack sorted with the nearest box last, because it is popped first.
                 let mut at = count;
                 while at > first && stack[at - 1].0 < entries[lane] {
                     stack[at] = stack[at - 1];
@@ -108,7 +108,7 @@ impl Tree {
         (found.place != usize::MAX).then_some(found)
     }
 
-    /// Whether there is any.
+    /// Returns `true` if the ray hits any triangle before `limit`.
     pub fn is_blocked(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
         let ray = Ray::new(origin, towards);
         let mut stack = [self.root; STACK];
@@ -132,7 +132,7 @@ impl Tree {
     }
 }
 
-/// The numbers of the bits that are set.
+/// Returns the indices of the set bits.
 fn lanes(mut mask: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let lane = (mask != 0).then(|| mask.trailing_zeros() as usize)?;
@@ -143,7 +143,7 @@ fn lanes(mut mask: u32) -> impl Iterator<Item = usize> {
 
 impl Ray {
     fn new(origin: Vec3, towards: Vec3) -> Self {
-        // Never infinite: a box has no distance then to whom it begins at.
+        // The inverse must stay finite: infinity times a distance of zero is NaN.
         let inverse = towards.map(|d| 1. / if d.abs() < 1e-20 { 1e-20f32.copysign(d) } else { d });
         let splat = |v: Vec3| v.to_array().map(Vec4::splat);
         let enters = towards.to_array().map(|d| usize::from(d.is_sign_negative()));
@@ -152,7 +152,7 @@ impl Ray {
 }
 
 impl Node {
-    /// Where the ray enters the boxes, and which of them it meets before `limit`.
+    /// Returns the distances at which the ray enters the boxes, and a mask of the boxes that it hits before `limit`.
     #[inline(always)]
     fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
         let reach =
@@ -165,8 +165,8 @@ impl Node {
 }
 
 impl Leaf {
-    /// The ray's distances to the triangles, and which of them it meets before `limit` (Möller and Trumbore, 1997). Edges belong to
-    /// them, so that there is no gap between two.
+    /// Returns the ray's distances to the triangles, and a mask of those that it hits before `limit` (Möller and Trumbore, 1997).
+    /// Triangles include their edges, so that there is no gap between adjacent ones.
     #[inline(always)]
     fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
         let Leaf { corner, right, up } = self;
@@ -176,7 +176,7 @@ impl Leaf {
         let across = cross(&way, &ray.towards);
         let (u, v) = (scale * dot(up, &across), -scale * dot(right, &across));
         let distance = scale * dot(&normal, &way);
-        // False, too, where nothing is a number: the ray runs along the triangle, or there is none.
+        // NaN also gives `false`: the ray is parallel to the triangle, or the lane is empty.
         let inside = u.cmpge(Vec4::ZERO) & v.cmpge(Vec4::ZERO) & (u + v).cmple(Vec4::ONE);
         let mask = inside & distance.cmpge(Vec4::ZERO) & distance.cmplt(Vec4::splat(limit));
         (distance.to_array(), mask.bitmask())
@@ -193,7 +193,7 @@ fn dot(a: &[Vec4; 3], b: &[Vec4; 3]) -> Vec4 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// A tree with two boxes a node becomes one with four.
+/// Converter of a binary tree to one with four boxes per node.
 struct Build<'a> {
     tree: &'a Bvh2,
     triangles: &'a [Triangle],
@@ -203,7 +203,7 @@ struct Build<'a> {
 }
 
 impl Build<'_> {
-    /// What becomes of node `index`, `level` levels below.
+    /// Converts node `index` of the binary tree, at depth `level`.
     fn child(&mut self, index: usize, level: usize) -> Child {
         assert!(level <= LEVELS, "triangles that no tree of {LEVELS} levels can sort");
         let Some(node) = self.tree.nodes.get(index) else { return self.leaf(&[]) };
@@ -211,7 +211,7 @@ impl Build<'_> {
         if node.is_leaf() {
             return self.leaf(&self.tree.primitive_indices[first..][..node.prim_count as usize]);
         }
-        // The largest is opened until there are four.
+        // Split the largest node until there are four.
         let mut open = vec![first, first + 1];
         let size = |index: &usize| self.tree.nodes[*index].aabb.half_area();
         while open.len() < WIDTH {
@@ -236,7 +236,7 @@ impl Build<'_> {
         let lane = |lane: usize| triangles.get(lane).map(|&index| index as usize);
         let found: [Option<usize>; WIDTH] = std::array::from_fn(lane);
         self.places.extend(found);
-        // What isn't there has no area, which no ray meets.
+        // Missing triangles have no area, and no ray hits them.
         let nothing = Triangle { v0: Vec3A::ZERO, v1: Vec3A::ZERO, v2: Vec3A::ZERO };
         let corners = found.map(|index| index.map_or(nothing, |index| self.triangles[index]));
         let along = |point: fn(&Triangle) -> Vec3A| transposed(corners.each_ref().map(point));
@@ -251,10 +251,10 @@ impl Build<'_> {
 
 impl Node {
     fn around<'a>(nodes: impl Iterator<Item = &'a Bvh2Node>) -> Node {
-        // What no ray meets: it ends before it begins.
+        // Empty boxes end before they begin, and no ray hits them.
         let mut boxes = [Aabb { min: Vec3A::splat(f32::MAX), max: Vec3A::splat(f32::MIN) }; WIDTH];
         for (known, node) in boxes.iter_mut().zip(nodes) {
-            // A little larger, for what is lost to rounding.
+            // Enlarge the boxes slightly to allow for rounding.
             let margin = Vec3A::splat(1e-4);
             *known = Aabb { min: node.aabb.min - margin, max: node.aabb.max + margin };
         }
@@ -263,7 +263,7 @@ impl Node {
     }
 }
 
-/// x of all of them, y and z.
+/// Returns the x, y and z coordinates of all points.
 fn transposed(points: [Vec3A; WIDTH]) -> [Vec4; 3] {
     std::array::from_fn(|axis| Vec4::from_array(points.map(|point| point[axis])))
 }
@@ -274,7 +274,8 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// Of a soup of triangles, some of them large, some flat along an axis, and of rays from everywhere, some along an axis.
+    /// The tree finds the same nearest hits as a search over all triangles. The triangles are random, some of them large and some flat
+    /// along an axis. The rays are random, too, some of them along an axis.
     #[test]
     fn rays_find_what_asking_every_triangle_finds() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -331,7 +332,7 @@ mod tests {
 
     #[test]
     fn what_is_at_the_same_distance_from_all_sides_has_no_gaps() {
-        // A fan of triangles about a point, seen along every edge.
+        // A fan of triangles around a point, seen along every edge.
         let point = |i: usize| {
             let angle = i as f32 / 12. * std::f32::consts::TAU;
             Vec3A::new(angle.cos(), 0.3, angle.sin())

@@ -1,4 +1,4 @@
-//! A made-up world, and a video taken in it.
+//! A synthetic scene and a video of it.
 
 use super::light::Sky;
 use super::maker::Maker;
@@ -15,27 +15,27 @@ use rand_chacha::ChaCha8Rng;
 use std::fmt;
 use std::sync::Arc;
 
-/// Rays a pixel, along a side.
+/// Rays per pixel along each side.
 const RAYS: u32 = 2;
-/// Share of worlds in which there is a thing to walk around.
+/// Fraction of scenes with an object to walk around.
 const EXHIBITS: f64 = 0.4;
-/// Share of these things that hang on a wall, where there are walls.
+/// Fraction of these objects that hang on a wall, if there are walls.
 const HUNG: f64 = 0.35;
-/// Worlds that are made until there is a way through one.
+/// Maximum number of scenes that are built until one has a free camera path.
 const WORLDS: u64 = 20;
 
-/// What every video of a data set has in common.
+/// Settings common to all videos of a dataset.
 #[derive(Debug, Clone)]
 pub struct VideoSettings {
-    /// Pictures of each.
+    /// Number of images per video.
     pub frames: usize,
-    /// Of a picture.
+    /// Size of an image.
     pub size: ImageSize,
-    /// Pictures of the user's, seen on some of the things.
+    /// Images of the user that are shown on some of the objects.
     pub pictures: Vec<Arc<Texture>>,
 }
 
-/// A world and the cameras in it. Pictures are made when they are asked for.
+/// A scene and its cameras. Images are rendered on request.
 pub struct Video {
     tracer: Tracer,
     sensor: Sensor,
@@ -44,10 +44,10 @@ pub struct Video {
 }
 
 impl Video {
-    /// From the eye; each of them asks a lamp by a ray of its own.
+    /// Number of camera rays per pixel. Each of them samples a lamp by one shadow ray.
     pub const RAYS_PER_PIXEL: u32 = RAYS * RAYS;
 
-    /// Video number `index` of those of `seed`: the same for any number of threads.
+    /// Creates video number `index` of `seed`. The result doesn't depend on the number of threads.
     pub fn new(seed: u64, index: u64, settings: &VideoSettings) -> Video {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         (0..WORLDS)
@@ -71,17 +71,17 @@ impl Video {
         Some(Video { tracer, sensor, cameras, seed })
     }
 
-    /// Of the pictures.
+    /// Returns the cameras of the images.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
     }
 
-    /// Triangles of the world.
+    /// Returns the number of triangles in the scene.
     pub fn triangles(&self) -> usize {
         self.tracer.triangles()
     }
 
-    /// Picture `index`.
+    /// Renders image `index`.
     pub fn photo(&self, index: usize) -> RgbImage {
         let camera = &self.cameras[index];
         let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
@@ -99,7 +99,7 @@ impl Video {
                 let on_lamp = vec2(random.uniform(), random.uniform());
                 let choice = SampleChoice { turn: sample as usize, on_lamp };
                 let radiance = self.tracer.look(eye, towards(camera, at), spread, choice);
-                // One ray that meets a lamp doesn't outshine all others of its pixel.
+                // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
                 light += radiance.min(Vec3::splat(8.));
             }
             let place = (vec2(x as f32, y as f32) - half) / half;
@@ -108,8 +108,8 @@ impl Video {
         })
     }
 
-    /// Depths along the camera's axis at the centres of picture `index`'s pixels, row by row, in metres; infinite where the sky
-    /// is.
+    /// Returns the depths along the camera's axis at the pixel centres of image `index`, row by row, in metres. They are infinite
+    /// in the sky.
     pub fn depth(&self, index: usize) -> Vec<f32> {
         let camera = &self.cameras[index];
         let eye = camera.c2w.w_axis.truncate().as_vec3();
@@ -123,14 +123,14 @@ impl Video {
     }
 }
 
-/// Of triangles nobody wants to read.
+/// Prints a summary without the triangles.
 impl fmt::Debug for Video {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "a video of {} frames, number {}", self.cameras.len(), self.seed)
     }
 }
 
-/// Rooms for the most part: what people photograph, and what is hardest to get right.
+/// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
 fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
     let mut sky = open::sky(make);
     let place = match make.within(0..100) {
@@ -148,7 +148,7 @@ fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
     (place, exhibit, sky)
 }
 
-/// Where something may hang, and the direction away from the wall.
+/// Returns a position on a wall, and the direction away from the wall.
 fn on_a_wall(make: &mut Maker, place: Place, behind: f32) -> (Vec3, Vec3) {
     let (least, most) = (place.least - behind, place.most + behind);
     let share = vec3(make.within(0.2..0.8), make.within(0.3..0.75), make.within(0.2..0.8));
@@ -169,7 +169,7 @@ fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> 
     poses.into_iter().map(camera).collect()
 }
 
-/// The unit direction from the camera through `at`, in pixels.
+/// Returns the unit direction from the camera through `at`, in pixels.
 fn towards(camera: &Camera, at: Vec2) -> Vec3 {
     let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
     let x = (at.x - cx as f32) / fx as f32;
@@ -179,8 +179,8 @@ fn towards(camera: &Camera, at: Vec2) -> Vec3 {
     (x * right + y * down + forward).normalize()
 }
 
-/// The geometric mean of the radiance of a few rays of a few pictures: a lamp or a window in the picture doesn't leave all else
-/// dark.
+/// Returns the geometric mean of the radiance of a few rays of a few images. With it, a lamp or a window in the image doesn't
+/// darken everything else.
 fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
     const SIDE: usize = 8;
     let mut sum = Vec3::ZERO;

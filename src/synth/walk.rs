@@ -1,64 +1,64 @@
-//! Where videos are taken from: walks, dollies, orbits and flights through free space, by hand.
+//! Camera paths of synthetic videos: walks, dollies, orbits and flights through free space, with the motion of a hand-held camera.
 
 use super::maker::Maker;
 use super::noise::Noise;
 use super::tracer::Tracer;
 use glam::{DMat4, DVec3, DVec4, Vec3, vec3};
 
-/// Paths that are tried before a world is given up.
+/// Maximum number of paths that are tried in a scene.
 const TRIES: usize = 80;
-/// Places of a path that have to be free.
+/// Number of intervals between the positions of a path that are checked for free space.
 const CHECKED: usize = 12;
-/// [`Path::wide`] of those that go past things.
+/// Value of [`Path::wide`] for paths past objects.
 const WIDE: f32 = 1.8;
 
-/// Where cameras may be.
+/// Space where cameras may be.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
-    /// A corner of the box around it, and the other one.
+    /// Minimum corner of the bounding box; `most` is the maximum corner.
     pub least: Vec3,
     pub most: Vec3,
-    /// Usual heights of an eye above the ground, in metres.
+    /// Range of usual heights of a camera above the ground, in metres.
     pub eye: (f32, f32),
     /// Free space that a camera needs around it, in metres.
     pub roomy: f32,
-    /// How far behind the box's sides walls are, where there are walls, in metres.
+    /// Distance of the walls behind the box's sides in metres, if there are walls.
     pub walls: Option<f32>,
 }
 
-/// A thing that is there to be looked at.
+/// An object that the video shows.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exhibit {
     pub middle: Vec3,
-    /// Of a ball that it fits into, more or less, in metres.
+    /// Radius of a ball that roughly encloses the object, in metres.
     pub radius: f32,
-    /// Away from the wall that it hangs on; none where it is seen from all sides.
+    /// Direction away from the wall that the object hangs on, or `None` if it is visible from all sides.
     pub front: Option<Vec3>,
 }
 
-/// How a camera moves as time goes from 0 to 1.
+/// Camera motion over time, which goes from 0 to 1.
 #[derive(Debug, Clone, Copy)]
 struct Path {
     start: Vec3,
-    /// What is looked at, at the start, and how it moves.
+    /// Point that the camera looks at, at the start; `target_motion` is its motion.
     target: Vec3,
     target_motion: Vec3,
     motion: Vec3,
-    /// Part of a circle about the target, in radians.
+    /// Angle of the orbit around the target, in radians.
     orbit: f32,
-    /// Sideways swing in metres, and its waves.
+    /// Sideways swing in metres, and its angular frequency.
     swing: (Vec3, f32),
-    /// A hand's: metres, and how fast.
+    /// Hand shake: amplitude in metres, and frequency.
     shake: (f32, f32),
-    /// Tilt of the horizon at the start and at the end.
+    /// Roll angles at the start and at the end.
     roll: (f32, f32),
-    /// Mean depth of what every picture shows at least, in metres, where paths are easy to find.
+    /// Minimum mean depth of every image in metres; reduced if paths are hard to find.
     wide: f32,
     noise: Noise,
 }
 
 impl Path {
-    /// Standing still at the origin, held by a hand.
+    /// Creates a path that stays at the origin, with the shake of a hand-held camera.
     fn by_hand(make: &mut Maker) -> Self {
         Path {
             start: Vec3::ZERO,
@@ -74,9 +74,9 @@ impl Path {
         }
     }
 
-    /// Position, direction of view, and roll.
+    /// Returns the position, viewing direction and roll at `time`.
     fn at(&self, time: f32) -> (Vec3, Vec3, f32) {
-        // Nobody starts at full speed.
+        // Ease in and out, because nobody starts at full speed.
         let eased = 0.7 * time + 0.3 * time * time * (3. - 2. * time);
         let target = self.target + eased * self.target_motion;
         let turned = turned(self.start - self.target, self.orbit * eased);
@@ -90,8 +90,8 @@ impl Path {
     }
 }
 
-/// Camera-to-world poses of `frames` pictures, x right, y down, z forward; none where there is no way through. Where there is an
-/// exhibit most go around it.
+/// Returns camera-to-world poses of `frames` images, x right, y down, z forward, or `None` if there is no free path. If there is an
+/// exhibit, most paths orbit it.
 pub(super) fn walk(
     make: &mut Maker,
     tracer: &Tracer,
@@ -100,7 +100,7 @@ pub(super) fn walk(
     frames: usize,
 ) -> Option<Vec<DMat4>> {
     for attempt in 0..TRIES {
-        // The longer it takes, the shorter paths get.
+        // Paths get shorter with every attempt.
         let patience = 1. - attempt as f32 / TRIES as f32;
         let path = match exhibit {
             Some(exhibit) if make.chance(0.85) => Some(around(make, exhibit, place, patience)),
@@ -114,14 +114,14 @@ pub(super) fn walk(
     None
 }
 
-/// Around something, by hand, from a few steps away.
+/// Creates a hand-held path around an object, from a short distance.
 fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Path {
     let Exhibit { middle, radius, front } = exhibit;
     let away = 1.2 * radius + make.scaled(0.3, 2.);
     let height = (middle.y + make.within(-0.4..0.9) * away).max(place.least.y + 0.2);
     let side = make.one_of(&[-1., 1.]);
     let (from, orbit) = match front {
-        // From one side before it to the other.
+        // Move from one side in front of the wall to the other.
         Some(_) => {
             let from = make.within(0.2..1.2);
             (side * from, -side * (from + make.within(0.2..1.2)))
@@ -135,16 +135,16 @@ fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Pa
         target_motion: 0.2 * radius * make.direction(),
         motion: vec3(wander(make), wander(make), wander(make)),
         orbit: patience * orbit,
-        // Some look at it from below and from above, too.
+        // Some paths also view the object from below and from above.
         swing: (Vec3::Y * away * patience * make.scaled(0.02, 0.7), make.within(2. ..9.)),
         wide: away,
         ..Path::by_hand(make)
     }
 }
 
-/// Past what there is to see.
+/// Creates a path past the objects of the scene.
 fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Option<Path> {
-    // Of several standpoints the one with the widest view, as photographers choose.
+    // Choose the standpoint with the widest view among several, as photographers do.
     let views: Vec<(Vec3, Vec3)> = (0..make.within(1..6)).map(|_| standpoint(make, tracer, place)).collect();
     let width = |&(start, towards): &(Vec3, Vec3)| {
         let (right, up) =
@@ -173,20 +173,20 @@ fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Op
         ..Path::by_hand(make)
     };
     match make.within(0..10) {
-        // Forwards or back, the way people walk and real-estate videos go.
+        // Forwards or backwards, as in walks and real-estate videos.
         0..4 => {
             let way = if make.chance(0.8) { towards } else { -towards };
             path.motion = length * (way.with_y(0.2 * way.y) + make.within(-0.5..0.5) * right);
             path.target_motion = path.motion * make.within(0.3..1.) + right * make.within(-0.3..0.3) * length;
         }
-        // Sideways on rails.
+        // Sideways, as on rails.
         4..7 => {
             path.motion = length * (sign * right + make.within(-0.3..0.3) * towards);
             path.target_motion = path.motion * make.within(0.2..1.1);
         }
-        // About something.
+        // Orbit around a point.
         7 | 8 => path.orbit = sign * patience * make.within(0.3..2.),
-        // Up and over.
+        // Free flight in any direction.
         _ => {
             path.motion = length
                 * (make.within(-0.5..0.5) * up
@@ -195,14 +195,14 @@ fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Op
             path.target_motion = make.within(0. ..0.6) * path.motion;
         }
     }
-    // Turning on the way.
+    // Additional rotation along the path.
     if make.chance(0.35) {
         path.target_motion += sign * right * depth * patience * make.within(0.2..1.2);
     }
     Some(path)
 }
 
-/// Where somebody might stand, or fly, and where they look.
+/// Returns the position of a standing or flying camera, and its viewing direction.
 fn standpoint(make: &mut Maker, tracer: &Tracer, place: Place) -> (Vec3, Vec3) {
     let Place { least, most, eye, .. } = place;
     let start = least + (most - least) * vec3(make.within(0. ..1.), 0., make.within(0. ..1.));
@@ -211,20 +211,20 @@ fn standpoint(make: &mut Maker, tracer: &Tracer, place: Place) -> (Vec3, Vec3) {
     let height =
         if is_flight { make.within(eye.1..most.y.max(eye.1 + 0.1)) } else { make.within(eye.0..eye.1) };
     let start = start.with_y(((most.y - below).max(0.) + height).min(most.y));
-    // Mostly into the scene, level or somewhat down.
+    // Look mostly towards the middle of the scene, horizontally or slightly down.
     let middle = (0.5 * (least + most) - start).with_y(0.).normalize_or(Vec3::X);
     let turn = make.within(-1f32..1.) * make.one_of(&[0.6, 1.2, 3.1]);
     let pitch = if is_flight { make.within(-0.8..-0.05) } else { make.within(-0.35..0.15) };
     (start, (turned(middle, turn) + pitch * Vec3::Y).normalize())
 }
 
-/// About y, by `angle`.
+/// Rotates `v` about y by `angle`.
 fn turned(v: Vec3, angle: f32) -> Vec3 {
     let (sin, cos) = angle.sin_cos();
     vec3(cos * v.x + sin * v.z, v.y, cos * v.z - sin * v.x)
 }
 
-/// Whether nothing is in the way, and something is seen.
+/// Returns `true` if nothing blocks the path and every image shows something.
 fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
     let margin = place.roomy * (0.3 + 0.7 * patience);
     let mut before: Option<Vec3> = None;
@@ -236,7 +236,7 @@ fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
         let is_roomy = || sides.iter().all(|&side| tracer.free(at, side, margin) >= margin);
         let right = towards.cross(Vec3::Y).normalize_or(Vec3::X);
         let up = right.cross(towards);
-        // Neither a nose against a wall nor a picture of nothing else.
+        // Reject views directly in front of a surface, and images that show nothing but one.
         let sees = || {
             let depths = [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].map(|(x, y)| {
                 let ray = (towards + x * right + y * up).normalize();

@@ -1,9 +1,9 @@
-//! Checkpoints: a folder per step, whole or not there.
+//! Checkpoints: one folder per step, which is either complete or missing.
 //!
-//! `RUN/checkpoints/step-00001000/`: `model.safetensors` (weights, with the configuration), `optimizer.safetensors`, and
-//! `state.json`, which holds the step, the position in the data, and the others' checksums. `RUN/best/` is the one that
-//! validation found best, with its score. Random numbers need no state: those of a sample depend on the seed, which is part
-//! of the configuration, and on its position in the data alone.
+//! `RUN/checkpoints/step-00001000/` has `model.safetensors` (weights and configuration), `optimizer.safetensors`, and `state.json` with the
+//! step, the position in the data, and the checksums of the other files. `RUN/best/` is the checkpoint with the best validation score, and
+//! has this score. Random number generators need no state: the random numbers of a sample depend only on the seed, which is part of the
+//! configuration, and on the sample's position in the data.
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
@@ -21,47 +21,47 @@ use tch::Tensor;
 const FOLDER: &str = "checkpoints";
 const BEST: &str = "best";
 const PREFIX: &str = "step-";
-/// The weights of a checkpoint, in its folder.
+/// Name of the file in a checkpoint's folder that has the weights.
 pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
-/// All that a checkpoint's folder has of ours. The state comes first, without which there is no checkpoint.
+/// Our files in a checkpoint's folder. The state comes first, because without it there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
-/// Those whose checksums the state has, in the order of their names.
+/// Files whose checksums are in the state, in the order of their names.
 const CHECKED_FILES: [&str; 2] = [MODEL_FILE, OPTIMIZER_FILE];
 
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct State {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Samples drawn: the position in the data.
+    /// Number of samples drawn, which is the position in the data.
     samples: u64,
-    /// Sizes in bytes and CRC-32 of the other files, by their names.
+    /// Size in bytes and CRC-32 of each of the other files, by name.
     files: BTreeMap<String, (u64, u32)>,
-    /// Of the best checkpoint: what validation found.
+    /// Validation score of the best checkpoint; `None` for other checkpoints.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     validation: Option<Validation>,
 }
 
-/// What makes a checkpoint the best one.
+/// Validation score of a best checkpoint.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Validation {
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
-    /// What the score depends on: scores by other settings can't be compared.
+    /// Settings that the score depends on. Scores with other settings can't be compared.
     #[serde(rename = "asked")]
     pub settings: String,
 }
 
-/// Of the checkpoint after so many steps.
+/// Returns the folder name of the checkpoint after `step` steps.
 fn folder_name(step: u64) -> String {
     format!("{PREFIX}{step:08}")
 }
 
-/// The run's checkpoints, oldest first.
+/// Lists the run's checkpoints, oldest first.
 ///
 /// # Errors
-/// A folder that can't be read.
+/// Returns an error if a folder can't be read.
 pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
     let folder = run.join(FOLDER);
     if !folder.is_dir() {
@@ -72,7 +72,7 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
         let path = entry.map_err(Error::read(&folder))?.path();
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let step = name.strip_prefix(PREFIX).and_then(|digits| digits.parse::<u64>().ok());
-        // A name that we don't give is somebody's own.
+        // Folders with other names aren't ours.
         if let Some(step) = step.filter(|&step| name == folder_name(step)) {
             found.push((step, path));
         }
@@ -81,10 +81,10 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// The newest one.
+/// Returns the run's newest checkpoint.
 ///
 /// # Errors
-/// None there, a folder that can't be read, or a checkpoint that was damaged.
+/// Returns an error if there is no checkpoint, a folder can't be read, or the checkpoint is damaged.
 pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
     let none = || {
         Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made")
@@ -94,10 +94,10 @@ pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
     Ok(latest)
 }
 
-/// The one that validation found best.
+/// Returns the run's checkpoint with the best validation score.
 ///
 /// # Errors
-/// A run that has none, or whose best checkpoint was damaged.
+/// Returns an error if the run has no best checkpoint, or if it is damaged.
 pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
     let best = run.join(BEST);
     match best.is_dir() {
@@ -114,23 +114,23 @@ pub(super) fn add_checkpoints(run: &Path, inputs: &mut Inputs) {
     [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
 }
 
-/// A checkpoint as it is told to people.
+/// Summary of a checkpoint, for display.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Kept {
-    /// Its folder in the run's.
+    /// Path of its folder, relative to the run's folder.
     pub name: String,
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Of its files together.
+    /// Total size of its files, in bytes.
     pub bytes: u64,
-    /// Seconds since it was saved.
+    /// Time since it was saved, in seconds.
     pub age: u64,
-    /// Of the best checkpoint: what validation found, in dB.
+    /// Validation PSNR of the best checkpoint, in dB; `None` for other checkpoints.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
 }
 
-/// The run's checkpoints, oldest first, and its best one. What is being replaced meanwhile is left out.
+/// Returns summaries of the run's checkpoints, oldest first, and of its best one. A checkpoint that is being replaced is left out.
 pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
     let told = |path: &PathBuf| {
         let state = read_state(path).ok()?;
@@ -139,7 +139,7 @@ pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
             name: path.strip_prefix(run).unwrap_or(path).display().to_string(),
             step: state.step,
             bytes: state.files.values().map(|(bytes, _)| bytes).sum(),
-            // A clock that was set back.
+            // The clock may have been set back; the age is then 0.
             age: saved.elapsed().unwrap_or_default().as_secs(),
             psnr: state.validation.map(|validation| validation.psnr),
         })
@@ -148,19 +148,19 @@ pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
     (checkpoints.iter().filter_map(told).collect(), told(&run.join(BEST)))
 }
 
-/// Puts right what a run that was killed within a save left.
+/// Cleans up what a run left if it was killed during a save.
 ///
 /// # Errors
-/// The system's refusal.
+/// Returns an error if files can't be read, renamed or removed.
 pub(super) fn recover(run: &Path) -> Result<()> {
     recover_dirs(run, &FILES)?;
     recover_dirs(&run.join(FOLDER), &FILES)
 }
 
-/// What validation, by `settings`, found the run's best checkpoint to be worth, in dB.
+/// Returns the validation PSNR of the run's best checkpoint in dB, or `None` if there is no best checkpoint.
 ///
 /// # Errors
-/// One that can't be read, or was found by other settings.
+/// Returns an error if the checkpoint can't be read or is damaged, or if its score was measured with settings other than `settings`.
 pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
     let best = run.join(BEST);
     if !best.is_dir() {
@@ -175,10 +175,10 @@ pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
     }
 }
 
-/// Makes `checkpoint` the run's best one, for what validation found. The files are shared where the file system can.
+/// Makes `checkpoint` the run's best checkpoint, with the score `validation`. Files are hard links where the file system supports it.
 ///
 /// # Errors
-/// The system's refusal to write; the best one before is left whole.
+/// Returns an error if files can't be written. The previous best checkpoint then stays complete.
 pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -> Result<()> {
     let state = State { validation: Some(validation), ..read_state(checkpoint)? };
     replace_dir(&run.join(BEST), &FILES, |folder| {
@@ -194,15 +194,16 @@ pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -
 }
 
 impl Trainer {
-    /// Where [`Trainer::save`] puts the state as it is.
+    /// Returns the folder in which [`Trainer::save`] stores the current state.
     pub(super) fn checkpoint(&self, run: &Path) -> PathBuf {
         run.join(FOLDER).join(folder_name(self.step))
     }
 
-    /// Saves a checkpoint under `run`, with the state of `optimizer`, drops the oldest beyond those to keep, and returns where it is.
+    /// Saves a checkpoint under `run` with the optimizer's state `optimizer`, and returns its folder. Removes the oldest checkpoints beyond
+    /// those to keep.
     ///
     /// # Errors
-    /// The system's refusal to write; older checkpoints are left whole.
+    /// Returns an error if files can't be written. Older checkpoints then stay complete.
     pub(super) fn save(&self, run: &Path, optimizer: &BTreeMap<String, Tensor>) -> Result<PathBuf> {
         let path = self.checkpoint(run);
         replace_dir(&path, &FILES, |folder| {
@@ -217,11 +218,11 @@ impl Trainer {
         Ok(path)
     }
 
-    /// Goes on from a checkpoint, which [`check`] found whole and of `state`. Weights that don't fit it leave the trainer
-    /// unusable, all else as it was.
+    /// Loads a checkpoint, for which [`check`] returned `state`. After an error, the weights and the optimizer's state may be those of the
+    /// checkpoint, so that the trainer can't be used any more.
     ///
     /// # Errors
-    /// Files that can't be read, or were written for another model.
+    /// Returns an error if files can't be read or were written for another model.
     pub(super) fn load(&mut self, checkpoint: &Path, state: &State) -> Result<()> {
         let file = checkpoint.join(MODEL_FILE);
         WeightsFile::open(&file)?.load_into(&self.vs)?;
@@ -232,11 +233,11 @@ impl Trainer {
     }
 }
 
-/// Drops the oldest checkpoints beyond the `kept` last ones, but never `latest`. Broken ones are worth nothing: they don't
-/// count, and go with what they are older than.
+/// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest`. Damaged checkpoints don't count, and are removed if
+/// they are older than `latest`.
 ///
 /// # Errors
-/// The system's refusal to remove.
+/// Returns an error if a folder can't be removed.
 pub(super) fn drop_surplus(run: &Path, latest: &Path, kept: usize) -> Result<()> {
     let mut others = list_checkpoints(run)?;
     others.retain(|other| other != latest);
@@ -249,10 +250,10 @@ pub(super) fn drop_surplus(run: &Path, latest: &Path, kept: usize) -> Result<()>
     Ok(())
 }
 
-/// Whether a checkpoint is whole: its files are as they were written.
+/// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
 ///
 /// # Errors
-/// What is missing or damaged.
+/// Returns an error that names what is missing or damaged.
 pub(super) fn check(checkpoint: &Path) -> Result<State> {
     let state = read_state(checkpoint)?;
     for (name, (bytes, crc)) in &state.files {
@@ -266,7 +267,7 @@ pub(super) fn check(checkpoint: &Path) -> Result<State> {
     Ok(state)
 }
 
-/// Whether a checkpoint's files are there and as long as they were. [`check`] reads all of them.
+/// Returns `true` if a checkpoint's files exist and have their original sizes. [`check`] reads the files, too.
 fn seems_whole(checkpoint: &Path) -> bool {
     let is_long = |(name, (bytes, _)): (&String, &(u64, u32))| {
         fs::metadata(checkpoint.join(name)).is_ok_and(|file| file.len() == *bytes)
@@ -295,7 +296,7 @@ fn write_state(checkpoint: &Path, state: &State) -> Result<()> {
     write_atomically(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))
 }
 
-/// A file's size and CRC-32.
+/// Returns the size and CRC-32 of a file.
 fn checksum(path: &Path) -> Result<(u64, u32)> {
     let mut file = fs::File::open(path).map_err(Error::read(path))?;
     let (mut buffer, mut hasher, mut size) = (vec![0; 1 << 20], crc32fast::Hasher::new(), 0);

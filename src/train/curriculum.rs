@@ -1,9 +1,9 @@
-//! When a scene token shows how many Gaussians (spec 8.7).
+//! Schedule of the coarse-to-fine curriculum: the stage of each step (spec 8.7).
 
 use crate::config::CurriculumConfig;
 use crate::model::Stage;
 
-/// The stage of `step`, counted from 0. λ rises from 0 at a boundary to 1 `transition` steps later.
+/// Returns the stage of `step`, counted from 0. λ rises from 0 at a boundary to 1 `transition` steps later.
 pub fn stage_at(config: &CurriculumConfig, step: u64) -> Stage {
     if config.full_capacity {
         return config.final_stage();

@@ -1,8 +1,8 @@
-//! Forward and backward pass of a slice of a step, part by part.
+//! Forward and backward pass of a slice of a step, module by module.
 //!
-//! Every part begins with leaves that hold what the part before gave, and its backward pass with the gradients that these
-//! leaves got. So what one part kept is freed before the backward pass of the one before it begins, the encoder may choose
-//! to keep nothing and compute its rounds again, and one can tell how long each part takes.
+//! Each module's inputs are the previous module's outputs, detached and with gradients required. Its backward pass starts from the
+//! gradients of its detached outputs. So the activations of a module are freed before the backward pass of the previous module starts, the
+//! encoder can recompute its rounds instead of storing them, and each module can be timed.
 
 use crate::config::Config;
 use crate::data::Sample;
@@ -14,20 +14,20 @@ use crate::ranks::Group;
 use crate::render::{DEFAULT_EPS2D, Pictures, render};
 use tch::{Tensor, no_grad};
 
-/// What all slices of a step have in common.
+/// Inputs that all slices of a step share.
 #[derive(Debug)]
 pub(super) struct ForwardBackward<'a> {
     pub config: &'a Config,
     pub model: &'a GlobalSplat,
     pub perceptual: Option<&'a PerceptualLoss>,
     pub stage: Stage,
-    /// Those that make the step together.
+    /// Group of the ranks that make the step together.
     pub group: &'a Group,
 }
 
 impl ForwardBackward<'_> {
-    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the variables' own. Returns the loss and its
-    /// terms, as [`Losses::packed`](crate::loss::Losses::packed) does.
+    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the gradients of the variables. Returns the loss and its
+    /// terms, packed by [`Losses::packed`](crate::loss::Losses::packed).
     pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<Tensor> {
         let context = &sample.context;
         let model = self.model;
@@ -68,7 +68,7 @@ impl ForwardBackward<'_> {
         Ok(losses.packed())
     }
 
-    /// `share` with the pixels that L_con compares on all ranks. A rank that is alone counts its own as it compares them.
+    /// Returns `share` with the number of pixels that L_con compares on all ranks. If there is only one rank, the loss counts them itself.
     fn counted(&self, sample: &Sample, alpha: &Tensor, share: &Share) -> Result<Share> {
         let mut pixels = share.depth_pixels.as_ref().map(Tensor::shallow_clone);
         let compares = sample.paired && self.config.loss.consistency_depth > 0.;
@@ -81,7 +81,7 @@ impl ForwardBackward<'_> {
         Ok(Share { depth_pixels: pixels, ..*share })
     }
 
-    /// Pixels of a paired sample whose depth L_con compares, a scalar.
+    /// Returns the number of pixels of a paired sample whose depth L_con compares, as a scalar.
     pub fn depth_pixels(&self, sample: &Sample) -> Result<Tensor> {
         let context = &sample.context;
         no_grad(|| {

@@ -1,4 +1,4 @@
-//! One process to a run: two would write over each other's checkpoints.
+//! Lock that limits a run's folder to one training process. Two processes would overwrite each other's checkpoints.
 
 use crate::error::{Error, Result};
 use std::fs::{File, OpenOptions, TryLockError};
@@ -7,22 +7,22 @@ use std::path::Path;
 
 const FILE: &str = ".lock";
 
-/// Holds a run's folder until it is dropped, or the process ends in whatever way.
+/// Lock on a run's folder. It is released when it is dropped, or when the process ends for any reason.
 #[derive(Debug)]
 pub(super) struct RunLock {
     _file: File,
 }
 
 impl RunLock {
-    /// Whether a run ever had the folder `run`.
+    /// Returns `true` if a run ever locked the folder `run`.
     pub(super) fn was_taken(run: &Path) -> bool {
         run.join(FILE).exists()
     }
 
-    /// Takes the folder `run`, which is there.
+    /// Locks the folder `run`, which must exist.
     ///
     /// # Errors
-    /// Another process that holds it, by its number.
+    /// Returns an error that gives the ID of the other process if the folder is locked.
     pub(super) fn take(run: &Path) -> Result<Self> {
         let path = run.join(FILE);
         let options = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);

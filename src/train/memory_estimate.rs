@@ -1,4 +1,4 @@
-//! How much memory a training step needs, told before it begins.
+//! Estimate of the memory that a training step needs, computed before training starts.
 
 use crate::config::{Config, OptimizerKind};
 use crate::error::Result;
@@ -7,36 +7,37 @@ use crate::model::{GlobalSplat, ModelConfig, Precision, Streams};
 use serde::Serialize;
 use tch::{Device, nn};
 
-/// What tensors of a training step take at the most, in bytes: counted by what each layer keeps for its gradient. Where a CPU computes
-/// slices side by side, each but the first has gradients of its own beside that.
+/// Estimated peak memory of the tensors in a training step, in bytes. It is computed from what each layer stores for the backward pass.
+/// If a CPU computes slices in parallel, each slice but the first needs memory for gradients of its own in addition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct MemoryEstimate {
-    /// Scenes of a step.
+    /// Number of scenes in a step.
     pub batch: usize,
-    /// Those of them that go through the model at a time.
+    /// Number of scenes that go through the model at a time.
     pub scenes_at_once: usize,
-    /// Weights and the optimizer's moments; and gradients, unless they take less than what layers kept before they came.
+    /// Weights and the optimizer's moments. Gradients are included unless they take less than the activations that they replace.
     pub weights: u64,
     /// Photos of all scenes.
     pub photos: u64,
-    /// What tokenizer and encoder keep of the scenes that go through the model at a time.
+    /// Activations of tokenizer and encoder, for the scenes that go through the model at a time.
     pub encoder: u64,
-    /// The same of heads, Gaussians, pictures and losses; or part of it and a round that is computed again, if that is more.
+    /// Activations of heads, Gaussians, rendered images and losses, for the scenes that go through the model at a time; or part of them and
+    /// a recomputed round, if that is more.
     pub pictures: u64,
-    /// What the network of L_perc keeps.
+    /// Activations of the network of L_perc.
     pub perceptual: u64,
 }
 
 impl MemoryEstimate {
-    /// Of a step of the curriculum's last stage, by one process on `device`.
+    /// Estimates the memory of a step in the curriculum's last stage, by one process on `device`.
     ///
     /// # Errors
-    /// A model whose numbers don't fit together.
+    /// Returns an error if the model's settings don't fit together.
     pub fn of(config: &Config, device: Device) -> Result<Self> {
         Ok(Self::of_learned(config, learned_numbers(&config.model)?, device))
     }
 
-    /// The same of a model that learns so many numbers.
+    /// Estimates the memory of a step for a model with `learned` trainable parameters.
     fn of_learned(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
         let (model, data) = (&config.model, &config.data);
@@ -46,12 +47,12 @@ impl MemoryEstimate {
             count => count.min(batch),
         };
 
-        // Muon has one moment of a matrix, AdamW two of everything. Without slices or recomputation each gradient
-        // replaces activations that are larger, so gradients add nothing to the peak.
+        // Muon has one moment per matrix, AdamW has two for all weights. Without slices or recomputation, each gradient replaces larger
+        // activations, so gradients add nothing to the peak.
         let moments = if config.train.optimizer == OptimizerKind::Muon { 1. } else { 2. };
         let gradients = if scenes_at_once < batch || config.train.checkpoint_rounds { 1. } else { 0. };
 
-        // Scenes go through the model twice where halves of their views are compared, each time with half of the tokens.
+        // If two halves of the context views are compared, scenes go through the model twice, each time with half of the tokens.
         let passes = if config.loss.has_consistency() && data.context_views >= 2 { 2. } else { 1. };
         let pixels = f64::from(data.image_size.height) * f64::from(data.image_size.width);
         let (context, target) = (data.context_views as f64, data.target_views as f64);
@@ -61,8 +62,8 @@ impl MemoryEstimate {
         let streams = if model.streams == Streams::Dual { 2. } else { 1. };
         let (rounds, blocks) = (model.rounds as f64, model.self_attention_blocks as f64);
 
-        // Numbers of a slot that the layers of a round keep, in units of the width. In bf16 norms, products, queries, keys, values,
-        // what is seen and both sides of GELU are half as large; sums of a stream stay in float32.
+        // Elements per slot that the layers of a round store, in units of the width. In bf16, norms, products, queries, keys, values,
+        // attention outputs and both sides of GELU take half of the memory; the sums of a residual stream stay in float32.
         let (of_reading, of_block, of_mixer, small) = match precision {
             Precision::F32 => (18., 18., 10., 1.),
             Precision::Bf16 => (10.5, 10., 6., 0.5),
@@ -74,7 +75,7 @@ impl MemoryEstimate {
             false => (rounds * of_round, 0.),
         };
         let per_scene = slots * 3. * streams + tokens * (2. + 2.7) * token_width + rounds_kept;
-        // Keys and values are read by weights that a norm's γ is folded into; bf16 has copies of all weights of products.
+        // The γ of a norm is folded into copies of the weights of keys and values. bf16 has copies of the weights of all matrix products.
         let folded = rounds * streams * 2. * width * token_width
             + if precision == Precision::Bf16 { 0.5 * learned } else { 0. };
 
@@ -82,7 +83,7 @@ impl MemoryEstimate {
         let of_candidate = 10.3 * (14 + 3 * model.sh_bases()) as f64;
         let of_pixel = 11. + 3.;
         let pictures = candidates * of_candidate + passes * target * pixels * of_pixel;
-        // Gaussians and pictures themselves, and their gradients, are still there when a round is computed again.
+        // Gaussians and rendered images, and their gradients, are still in memory when a round is recomputed.
         let pictures = pictures.max(0.4 * pictures + computed_again);
 
         let bytes = |numbers: f64| (FLOAT * numbers) as u64;
@@ -104,22 +105,22 @@ impl MemoryEstimate {
         }
     }
 
-    /// All together.
+    /// Returns the sum of all items.
     pub fn total(&self) -> u64 {
         self.weights + self.photos + self.encoder + self.pictures + self.perceptual
     }
 
-    /// Whether a step fits into `bytes` of memory, with the 15 % by which the estimate may be too low.
+    /// Returns `true` if a step fits into `bytes` of memory, with a margin of 15 % by which the estimate may be too low.
     pub fn fits_into(&self, bytes: u64) -> bool {
         self.total() + self.total() * 3 / 20 <= bytes
     }
 }
 
-/// The batch of `config`, halved until all its scenes fit at once into `bytes` of memory on `device`, and the estimate of the last one that
-/// did not, if any. A batch of 1 is tried in any case.
+/// Returns the batch size of `config`, halved until all scenes fit at once into `bytes` of memory on `device`, and the estimate of the last
+/// batch size that did not fit, if any. A batch size of 1 is accepted without a check.
 ///
 /// # Errors
-/// As [`MemoryEstimate::of`].
+/// Returns an error if the model's settings don't fit together.
 pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usize, Option<MemoryEstimate>)> {
     let mut config = config.clone();
     config.train.micro_batch = 0;
@@ -136,7 +137,7 @@ pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usiz
     Ok((config.train.batch, refused))
 }
 
-/// How many numbers a model of `config` learns.
+/// Returns the number of trainable parameters of a model of `config`.
 fn learned_numbers(config: &ModelConfig) -> Result<f64> {
     let mut vs = nn::VarStore::new(Device::Cpu);
     GlobalSplat::to_be_filled(&mut vs, config, Precision::F32)?;

@@ -1,4 +1,4 @@
-//! What a run writes down: `metrics.jsonl`, a line for every step and for every validation.
+//! Metrics of a run, written to `metrics.jsonl`: one line for every step and for every validation.
 
 use super::step_report::StepReport;
 use super::validator::Score;
@@ -9,10 +9,10 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// A line for every step and every validation.
+/// Name of the metrics file, which has one line for every step and every validation.
 pub const METRICS_FILE: &str = "metrics.jsonl";
 
-/// How a step went, by name: not what it minimized.
+/// Returns the values that describe a step, with their names, except the terms of its loss.
 pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
     [
         ("loss", report.losses.total),
@@ -25,12 +25,13 @@ pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'stat
     ]
 }
 
-/// The terms of a step's loss, by name.
+/// Returns the terms of a step's loss, with their names.
 pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL.len()] {
     Term::ALL.map(|term| (term.name(), report.losses[term]))
 }
 
-/// What is read of a line: of a step, or, with `validation`, of what was found after it. A number that wasn't finite is absent.
+/// Values read from a line, which is that of a step or, if it has `validation`, of a validation after that step. Values that weren't finite
+/// are missing.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct Line {
     pub step: u64,
@@ -43,29 +44,29 @@ pub(super) struct Line {
     pub stage: u32,
     pub mix: Option<f64>,
     pub samples_per_second: Option<f64>,
-    /// Of a step that was skipped: what it showed.
+    /// Names of the scenes of a skipped step.
     #[serde(default)]
     pub scenes: Vec<String>,
     pub validation: Option<ValidationLine>,
 }
 
-/// What validation found.
+/// Scores of a validation.
 #[derive(Debug, Deserialize)]
 pub(super) struct ValidationLine {
     pub psnr: Option<f64>,
 }
 
-/// `metrics.jsonl`, which steps and validations are added to.
+/// Writer of `metrics.jsonl`.
 #[derive(Debug)]
 pub(super) struct Metrics {
     file: AppendFile,
-    /// The step before the last validation that it has.
+    /// Step before the last validation in the file.
     validated: Option<u64>,
 }
 
 impl Metrics {
-    /// Opens the file and takes away what a run that was stopped wrote after the checkpoint it goes on from, before which
-    /// `step` steps were done.
+    /// Opens the file of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run wrote after the
+    /// checkpoint that it continues from.
     pub fn open(path: &Path, step: u64) -> Result<Self> {
         let mut validated = None;
         if path.is_file() {
@@ -101,7 +102,7 @@ impl Metrics {
         self.append(&line)
     }
 
-    /// Scores after step `step`.
+    /// Writes the scores of a validation after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let Score { psnr, ssim, scenes, stage, .. } = score;
         let validation = json!({
@@ -112,7 +113,7 @@ impl Metrics {
         Ok(())
     }
 
-    /// The step before the last validation that it has.
+    /// Returns the step before the last validation in the file.
     pub fn last_validation(&self) -> Option<u64> {
         self.validated
     }
@@ -122,20 +123,20 @@ impl Metrics {
     }
 }
 
-/// How a run went, by what it wrote down.
+/// Training curves of a run, read from its metrics.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curves {
-    /// Of views in training, in dB: the last step of some in a row, and the mean over them.
+    /// PSNR of training views, in dB: the last of several consecutive steps, and the mean over these steps.
     pub training: Vec<(u64, f64)>,
-    /// Of held-out views, in dB: the last step before each validation, and its score.
+    /// PSNR of held-out views, in dB: the last step before each validation, and its score.
     pub held_out: Vec<(u64, f64)>,
 }
 
 impl Curves {
-    /// Reads those of the folder `run`, steps in `parts` parts.
+    /// Reads the curves of the run in the folder `run`. The training curve has at most `parts` points.
     ///
     /// # Errors
-    /// Metrics that can't be read, or tell of no step.
+    /// Returns an error if the metrics can't be read or have no step.
     pub fn read(run: &Path, parts: u64) -> Result<Self> {
         let path = run.join(METRICS_FILE);
         let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
@@ -167,7 +168,7 @@ mod tests {
         let run = tempfile::tempdir().unwrap();
         let step = |step: u64| format!("{{\"step\": {step}, \"psnr\": {}.0}}\n", 10 + step);
         let mut text: String = (0..5).map(step).collect();
-        // A step that was skipped has no number, and a line may be cut off.
+        // A skipped step has no value, and the last line may be incomplete.
         text += "{\"step\": 5, \"psnr\": null}\n{\"step\": 4, \"validation\": {\"psnr\": 8.5}}\n{\"step\": 6, \"ps";
         std::fs::write(run.path().join(METRICS_FILE), text).unwrap();
         let curves = Curves::read(run.path(), 2).unwrap();

@@ -1,4 +1,4 @@
-//! Training: what a step does, how the run goes on, and how it survives being stopped.
+//! Training: the step, the run with its checkpoints and logs, and resumption.
 
 mod checkpoint;
 mod curriculum;
@@ -31,7 +31,7 @@ pub use trainer::Trainer;
 pub use validator::{Score, Validator};
 pub use watch::{RunCurves, RunState, WatchedRun};
 
-// For the parity checks, which run every part by itself.
+// For the parity checks, which run every function by itself.
 pub(crate) use curriculum::stage_at;
 pub(crate) use parameter_groups::parameter_groups;
 pub(crate) use schedule::learning_rate;
@@ -39,7 +39,7 @@ pub(crate) use subsets::subsets;
 // For benchmarks.
 pub(crate) use trainer::COMMUNICATION;
 
-/// Whether something that is done every so many steps, or never (0), is done at `step`.
+/// Returns `true` if an action that is taken every `every` steps (0: never) is due at `step`.
 fn is_due(every: u64, step: u64) -> bool {
     every > 0 && step.is_multiple_of(every)
 }

@@ -1,14 +1,14 @@
-//! Which of a network's weights decay, and how each is updated.
+//! Parameter groups of a network: weight decay and update rule of each weight.
 
 use crate::config::{OptimizerKind, TrainConfig};
 use crate::optim::{ParameterGroup, Rule};
 use tch::{Tensor, nn};
 
-/// Queries, keys and values of self-attention, which are one layer.
+/// Suffix of the weights of self-attention's queries, keys and values, which are one layer.
 const QKV: &str = ".qkv.weight";
 
-/// The trained variables of `vs`: weights of two or more dimensions decay; biases, norms, LayerScale and learned tokens don't. With Muon
-/// the encoder's matrices are updated by it, all else by AdamW (spec 8.5).
+/// Returns the trained variables of `vs` in groups. Weights of two or more dimensions decay; biases, norms, LayerScale and learned tokens
+/// don't. If the optimizer is Muon, it updates the encoder's matrices, and AdamW updates all other variables (spec 8.5).
 pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<ParameterGroup> {
     let trained = vs.variables().into_iter().filter(|(_, value)| value.requires_grad());
     let decays = |(name, value): &(String, Tensor)| name.ends_with(".weight") && value.dim() >= 2;
@@ -31,15 +31,15 @@ pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<Paramete
     ]
 }
 
-/// The trained variables of `vs` in the order in which the backward pass gives their gradients, about: of the decoder, of the encoder's
-/// rounds from the last to the first, and of what comes before them. By the names alone, so it is the same in every process.
+/// Returns the trained variables of `vs` approximately in the order in which the backward pass computes their gradients: the decoder, the
+/// encoder's rounds from the last to the first, and the rest. The order depends only on the names, so it is the same in all processes.
 pub fn in_backward_order(vs: &nn::VarStore) -> Vec<(String, Tensor)> {
     let mut trained: Vec<_> = vs.variables().into_iter().filter(|(_, value)| value.requires_grad()).collect();
     trained.sort_by_cached_key(|(name, _)| (turn(name), name.clone()));
     trained
 }
 
-/// The lower, the earlier.
+/// Returns the sort key of a variable in [`in_backward_order`]. Gradients of lower keys come earlier.
 fn turn(name: &str) -> i64 {
     let mut words = name.split('.');
     match (words.next(), words.next(), words.next().and_then(|word| word.parse::<i64>().ok())) {
@@ -89,7 +89,7 @@ mod tests {
         let counts =
             |groups: &[ParameterGroup]| groups.iter().map(|g| g.parameters.len()).collect::<Vec<_>>();
         assert_eq!(counts(&adamw)[2..], [0, 0]);
-        // Two layers before the rounds; ten of each stream's round, one of which makes queries, keys and values; the mixer's two.
+        // Two layers before the rounds. Ten in the round of each stream, one of which computes queries, keys and values. Two in the mixer.
         assert_eq!(counts(&muon)[2..], [2 + 2 * 9 + 2, 2]);
         assert_eq!(counts(&muon).iter().sum::<usize>(), counts(&adamw).iter().sum::<usize>());
         for (group, parts) in muon[2..].iter().zip([1, 3]) {

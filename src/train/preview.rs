@@ -1,4 +1,4 @@
-//! A picture of how training goes.
+//! Preview image of the training progress.
 
 use crate::data::Sample;
 use crate::error::Result;
@@ -7,8 +7,8 @@ use crate::model::{GlobalSplat, Stage};
 use crate::render::{DEFAULT_EPS2D, render};
 use tch::{Device, Tensor};
 
-/// Of the first scene of `sample`, which isn't paired: a photo that the model sees, a target, what it makes of that,
-/// its depth and its accumulated opacity, side by side, [3, H, W'] in [0, 1] on the CPU.
+/// Renders a preview of the first scene of `sample`, which isn't paired: a context photo, a target photo, its rendered image, its depth
+/// and its accumulated opacity, side by side, `[3, H, W']` in [0, 1] on the CPU.
 pub(super) fn preview(model: &GlobalSplat, sample: &Sample, stage: Stage) -> Result<Tensor> {
     let Sample { context, target, .. } = sample.slice(0, 1);
     let middle = |views: &Tensor| views.size()[1] as usize / 2;

@@ -1,4 +1,4 @@
-//! Ranks that make a step together make the step of one.
+//! Tests that a step of several ranks equals the step of a single one.
 
 use super::step_tests::{config, far_from_the_start, scenes, small, trained};
 use super::{StepReport, Trainer};
@@ -12,19 +12,19 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use tch::{Device, Tensor};
 
-/// Scenes of a step, all ranks together.
+/// Number of scenes in a step of all ranks together.
 const SCENES: usize = 6;
 const STEPS: usize = 10;
-/// A variable of the model that no step changes.
+/// Variable of the model that no step changes.
 const NOT_TRAINED: &str = "gaussian_decoder.patch_center_bias";
 
 fn training(train: TrainConfig) -> Config {
-    // Every step goes as far as any.
+    // Without warm-up, so that the learning rate is about the same in all steps.
     config(small(), TrainConfig { steps: 100, warmup: 0., learning_rate: 3e-5, ..train })
 }
 
-/// A trainer that has done some steps on its group's share of `scenes`, whose `disturb`ed copies each step sees, and what it
-/// told of them.
+/// Trains a trainer for some steps on its rank's share of `scenes`, which `disturb` changes before each step. Returns the trainer and its
+/// reports.
 fn trained_on(
     config: &Config,
     group: Group,
@@ -32,7 +32,7 @@ fn trained_on(
 ) -> (Trainer, Vec<StepReport>) {
     let (rank, share) = (group.rank(), SCENES / group.ranks());
     let mut trainer = far_from_the_start(config).with_ranks(group);
-    // It takes most of the time, and is a mean over scenes as L_mse is.
+    // L_perc takes most of the time. It is a mean over scenes like L_mse, so the tests don't need it.
     trainer.perceptual = None;
     let step = |step: usize| {
         let mut scenes = scenes(SCENES);
@@ -44,17 +44,17 @@ fn trained_on(
     (trainer, reports)
 }
 
-/// Weights, copied.
+/// Returns copies of the trained weights.
 fn weights(trainer: &Trainer) -> BTreeMap<String, Tensor> {
     trained(trainer).into_iter().map(|(name, value)| (name, value.detach().copy())).collect()
 }
 
-/// How far `a` is from `b`, as a share of `b`.
+/// Returns the distance of `a` from `b`, relative to the norm of `b`.
 fn distance(a: &Tensor, b: &Tensor) -> f64 {
     ((a - b).norm() / b.norm()).double_value(&[])
 }
 
-/// Holds what ranks have become by `config` against a trainer that did the same alone, by `alone`, to `tolerance`.
+/// Compares ranks that train with `config` to a trainer that does the same steps alone, with `alone`. Returns the reports of the latter.
 fn assert_like_one(
     ranks: usize,
     config: &Config,
@@ -72,7 +72,7 @@ fn assert_like_one(
     for (rank, (weights, reports)) in found.iter().enumerate() {
         for (name, value) in weights {
             assert!(*value == found[0].0[name], "rank {rank} has other bits than the first in {name}");
-            // A key's bias adds the same to all scores of a query: its gradient is 0.
+            // A key's bias adds the same value to all scores of a query, so its gradient is 0.
             if name.ends_with("mem_k.bias") {
                 assert!(*value == start[name], "{name} moved");
                 continue;
@@ -102,8 +102,8 @@ fn assert_like_one(
     expected
 }
 
-/// However a step is cut into slices, the sums are the same up to their rounding; where a gradient is nothing but that, Adam makes
-/// much of it.
+/// Several ranks make the step of one up to rounding, however the step is cut into slices. Adam amplifies gradients that are nothing but
+/// rounding errors.
 #[test]
 fn ranks_make_the_step_of_one() {
     if !can_meet() {
@@ -113,7 +113,7 @@ fn ranks_make_the_step_of_one() {
     for (ranks, train) in [
         (2, TrainConfig::default()),
         (3, TrainConfig::default()),
-        // Slices of one and two scenes; and each round computed again.
+        // Slices of one and two scenes, and then recomputed rounds.
         (2, TrainConfig { micro_batch: 2, ..Default::default() }),
         (3, TrainConfig { micro_batch: 1, checkpoint_rounds: true, ..Default::default() }),
     ] {
@@ -121,14 +121,14 @@ fn ranks_make_the_step_of_one() {
     }
 }
 
-/// Slices of one rank are those of another way to share the same work out.
+/// Ranks give the same step as the slices of a single rank that divide the scenes alike.
 #[test]
 fn ranks_make_the_slices_of_one() {
     if !can_meet() {
         return;
     }
     let with = |micro_batch| training(TrainConfig { micro_batch, ..Default::default() });
-    // The sum of two numbers has no order.
+    // The sum of two values doesn't depend on their order.
     assert_like_one(2, &with(0), &with(3), 0., |_, _| {});
     assert_like_one(3, &with(0), &with(2), 1e-5, |_, _| {});
 }
@@ -140,7 +140,7 @@ fn a_loss_that_is_no_number_on_one_rank_skips_the_step_on_all() {
     }
     let disturb = |step: usize, scenes: &mut [LoadedScene]| {
         if step == 3 {
-            // The last rank's.
+            // A scene of the last rank.
             scenes[SCENES - 1].far = f64::NAN;
         }
     };
@@ -169,7 +169,8 @@ fn of_a_skipped_step_all_ranks_know_all_scenes() {
     assert_eq!((&found[0][1], &found[1][1]), (&names(0..3), &names(3..6)));
 }
 
-/// Each rank updates its share of the parameters, and all have the others': bit by bit what they would have made by themselves.
+/// A sharded optimizer gives the same bits as an unsharded one. Each rank updates its share of the parameters, and all ranks get the
+/// others' shares.
 #[test]
 fn a_sharded_optimizer_is_the_whole_one() {
     if can_meet() {
@@ -224,7 +225,7 @@ fn ranks_stop_together() {
     assert_eq!(found, vec![vec![true, true, false, true]; 3]);
 }
 
-/// What one rank has learned, others take over: weights, moments, and where the run stands.
+/// All ranks take over the state of the first one: weights, moments, step and position in the data.
 #[test]
 fn ranks_follow_the_first() {
     if !can_meet() {
@@ -237,7 +238,7 @@ fn ranks_follow_the_first() {
             let sample = Sample::of(&scenes(1), Device::Cpu);
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             trainer.samples = 7;
-            // Somebody else's weights may have it elsewhere.
+            // Weights from elsewhere may have another value here.
             let _ = trainer.vs.variables()[NOT_TRAINED].shallow_clone().fill_(0.25);
         }
         let mut trainer = trainer.with_ranks(group);
@@ -263,7 +264,7 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
     if !can_meet() {
         return;
     }
-    // What the second of two ranks says.
+    // Returns the error of the second of two ranks.
     let refused = |second: fn(Config) -> Trainer| {
         let mut found = together(2, |group| {
             let config = training(TrainConfig::default());
@@ -274,7 +275,7 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
     };
     let other = refused(|mut config| {
         config.train.learning_rate = 0.5;
-        // Where data lie may differ.
+        // The locations of the data may differ.
         config.data.captures = vec!["elsewhere".into()];
         far_from_the_start(&config)
     });

@@ -1,4 +1,4 @@
-//! A whole run: from where it stands to the last step, with checkpoints on the way.
+//! Training run, from its current state to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
     Validation, add_checkpoints, best_score, check, drop_surplus, keep_best, latest_checkpoint,
@@ -17,57 +17,58 @@ use crate::io::{Inputs, write_atomically};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// The run's configuration, every key written out.
+/// Name of the file that has the run's configuration, with every key written out.
 pub const CONFIG_FILE: &str = "config.toml";
 
-/// Where a run begins.
+/// Starting point of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Resume {
-    /// At the run's newest checkpoint that is whole; at step 0 where there is none at all.
+    /// Newest complete checkpoint of the run, or step 0 if the run has no checkpoints.
     Auto,
-    /// At step 0; a run that has checkpoints is refused.
+    /// Step 0. A run that has checkpoints is an error.
     Never,
-    /// At this checkpoint.
+    /// Checkpoint in the given folder.
     From(PathBuf),
 }
 
-/// What a run tells while it goes on.
+/// Event that a run reports.
 #[derive(Debug)]
 pub enum Event<'a> {
-    /// A step was done.
+    /// Completed step.
     Step {
-        /// What it did.
+        /// Report of the step.
         report: &'a StepReport,
-        /// How fast.
+        /// Speed of the step, in samples per second.
         samples_per_second: f64,
     },
-    /// The model was validated.
+    /// Score of a completed validation.
     Validation(&'a Score),
-    /// Something a person should know, in one sentence.
+    /// Message for the user, in one sentence.
     Notice(String),
-    /// Nothing has changed: the run waits for room on the disk, or is in the middle of a validation.
+    /// No progress to report: the run waits for disk space, or is inside of a step or a validation.
     Waiting,
 }
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Outcome {
-    /// The last checkpoint.
+    /// Last checkpoint.
     pub checkpoint: PathBuf,
-    /// Whether all steps are done; else it was stopped.
+    /// `true` if all steps are done; `false` if the run was stopped.
     pub complete: bool,
-    /// Steps that were skipped because loss or gradient wasn't finite.
+    /// Number of steps that were skipped because loss or gradient wasn't finite.
     pub skipped: u64,
 }
 
-/// Trains into the folder `out`, which nobody else may train into meanwhile. `observe` hears what happens and says whether to
-/// go on: a stopped run is saved first. `validator` scores the model now and then, and at the end.
+/// Trains into the folder `out`, which no other process may use for training at the same time. `observe` is called with every event and
+/// returns whether to continue. If it returns `false`, the run saves a checkpoint and stops. `validator` scores the model at intervals and
+/// at the end.
 ///
-/// Of ranks that train together, all call this. The first one reads and writes `out`, and the others follow it.
+/// If several ranks train together, all of them call this. The first rank reads and writes `out`, and the others take over its state.
 ///
 /// # Errors
-/// A run that is in use, a checkpoint that doesn't fit, too many steps in a row that had to be skipped, another rank that is gone, or
-/// whatever a step or a save fails with. A full disk is waited for, and a validation that fails is left out.
+/// Returns an error if another process uses the run, a checkpoint doesn't fit, too many steps in a row were skipped, another rank is gone,
+/// or a step or a save fails. If the disk is full, the run waits for free space. If a validation fails, it is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -95,14 +96,14 @@ pub fn run(
     Run { trainer, out, validator, observe, books, validated, asked_to_stop: false }.train(saved)
 }
 
-/// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and what it wrote beside them.
+/// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and the files beside them.
 pub fn add_run_inputs(run: &Path, inputs: &mut Inputs) {
     add_checkpoints(run, inputs);
     event_files(run).iter().for_each(|file| inputs.add(file));
     [CONFIG_FILE, METRICS_FILE].iter().for_each(|file| inputs.add(&run.join(file)));
 }
 
-/// That a run may keep its books in `out`: it did before, or there are none of somebody else's.
+/// Checks that a run may write into `out`: it has done so before, or the folder has no other files of the names that a run uses.
 fn check_books(out: &Path) -> Result<()> {
     if RunLock::was_taken(out) || !list_checkpoints(out)?.is_empty() {
         return Ok(());
@@ -121,19 +122,19 @@ fn check_books(out: &Path) -> Result<()> {
     }
 }
 
-/// What a run writes beside checkpoints.
+/// Files that a run writes beside its checkpoints.
 struct Books {
     _lock: RunLock,
     metrics: Metrics,
     tensorboard: TensorBoard,
-    /// Of the best checkpoint, in dB.
+    /// PSNR of the best checkpoint, in dB.
     best: Option<f64>,
-    /// What scores depend on.
+    /// Settings that validation scores depend on.
     settings: String,
 }
 
 impl Books {
-    /// Brings the trainer to where the run begins, and opens its books there. Also returns the run's own checkpoint of that.
+    /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the run's own checkpoint of this state.
     fn open(
         trainer: &mut Trainer,
         out: &Path,
@@ -193,28 +194,28 @@ impl Books {
     }
 }
 
-/// A run that goes on. All ranks take the same way through it.
+/// State of a run in progress. All ranks take the same path through it.
 struct Run<'a, 'v, O> {
     trainer: &'a mut Trainer,
     out: &'a Path,
     validator: Option<&'v mut dyn Validator>,
     observe: O,
-    /// The first rank's.
+    /// Log files, which only the first rank has.
     books: Option<Books>,
-    /// The step before the last validation that is in the books.
+    /// Step before the last validation that was logged.
     validated: Option<u64>,
-    /// Whether somebody asked this rank to stop; the others hear of it with the next step.
+    /// `true` if this rank was asked to stop. The other ranks learn of it with the next step.
     asked_to_stop: bool,
 }
 
 impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
-    /// `saved` is the run's own checkpoint of the state as it is, if there is one.
+    /// Trains until all steps are done or the run is stopped. `saved` is the run's own checkpoint of the current state, if there is one.
     fn train(mut self, mut saved: Option<PathBuf>) -> Result<Outcome> {
         let TrainConfig { steps, checkpoint_every, validate_every, max_skipped, .. } =
             self.trainer.config.train;
         let batch = self.trainer.batch() as f64;
         let (mut skipped, mut go_on) = (0, true);
-        // Steps that were skipped since the last one that wasn't.
+        // Number of steps that were skipped since the last one that wasn't.
         let mut skipped_in_a_row = 0;
         while self.trainer.step < steps {
             let step = self.trainer.step;
@@ -222,7 +223,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             if validates && skipped_in_a_row == 0 && self.validated != Some(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 go_on = match self.validate(&checkpoint) {
-                    // What can't be written is no matter of what is held out.
+                    // A failed write or a lost rank isn't a problem of the held-out data.
                     Err(e @ (Error::Write { .. } | Error::Ranks(_))) => return Err(e),
                     Err(e) => self.tell(Event::Notice(format!("a validation is left out: {e}"))),
                     go_on => go_on?,
@@ -262,11 +263,11 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             }
         }
         let mut complete = self.trainer.step >= steps;
-        // Skipped steps changed nothing, so this is the state before them. They are tried again when the run is resumed.
+        // Skipped steps changed nothing, so this is the state before them. They are repeated when the run is resumed.
         self.trainer.take_back(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
         if self.books.is_some() {
-            // What a save couldn't remove is tried again.
+            // Retry to remove checkpoints that an earlier save couldn't remove.
             drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
         }
         if complete && self.validator.is_some() {
@@ -275,21 +276,21 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 Err(e) => {
                     self.tell(Event::Notice(format!("the last validation is left out: {e}")));
                 }
-                // Stopped before the end, the same command does it again.
+                // If the validation was stopped before its end, the run isn't complete, and the same command repeats the validation.
                 Ok(_) => complete = self.validated == Some(self.trainer.step.saturating_sub(1)),
             }
         }
         Ok(Outcome { checkpoint, complete, skipped })
     }
 
-    /// Returns whether to go on. Of several ranks each is told only what all of them agree on: what one was asked, the others
-    /// learn with the next step.
+    /// Reports an event and returns whether to continue. If there are several ranks, always returns `true`: a request to stop reaches all
+    /// ranks with the next step, so that they stop together.
     fn tell(&mut self, event: Event) -> bool {
         self.asked_to_stop |= !(self.observe)(event);
         self.trainer.group.ranks() > 1 || !self.asked_to_stop
     }
 
-    /// Returns where the checkpoint is that the first rank has saved, or is about to.
+    /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.
     fn save(&mut self) -> Result<PathBuf> {
         let optimizer = self.trainer.optimizer_state()?;
         match &self.books {
@@ -298,8 +299,8 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         }
     }
 
-    /// Has the state that `checkpoint` holds judged. It is told last of all, so that a run that is killed meanwhile repeats
-    /// all of this. Returns whether to go on.
+    /// Validates the current state, which `checkpoint` holds, and returns whether to continue. The score is logged last, so that a run that
+    /// is killed during the validation repeats all of it.
     fn validate(&mut self, checkpoint: &Path) -> Result<bool> {
         let Some(validator) = &mut self.validator else { return Ok(true) };
         let observe = &mut self.observe;
@@ -324,7 +325,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         Ok(self.tell(Event::Validation(&score)))
     }
 
-    /// Why nothing is learned any more.
+    /// Returns the error for too many skipped steps in a row.
     fn not_finite(&self, steps: u64, last: &StepReport) -> Error {
         let before = match latest_checkpoint(self.out) {
             Ok(checkpoint) => format!("{} is from before", checkpoint.display()),
@@ -339,7 +340,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     }
 }
 
-/// Brings the trainer to where the run begins, and returns its own checkpoint of that.
+/// Brings the trainer to the run's starting point, and returns the run's own checkpoint of this state.
 fn begin(
     trainer: &mut Trainer,
     out: &Path,
@@ -351,7 +352,7 @@ fn begin(
         Resume::From(checkpoint) => {
             let state = check(checkpoint)?;
             let step = state.step;
-            // They would be taken for newer ones of what is trained now.
+            // Later checkpoints would be mistaken for newer ones of this training.
             let later = |of: &&PathBuf| check(of).map_or(true, |other| other.step > step);
             if let Some(later) = checkpoints.iter().rev().find(later) {
                 let expected = format!(
@@ -386,10 +387,10 @@ fn begin(
     }
 }
 
-/// How long a full disk is left alone.
+/// Time between attempts to write to a full disk.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Does `write`, and again as long as there is no room on the disk and `observe` wants to go on.
+/// Calls `write`, and repeats it as long as the disk is full and `observe` returns `true`.
 fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut() -> Result<T>) -> Result<T> {
     let mut waited = false;
     loop {

@@ -1,14 +1,14 @@
-//! The learning rate (spec 8.6).
+//! Learning rate schedule (spec 8.6).
 
 use crate::config::TrainConfig;
 use std::f64::consts::PI;
 
-/// Where the warm-up begins, as a share of the peak.
+/// Learning rate at the start of the warm-up, as a share of the peak.
 const WARMUP_START: f64 = 1e-3;
-/// Where the cosine ends: a fiftieth of the peak, and never below this.
+/// Minimum of the learning rate at the end of the cosine, which is otherwise a fiftieth of the peak.
 const MIN_LEARNING_RATE: f64 = 1e-6;
 
-/// Of `step`, counted from 0: linear from a thousandth of the peak, then a cosine.
+/// Returns the learning rate of `step`, counted from 0: linear warm-up from a thousandth of the peak, then a cosine.
 pub fn learning_rate(config: &TrainConfig, step: u64) -> f64 {
     let peak = config.learning_rate;
     let warmup = (config.warmup * config.steps as f64).round();

@@ -1,7 +1,7 @@
-//! Slices of a step side by side, each on threads of its own.
+//! Parallel computation of a step's slices, each on threads of its own.
 //!
-//! Operations of a small network are too short to share among threads: with two a scene takes hardly less time than with one. Scenes
-//! don't need each other before their gradients are added up, so each thread may have its own.
+//! Operations of a small network are too short to be split among threads: a scene takes hardly less time on two threads than on one. Scenes
+//! are independent until their gradients are summed, so each slice of a step can have its own threads.
 
 use super::forward_backward::ForwardBackward;
 use crate::data::Sample;
@@ -14,20 +14,20 @@ use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 use tch::{Kind, Tensor, nn, no_grad};
 
-/// The model once more, with the same weights in the same memory, and leaves of its own for gradients to come to. So those of a step are
-/// added up in the order of its scenes, whichever is done first, and the sums have the same bits every time.
+/// Copy of the model that shares its weights in memory and has gradients of its own. So the gradients of a step are summed in the order of
+/// its scenes, whichever is done first, and the sums are bit-identical every time.
 #[derive(Debug)]
 pub(super) struct Twin {
     model: GlobalSplat,
-    /// The trained variables of the model, and those of this one beside them.
+    /// Trained variables of the model, each with the copy's variable for it.
     leaves: Vec<(Tensor, Tensor)>,
 }
 
 impl Twin {
-    /// Of `model`, whose variables are those of `vs`.
+    /// Creates a copy of `model`, whose variables are those of `vs`.
     ///
     /// # Errors
-    /// None that the model didn't have.
+    /// Returns an error if the model can't be built. This is not expected, because `model` was built with the same configuration.
     pub fn of(model: &GlobalSplat, vs: &nn::VarStore) -> Result<Self> {
         let mut own = nn::VarStore::new(vs.device());
         let twin = GlobalSplat::to_be_filled(&mut own, model.config(), model.precision())?;
@@ -40,7 +40,7 @@ impl Twin {
         Ok(Twin { leaves: leaves.collect(), model: twin })
     }
 
-    /// Adds the gradients that came to the leaves to those of the model's own variables, and forgets them.
+    /// Adds the gradients of the copy to those of the model's own variables, and clears them.
     fn hand_over(&self) {
         for (variable, leaf) in &self.leaves {
             let gradient = leaf.grad();
@@ -52,12 +52,13 @@ impl Twin {
     }
 }
 
-/// What [`ForwardBackward::gradients`] does of each of `slices`, which share libtorch's threads out: of the first on this thread, of each
-/// other by a twin. There are no more of them than threads, and a twin for each but the first. `watch` hears of the first, and of the
-/// time for which others are waited for.
+/// Computes [`ForwardBackward::gradients`] of all `slices` in parallel and returns the sum of their losses. The slices share libtorch's
+/// threads equally: this thread computes the first slice, and a new thread with a copy of the model each of the others. There must be at
+/// most as many slices as threads, and a copy for each slice but the first. `watch` records the time of the first slice's sections, and the
+/// time of waiting for the other slices.
 ///
 /// # Errors
-/// A picture that can't be made.
+/// Returns an error if rendering fails.
 pub(super) fn gradients_side_by_side(
     part: &ForwardBackward,
     twins: &mut [Twin],
@@ -86,7 +87,7 @@ pub(super) fn gradients_side_by_side(
         let joined = |other: ScopedJoinHandle<_>| other.join().unwrap_or_else(|panic| resume_unwind(panic));
         watch.time("other scenes", || std::iter::once(first).chain(others.into_iter().map(joined)).collect())
     });
-    // A thread that sets its number sets that of new threads, too.
+    // Setting the number of threads in one thread sets it for threads that start later, too.
     tch::set_num_threads(threads);
     let count = losses.len();
     let losses: Vec<Tensor> = losses.into_iter().collect::<Result<_>>()?;

@@ -1,34 +1,34 @@
-//! What a training step did.
+//! Report of a training step.
 
 use crate::loss::{Losses, Term, psnr_of_mse};
 use crate::model::Stage;
 use tch::Tensor;
 
-/// What a step did.
+/// Report of a training step.
 #[derive(Debug)]
 pub struct StepReport {
-    /// Counted from 0.
+    /// Step, counted from 0.
     pub step: u64,
-    /// Where the curriculum stood.
+    /// Curriculum stage.
     pub stage: Stage,
-    /// The learning rate used.
+    /// Learning rate.
     pub learning_rate: f64,
-    /// The loss and its terms.
+    /// Loss and its terms.
     pub losses: Losses<f64>,
-    /// Of the gradient, before clipping.
+    /// Norm of the gradient, before clipping.
     pub gradient_norm: f64,
-    /// Loss or gradient wasn't finite, so nothing was changed.
+    /// `true` if loss or gradient wasn't finite, so that no weights were changed.
     pub skipped: bool,
-    /// Names of the scenes that this rank looked at; of a skipped step, those of all ranks.
+    /// Names of the scenes of this rank, or of all ranks if the step was skipped.
     pub scenes: Vec<String>,
-    /// What the first of them looked like before the step, at the steps that `train.pictures_every` chooses, [3, H, W].
+    /// Preview of the first scene before the step, `[3, H, W]`, at the steps that `train.pictures_every` selects.
     pub picture: Option<Tensor>,
-    /// Whether no rank was asked to stop.
+    /// `true` if no rank was asked to stop.
     pub go_on: bool,
 }
 
 impl StepReport {
-    /// Of all pictures together, in dB.
+    /// Returns the PSNR of all rendered images together, in dB.
     pub fn psnr(&self) -> f64 {
         psnr_of_mse(self.losses[Term::Mse])
     }

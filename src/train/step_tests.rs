@@ -1,4 +1,4 @@
-//! A step's gradient, however it is computed.
+//! Tests that all ways to compute a step give the same gradient.
 
 use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
@@ -19,12 +19,12 @@ use tch::{Device, Kind, Tensor, nn};
 const SIZE: u32 = 32;
 const STAGE: Stage = Stage { index: 2, mix: 0.4 };
 
-/// Three scenes.
+/// Returns a sample of three scenes.
 fn sample() -> Sample {
     Sample::of(&scenes(3), Device::Cpu)
 }
 
-/// Of five context and two target views, pictures of noise.
+/// Returns scenes of five context and two target views, with noise as images.
 pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let intrinsics = Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. };
@@ -47,7 +47,7 @@ pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
 }
 
 pub(super) fn config(model: ModelConfig, train: TrainConfig) -> Config {
-    // Factors that let every term count.
+    // Factors that let every term of the loss contribute.
     let loss = LossConfig {
         perceptual: PerceptualKind::None,
         consistency_alpha: 0.5,
@@ -73,22 +73,22 @@ pub(super) fn small() -> ModelConfig {
     }
 }
 
-/// Loss and gradients.
+/// Loss and gradients of a step.
 type Step = (Losses<f64>, BTreeMap<String, Tensor>);
 
-/// By the trainer.
+/// Computes the loss and gradients of a step with the trainer.
 fn gradients(config: &Config, sample: &Sample) -> Step {
     of_model(config, |trainer| {
         numbers(&trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
     })
 }
 
-/// Packed losses as numbers.
+/// Converts packed losses to numbers.
 fn numbers(losses: &Tensor) -> Losses<f64> {
     Losses::unpacked(&Vec::try_from(losses).expect("float64").try_into().expect("all terms"))
 }
 
-/// What `compute` says of, and leaves in, a model that is [`far_from_the_start`].
+/// Returns the losses that `compute` returns for a model that is [`far_from_the_start`], and the gradients that it leaves there.
 fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) -> Step {
     let mut trainer = far_from_the_start(config);
     let values = compute(&mut trainer);
@@ -96,14 +96,14 @@ fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) 
     (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
 }
 
-/// A trainer's variables by their names.
+/// Returns a trainer's trained variables, by name.
 pub(super) fn trained(trainer: &Trainer) -> BTreeMap<String, Tensor> {
     let mut variables: BTreeMap<String, Tensor> = trainer.vs.variables().into_iter().collect();
     variables.retain(|_, variable| variable.requires_grad());
     variables
 }
 
-/// A trainer of a model whose weights are far enough from the start for its parts to matter; always the same.
+/// Returns a trainer whose weights are far enough from their initial values for all modules to matter. They are always the same.
 pub(super) fn far_from_the_start(config: &Config) -> Trainer {
     let scenes = Arc::new(Vec::<Capture>::new());
     let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
@@ -112,16 +112,16 @@ pub(super) fn far_from_the_start(config: &Config) -> Trainer {
     for (name, variable) in &mut variables {
         let noise: Vec<f32> = (0..variable.numel()).map(|_| random.random_range(-0.15..0.15)).collect();
         let noise = Tensor::from_slice(&noise).view(variable.size().as_slice());
-        // Nothing is left of the numbers drawn for a fresh model: other tests draw from the same generator.
+        // All values that were drawn for the initial model are replaced, because other tests draw from the same generator.
         let is_norm = name.ends_with(".weight") && noise.dim() == 1;
         let value = if is_norm { noise + 1. } else { noise };
         tch::no_grad(|| variable.copy_(&value));
     }
-    // Some Gaussians outside of all frusta; opacities begin at 0.007, which would hardly be seen.
+    // Some Gaussians outside of all frusta. Opacities are initially 0.007, which would be almost invisible.
     let _ = tch::no_grad(|| {
         variables["gaussian_decoder.geo_pos_readout.bias"].shallow_clone().g_mul_scalar_(20.)
     });
-    // The weights of a network that compares pictures are a file that tests may not have.
+    // The weights of the perceptual network are in a file that may be missing in tests, so they are drawn here.
     let perceptual = nn::VarStore::new(Device::Cpu);
     trainer.perceptual = Some(PerceptualLoss::Vgg19(Vgg19::new(&perceptual.root())));
     for (name, mut weight) in perceptual.variables().into_iter().collect::<BTreeMap<_, _>>() {
@@ -138,7 +138,7 @@ pub(super) fn far_from_the_start(config: &Config) -> Trainer {
     trainer
 }
 
-/// Holds losses and gradients against those of another way to compute them.
+/// Asserts that losses and gradients equal those that were computed in another way.
 fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
     let ((loss, found), (expected_loss, expected)) = (found, expected);
     let terms = Term::ALL.map(|term| (term.name(), loss[term], expected_loss[term]));
@@ -149,7 +149,8 @@ fn assert_same(found: &Step, expected: &Step, tolerance: f64) {
     assert_same_gradients(found, expected, tolerance);
 }
 
-/// Gradients alone; key biases, whose gradient is zero in exact arithmetic, as a share of the largest.
+/// Asserts that gradients are equal. Errors of key biases, whose gradient is zero in exact arithmetic, are relative to the largest
+/// gradient.
 fn assert_same_gradients(
     found: &BTreeMap<String, Tensor>,
     expected: &BTreeMap<String, Tensor>,
@@ -175,8 +176,8 @@ fn slices_of_a_step_add_up_to_it() {
     }
 }
 
-/// A step whose scenes nothing but the mean brings together, in one, two and three slices. In bf16, gradients of weights are rounded
-/// slice by slice.
+/// Parallel slices give the same step every time, in one, two and three slices. Only the mean connects the scenes of this step. In bf16,
+/// the gradients of weights are rounded in each slice.
 #[test]
 fn scenes_side_by_side_make_the_same_step_every_time() {
     let sample = sample();
@@ -195,10 +196,10 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
                     numbers(&losses)
                 };
                 step();
-                // Now there are gradients to forget.
+                // This time, there are gradients to clear.
                 let losses = step();
                 assert_eq!(trainer.twins.len() + 1, threads as usize);
-                // Three threads can't have four scenes more evenly than two can.
+                // Three threads can't share four scenes more evenly than two can.
                 assert_eq!(trainer.slices_at_once(4), [1, 2, 2][threads as usize - 1]);
                 losses
             })
@@ -264,7 +265,7 @@ fn the_network_of_l_perc_has_the_model_s_precision() {
         let trainer = Trainer::new(&config, scenes, Device::Cpu).expect("a trainer");
         let Some(PerceptualLoss::Vgg19(network)) = trainer.perceptual else { panic!("a network") };
         let features = network.features(&Tensor::zeros([1, 3, 16, 16], (Kind::Float, Device::Cpu)));
-        // The picture itself is compared as it is.
+        // The image itself is compared in float32.
         let kinds: Vec<Kind> = features.iter().map(Tensor::kind).collect();
         assert_eq!(kinds, [Kind::Float, kind, kind, kind, kind, kind]);
         assert_eq!(network.compare(&features, &features).kind(), Kind::Float);
@@ -273,11 +274,11 @@ fn the_network_of_l_perc_has_the_model_s_precision() {
     }
 }
 
-/// Launches of a step are mostly libtorch's ops, forward and backward: those of the main model's layers, of every loss but L_perc's
-/// network, and of tokens. To these come nine of the rasterizer's kernels, and a few of the optimizer's.
+/// A step launches few kernels. Most are libtorch's ops, forward and backward: those of the main model's layers, of all losses without
+/// L_perc's network, and of the tokens. In addition, there are nine kernels of the rasterizer, and a few of the optimizer.
 #[test]
 fn a_step_takes_few_kernels() {
-    // Narrow, in float64 and with an odd number of heads, as in the test of a pass.
+    // A narrow model, in float64 and with an odd number of heads, as in the test of a pass of the model.
     let model =
         ModelConfig { latents: 16, width: 24, heads: 3, rgb_width: 16, ray_width: 8, ..Default::default() };
     let mut trainer = far_from_the_start(&config(model, TrainConfig::default()));
@@ -325,11 +326,11 @@ fn a_step_moves_nothing_but_what_is_told() {
             let is_fused = |op: &&String| {
                 op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"
             };
-            // In every round of either stream, to the memory and among the slots.
+            // In every round of either stream: cross-attention to the memory, and self-attention among the slots.
             assert_eq!(ops.iter().filter(is_fused).count(), 2 * 2 * 2, "attention");
             let cameras = sample.target.cameras();
             let (pictures, ops) = ops_of(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));
-            // Rendering brings pictures to where the Gaussians are.
+            // Rendering moves the rendered images to the device of the Gaussians.
             let of_pictures = moves(&ops);
             let pictures = pictures.expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
@@ -341,7 +342,7 @@ fn a_step_moves_nothing_but_what_is_told() {
             let (report, ops) = ops_of(|| trainer.learn(&sample, &mut Stopwatch::default(), &mut || true));
             let renders = match micro_batch {
                 0 => 1,
-                // Depths are compared over all slices, whose pixels are counted before.
+                // Depths are compared over all slices, so their pixels are counted in an earlier pass.
                 count => 2 * sample.scenes().div_ceil(count),
             };
             assert_eq!(moves(&ops), 1 + renders * of_pictures, "a step in slices of {micro_batch}");

@@ -1,8 +1,8 @@
-//! Two halves of the context that overlap in its ends (spec 7.8).
+//! Two overlapping subsets of the context views, which share the first and the last view (spec 7.8).
 
-/// Positions of the two subsets of `views` ordered context views at `step`: the first and the last go to both; of those
-/// between, odd positions go to the first subset and even ones to the second, the other way round on odd steps; the
-/// smaller is padded by its last view. Needs two views.
+/// Returns the positions of the two subsets of `views` ordered context views at `step`. Both have the first and the last view. Of the views
+/// in between, odd positions go to the first subset and even ones to the second; on odd steps it is the other way round. The smaller
+/// subset is padded with the last view. Needs at least two views.
 pub fn subsets(views: usize, step: u64) -> [Vec<usize>; 2] {
     let last = views - 1;
     let subset = |parity: usize| {

@@ -1,4 +1,4 @@
-//! What TensorBoard shows of a run: `RUN/tensorboard`, a file for every time that the run was begun or resumed.
+//! TensorBoard log of a run in `RUN/tensorboard`, with one file for every time that the run was started or resumed.
 
 use super::is_due;
 use super::metrics::{loss_terms, progress};
@@ -9,15 +9,15 @@ use crate::io::EventFile;
 use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "tensorboard";
-/// TensorBoard reads a folder's files in the order of their names, so each has its number.
+/// Prefix of the names of our files. A number follows, because TensorBoard reads the files of a folder in the order of their names.
 const PREFIX: &str = "events.out.tfevents.";
 
-/// The number in the name of one of our files.
+/// Returns the number in the name of one of our files.
 fn number_of(file: &Path) -> Option<u64> {
     file.file_name()?.to_str()?.strip_prefix(PREFIX)?.parse().ok()
 }
 
-/// The files in the folder `run`, oldest first; none where there is none, or where they can't be listed.
+/// Returns the event files of the folder `run`, oldest first. The list is empty if there are none or if they can't be listed.
 pub(super) fn event_files(run: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(run.join(FOLDER)).into_iter().flatten().flatten();
     let mut files: Vec<_> =
@@ -26,16 +26,16 @@ pub(super) fn event_files(run: &Path) -> Vec<PathBuf> {
     files.into_iter().map(|(_, file)| file).collect()
 }
 
-/// The file of this start.
+/// Event file of the current start of the run.
 #[derive(Debug)]
 pub(super) struct TensorBoard {
     file: EventFile,
-    /// Steps between numbers.
+    /// Number of steps between scalars.
     every: u64,
 }
 
 impl TensorBoard {
-    /// Makes a new file in the run's folder. [`TensorBoard::start`] comes next.
+    /// Creates a new file in the run's folder. Call [`TensorBoard::start`] next.
     pub fn create(run: &Path, every: u64) -> Result<Self> {
         let folder = run.join(FOLDER);
         std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
@@ -47,7 +47,7 @@ impl TensorBoard {
         Ok(TensorBoard { file: EventFile::create(&folder.join(format!("{PREFIX}{number:010}")))?, every })
     }
 
-    /// The run goes on with `step`: what was logged of it before, and of later ones, is void.
+    /// Records that the run continues with `step`. Earlier events of this step and of later ones become void.
     pub fn start(&mut self, step: u64) -> Result<()> {
         self.file.start(step)
     }
@@ -69,7 +69,7 @@ impl TensorBoard {
         }
     }
 
-    /// Scores after step `step`.
+    /// Logs the validation scores after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let values = [
             ("validation/psnr", score.psnr),

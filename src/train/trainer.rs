@@ -1,4 +1,4 @@
-//! One training step, and the state that steps change.
+//! Training step, and the state that it changes.
 
 use super::curriculum::stage_at;
 use super::forward_backward::ForwardBackward;
@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
-/// The part of a step in which ranks wait for each other.
+/// Name of the section of a step in which ranks wait for each other.
 pub(crate) const COMMUNICATION: &str = "communication";
 
 /// Model, optimizer and data of a run.
@@ -31,33 +31,33 @@ pub struct Trainer {
     pub(super) config: Config,
     pub(super) vs: nn::VarStore,
     pub(super) model: GlobalSplat,
-    /// The model for further threads; made when they are first needed.
+    /// Copies of the model for additional threads, created when they are first needed.
     pub(super) twins: Vec<Twin>,
     pub(super) optimizer: Optimizer,
     pub(super) perceptual: Option<PerceptualLoss>,
-    /// The file that has the first weights, if they aren't fresh.
+    /// File that has the initial weights, if they aren't drawn at random.
     weights: Option<PathBuf>,
-    /// Steps done.
+    /// Number of steps done.
     pub(super) step: u64,
-    /// Samples drawn: the position in the data.
+    /// Number of samples drawn, which is the position in the data.
     pub(super) samples: u64,
     scenes: Arc<dyn SceneGroups>,
-    /// Begins with the first step that is done, wherever that is.
+    /// Loader of the samples, started by the first step that is done.
     loader: Option<Loader>,
-    /// Those that make every step together, each with samples of its own.
+    /// Group of the ranks that make every step together, each with its own samples.
     pub(super) group: Group,
     buckets: Buckets,
-    /// Whether each rank has moments of its share of the parameters alone.
+    /// `true` if each rank has only the moments of its share of the parameters.
     shards_optimizer: bool,
 }
 
-/// What ranks tell each other in every step, beside gradients: numbers, which are added up.
+/// Values that ranks exchange in every step in addition to gradients. They are summed over all ranks.
 struct Word {
-    /// Ranks that were asked to stop.
+    /// Number of ranks that were asked to stop.
     asked_to_stop: f64,
-    /// Ranks that found bad data.
+    /// Number of ranks that found bad data.
     found_bad_data: f64,
-    /// Gradients that there are, and their square: ranks that have as many have a sum of squares that says so.
+    /// Number of gradients, and its square. Their sums show whether all ranks have the same number of gradients.
     gradients: [f64; 2],
 }
 
@@ -74,10 +74,10 @@ impl Word {
 }
 
 impl Trainer {
-    /// Fresh weights by the configuration's seed. `scenes` are what is learned; views held out aren't shown.
+    /// Creates a trainer with initial weights drawn from the configuration's seed. It trains on `scenes`, but never on held-out views.
     ///
     /// # Errors
-    /// A model that can't be built, or no weights for the perceptual loss.
+    /// Returns an error if the model can't be built, or if the weights of the perceptual loss are missing.
     pub fn new(config: &Config, scenes: Arc<dyn SceneGroups>, device: Device) -> Result<Self> {
         let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?
             .map(|network| network.with_precision(config.train.precision));
@@ -108,10 +108,10 @@ impl Trainer {
         })
     }
 
-    /// Together with other processes: `train.batch` is of each of them, and a step is that of one alone with as many samples as
-    /// all have.
+    /// Makes this trainer a rank of `group`. `train.batch` is the batch size of each rank. A step equals that of a single process with the
+    /// samples of all ranks.
     pub fn with_ranks(mut self, group: Group) -> Self {
-        // Parameters tell one set of buckets alone.
+        // Parameters notify only one set of buckets, so the old one is dropped first.
         self.buckets = Buckets::new(&Group::alone(), &[]);
         let parameters: Vec<Tensor> =
             in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
@@ -119,30 +119,30 @@ impl Trainer {
         Trainer { group, buckets, ..self }
     }
 
-    /// With the optimizer's moments shared out over the ranks from where the run begins. Checkpoints have all of them.
+    /// Shards the optimizer's moments over the ranks, from the start of the run. Checkpoints have all moments.
     pub fn with_sharded_optimizer(self) -> Self {
         Trainer { shards_optimizer: true, ..self }
     }
 
-    /// [`run`](super::run) begins, where it has no checkpoint yet, with the weights in a file that [`ModelFile`] reads in place of the fresh
-    /// ones. They may be of a smaller model: of larger patches, whose edge is a multiple of this model's, or of fewer scene tokens, of whose
-    /// number this model's is a multiple. All Gaussians are shown from the first step on: weights that were trained to the last stage know
-    /// nothing of the first any more.
+    /// Makes [`run`](super::run) start from the weights in the file `path`, which [`ModelFile`] reads, if it has no checkpoint yet. They
+    /// may be those of a smaller model: with larger patches, whose edge is a multiple of this model's, or with fewer scene tokens, of whose
+    /// number this model's is a multiple. The curriculum is switched to full capacity from the first step on, because weights that were
+    /// trained to the last stage don't fit the first stage any more.
     pub fn with_weights(mut self, path: &Path) -> Self {
         self.config.curriculum.full_capacity = true;
         Trainer { weights: Some(path.into()), ..self }
     }
 
-    /// Takes the weights that a run begins with.
+    /// Loads the initial weights of the run, if they come from a file.
     ///
     /// # Errors
-    /// A file that can't be read, or whose model has another shape: its keys are named.
+    /// Returns an error if the file can't be read, or if its model has another shape. The error names the keys that differ.
     pub(super) fn take_weights(&mut self) -> Result<()> {
         let Some(path) = &self.weights else { return Ok(()) };
         let file = ModelFile::open(path, &[])?;
         let (ours, mut theirs) = (self.config.model.clone(), file.config.model.clone());
         if file.assumed.is_some() {
-            // Shapes don't tell it.
+            // The number of heads can't be inferred from shapes.
             theirs.heads = ours.heads;
         }
         let growth = Growth::between(&theirs, &ours);
@@ -168,10 +168,10 @@ impl Trainer {
         Ok(())
     }
 
-    /// Draws a sample and follows its gradient. `go_on` is asked before other ranks are told whether to.
+    /// Draws a batch and updates the weights by its gradient. Calls `go_on` once; the report says whether it returned `true` on all ranks.
     ///
     /// # Errors
-    /// A sample or a picture that can't be made, or another rank that is gone.
+    /// Returns an error if loading or rendering fails, or if another rank is gone.
     pub fn step(&mut self, go_on: &mut dyn FnMut() -> bool) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
@@ -183,7 +183,7 @@ impl Trainer {
         Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default(), go_on)? })
     }
 
-    /// Samples of a step, those of all ranks.
+    /// Returns the number of samples in a step, on all ranks together.
     pub fn batch(&self) -> u64 {
         self.part().of_step()
     }
@@ -192,11 +192,11 @@ impl Trainer {
         Part { batch: self.config.train.batch, number: self.group.rank(), parts: self.group.ranks() }
     }
 
-    /// Renders what the model makes of `sample`, which isn't paired yet, and follows the gradient. `watch` hears of
-    /// every part of the step.
+    /// Computes the loss and gradient of `sample`, which isn't paired yet, and updates the weights. Records the time of each section of the
+    /// step in `watch`.
     ///
     /// # Errors
-    /// A picture that can't be made, or another rank that is gone.
+    /// Returns an error if rendering fails, or if another rank is gone.
     pub(crate) fn learn(
         &mut self,
         sample: &Sample,
@@ -210,7 +210,7 @@ impl Trainer {
             1 => self.add_up(losses, go_on)?,
             _ => watch.time(COMMUNICATION, || self.add_up(losses, go_on))?,
         };
-        // A GPU is still busy with that, and the next samples are on their way when it is done.
+        // The GPU is still busy with this step. The next samples are copied meanwhile.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
             loader.send_ahead(self.config.train.batch, device);
         }
@@ -255,7 +255,8 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Has the gradients of all ranks summed, and returns the sums of `losses` and of what ranks tell each other, packed.
+    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the values of [`Word`] over all ranks,
+    /// packed.
     fn add_up(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()? as f64;
         let word = Word {
@@ -263,14 +264,14 @@ impl Trainer {
             found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_news)),
             gradients: [gradients, gradients * gradients],
         };
-        // A GPU gets a new tensor's numbers without being waited for.
+        // Filling a new tensor on a GPU doesn't wait for the GPU.
         let numbers = word.packed().map(|number| Tensor::full([1], number, (Kind::Double, losses.device())));
         let told = Tensor::cat(&std::iter::once(losses).chain(numbers).collect::<Vec<_>>(), 0);
         self.group.sum(&told)?;
         Ok(told)
     }
 
-    /// Every rank gets the parameters that others have updated.
+    /// Broadcasts the parameters that each rank has updated to all others.
     fn spread_parameters(&self) -> Result<()> {
         for part in 0..self.group.ranks() {
             let parameters: Vec<&Tensor> = self.optimizer.of_part(part).collect();
@@ -289,10 +290,11 @@ impl Trainer {
         Ok(())
     }
 
-    /// The optimizer's state, whoever has its parts. All ranks call this; those but the first get nothing to keep.
+    /// Returns the complete state of the optimizer, collected from its shards. All ranks call this. If the optimizer is sharded, only the
+    /// first rank gets the moments.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub(super) fn optimizer_state(&self) -> Result<BTreeMap<String, Tensor>> {
         if self.optimizer.is_whole() {
             return Ok(self.optimizer.state());
@@ -309,7 +311,7 @@ impl Trainer {
         })
     }
 
-    /// Every rank counts the bad data that any of them found.
+    /// Exchanges the bad data that the ranks found, so that every rank counts all of it.
     fn tell_bad_data(&self) -> Result<()> {
         let Some(loader) = &self.loader else { return Ok(()) };
         if self.group.ranks() > 1 {
@@ -320,31 +322,31 @@ impl Trainer {
         Ok(())
     }
 
-    /// Has the gradients as they are added up once more, with nothing else to do meanwhile. For benchmarks.
+    /// Repeats the sum of the gradients over all ranks, with no other work at the same time. For benchmarks.
     ///
     /// # Errors
-    /// Another rank that is gone.
+    /// Returns an error if another rank is gone.
     pub(crate) fn add_gradients_up(&self) -> Result<()> {
         self.buckets.begin();
         self.buckets.finish().map(|_| ())
     }
 
-    /// Bytes of the gradients that the last step has left.
+    /// Returns the size of the gradients that the last step left, in bytes.
     pub(crate) fn gradient_bytes(&self) -> u64 {
         self.optimizer.gradients().map(|(_, t)| (t.numel() * t.kind().elt_size_in_bytes()) as u64).sum()
     }
 
-    /// Brings all ranks to where the first one is: its weights, moments and position.
+    /// Copies the state of the first rank to all ranks: its weights, moments, step and position in the data.
     ///
     /// # Errors
-    /// Another configuration than the first rank's, other scenes, or another rank that is gone.
+    /// Returns an error if this rank's configuration or scenes differ from the first rank's, or if another rank is gone.
     pub(crate) fn follow_first(&mut self) -> Result<()> {
         self.agree_with_first()?;
         let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
         let (step, samples, updates) = self.group.from_first(position)?;
         (self.step, self.samples) = (step, samples);
         self.optimizer.set_steps(updates);
-        // Those that aren't trained, too.
+        // Variables that aren't trained are copied, too.
         let variables: BTreeMap<String, Tensor> = self.vs.variables().into_iter().collect();
         let moments = self.optimizer.moments();
         variables.values().chain(moments).try_for_each(|t| self.group.copy_from(0, t))?;
@@ -354,12 +356,12 @@ impl Trainer {
         Ok(())
     }
 
-    /// That this rank does what the first one does. Where data lie may differ from machine to machine.
+    /// Checks that this rank has the configuration and scenes of the first one. The locations of the data may differ between machines.
     fn agree_with_first(&self) -> Result<()> {
         let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
         let (config, scenes, shards) = self.group.from_first(self.group.is_first().then(|| own.clone()))?;
         let mut changed = changed_keys(&config, &own.0);
-        // A change reads `key first → own`.
+        // A change has the form `key first → own`.
         changed.retain(|change| {
             !["data.captures ", "data.validation "].iter().any(|key| change.starts_with(key))
         });
@@ -382,7 +384,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Leaves the gradient of the sample's loss in the variables, and returns the loss, packed.
+    /// Computes the gradient of the sample's loss, stores it in the variables, and returns the loss, packed.
     pub(super) fn gradients(
         &mut self,
         sample: &Sample,
@@ -443,24 +445,25 @@ impl Trainer {
         Ok(losses)
     }
 
-    /// Into how many slices, side by side, a step of `scenes` is cut. A GPU has work enough from one. Networks that compare pictures have
-    /// operations large enough to share, and depths are compared over all scenes. Ranks are side by side already, and their gradients
-    /// leave while the backward pass goes on.
+    /// Returns the number of slices of a step of `scenes` scenes that are computed in parallel. It is more than 1 only on the CPU: one
+    /// slice keeps a GPU busy. Steps with a perceptual loss stay whole because its network has operations that are large enough to be split
+    /// among threads, and steps with a depth loss because depths are compared over all scenes. Several ranks already run in parallel, and
+    /// send their gradients during the backward pass.
     pub(crate) fn slices_at_once(&self, scenes: usize) -> usize {
         let apart = self.vs.device() == Device::Cpu
             && self.group.ranks() == 1
             && self.config.train.micro_batch == 0
             && self.perceptual.is_none()
             && self.config.loss.consistency_depth == 0.;
-        // As many as there are with a thread or more for each, and as few scenes in the largest as that allows.
+        // With at least one thread per slice, the largest slice is as small as possible. There are no more slices than that needs.
         if apart { scenes.div_ceil(scenes.div_ceil(tch::get_num_threads() as usize)) } else { 1 }
     }
 
-    /// Where the next step's samples come from.
+    /// Returns the loader at the position of the next step's samples. Starts a new one if necessary.
     fn loader(&mut self) -> Result<&mut Loader> {
         let first = self.samples;
         let loader = match self.loader.take() {
-            // A step's first samples may be another rank's.
+            // The first samples of a step may belong to another rank.
             Some(loader) if loader.position() == self.part().sample(first, 0) => loader,
             _ => {
                 let mut config = self.config.data.clone();
@@ -475,33 +478,33 @@ impl Trainer {
         Ok(self.loader.insert(loader))
     }
 
-    /// Takes back the last `steps` steps, which were all skipped and so changed nothing but where the run stands.
+    /// Takes back the last `steps` steps. All of them were skipped, so only the step and the position in the data have changed.
     pub(super) fn take_back(&mut self, steps: u64) {
         self.step -= steps;
         self.samples -= steps * self.batch();
     }
 
-    /// Scenes that were skipped since the run was begun or resumed.
+    /// Returns the scenes that were skipped since the run was started or resumed.
     pub fn bad_data(&self) -> BadData {
         self.loader.as_ref().map(Loader::bad_data).unwrap_or_default()
     }
 
-    /// What it was made from.
+    /// Returns the configuration.
     pub fn config(&self) -> &Config {
         &self.config
     }
 
-    /// Those that it trains with.
+    /// Returns the group of ranks that train together.
     pub fn group(&self) -> &Group {
         &self.group
     }
 
-    /// The model as it is now.
+    /// Returns the model in its current state.
     pub fn model(&self) -> &GlobalSplat {
         &self.model
     }
 
-    /// The stage that the weights were trained to: that of the last step, or, once all are done, the final one (spec 8.7).
+    /// Returns the stage that the weights were trained to: that of the last step, or the final stage once all steps are done (spec 8.7).
     pub fn stage(&self) -> Stage {
         match self.step < self.config.train.steps {
             true => stage_at(&self.config.curriculum, self.step.saturating_sub(1)),
@@ -509,12 +512,12 @@ impl Trainer {
         }
     }
 
-    /// Where the weights are.
+    /// Returns the device of the weights.
     pub fn device(&self) -> Device {
         self.vs.device()
     }
 
-    /// The model as it is now, to reconstruct with.
+    /// Returns the model in its current state, for reconstruction.
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
@@ -522,8 +525,8 @@ impl Trainer {
     }
 }
 
-/// A step's packed losses, what ranks tell each other, and the gradient's norm, a scalar, as numbers. They come from a GPU together,
-/// as each time it is waited for until all that it was given is done: this is the only one of a step.
+/// Returns a step's packed losses, the exchanged values, and the gradient's norm (a scalar) as numbers. They are copied from a GPU
+/// together, because every copy waits for all of the GPU's work; this is the only copy of a step.
 fn read(told: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, Word, f64) {
     let all = Tensor::cat(&[told, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
     let numbers = Vec::<f64>::try_from(all.to_device(Device::Cpu)).expect("float64");

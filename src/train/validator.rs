@@ -1,32 +1,32 @@
-//! How good the model has become: what a run validates it with.
+//! Interface by which a run validates its model.
 
 use super::trainer::Trainer;
 use crate::error::Result;
 use crate::model::Stage;
 
-/// Means over everything that is held out.
+/// Mean scores over all held-out views or scenes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Score {
-    /// In dB, the mean over the scenes.
+    /// Mean PSNR over the scenes, in dB.
     pub psnr: f64,
-    /// The mean over the scenes.
+    /// Mean SSIM over the scenes.
     pub ssim: f64,
-    /// How many there are.
+    /// Number of scenes.
     pub scenes: usize,
-    /// At which the model was judged: the one that it has been trained to.
+    /// Stage at which the model was evaluated: the one that it has been trained to.
     pub stage: Stage,
-    /// What is wrong with those that can't be used, each told once.
+    /// Reasons why scenes were left out, each listed once.
     pub left_out: Vec<String>,
 }
 
-/// Judges a model by what training never shows.
+/// Evaluation of a model on data that training doesn't use.
 pub trait Validator {
-    /// How many scenes it looks at, by which ranks see that they look at the same.
+    /// Returns the number of scenes. Ranks compare it to check that they evaluate the same scenes.
     fn scenes(&self) -> usize;
 
-    /// The score of the model as it is now; none where `go_on`, which is called now and then, says no.
+    /// Returns the score of the model as it is now, or `None` if `go_on`, which is called at intervals, returns `false`.
     ///
     /// # Errors
-    /// No scene that can be used, or whatever the model fails with.
+    /// Returns an error if no scene can be used, or if the evaluation fails.
     fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>>;
 }

@@ -1,6 +1,6 @@
-//! A real browser, without a window and without a network, that tells what a page looks like.
+//! A real browser, headless and without network access, for tests of pages.
 //!
-//! It is spoken to over two pipes by the DevTools protocol (`--remote-debugging-pipe`): a JSON object, then a zero byte.
+//! Communication is by the DevTools protocol over two pipes (`--remote-debugging-pipe`): a JSON object, then a zero byte.
 
 use globalsplat::io::write_png;
 use serde_json::{Value, json};
@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use tch::Tensor;
 use tempfile::TempDir;
 
-/// A browser that doesn't answer for so long hangs.
+/// Timeout after which an unresponsive browser counts as hung.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 pub struct Browser {
@@ -21,12 +21,12 @@ pub struct Browser {
     messages: Receiver<Value>,
     last_id: u64,
     page: Option<String>,
-    /// What the page reported since it was opened.
+    /// Events of the page since it was opened.
     events: Vec<Value>,
     _profile: TempDir,
 }
 
-/// The browser that `CHROME` names, or one on the path.
+/// Returns the browser that `CHROME` names, or one on the path.
 fn find() -> Option<PathBuf> {
     if let Some(path) = std::env::var_os("CHROME") {
         return Some(path.into());
@@ -39,7 +39,7 @@ fn find() -> Option<PathBuf> {
 }
 
 impl Browser {
-    /// With one empty page. Where there is no browser, the test is skipped.
+    /// Starts a browser with one empty page. Without a browser, skips the test.
     pub fn start() -> Option<Self> {
         let Some(program) = find() else {
             let why = "no chromium, chromium-browser or google-chrome is on the path; set CHROME";
@@ -47,7 +47,7 @@ impl Browser {
             return None;
         };
         let profile = tempfile::tempdir().expect("a folder");
-        // The pipes are file descriptors 3 and 4; a shell puts standard input and output there.
+        // The pipes are file descriptors 3 and 4; the shell redirects standard input and output to them.
         let mut process = Command::new("sh")
             .args(["-c", r#"exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null 2>&1"#])
             .arg(&program)
@@ -55,7 +55,7 @@ impl Browser {
                 "--remote-debugging-pipe",
                 "--headless",
                 "--no-sandbox",
-                // WebGL on the CPU, as no machine that tests has to have a GPU.
+                // WebGL on the CPU, since test machines need not have a GPU.
                 "--use-angle=swiftshader",
                 "--enable-unsafe-swiftshader",
                 "--disable-quic",
@@ -133,7 +133,7 @@ impl Browser {
         self.navigate(&format!("file://{}", file.display()));
     }
 
-    /// Opens a page that this machine serves at 127.0.0.1, the only address that can be reached, and waits until it is shown.
+    /// Opens a page that this machine serves at 127.0.0.1, the only reachable address, and waits until it is shown.
     pub fn open_served(&mut self, url: &str) {
         self.go(false);
         self.navigate(url);
@@ -148,7 +148,7 @@ impl Browser {
         }
     }
 
-    /// `width` in pixels; `scheme` is `light` or `dark`; `media` is `screen` or `print`.
+    /// Sets the viewport and media: `width` in pixels; `scheme` is `light` or `dark`; `media` is `screen` or `print`.
     pub fn look(&mut self, width: u32, scheme: &str, media: &str) {
         let size = json!({"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": false});
         self.call("Emulation.setDeviceMetricsOverride", size);
@@ -156,7 +156,7 @@ impl Browser {
         self.call("Emulation.setEmulatedMedia", json!({"media": media, "features": [feature]}));
     }
 
-    /// The value of a JavaScript expression in the page.
+    /// Returns the value of a JavaScript expression in the page.
     pub fn evaluate(&mut self, expression: &str) -> Value {
         let request = json!({"expression": expression, "returnByValue": true, "awaitPromise": true});
         let mut answer = self.call("Runtime.evaluate", request);
@@ -164,7 +164,7 @@ impl Browser {
         answer["result"]["value"].take()
     }
 
-    /// Errors that the page reported since it was opened.
+    /// Returns the errors that the page reported since it was opened.
     pub fn errors(&self) -> Vec<&Value> {
         let is_error = |event: &&Value| match event["method"].as_str() {
             Some("Runtime.exceptionThrown") => true,
@@ -175,7 +175,7 @@ impl Browser {
         self.events.iter().filter(is_error).collect()
     }
 
-    /// What the page asked for since it was opened, itself included, but not what its own text holds.
+    /// Returns the URLs that the page requested since it was opened, including itself, excluding data URLs.
     pub fn requests(&self) -> Vec<&str> {
         let sent = self.events.iter().filter(|event| event["method"] == "Network.requestWillBeSent");
         let urls = sent.filter_map(|event| event["params"]["request"]["url"].as_str());
@@ -184,7 +184,7 @@ impl Browser {
 }
 
 impl Drop for Browser {
-    /// Lets it end by itself, so that none of its processes still writes when its profile is removed.
+    /// Closes the browser gracefully, so that none of its processes still writes when its profile is removed.
     fn drop(&mut self) {
         let _ = self.requests.write_all(b"{\"id\": 0, \"method\": \"Browser.close\"}\0");
         let deadline = Instant::now() + Duration::from_secs(10);
@@ -196,7 +196,7 @@ impl Drop for Browser {
     }
 }
 
-/// A temporary folder for a test's screenshots. It is deleted when the test passes. When the test fails, the folder stays and its
+/// Temporary folder for a test's screenshots. It is deleted when the test passes. When the test fails, the folder stays and its
 /// path is printed.
 pub struct Screenshots(Option<TempDir>);
 
@@ -205,7 +205,7 @@ impl Screenshots {
         Screenshots(Some(tempfile::tempdir().expect("a folder")))
     }
 
-    /// Writes a picture [3, H, W] to `<name>.png`.
+    /// Writes an image [3, H, W] to `<name>.png`.
     pub fn save(&self, name: &str, picture: &Tensor) {
         let folder = self.0.as_ref().expect("a folder until it is dropped");
         write_png(&folder.path().join(format!("{name}.png")), picture).expect("a PNG");

@@ -1,4 +1,4 @@
-//! Captures in the formats that other tools write, written here from the formats' documentation.
+//! Captures in the formats of other tools, written here from the formats' documentation.
 
 use glam::{DMat4, DQuat, DVec3, DVec4, EulerRot};
 use globalsplat::data::{Capture, open_capture};
@@ -6,11 +6,11 @@ use globalsplat::scene::{Camera, Intrinsics, pose_to_rows};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Of the photos.
+/// Size of the photos in pixels.
 pub const WIDTH: u32 = 24;
 pub const HEIGHT: u32 = 16;
 
-/// Five cameras in general position.
+/// Returns five cameras in general position.
 pub fn cameras() -> Vec<Camera> {
     let intrinsics = Intrinsics { fx: 21.5, fy: 20.25, cx: 11.75, cy: 8.5 };
     (0..5)
@@ -41,7 +41,7 @@ pub fn assert_same_cameras(found: &Capture, expected: &[Camera]) {
     }
 }
 
-/// `transforms.json` contents: OpenGL axes, the lens shared by all frames.
+/// Returns the contents of a `transforms.json`: OpenGL axes, the lens shared by all frames.
 pub fn transforms(images: &[String], cameras: &[Camera]) -> Value {
     let k = cameras[0].intrinsics;
     let frames: Vec<Value> = images
@@ -59,14 +59,14 @@ pub fn transforms(images: &[String], cameras: &[Camera]) -> Value {
     })
 }
 
-/// World-to-camera: quaternion (w, x, y, z) and translation.
+/// Returns the world-to-camera pose: quaternion (w, x, y, z) and translation.
 fn colmap_pose(camera: &Camera) -> [f64; 7] {
     let w2c = camera.c2w.inverse();
     let ([x, y, z, w], t) = (DQuat::from_mat4(&w2c).to_array(), w2c.w_axis);
     [w, x, y, z, t.x, t.y, t.z]
 }
 
-/// Writes cameras.txt and images.txt at `folder`: one camera, whose model and parameters are `lens`.
+/// Writes cameras.txt and images.txt to `folder`: one camera, whose model and parameters are `lens`.
 pub fn write_colmap_text(folder: &Path, names: &[String], cameras: &[Camera], lens: &str) {
     std::fs::create_dir_all(folder).unwrap();
     let (width, height) = (cameras[0].width, cameras[0].height);
@@ -90,13 +90,13 @@ fn rest(text: &str) -> &str {
     text.split_once(' ').unwrap().1
 }
 
-/// `PINHOLE fx fy cx cy`.
+/// Returns a pinhole lens, `PINHOLE fx fy cx cy`.
 pub fn pinhole(camera: &Camera) -> String {
     let k = camera.intrinsics;
     format!("PINHOLE {} {} {} {}", k.fx, k.fy, k.cx, k.cy)
 }
 
-/// Writes cameras.bin and images.bin at `folder`: one camera, a pinhole.
+/// Writes cameras.bin and images.bin to `folder`: one camera, a pinhole.
 pub fn write_colmap_binary(folder: &Path, names: &[String], cameras: &[Camera]) {
     std::fs::create_dir_all(folder).unwrap();
     let (width, height, k) = (cameras[0].width, cameras[0].height, cameras[0].intrinsics);
@@ -127,7 +127,7 @@ pub fn write_colmap_binary(folder: &Path, names: &[String], cameras: &[Camera]) 
     std::fs::write(folder.join("images.bin"), bytes).unwrap();
 }
 
-/// What a `cameras.json` capture is rewritten as.
+/// Format in which a `cameras.json` capture is rewritten.
 #[derive(Debug, Clone, Copy)]
 pub enum Format {
     Transforms,
@@ -135,7 +135,7 @@ pub enum Format {
     ColmapBinary,
 }
 
-/// Adds the `cameras.json` capture at `folder` in another format, and takes the `cameras.json` away.
+/// Converts the `cameras.json` capture in `folder` to another format, and removes the `cameras.json`.
 pub fn rewrite(folder: &Path, format: Format) {
     let capture = open_capture(folder).unwrap();
     let images: Vec<String> = capture.names().map(String::from).collect();
@@ -152,7 +152,7 @@ pub fn rewrite(folder: &Path, format: Format) {
     std::fs::remove_file(folder.join("cameras.json")).unwrap();
 }
 
-/// Adds points to a model of COLMAP: x, y and z of one after the other, all of the colour (255, 0, 51).
+/// Adds points to a COLMAP model: `positions` has x, y and z of each; all have the colour (255, 0, 51).
 pub fn write_points(model: &Path, format: Format, positions: &[f64]) {
     if let Format::ColmapText = format {
         let lines = positions.chunks(3).enumerate().map(|(i, p)| {

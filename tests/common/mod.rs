@@ -1,5 +1,5 @@
-//! Where real data and golden tensors are found, what is done without them, and how tensors are compared.
-#![allow(dead_code)] // every test binary uses its own part
+//! Test utilities: locating real data and golden tensors, skipping tests without them, and comparing tensors.
+#![allow(dead_code)] // every test binary uses only a part
 
 pub mod browser;
 pub mod formats;
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use tch::{Kind, Tensor};
 
-/// Says that a test is skipped for want of `what`, and why; its caller returns early. `GLOBALSPLAT_SKIPPED` names the file in
-/// which `make test` counts it. Where `GLOBALSPLAT_NO_SKIPS` is set, it is a failure.
+/// Reports that a test is skipped because `what` is missing, and why; its caller returns early. `GLOBALSPLAT_SKIPPED` names the
+/// file in which `make test` counts skipped tests. If `GLOBALSPLAT_NO_SKIPS` is set, skipping is a failure.
 pub fn skip(what: &str, why: &str) {
     let set = |variable| std::env::var_os(variable).filter(|value| !value.is_empty());
     assert!(set("GLOBALSPLAT_NO_SKIPS").is_none(), "no test may be skipped, but {why}");
@@ -26,8 +26,8 @@ pub fn skip(what: &str, why: &str) {
     }
 }
 
-/// Runs the test `name` of the running file once more, by itself and with `variables`: whether it passes, and what it was
-/// skipped for.
+/// Runs the test `name` of the current test binary again, by itself and with the environment `variables`; returns `true` if it
+/// passes, and what it was skipped for.
 pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
     let skipped = tempfile::NamedTempFile::new().expect("a file");
     let output = Command::new(std::env::current_exe().expect("a program"))
@@ -42,7 +42,8 @@ pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
     (output.status.success(), std::fs::read_to_string(skipped.path()).expect("a file"))
 }
 
-/// The folder that `variable` names, else `../shared/<name>`; where neither is there, the test is skipped for want of `what`.
+/// Returns the folder that `variable` names, else `../shared/<name>`; if it doesn't exist, skips the test because `what` is
+/// missing.
 fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     let path = match std::env::var_os(variable) {
         Some(path) => PathBuf::from(path),
@@ -55,12 +56,12 @@ fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     None
 }
 
-/// Golden tensors.
+/// Returns the folder of golden tensors.
 pub fn golden() -> Option<PathBuf> {
     outside("GLOBALSPLAT_GOLDEN", "golden", "golden tensors")
 }
 
-/// Real captures, one at least: folders with `cameras.json` and a published `reference.ply` under `re10k`.
+/// Returns real captures, at least one: folders with `cameras.json` and a published `reference.ply` under `re10k`.
 pub fn captures() -> Option<Vec<PathBuf>> {
     let root = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?;
     let root = if root.join("re10k").is_dir() { root.join("re10k") } else { root };
@@ -77,7 +78,7 @@ pub fn captures() -> Option<Vec<PathBuf>> {
     Some(captures)
 }
 
-/// A real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
+/// Returns a real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
 pub fn fox() -> Option<PathBuf> {
     let fox = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?.join("nerfstudio/fox");
     if fox.is_dir() {
@@ -87,7 +88,7 @@ pub fn fox() -> Option<PathBuf> {
     None
 }
 
-/// Whether the weights of LPIPS are there; without them, the test is skipped.
+/// Returns `true` if the weights of LPIPS are available; otherwise, skips the test.
 pub fn has_lpips() -> bool {
     let has = LpipsNetwork::ALL.iter().all(|network| find_pretrained(network.file_name()).is_some());
     if !has {
@@ -96,20 +97,20 @@ pub fn has_lpips() -> bool {
     has
 }
 
-/// ‖a − b‖ / ‖b‖.
+/// Returns the relative error ‖a − b‖ / ‖b‖.
 pub fn relative_error(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());
     let (a, b) = (a.to_kind(Kind::Double), b.to_kind(Kind::Double));
     ((&a - &b).norm() / b.norm()).double_value(&[])
 }
 
-/// Largest |a − b|.
+/// Returns the largest |a − b|.
 pub fn largest_error(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());
     (a.to_kind(Kind::Double) - b.to_kind(Kind::Double)).abs().max().double_value(&[])
 }
 
-/// Random numbers of a test's own: torch's generator is shared by all threads, so tests would take each other's.
+/// Random number generator of one test: torch's generator is shared by all threads, so tests would affect each other's numbers.
 pub struct Random(StdRng);
 
 impl Random {
@@ -117,13 +118,13 @@ impl Random {
         Random(StdRng::seed_from_u64(seed))
     }
 
-    /// float64 in [0, 1).
+    /// Returns float64 values, uniform in [0, 1).
     pub fn uniform(&mut self, shape: &[i64]) -> Tensor {
         let values: Vec<f64> = (0..shape.iter().product::<i64>()).map(|_| self.0.random()).collect();
         Tensor::from_slice(&values).view(shape)
     }
 
-    /// float64 in [−1, 1).
+    /// Returns float64 values, uniform in [−1, 1).
     pub fn symmetric(&mut self, shape: &[i64]) -> Tensor {
         self.uniform(shape) * 2. - 1.
     }

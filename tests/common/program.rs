@@ -1,11 +1,11 @@
-//! The program as a user runs it, on a small capture that it makes itself.
+//! Running the program as a user does, on a small capture that it generates itself.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 use tempfile::TempDir;
 
-/// A small model that trains in no time.
+/// Configuration of a small model that trains quickly.
 pub const TINY_CONFIG: &str = r#"
 [model]
 latents = 16
@@ -38,19 +38,19 @@ batch = 1
 checkpoint_every = 2
 "#;
 
-/// Runs `globalsplat` with `arguments` and returns what it did.
+/// Runs `globalsplat` with `arguments` and returns its output.
 pub fn globalsplat(arguments: &[&str]) -> Output {
     command(arguments).output().expect("a program that starts")
 }
 
-/// `globalsplat` with `arguments`. One thread: tests run beside each other.
+/// Returns the command `globalsplat` with `arguments`, limited to one thread because tests run concurrently.
 pub fn command(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_globalsplat"));
     command.args(arguments).env("OMP_NUM_THREADS", "1");
     command
 }
 
-/// Standard output of a run that must succeed.
+/// Returns the standard output of a run that must succeed.
 pub fn succeed(arguments: &[&str]) -> String {
     let output = globalsplat(arguments);
     let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
@@ -58,12 +58,12 @@ pub fn succeed(arguments: &[&str]) -> String {
     out.into_owned()
 }
 
-/// The one sentence of a run that must be refused with exit code 2.
+/// Returns the one-sentence error of a run that must be refused with exit code 2.
 pub fn refuse(arguments: &[&str]) -> String {
     fail(arguments, 2)
 }
 
-/// The one sentence of a run that must end with `code`.
+/// Returns the one-sentence error of a run that must end with `code`.
 pub fn fail(arguments: &[&str], code: i32) -> String {
     let output = globalsplat(arguments);
     let err = String::from_utf8_lossy(&output.stderr).trim().to_string();
@@ -74,19 +74,19 @@ pub fn fail(arguments: &[&str], code: i32) -> String {
     err
 }
 
-/// The path as an argument.
+/// Returns the path as an argument.
 pub fn arg(path: &Path) -> &str {
     path.to_str().expect("an UTF-8 path")
 }
 
-/// Makes the rooms `room_000`, … in `folder`, each with so many photos of `size` × `size`.
+/// Writes the rooms `room_000`, … to `folder`, each with `frames` photos of `size` × `size`.
 pub fn rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
     let [scenes, frames, size] = [scenes, frames, size].map(|number| number.to_string());
     let numbers = ["--scenes", &scenes, "--frames", &frames, "--size", &size];
     succeed(&[&["synth", "--gaussians", "--out", arg(folder)][..], &numbers].concat());
 }
 
-/// A capture of nine 40×40 photos of a procedural room, `truth.ply` beside them; every caller has a copy of its own.
+/// Returns a capture of nine 40×40 photos of a procedural room, with `truth.ply` beside them; every caller gets its own copy.
 pub fn room() -> (TempDir, PathBuf) {
     static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
     let original = ORIGINAL.get_or_init(|| {
@@ -112,7 +112,7 @@ fn copy_dir(from: &Path, to: &Path) {
     }
 }
 
-/// [`TINY_CONFIG`] in `folder`, looking at `capture`.
+/// Writes [`TINY_CONFIG`] to `folder`, with `capture` as its data.
 pub fn tiny_config(folder: &Path, capture: &Path) -> PathBuf {
     let file = folder.join("tiny.toml");
     let data = format!("[data]\ncaptures = [{:?}]", arg(capture));
@@ -120,21 +120,21 @@ pub fn tiny_config(folder: &Path, capture: &Path) -> PathBuf {
     file
 }
 
-/// Exported weights of [`TINY_CONFIG`], not trained.
+/// Exports untrained weights of [`TINY_CONFIG`].
 pub fn tiny_weights(folder: &Path, capture: &Path) -> PathBuf {
     let (config, weights) = (tiny_config(folder, capture), folder.join("tiny.safetensors"));
     succeed(&["export", "--config", arg(&config), "--out", arg(&weights)]);
     weights
 }
 
-/// The arguments by which the model of `config` is trained in `run`, with `settings`.
+/// Returns the arguments that train the model of `config` in `run`, with `settings`.
 pub fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
     let mut arguments = vec!["train", "--config", arg(config), "--out", arg(run)];
     arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
     arguments.into_iter().map(String::from).collect()
 }
 
-/// Arguments as the program is given them.
+/// Returns the arguments as string slices.
 pub fn text(arguments: &[String]) -> Vec<&str> {
     arguments.iter().map(String::as_str).collect()
 }

@@ -1,21 +1,21 @@
-//! Compiled kernels on disk, so that they are compiled once for a machine and not at every start.
+//! On-disk cache of compiled kernels: they are compiled once per machine, not at every start.
 
 use super::compile::{Form, Nvrtc, everything};
 use sha2::{Digest, Sha256};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// Bytes of the digest that a file begins with.
+/// Length in bytes of the digest at the start of a file.
 const DIGEST: usize = 32;
 
-/// Where compiled kernels are kept, where there is a home: $XDG_CACHE_HOME/globalsplat, or ~/.cache/globalsplat.
+/// Returns the cache folder, $XDG_CACHE_HOME/globalsplat or ~/.cache/globalsplat; `None` if neither variable is set.
 pub fn cache_folder() -> Option<PathBuf> {
     let named = |variable| std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from);
     let caches = named("XDG_CACHE_HOME").or_else(|| named("HOME").map(|home| home.join(".cache")))?;
     Some(caches.join("globalsplat"))
 }
 
-/// The file of the kernels' text as it is now, compiled so, for this driver.
+/// Returns the file name for the current kernel sources, compiled for this architecture, format and driver version.
 pub fn file_name(nvrtc: &Nvrtc, driver: i32, architecture: i32, form: Form) -> String {
     let mut digest = Sha256::new();
     for part in everything(architecture, form) {
@@ -30,14 +30,14 @@ pub fn file_name(nvrtc: &Nvrtc, driver: i32, architecture: i32, form: Form) -> S
     name
 }
 
-/// What was stored there, whole.
+/// Reads a cached image; `None` if the file is missing, incomplete or corrupt.
 pub fn read(file: &Path) -> Option<Vec<u8>> {
     let mut bytes = std::fs::read(file).ok()?;
     let image = bytes.split_off(DIGEST.min(bytes.len()));
     (Sha256::digest(&image)[..] == bytes[..]).then_some(image)
 }
 
-/// Stores what was compiled, and tells whether that worked. Where it fails, it will be compiled again.
+/// Stores a compiled image and returns `true` on success. After a failure the next start compiles again.
 pub fn write(file: &Path, image: &[u8]) -> bool {
     let Some(folder) = file.parent() else { return false };
     let part = file.with_extension(format!("{}.part", std::process::id()));

@@ -1,4 +1,4 @@
-//! The kernels' text to machine code, by NVRTC.
+//! Compilation of the kernels' source to machine code with NVRTC.
 
 use super::{
     Result,
@@ -7,7 +7,7 @@ use super::{
 use std::ffi::{CStr, CString, c_char, c_int};
 use std::ptr;
 
-/// The kernels, and what they include, by the names by which they do.
+/// Source of the kernels. `HEADERS` are the files that it includes, by the names in its include directives.
 const TEXT: &str = include_str!("../../cuda/kernels.cu");
 const HEADERS: &[(&str, &str)] = &[
     ("call.h", include_str!("../../cuda/call.h")),
@@ -27,7 +27,7 @@ const HEADERS: &[(&str, &str)] = &[
     ("types.h", include_str!("../../raster/types.h")),
     ("warp.h", include_str!("../../cuda/warp.h")),
     ("window.h", include_str!("../../raster/window.h")),
-    // Of the standard library NVRTC has the functions, but not the headers.
+    // NVRTC has the functions of the standard library built in, but not its headers.
     ("cmath", ""),
     (
         "cstdint",
@@ -37,7 +37,8 @@ const HEADERS: &[(&str, &str)] = &[
     ),
 ];
 
-/// Nothing is fused that isn't written so, and nothing is rounded in another way than on a CPU: pictures have the CPU's bits.
+/// Compiler options. They prevent fusing of operations unless the source asks for it, and rounding that differs from a CPU's: images are
+/// bit-identical to the CPU's.
 const OPTIONS: &[&str] = &[
     "--std=c++17",
     "--device-as-default-execution-space",
@@ -47,61 +48,61 @@ const OPTIONS: &[&str] = &[
     "--prec-sqrt=true",
 ];
 
-/// The least compute capability that the kernels are for, as in 75 for 7.5.
+/// Minimum compute capability that the kernels support, as in 75 for 7.5.
 pub const OLDEST: i32 = 75;
 
-/// What NVRTC makes.
+/// Output format of NVRTC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// Machine code of one architecture.
+    /// Machine code for one architecture.
     Cubin,
-    /// What the driver turns into it, for that architecture or a newer one.
+    /// Intermediate code that the driver compiles for that architecture or a newer one.
     Ptx,
 }
 
-/// What the driver loads.
+/// Compiled kernels.
 #[derive(Debug)]
 pub struct Compiled {
-    /// A cubin, or PTX.
+    /// Image that the driver loads: a cubin, or PTX.
     pub image: Vec<u8>,
-    /// What the compiler said of every kernel: registers, shared memory, spills.
+    /// Compiler log with the resources of every kernel: registers, shared memory, spills.
     pub log: String,
 }
 
-/// The compiler that was found.
+/// Installed NVRTC compiler.
 #[derive(Debug, Clone)]
 pub struct Nvrtc {
-    /// As in 13.0.
+    /// Version as major and minor, as in 13.0.
     pub version: (i32, i32),
-    /// Compute capabilities that it compiles for, as in 90 for 9.0, in their order.
+    /// Supported compute capabilities in ascending order, as in 90 for 9.0.
     pub architectures: Vec<i32>,
 }
 
 impl Nvrtc {
-    /// Loads it.
+    /// Loads NVRTC and queries its properties.
     ///
     /// # Errors
-    /// It isn't there, or isn't what it seems.
+    /// Returns an error if NVRTC is missing or a call fails.
     pub fn find() -> Result<Self> {
         let nvrtc = nvrtc()?;
         let (mut major, mut minor, mut count) = (0, 0, 0);
-        // SAFETY: the list has room for as many as were told.
+        // SAFETY: the list has as many elements as NVRTC reported.
         unsafe {
             nvrtc.told((nvrtc.nvrtcVersion)(&mut major, &mut minor))?;
             nvrtc.told((nvrtc.nvrtcGetNumSupportedArchs)(&mut count))?;
             let mut architectures = vec![0; count as usize];
             nvrtc.told((nvrtc.nvrtcGetSupportedArchs)(architectures.as_mut_ptr()))?;
-            // Warps of older GPUs can't do what the kernels ask of them.
+            // Warps of older GPUs lack instructions that the kernels need.
             architectures.retain(|&of| of >= OLDEST);
             architectures.sort_unstable();
             Ok(Nvrtc { version: (major, minor), architectures })
         }
     }
 
-    /// For a GPU of compute capability `of`, as in 90: for which architecture to compile, and to what.
+    /// Returns the architecture and the format to compile for, given a GPU of compute capability `of`, as in 90.
     ///
     /// # Errors
-    /// A GPU that is too old.
+    /// Returns an error if the GPU is too old.
     pub fn target(&self, of: i32) -> Result<(i32, Form)> {
         let known = self.architectures.iter().rev().find(|&&known| known <= of);
         match known {
@@ -120,7 +121,7 @@ impl Nvrtc {
     /// Compiles all kernels.
     ///
     /// # Errors
-    /// What the compiler says.
+    /// Returns the compiler's messages.
     pub fn compile(&self, architecture: i32, form: Form) -> Result<Compiled> {
         let terminated = |text: &str| CString::new(text).expect("C++ holds no 0");
         let text = terminated(TEXT);
@@ -132,7 +133,7 @@ impl Nvrtc {
 
         let nvrtc = nvrtc()?;
         let mut program = ptr::null_mut();
-        // SAFETY: all texts are terminated, and live until the program is destroyed.
+        // SAFETY: all strings are null-terminated and live until the program is destroyed.
         unsafe {
             nvrtc.told((nvrtc.nvrtcCreateProgram)(
                 &mut program,
@@ -150,10 +151,12 @@ impl Nvrtc {
 }
 
 impl NvrtcFunctions {
+    /// Compiles a program and returns the result and the log.
+    ///
     /// # Safety
-    /// A program, and terminated texts.
+    /// `program` must be a valid program, and `options` null-terminated strings.
     unsafe fn compile(&self, program: Program, options: &[*const c_char], form: Form) -> Result<Compiled> {
-        // SAFETY: the caller's promise; what is asked for has the size that was told.
+        // SAFETY: the caller's promise; output buffers have the size that NVRTC reported.
         unsafe {
             let done = (self.nvrtcCompileProgram)(program, options.len() as c_int, options.as_ptr());
             let log = self.filled(program, self.nvrtcGetProgramLogSize, self.nvrtcGetProgramLog)?;
@@ -169,10 +172,10 @@ impl NvrtcFunctions {
         }
     }
 
-    /// What NVRTC has of a program, by the two functions that tell its size and fill in that much.
+    /// Reads an output of a program, given the function that returns its size and the one that fills a buffer of that size.
     ///
     /// # Safety
-    /// A program, and two functions that belong together.
+    /// `program` must be a valid program, and the two functions must belong together.
     unsafe fn filled(
         &self,
         program: Program,
@@ -189,12 +192,12 @@ impl NvrtcFunctions {
         }
     }
 
-    /// What a function's result means.
+    /// Converts a result code of NVRTC to a `Result`.
     fn told(&self, result: c_int) -> Result<()> {
         if result == 0 {
             return Ok(());
         }
-        // SAFETY: it gives a text for any number.
+        // SAFETY: the function returns a string for any number.
         let words = unsafe { CStr::from_ptr((self.nvrtcGetErrorString)(result)) };
         Err(format!("NVRTC can't compile the kernels: {}", words.to_string_lossy()))
     }
@@ -213,7 +216,7 @@ fn options(architecture: i32, form: Form) -> Vec<String> {
     options
 }
 
-/// All that goes into what is compiled, but for the compiler.
+/// Returns everything that the output depends on except the compiler: sources, headers and options.
 pub(super) fn everything(architecture: i32, form: Form) -> impl Iterator<Item = String> {
     let texts = HEADERS.iter().flat_map(|(name, header)| [name.to_string(), header.to_string()]);
     std::iter::once(TEXT.to_string()).chain(texts).chain(options(architecture, form))

@@ -1,4 +1,4 @@
-//! GPUs, by the driver, and launches on them.
+//! GPUs as the driver reports them, and kernel launches on them.
 
 use super::{
     Result, cache,
@@ -18,37 +18,37 @@ const MULTIPROCESSOR_COUNT: c_int = 16;
 const COMPUTE_CAPABILITY_MAJOR: c_int = 75;
 const COMPUTE_CAPABILITY_MINOR: c_int = 76;
 
-/// What the driver says of itself and of the GPUs.
+/// Version of the CUDA driver, and the GPUs that it reports.
 #[derive(Debug)]
 pub struct Driver {
-    /// The CUDA that it serves at the most, as in 13000 for 13.0.
+    /// Newest supported CUDA version, as in 13000 for 13.0.
     pub version: i32,
-    /// In the order of their numbers.
+    /// GPUs in the order of their indices.
     pub gpus: Vec<Gpu>,
 }
 
-/// A device.
+/// Properties of a GPU.
 #[derive(Debug)]
 pub struct Gpu {
-    /// As in `NVIDIA H100 80GB HBM3`.
+    /// Name, as in `NVIDIA H100 80GB HBM3`.
     pub name: String,
     /// Compute capability, as in 90 for 9.0.
     pub architecture: i32,
-    /// Bytes of memory.
+    /// Memory in bytes.
     pub memory: usize,
-    /// Multiprocessors.
+    /// Number of multiprocessors.
     pub multiprocessors: i32,
 }
 
 impl Driver {
-    /// Asks the driver.
+    /// Queries the driver.
     ///
     /// # Errors
-    /// There is none, or it can't reach the GPUs.
+    /// Returns an error if there is no driver or it can't reach the GPUs.
     pub fn find() -> Result<Self> {
         let driver = driver()?;
         let (mut count, mut version) = (0, 0);
-        // SAFETY: what is asked for has its place.
+        // SAFETY: every output argument points to a variable of the right type.
         unsafe {
             match (driver.cuInit)(0) {
                 CUDA_ERROR_NO_DEVICE => {}
@@ -67,7 +67,7 @@ impl Driver {
 impl Gpu {
     fn find(driver: &DriverFunctions, number: c_int) -> Result<Self> {
         let (mut device, mut memory, mut name) = (0, 0, [0; 256]);
-        // SAFETY: a device that is there, and places for what is asked for.
+        // SAFETY: `number` is a valid device index, and every output argument points to a variable or buffer of the right size.
         unsafe {
             driver.check((driver.cuDeviceGet)(&mut device, number))?;
             driver.check((driver.cuDeviceTotalMem_v2)(&mut memory, device))?;
@@ -80,7 +80,7 @@ impl Gpu {
             Ok::<_, String>(value)
         };
         Ok(Gpu {
-            // SAFETY: the driver ended it with a 0.
+            // SAFETY: the driver has terminated the string with a 0.
             name: unsafe { CStr::from_ptr(name.as_ptr()) }.to_string_lossy().into_owned(),
             architecture: 10 * attribute(COMPUTE_CAPABILITY_MAJOR)? + attribute(COMPUTE_CAPABILITY_MINOR)?,
             memory,
@@ -90,14 +90,14 @@ impl Gpu {
 }
 
 impl DriverFunctions {
-    /// Puts an error into words.
+    /// Converts a result code of the driver to a `Result` with an error message.
     fn check(&self, status: c_int) -> Result<()> {
         if status == 0 {
             return Ok(());
         }
         let words = [self.cuGetErrorString, self.cuGetErrorName].map(|ask| {
             let mut text: *const c_char = null_mut();
-            // SAFETY: the driver sets a text that stays, or none.
+            // SAFETY: the driver sets a static string, or null.
             unsafe {
                 ask(status, &mut text);
                 if text.is_null() { "unknown".into() } else { CStr::from_ptr(text).to_string_lossy() }
@@ -107,25 +107,25 @@ impl DriverFunctions {
     }
 }
 
-/// The kernels on one device.
+/// Kernels that are loaded on one device.
 struct Loaded {
-    /// The one that torch uses, too.
+    /// Primary context of the device, which torch uses, too.
     context: Handle,
     module: Handle,
     kernels: HashMap<String, Handle>,
 }
 
-// SAFETY: what the driver gives belongs to the process, not to a thread.
+// SAFETY: handles of the driver belong to the process, not to a thread.
 unsafe impl Send for Loaded {}
 
-/// Where the kernels of a device came from.
+/// Origin of the kernels of a device.
 #[derive(Debug)]
 pub struct Prepared {
-    /// The architecture that they were compiled for, as in 90.
+    /// Architecture that they were compiled for, as in 90.
     pub architecture: i32,
-    /// The file that keeps them, if one does.
+    /// Cache file of the kernels, if there is one.
     pub file: Option<PathBuf>,
-    /// Whether they were read from it.
+    /// `true` if the kernels were read from the cache file.
     pub was_kept: bool,
 }
 
@@ -143,7 +143,7 @@ impl Loaded {
             .map(|folder| folder.join(cache::file_name(&nvrtc, found.version, architecture, form)));
         let driver = driver()?;
         let (mut device, mut context) = (0, null_mut());
-        // SAFETY: a device that is there; its context is kept for good.
+        // SAFETY: the device exists; its context is retained for the lifetime of the process.
         unsafe {
             driver.check((driver.cuDeviceGet)(&mut device, number))?;
             driver.check((driver.cuDevicePrimaryCtxRetain)(&mut context, device))?;
@@ -151,7 +151,7 @@ impl Loaded {
         }
         let load = |image: &[u8]| {
             let mut module = null_mut();
-            // SAFETY: a whole image; PTX ends with a 0.
+            // SAFETY: the image is complete, and PTX is terminated with a 0.
             driver.check(unsafe { (driver.cuModuleLoadData)(&mut module, image.as_ptr().cast()) })?;
             Ok::<_, String>(module)
         };
@@ -162,7 +162,7 @@ impl Loaded {
             None => {
                 let mut image = nvrtc.compile(architecture, form)?.image;
                 let mut module = load(&image);
-                // A driver that is older than NVRTC may refuse its machine code, and compile for itself.
+                // A driver older than NVRTC may refuse its machine code; the driver then compiles PTX itself.
                 if module.is_err() && form == Form::Cubin {
                     image = nvrtc.compile(architecture, Form::Ptx)?.image;
                     module = load(&image);
@@ -180,7 +180,7 @@ impl Loaded {
         }
         let terminated = CString::new(name).map_err(|e| e.to_string())?;
         let mut kernel = null_mut();
-        // SAFETY: a module that is loaded.
+        // SAFETY: the module is loaded.
         driver
             .check(unsafe { (driver.cuModuleGetFunction)(&mut kernel, self.module, terminated.as_ptr()) })?;
         self.kernels.insert(name.into(), kernel);
@@ -190,20 +190,20 @@ impl Loaded {
 
 static DEVICES: LazyLock<Mutex<HashMap<i32, Loaded>>> = LazyLock::new(Default::default);
 
-/// Compiles the kernels for a device, by its number, and loads them, or loads those that were kept.
+/// Loads the kernels on the device with this index: from the cache, or compiled now.
 ///
 /// # Errors
-/// What is missing, or what the compiler or the driver refuses.
+/// Returns an error if a library is missing, or if the compiler or the driver fails.
 pub fn prepare(device: i32) -> Result<Prepared> {
     let (loaded, prepared) = Loaded::on(device)?;
     DEVICES.lock().unwrap_or_else(PoisonError::into_inner).insert(device, loaded);
     Ok(prepared)
 }
 
-/// See `launch_kernel` in the bridge.
+/// Launches a kernel; see `launch_kernel` in the bridge.
 ///
 /// # Safety
-/// A stream of the device, and as many arguments as the kernel has, of its types.
+/// `stream` must be a stream of the device, and `arguments` must match the kernel's parameters in number and types.
 pub unsafe fn launch_kernel(
     device: i32,
     stream: usize,
@@ -220,7 +220,7 @@ pub unsafe fn launch_kernel(
     let driver = driver()?;
     let function = loaded.kernel(driver, kernel)?;
     let (shared_bytes, extra) = (0, null_mut());
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     let launched = driver.check(unsafe { (driver.cuCtxSetCurrent)(loaded.context) }).and_then(|()| {
         driver.check(unsafe {
             (driver.cuLaunchKernel)(

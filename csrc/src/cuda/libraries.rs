@@ -1,4 +1,4 @@
-//! Where the driver and NVRTC are.
+//! Lookup and loading of the CUDA driver and of NVRTC.
 
 use super::Result;
 use libloading::os::unix::{Library, RTLD_GLOBAL, RTLD_LAZY};
@@ -7,13 +7,13 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// A program that NVRTC compiles.
+/// Handle of a program that NVRTC compiles.
 pub type Program = *mut c_void;
 
-/// What the driver makes: a context, a module, a kernel, a stream.
+/// Handle of a driver object: a context, a module, a kernel, a stream.
 pub type Handle = *mut c_void;
 
-/// Declares the functions of a library, and how they are looked up by their names.
+/// Declares a table of a library's functions, and their lookup by name.
 macro_rules! functions {
     ($(#[$about:meta])* $table:ident, $library:literal: $($name:ident ( $($parameter:ty),* ) -> $result:ty;)*) => {
         $(#[$about])*
@@ -41,7 +41,7 @@ macro_rules! functions {
 }
 
 functions! {
-    /// The driver's functions, as in its manual. They return 0 or the number of an error.
+    /// Functions of the CUDA driver, as in its manual. They return 0 or an error code.
     DriverFunctions, "NVIDIA's driver":
     cuInit(c_uint) -> c_int;
     cuDriverGetVersion(*mut c_int) -> c_int;
@@ -60,7 +60,7 @@ functions! {
 }
 
 functions! {
-    /// NVRTC's functions, as in its manual. They return 0 or the number of an error.
+    /// Functions of NVRTC, as in its manual. They return 0 or an error code.
     NvrtcFunctions, "NVRTC":
     nvrtcVersion(*mut c_int, *mut c_int) -> c_int;
     nvrtcGetNumSupportedArchs(*mut c_int) -> c_int;
@@ -77,11 +77,11 @@ functions! {
     nvrtcGetPTX(Program, *mut c_char) -> c_int;
 }
 
-/// Returns NVIDIA's driver, loaded once, as `libcuda.so.1`, as torch loads it: `libcuda.so` may be a CUDA toolkit's stub, which only
-/// linkers use.
+/// Returns NVIDIA's driver, which is loaded once, as `libcuda.so.1` like torch loads it: `libcuda.so` may be a CUDA toolkit's stub for
+/// linking.
 ///
 /// # Errors
-/// It isn't there, or lacks a function.
+/// Returns an error if the driver is missing or lacks a function.
 pub fn driver() -> Result<&'static DriverFunctions> {
     static LOADED: OnceLock<Result<DriverFunctions>> = OnceLock::new();
     let load = || {
@@ -94,10 +94,10 @@ pub fn driver() -> Result<&'static DriverFunctions> {
     LOADED.get_or_init(load).as_ref().map_err(String::clone)
 }
 
-/// NVRTC, loaded once: torch's own, which is of its CUDA, else the one on the loader's path.
+/// Returns NVRTC, which is loaded once: torch's own, which matches its CUDA version, or else the one on the loader's path.
 ///
 /// # Errors
-/// It isn't there, or lacks a function.
+/// Returns an error if NVRTC is missing or lacks a function.
 pub fn nvrtc() -> Result<&'static NvrtcFunctions> {
     static LOADED: OnceLock<Result<NvrtcFunctions>> = OnceLock::new();
     LOADED.get_or_init(|| NvrtcFunctions::of(load_nvrtc()?)).as_ref().map_err(String::clone)
@@ -117,10 +117,10 @@ fn load_nvrtc() -> Result<Library> {
     })
 }
 
-/// Where torch and pip put NVRTC.
+/// Returns the folders where torch and pip install NVRTC.
 fn folders() -> Vec<PathBuf> {
     let Some(torch) = libtorch_folder() else { return vec![] };
-    // As in Python: site-packages/torch/lib and site-packages/nvidia/*/lib.
+    // Python environments have site-packages/torch/lib and site-packages/nvidia/*/lib.
     let packages = torch.ancestors().nth(2).map(|packages| packages.join("nvidia"));
     let entries =
         packages.and_then(|packages| std::fs::read_dir(packages).ok()).into_iter().flatten().flatten();
@@ -130,24 +130,24 @@ fn folders() -> Vec<PathBuf> {
     folders
 }
 
-/// Of the libtorch that this program runs with.
+/// Returns the folder of the libtorch that is loaded into this process.
 fn libtorch_folder() -> Option<PathBuf> {
     let mut origin = [0; libc::PATH_MAX as usize];
-    // SAFETY: asks for a library that is loaded, and for a path that fits.
+    // SAFETY: the library is only looked up, not loaded, and the path fits into the buffer.
     let found = unsafe {
         let library = libc::dlopen(c"libtorch_cpu.so".as_ptr(), libc::RTLD_LAZY | libc::RTLD_NOLOAD);
         !library.is_null()
             && libc::dlinfo(library, libc::RTLD_DI_ORIGIN, origin.as_mut_ptr().cast::<c_void>()) == 0
     };
-    // SAFETY: dlinfo ended it with a 0.
+    // SAFETY: dlinfo has terminated the string with a 0.
     let origin = || unsafe { CStr::from_ptr(origin.as_ptr()) };
     found
         .then(|| PathBuf::from(std::ffi::OsStr::from_bytes(origin().to_bytes())).canonicalize().ok())
         .flatten()
 }
 
-/// NVRTC of a folder, after the library that it asks for by name alone. In wheels it is called libnvrtc.so.13, in libtorch's archives
-/// libnvrtc-<digits>.so.13.
+/// Loads NVRTC from a folder, preceded by its builtins library, which it opens by name only. The file is called libnvrtc.so.13 in wheels
+/// and libnvrtc-<digits>.so.13 in libtorch's archives.
 fn load_from(folder: &Path) -> Option<Library> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut names: Vec<String> = entries
@@ -164,6 +164,6 @@ fn load_from(folder: &Path) -> Option<Library> {
 }
 
 fn load(path: &Path) -> Option<Library> {
-    // SAFETY: these libraries have no initializers that need anything.
+    // SAFETY: the initializers of these libraries have no requirements.
     unsafe { Library::open(Some(path), RTLD_LAZY | RTLD_GLOBAL) }.ok()
 }

@@ -1,21 +1,21 @@
-//! What a kernel takes of a GPU, as the compiler says.
+//! GPU resources that kernels use, as reported by the compiler.
 
-/// Of one kernel on one architecture.
+/// Resources that one kernel uses on one architecture.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KernelUse {
-    /// Its name in the text.
+    /// Name of the kernel in the source.
     pub name: String,
-    /// Of a thread, at most 255.
+    /// Number of registers per thread, at most 255.
     pub registers: u32,
-    /// Bytes that the threads of a block share.
+    /// Bytes of shared memory per block.
     pub shared: u32,
-    /// Bytes of memory that a thread's local arrays take, which lie in the caches.
+    /// Bytes of local memory per thread for arrays, which are cached.
     pub stack: u32,
-    /// Bytes that a thread stores and loads for want of registers.
+    /// Bytes per thread that are stored and loaded because registers are short.
     pub spills: u32,
 }
 
-/// Every kernel that a compiler's log speaks of, by ptxas' words:
+/// Parses a compiler log and returns the resources of every kernel in it. The format is that of ptxas:
 ///
 /// ```text
 /// ptxas info    : Compiling entry function 'gs_blend' for 'sm_90'

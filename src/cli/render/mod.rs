@@ -1,4 +1,4 @@
-//! What is seen of a splat: `render`.
+//! The command `render`: renders of a splat, or a page to explore it in.
 
 mod output;
 mod shots;
@@ -20,13 +20,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tch::{Device, Tensor};
 
-/// What names of pictures that aren't of colours end in.
+/// File name suffixes of images of depth and of alpha.
 const DEPTH: &str = "_depth";
 const ALPHA: &str = "_alpha";
 
-/// Render a splat, or what a model makes of a capture's photos, from the capture's cameras, along a path, or on an orbit.
+/// Render a splat, or a model's reconstruction of a capture, from the capture's cameras, along a path, or on an orbit.
 ///
-/// Colour always; --depth and --alpha add those, side by side in a film and as files of their own in a folder.
+/// Colour is always rendered; --depth and --alpha add those, side by side in a video and as files of their own in a folder.
 #[derive(Args)]
 #[command(group(ArgGroup::new("source").required(true)))]
 #[command(group(ArgGroup::new("cameras").required(true).multiple(true)))]
@@ -39,45 +39,47 @@ const ALPHA: &str = "_alpha";
     globalsplat render --splat room.ply --scene captures/room --html room.html"
 )]
 pub struct Render {
-    /// A splat: .ply, .compressed.ply, .spz or .splat
+    /// Splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE", group = "source")]
     splat: Option<PathBuf>,
-    /// What a model makes of the capture's photos, as `reconstruct` does: what `export` or `import` wrote, or a checkpoint (.ckpt)
+    /// Weights to reconstruct the capture with, as `reconstruct` does: a file that `export` or `import` wrote, or a checkpoint
+    /// (.ckpt)
     #[arg(long, value_name = "FILE", group = "source", requires = "scene")]
     weights: Option<PathBuf>,
-    /// Cameras of this capture; with --orbit, an orbit amid them
+    /// Capture whose cameras are used; with --orbit, an orbit around their mean, within their spread
     #[arg(long, value_name = "PATH", group = "cameras")]
     scene: Option<PathBuf>,
-    /// An orbit, around the splat when no capture is named
+    /// Render an orbit, around the splat if no capture is given
     #[arg(long, group = "cameras")]
     orbit: bool,
-    /// Cameras of this capture, of any format, whose photos need not exist, or of a camera_path.json of nerfstudio's viewer
+    /// Camera path: a capture of any format, whose photos need not exist, or a camera_path.json of nerfstudio's viewer
     #[arg(long, value_name = "PATH", group = "cameras", conflicts_with_all = ["scene", "orbit"])]
     path: Option<PathBuf>,
-    /// A folder for a PNG per camera, or a film: .mp4 (by ffmpeg), .gif; or a .png of all side by side, shrunk where it would have
-    /// more than 64 million pixels
+    /// Output: a folder for a PNG per camera, or a video: .mp4 (by ffmpeg), .gif; or a .png of all images side by side,
+    /// downscaled if it would have more than 64 million pixels
     #[arg(long, value_name = "DIR|FILE", required_unless_present = "html")]
     out: Option<PathBuf>,
-    /// Instead, a page to walk in, with the photos of --scene if there is one: one file that needs no other and no network
+    /// Write an interactive page instead, with the photos of --scene if there is one: a single file that needs no other file
+    /// and no network
     #[arg(long, value_name = "FILE", group = "cameras",
         conflicts_with_all = ["out", "orbit", "path", "depth", "alpha", "frames", "fps", "size"])]
     html: Option<PathBuf>,
-    /// Also depth, near bright and far dark, on one scale for all pictures
+    /// Also render depth, near bright and far dark, on one scale for all images
     #[arg(long)]
     depth: bool,
-    /// Also accumulated opacity
+    /// Also render accumulated opacity
     #[arg(long)]
     alpha: bool,
-    /// So many pictures: on a smooth path through the cameras, at constant speed, or of the orbit, which has 60 by default
+    /// Number of images: on a smooth path through the cameras, at constant speed, or on the orbit, which has 60 by default
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     frames: Option<u32>,
-    /// Frames of a film per second; by default what the path says, else 20
+    /// Frames per second of a video; by default those of the path, else 20
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=120))]
     fps: Option<u32>,
-    /// Picture size, as in 640x480; by default the capture's
+    /// Image size, as in 640x480; by default the capture's
     #[arg(long, value_name = "WxH")]
     size: Option<String>,
-    /// Print what was written as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -167,7 +169,7 @@ impl Render {
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }
 
-    /// The files that are read, which no output may replace.
+    /// Returns the input files, which no output may replace.
     fn inputs(&self, capture: Option<&Capture>) -> Inputs {
         let mut inputs = Inputs::default();
         self.weights.iter().for_each(|path| inputs.add_weights(path));
@@ -176,13 +178,13 @@ impl Render {
         inputs
     }
 
-    /// What the names of a camera's pictures end in.
+    /// Returns the file name suffixes of a camera's images.
     fn suffixes(&self) -> Vec<&'static str> {
         let depth = self.depth.then_some(DEPTH);
         [""].into_iter().chain(depth).chain(self.alpha.then_some(ALPHA)).collect()
     }
 
-    /// Colour and what else was asked for, [3, H, W], in the order of the suffixes.
+    /// Returns colour and the other requested images, [3, H, W] each, in the order of the suffixes.
     fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<Tensor> {
         let mut parts = vec![rendered.rgb.clamp(0., 1.)];
         if let Some(scale) = scale {
@@ -194,7 +196,7 @@ impl Render {
         parts
     }
 
-    /// Of the largest picture, with its parts side by side.
+    /// Returns the size of the largest frame, with its parts side by side.
     fn size_of_all(&self, cameras: &[Camera]) -> ImageSize {
         let largest = |side: fn(&Camera) -> u32| cameras.iter().map(side).max().unwrap_or(0);
         let size =
@@ -203,7 +205,7 @@ impl Render {
     }
 }
 
-/// What all pictures together show, told by a few that are small: before the first is rendered, the last counts as well.
+/// Returns the depth scale for all images, estimated from a few small renders, so that it is known before the first image.
 fn depth_scale(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<DepthScale> {
     const FEW: usize = 12;
     const SMALL: u32 = 128;

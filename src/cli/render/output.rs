@@ -1,4 +1,4 @@
-//! Where pictures go, one by one as they are rendered.
+//! Output of rendered images, one by one.
 
 use super::super::say_shrunk;
 use globalsplat::error::{Error, Result};
@@ -11,22 +11,22 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
-/// What `--out` asks for.
+/// Output that `--out` selects.
 pub enum Output<'a> {
-    /// A folder of PNGs.
+    /// Folder of PNGs.
     Folder {
-        /// The files of each picture's parts.
+        /// Files of each image, one per part.
         files: Vec<Vec<PathBuf>>,
-        /// How many pictures are written.
+        /// Number of images written so far.
         written: usize,
     },
-    /// One PNG of all side by side.
+    /// One PNG of all images side by side.
     Row(&'a Path, Mosaic),
     Film(&'a Path, Film),
 }
 
 impl<'a> Output<'a> {
-    /// Refuses, before the work, what could not be written after it. `frames_per_second` is what was asked for.
+    /// Returns an error, before the work, if the output couldn't be written. `frames_per_second` is the user's `--fps`.
     pub fn check(path: &Path, frames_per_second: Option<u32>) -> Result<()> {
         let kind = kind(path);
         if kind != Kind::Film && frames_per_second.is_some() {
@@ -43,7 +43,8 @@ impl<'a> Output<'a> {
         check_writable_file(path)
     }
 
-    /// For pictures that are called `names`, of parts with `suffixes`, in frames of `size` at most with all parts side by side.
+    /// Creates the output for images called `names`, whose parts have `suffixes`, in frames of at most `size` with all parts
+    /// side by side.
     ///
     /// # Errors
     /// An output that would replace one of `inputs`, or that can't be written.
@@ -72,7 +73,7 @@ impl<'a> Output<'a> {
         })
     }
 
-    /// Adds the next picture, of parts [3, H, W].
+    /// Adds the next image, as its parts [3, H, W].
     pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
         match self {
             Output::Film(_, film) => film.add(&tile_horizontally(parts)),
@@ -89,7 +90,7 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// The files that were written.
+    /// Finishes the output and returns the files written.
     pub fn finish(self) -> Result<Vec<PathBuf>> {
         match self {
             Output::Folder { files, .. } => Ok(files.into_iter().flatten().collect()),
@@ -106,8 +107,8 @@ impl<'a> Output<'a> {
     }
 }
 
-/// The files in `folder` of pictures that are called `names`, each with one for every suffix. Where two would be the same, as of `x`
-/// with a suffix and of a photo that is called so, numbers stand for the names.
+/// Returns the files in `folder` of images called `names`, each with one per suffix. If two would have the same path, as `x`
+/// with a suffix and a photo of that name, all names are replaced by numbers.
 fn files_of(folder: &Path, names: &[String], suffixes: &[&str]) -> Vec<Vec<PathBuf>> {
     let of_picture = |name: &str| -> Vec<PathBuf> {
         suffixes.iter().map(|suffix| folder.join(format!("{name}{suffix}.png"))).collect()
@@ -127,7 +128,7 @@ enum Kind {
     Film,
 }
 
-/// Told by the ending.
+/// Returns the kind of output that the file extension selects.
 fn kind(path: &Path) -> Kind {
     if Film::is_name(path) {
         Kind::Film

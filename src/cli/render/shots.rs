@@ -1,4 +1,4 @@
-//! From where pictures are taken.
+//! Cameras of `render`.
 
 use super::super::cameras::{median_depth, orbit_around_splat};
 use crate::cli::warn;
@@ -10,23 +10,24 @@ use globalsplat::scene::{Camera, ImageSize, orbit_around_cameras, smooth_path};
 use std::path::Path;
 
 const FRAMES_PER_SECOND: u32 = 20;
-/// Of an orbit.
+/// Default number of frames of an orbit.
 const DEFAULT_FRAMES: usize = 60;
-/// Of a picture when no capture tells one.
+/// Default width and height of an image, without a capture.
 const DEFAULT_SIZE: u32 = 512;
 
-/// Cameras, one after the other.
+/// Sequence of cameras to render.
 pub struct Shots {
-    /// What their pictures are called.
+    /// Names of the images.
     pub names: Vec<String>,
     pub cameras: Vec<Camera>,
     pub frames_per_second: u32,
-    /// What a path was read from.
+    /// Files that a path was read from.
     pub inputs: Inputs,
 }
 
 impl Shots {
-    /// From the capture's cameras, or so many on a smooth path through them. Pictures of a camera are told apart by `suffixes`.
+    /// Returns the capture's cameras, or `frames` of them on a smooth path through these. Names of images stay unique with
+    /// `suffixes`.
     pub fn of(
         capture: &Capture,
         size: Option<ImageSize>,
@@ -41,7 +42,8 @@ impl Shots {
         })
     }
 
-    /// On an orbit amid the capture's cameras.
+    /// Returns cameras on an orbit around the mean of the capture's cameras, all looking at the point that the mean camera
+    /// looks at.
     pub fn amid(
         capture: &Capture,
         size: Option<ImageSize>,
@@ -54,13 +56,13 @@ impl Shots {
         Ok(Shots::numbered(orbit))
     }
 
-    /// On an orbit around the splat.
+    /// Returns cameras on an orbit around the splat.
     pub fn around(splat: &Splat, size: Option<ImageSize>, frames: Option<usize>) -> Self {
         let size = size.unwrap_or(ImageSize { width: DEFAULT_SIZE, height: DEFAULT_SIZE });
         Shots::numbered(orbit_around_splat(splat, size, frames.unwrap_or(DEFAULT_FRAMES)))
     }
 
-    /// From the cameras at `path`, or so many on a smooth path through them.
+    /// Returns the cameras at `path`, or `frames` of them on a smooth path through these.
     pub fn along(
         path: &Path,
         size: Option<ImageSize>,

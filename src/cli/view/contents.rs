@@ -1,4 +1,4 @@
-//! What a page is told about its scene.
+//! Data about the scene that is embedded in a page.
 
 use super::super::cameras::{median_depth, orbit_around_splat};
 use anyhow::Result;
@@ -11,33 +11,33 @@ use globalsplat::render::DEFAULT_EPS2D;
 use globalsplat::scene::{Camera, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
-/// The longer side of a photo, in pixels.
+/// Maximum length of a photo's longer side, in pixels.
 const LONGEST: u32 = 640;
-/// A page with more would take long to load: at about 100 KB each.
+/// Maximum number of photos, at about 100 KB each: a page with more would take long to load.
 const MOST_PHOTOS: usize = 100;
-/// Around a splat whose capture isn't named.
+/// Number and size of views on an orbit around a splat without a capture.
 const ORBIT: usize = 24;
 const SIZE: ImageSize = ImageSize { width: 640, height: 480 };
-/// On the path through the capture's cameras. Between them the page goes straight on.
+/// Number of frames per camera on the path through the capture's cameras. The page interpolates linearly between them.
 const FRAMES_PER_CAMERA: usize = 12;
 const MOST_FRAMES: usize = 1200;
-/// A camera's frustum is as long as this share of the distance to what is seen.
+/// Length of a camera's frustum, as a share of the distance to the scene.
 const FRUSTUM: f64 = 0.06;
 
-/// In the page as JSON; read in web/src. Lengths and places are in the splat's local frame (spec 2.5), which a browser's float32 and
-/// its half-precision centres suit.
+/// Contents of the page as JSON, read in web/src. Lengths and positions are in the splat's local frame (spec 2.5), which suits
+/// a browser's float32 and its half-precision centres.
 #[derive(Serialize)]
 pub struct Contents {
     pub name: String,
     cameras: Vec<PageCamera>,
-    /// Camera-to-world [3, 4], row by row, as those of cameras.
+    /// Camera-to-world matrices of the path, [3, 4] in row-major order, like those of the cameras.
     path: Vec<[f64; 12]>,
-    /// Where the photos' up is, of length 1.
+    /// Up direction of the photos, a unit vector.
     up: [f64; 3],
-    /// To what the middle camera sees.
+    /// Median distance from the middle camera to the scene.
     distance: f64,
     frustum: f64,
-    /// What is added to the covariance of a Gaussian in the picture, in square pixels (spec 6.2).
+    /// Value added to the diagonal of a Gaussian's projected covariance, in square pixels (spec 6.2).
     blur: f64,
 }
 
@@ -46,12 +46,12 @@ struct PageCamera {
     name: String,
     c2w: [f64; 12],
     lens: Lens,
-    /// A JPEG as a data URL.
+    /// Photo, a JPEG as a data URL.
     #[serde(skip_serializing_if = "Option::is_none")]
     photo: Option<String>,
 }
 
-/// In pixels.
+/// Intrinsics of a camera, in pixels.
 #[derive(Serialize)]
 struct Lens {
     fx: f64,
@@ -63,7 +63,8 @@ struct Lens {
 }
 
 impl Contents {
-    /// Of `splat`, which is in the local frame `frame`, seen from the cameras of `capture` or, without one, from around it.
+    /// Creates the contents for `splat`, which is in the local frame `frame`, with the cameras of `capture` or, without one, on
+    /// an orbit.
     ///
     /// # Errors
     /// Photos that can't be read.
@@ -104,12 +105,12 @@ impl PageCamera {
     }
 }
 
-/// The first three rows of a camera-to-world matrix.
+/// Returns the first three rows of a camera-to-world matrix.
 fn rows(camera: &Camera) -> [f64; 12] {
     std::array::from_fn(|i| camera.c2w.col(i % 4)[i / 4])
 }
 
-/// Cameras and their photos, spread over the capture where there are many.
+/// Returns cameras with their photos, at most [`MOST_PHOTOS`] evenly spaced over the capture.
 fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>> {
     let (count, cameras) = (capture.len().min(MOST_PHOTOS), capture.cameras());
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
@@ -122,7 +123,7 @@ fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>
     indices.map(photographed).collect()
 }
 
-/// The size to which a photo is shrunk; none where it is small enough.
+/// Returns the size to which a photo is downscaled, or `None` if it is small enough.
 fn shrunk(&Camera { width, height, .. }: &Camera) -> Option<ImageSize> {
     let longest = width.max(height);
     let side = |side: u32| (side * LONGEST).div_ceil(longest);

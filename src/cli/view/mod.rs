@@ -12,22 +12,22 @@ use serde_json::json;
 use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 
-/// Walk in a splat: writes a page for a browser, with everything in one file, and opens it.
+/// Explore a splat interactively: writes a page for a browser, with everything in one file, and opens it.
 ///
-/// With --scene there are the capture's photos, too: to jump to, to see in the places they were taken from, and to compare with.
-/// The page is in the temporary folder, where you alone can read it, until the next `view` removes it; `render --html` writes one
-/// that stays.
+/// With --scene the page includes the capture's photos: to jump to, to see at their camera positions, and to compare with. The
+/// page is in the temporary folder, readable only by the current user, until the next `view` removes it; `render --html` writes
+/// a permanent one.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat view room.ply --scene captures/room\n  \
     globalsplat render --splat room.ply --scene captures/room --html room.html")]
 pub struct View {
-    /// A splat: .ply, .compressed.ply, .spz or .splat
+    /// Splat: .ply, .compressed.ply, .spz or .splat
     #[arg(value_name = "SPLAT")]
     splat: PathBuf,
-    /// The capture that it was made from
+    /// Capture that the splat was made from
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
-    /// Print where the page is as one JSON object
+    /// Print the path of the page as one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -40,7 +40,7 @@ impl View {
         warn(&splat.warnings);
         let name = name_of(&self.splat);
         remove_pages(&std::env::temp_dir());
-        // Its owner alone can read it. The browser does when this program is gone.
+        // Only its owner can read the file. It must remain after this program exits, since the browser reads it then.
         let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile()?;
         write_page(page.path(), &name, &splat, capture.as_ref())?;
         let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
@@ -59,10 +59,10 @@ impl View {
     }
 }
 
-/// Of a page's name, by which the next `view` knows it.
+/// End of a page's file name, by which the next `view` recognizes it.
 const PAGE_ENDING: &str = ".globalsplat-view.html";
 
-/// Removes what earlier `view`s left in `folder`: those of this user.
+/// Removes the pages that earlier `view`s of this user left in `folder`.
 fn remove_pages(folder: &Path) {
     for file in folder.read_dir().into_iter().flatten().flatten() {
         if file.file_name().to_string_lossy().ends_with(PAGE_ENDING) && is_own(&file) {
@@ -71,11 +71,11 @@ fn remove_pages(folder: &Path) {
     }
 }
 
-/// Whether a file is this user's.
+/// Returns `true` if the file belongs to this user.
 #[cfg(unix)]
 fn is_own(file: &DirEntry) -> bool {
     use std::os::unix::fs::MetadataExt;
-    // SAFETY: it reads nothing and always succeeds.
+    // SAFETY: `geteuid` takes no arguments and always succeeds.
     file.metadata().is_ok_and(|file| file.is_file() && file.uid() == unsafe { libc::geteuid() })
 }
 
@@ -84,7 +84,7 @@ fn is_own(file: &DirEntry) -> bool {
     file.metadata().is_ok_and(|file| file.is_file())
 }
 
-/// What a page is called that is about the file at `path`.
+/// Returns the name of a page about the file at `path`.
 pub fn name_of(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }

@@ -1,4 +1,4 @@
-//! The page: a frame around the viewer that `web/` bundles, and all that it shows.
+//! The page: HTML around the viewer that `web/` bundles, with all its data.
 
 use super::contents::Contents;
 use anyhow::Result;
@@ -12,22 +12,23 @@ use globalsplat::scene::Camera;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::Path;
 
-/// What `web/` was bundled to when this program was built; empty where npm wasn't there.
+/// Viewer bundled from `web/` when this program was built; empty if npm wasn't available.
 const VIEWER: &str = include_str!(concat!(env!("OUT_DIR"), "/page.js"));
 const STYLE: &str = include_str!("page.css");
-/// Nothing is asked of anybody: all that the page needs is in it. Spark's sorting is a worker, and WebAssembly, in the script.
+/// Content security policy without network access: the page contains all it needs. Spark's sorting runs in a worker and in
+/// WebAssembly, both part of the script.
 const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; \
     connect-src data: blob:; img-src data: blob:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
 
-/// Whether this program was built where npm was.
+/// Returns `true` if this program was built with the viewer, which requires npm.
 pub fn has_viewer() -> bool {
     !VIEWER.is_empty()
 }
 
-/// That pages can be written.
+/// Checks that this program can write pages.
 ///
 /// # Errors
-/// A program that was built where npm wasn't.
+/// A program that was built without npm.
 pub fn check_has_viewer() -> Result<()> {
     if !has_viewer() {
         return Err(Error::Request(
@@ -38,19 +39,19 @@ pub fn check_has_viewer() -> Result<()> {
     Ok(())
 }
 
-/// That a page can be written at `path`. Call it before the work, not after.
+/// Checks that a page can be written to `path`. Call it before the work, not after.
 ///
 /// # Errors
-/// As [`check_has_viewer`], or a place that can't be written to.
+/// The errors of [`check_has_viewer`], or a path that can't be written to.
 pub fn check_writable(path: &Path) -> Result<()> {
     check_has_viewer()?;
     Ok(check_writable_file(path)?)
 }
 
-/// Writes a page in which `splat` can be walked in, with the photos of `capture`, as one file at `path`.
+/// Writes an interactive page of `splat`, with the photos of `capture`, as one file at `path`.
 ///
 /// # Errors
-/// Photos that can't be read, or the system's refusal to write.
+/// Photos that can't be read, or a failed write.
 pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<()> {
     let frame = splat.frame();
     let splat = Splat::of(&frame.gaussians_to_local(&splat.gaussians, splat.origin))?;
@@ -60,7 +61,7 @@ pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Captu
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
 }
 
-/// The splat in few bytes, by colours that viewers can show.
+/// Encodes the splat compactly as SPZ, with colours within the range that viewers can show.
 fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
@@ -68,7 +69,7 @@ fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     Ok(std::fs::read(file)?)
 }
 
-/// Text that no end of its element is in.
+/// Escapes JSON so that it can't end the script element that contains it.
 fn in_script(json: &str) -> PreEscaped<String> {
     PreEscaped(json.replace('<', "\\u003c"))
 }
@@ -144,7 +145,7 @@ fn help() -> Markup {
     }
 }
 
-/// A filter that gives greys of depth the colours of `render --depth`, and leaves black what isn't there.
+/// Returns an SVG filter that maps greyscale depth to the colours of `render --depth`, and keeps empty pixels black.
 fn depth_colours() -> Markup {
     let colours = io::depth_colours();
     let table = |channel: usize| -> String {

@@ -10,25 +10,25 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// How long a Ctrl-C may go unnoticed.
+/// Interval between two checks for Ctrl-C.
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Show a run while it trains, or afterwards: one page for a browser on this machine, which no other machine can open.
+/// Show a run during or after training: a page for a browser on this machine, which no other machine can open.
 ///
-/// Curves, the newest pictures, speed, the time left, checkpoints, and whatever is out of the ordinary, a few seconds old at most.
-/// The run's folder is read alone. Ctrl-C ends it; the training doesn't notice.
+/// The page shows curves, the newest images, speed, the time left, checkpoints, and anomalies, a few seconds old at most. Only
+/// the run's folder is read. Ctrl-C ends the command without any effect on the training.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  globalsplat watch runs/mine\n  ssh -L 8000:127.0.0.1:8000 trainer globalsplat watch runs/mine --port 8000"
 )]
 pub struct Watch {
-    /// The folder of the run
+    /// Folder of the run
     #[arg(value_name = "RUN")]
     run: PathBuf,
-    /// The page's port; 0 for any that is free
+    /// Port of the page; 0 for any free port
     #[arg(long, value_name = "N", default_value_t = 0)]
     port: u16,
-    /// Print the page's address as one JSON object
+    /// Print the page's URL as one JSON object
     #[arg(long)]
     json: bool,
 }

@@ -1,20 +1,21 @@
-//! The page: a frame that its script fills with what the run tells.
+//! The page: HTML that its script fills with the state of the run.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
-/// What the reports look like, so that a run looks the same.
+/// Style sheet of the reports, so that both look alike.
 const REPORT_STYLE: &str = include_str!("../../eval/report/style.css");
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 
-/// The page, and what a browser may do for it.
+/// Page with its content security policy.
 pub struct Page {
     pub html: String,
     pub policy: String,
 }
 
 impl Page {
-    /// Each has a number of its own, by which the browser knows our script and style from any that a name smuggles in.
+    /// Creates a page with a random nonce, by which the browser distinguishes our script and style from any that a name
+    /// injects.
     pub fn new() -> Self {
         let nonce = format!("{:032x}", rand::random::<u128>());
         let policy = format!(
@@ -33,7 +34,7 @@ fn page(nonce: &str) -> Markup {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
                 meta name="color-scheme" content="light dark";
-                // Without it a browser asks the server for an icon.
+                // Without this, browsers request a favicon from the server.
                 link rel="icon" href="data:,";
                 title { "A run" }
                 style nonce=(nonce) { (PreEscaped(REPORT_STYLE)) (PreEscaped(STYLE)) }

@@ -1,4 +1,4 @@
-//! Who may ask what, and what is answered.
+//! HTTP server of `watch`: checks requests and answers them.
 
 use super::page;
 use anyhow::{Result, bail};
@@ -16,24 +16,23 @@ use std::net::{Ipv4Addr, TcpListener};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-/// Who says nothing for so long is hung up on.
+/// Timeout after which an idle connection is closed.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// A page keeps up to six.
+/// Maximum number of concurrent connections; a page keeps up to six.
 const CONNECTIONS: usize = 64;
-/// A free port may be taken by somebody else before it is ours.
+/// Maximum number of attempts: another process may take a free port before we bind it.
 const TRIES: usize = 8;
 
 const TEXT: &str = "text/plain; charset=utf-8";
 
-/// Serves `run` from now on and as long as the process lives, on `port` or, where that is 0, a free one, and returns the
-/// page's address.
+/// Serves `run` for the lifetime of the process, on `port` or, if that is 0, on a free port, and returns the page's URL.
 ///
 /// # Errors
 /// A port that is in use, or that the system refuses.
 pub fn serve(run: WatchedRun, port: u16) -> Result<String> {
     let run = std::sync::Arc::new(Mutex::new(run));
     for _ in 0..TRIES {
-        // The server doesn't tell which port it was given.
+        // The server doesn't report the port it was given.
         let chosen = match port {
             0 => TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
             port => port,
@@ -65,7 +64,7 @@ fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Respon
         answer.headers_mut().insert(ALLOW, "GET, HEAD".parse().expect("two methods"));
         return answer;
     }
-    // A reader that panicked left nothing that isn't read again.
+    // A reader that panicked left no state that isn't read again.
     let mut run = run.lock().unwrap_or_else(PoisonError::into_inner);
     let mut answer = match request.uri().path() {
         "/" => {
@@ -96,8 +95,8 @@ fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Respon
     answer
 }
 
-/// Whether the browser knows that it speaks to its own machine. One that was told that a stranger's name means this address
-/// (DNS rebinding) names the stranger, whose page could read the answer.
+/// Returns `true` if the request is addressed to this machine. After DNS rebinding, where a foreign host name resolves to this
+/// address, the Host header has that name, and the foreign page could read the answer.
 fn is_meant_for_us(request: &Request<Body>, port: u16) -> bool {
     let mut hosts = request.headers().get_all(HOST).iter();
     match (hosts.next().and_then(|host| host.to_str().ok()), hosts.next()) {
@@ -106,8 +105,8 @@ fn is_meant_for_us(request: &Request<Body>, port: u16) -> bool {
     }
 }
 
-/// Whether the value of a Host header names this machine and `port`: names are the same in capitals and with a dot at their end,
-/// and without a port it is HTTP's own (RFC 9110, section 7.2).
+/// Returns `true` if the value of a Host header names this machine and `port`: names are case-insensitive, may end with a dot,
+/// and without a port it is HTTP's default (RFC 9110, section 7.2).
 fn is_this_machine(host: &str, port: u16) -> bool {
     const HTTP: u16 = 80;
     // An IPv6 address has colons of its own, in brackets.
@@ -125,7 +124,7 @@ fn is_this_machine(host: &str, port: u16) -> bool {
     said == Some(port) && ["127.0.0.1", "localhost", "[::1]"].contains(&name.as_str())
 }
 
-/// `/picture/STEP.png`. A number is all that ever gets from an address to a file.
+/// Parses `/picture/STEP.png`. The step number is the only part of a URL that reaches a file name.
 fn step_of(path: &str) -> Option<u64> {
     path.strip_prefix("/picture/")?.strip_suffix(".png")?.parse().ok()
 }
@@ -141,7 +140,7 @@ fn send(status: StatusCode, kind: &str, body: impl Into<Body>) -> Response<Body>
         .header(X_CONTENT_TYPE_OPTIONS, "nosniff")
         .header(REFERRER_POLICY, "no-referrer")
         .header(CACHE_CONTROL, "no-store")
-        // Nor may a stranger's page show our pictures.
+        // Pages of other origins may not embed our images, either.
         .header("cross-origin-resource-policy", "same-origin")
         .body(body.into())
         .expect("headers without a line's end")
@@ -156,7 +155,7 @@ mod tests {
         for host in ["127.0.0.1:8123", "localhost:8123", "LocalHost:8123", "localhost.:8123", "[::1]:8123"] {
             assert!(is_this_machine(host, 8123), "{host}");
         }
-        // A browser leaves out HTTP's own port.
+        // Browsers omit HTTP's default port.
         for host in
             ["127.0.0.1", "localhost", "LOCALHOST.", "[::1]", "localhost:", "localhost:80", "[::1]:80"]
         {

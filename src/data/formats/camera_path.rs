@@ -1,7 +1,7 @@
-//! Cameras to render along: those of any capture, without its photos, or a `camera_path.json` of nerfstudio's viewer.
+//! Camera paths to render: the cameras of any capture, without its photos, or a `camera_path.json` of nerfstudio's viewer.
 //!
-//! The latter is {"camera_path": [{"camera_to_world": 16 numbers, row by row, OpenGL axes, "fov": degrees from top to bottom}, …],
-//! "render_height", "render_width", and maybe "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
+//! The latter is {"camera_path": [{"camera_to_world": 16 numbers, row by row, OpenGL axes, "fov": vertical, in degrees}, …],
+//! "render_height", "render_width", and optionally "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
 
 use super::json::null_for_not_a_number;
 use super::transforms_json::{from_opengl, shown};
@@ -13,25 +13,25 @@ use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
 use serde_json::Value;
 use std::path::Path;
 
-/// Where pictures are to be taken from, one after the other.
+/// A sequence of cameras to render from.
 #[derive(Debug)]
 pub struct CameraPath {
-    /// One at least.
+    /// Cameras in order, at least one.
     pub cameras: Vec<Camera>,
-    /// How fast they follow each other, where the file tells.
+    /// Frame rate, if the file specifies one.
     pub frames_per_second: Option<u32>,
-    /// As [`Capture::warnings`](crate::data::Capture::warnings).
+    /// Warnings as returned by [`Capture::warnings`](crate::data::Capture::warnings).
     pub warnings: Vec<String>,
-    /// What they were read from, and the photos of the capture that are there.
+    /// Files that the cameras were read from, and the existing photos of the capture.
     pub inputs: Inputs,
 }
 
-/// Reads the cameras of a capture of any format, as [`open_capture`](super::open_capture) finds it, or of a JSON file of any
-/// name, which its keys tell: `frames` of a `transforms.json`, `camera_path` of nerfstudio's viewer, else a `cameras.json`. No
-/// photo has to be there; where only a photo could tell its size and isn't there, it is taken to be of `size`.
+/// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) finds, or of a JSON file of any name.
+/// The keys of the JSON file tell its format: `frames` for a `transforms.json`, `camera_path` for nerfstudio's viewer, otherwise a
+/// `cameras.json`. Photos may be missing. If only a missing photo could tell its size, `size` is assumed.
 ///
 /// # Errors
-/// As [`open_capture`](super::open_capture).
+/// Fails like [`open_capture`](super::open_capture).
 pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
     let purpose = Purpose::Cameras(size);
     let json =
@@ -39,7 +39,7 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
             false => None,
             true => {
                 let text = read_text(path)?;
-                // What is no JSON is refused by whoever reads it.
+                // The reader of the format reports invalid JSON.
                 Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
             }
         };

@@ -1,5 +1,5 @@
-//! `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}.
-//! (Spec 10.2.)
+//! Reader and writer of `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}
+//! (spec 10.2).
 
 use super::json::null_for_not_a_number;
 use super::photos::{find_photos, portable};
@@ -13,7 +13,7 @@ use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// By which a capture of this format is recognized.
+/// File name that identifies a capture of this format.
 const FILE_NAME: &str = "cameras.json";
 
 #[derive(Serialize, Deserialize)]
@@ -30,18 +30,19 @@ struct ViewEntry {
     c2w: Vec<Vec<Number>>,
 }
 
-/// Python writes NaN and Infinity, which JSON doesn't know: they come as null and are found by the checks on cameras.
+/// A number or null. Python writes NaN and Infinity, which JSON lacks: they are read as null, and the checks on cameras report
+/// them.
 type Number = Option<f64>;
 
-/// A folder with a `cameras.json`, or that file.
+/// Recognizes a folder that contains a `cameras.json`, or that file itself.
 pub(super) fn find(path: &Path) -> Option<Found> {
     let itself = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
     let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
     Some(Box::new(move |purpose| read(&file, purpose)))
 }
 
-/// Reads the capture that `file` describes. Views come as its author put them, whatever they are called. Those whose photo isn't
-/// there are left out.
+/// Reads the capture that `file` describes. Views keep the order of the file, whatever their names. Views with a missing photo are
+/// left out.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let parsed = parse(file)?;
     let root = file.parent().unwrap_or(Path::new("."));
@@ -65,10 +66,10 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)
 }
 
-/// Writes a `cameras.json` at `file`; `images` are paths relative to its folder. All cameras have one size.
+/// Writes a `cameras.json` at `file`. `images` are paths relative to its folder. All cameras must have the same size.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Fails if the file can't be written.
 pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) -> Result<()> {
     let views = images.iter().zip(cameras).map(|(image, camera)| ViewEntry {
         image: image.clone(),

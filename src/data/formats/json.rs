@@ -1,6 +1,6 @@
-//! JSON as Python writes it.
+//! Support for JSON as Python writes it.
 
-/// Replaces NaN, Infinity and −Infinity outside of strings.
+/// Replaces NaN, Infinity and −Infinity outside of strings by null.
 pub(super) fn null_for_not_a_number(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;

@@ -1,4 +1,4 @@
-//! Formats of captures on disk: a file a format, and a line in [`FORMATS`], by which captures are recognized.
+//! Formats of captures on disk. Each has a module, and an entry in [`FORMATS`] that recognizes its captures.
 
 mod camera_path;
 mod cameras_json;
@@ -19,47 +19,48 @@ use crate::error::{Error, Result};
 use natural::natural_order;
 use std::path::{Path, PathBuf};
 
-/// Looks for a capture of one format at a path, a folder or the file that describes it.
+/// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.
 type Format = fn(&Path) -> Option<Found>;
 
-/// Reads the capture that was found.
+/// Function that reads a capture that was found.
 type Found = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
 
-/// Of several in a folder, the first that can be read is taken.
+/// All formats in order of preference. If several match a folder, the first that can be read is used.
 const FORMATS: [Format; 4] = [chunk::find, cameras_json::find, transforms_json::find, colmap::find];
 
-/// What is expected where nothing known is found.
+/// Description of the supported formats for error messages.
 const KNOWN: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
                      .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, or a \
                      CHUNK.torch#KEY";
 
-/// Whether a capture is at `path`, as far as names tell.
+/// Returns `true` if a capture is at `path`, judging by file names alone.
 pub(in crate::data) fn is_capture(path: &Path) -> bool {
     FORMATS.iter().any(|find| find(path).is_some())
 }
 
-/// The file `name` that describes a capture, where `path` is the capture's folder.
+/// Returns the file `name` that describes a capture, if it exists in the capture's folder `path`.
 fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
     Some(path.join(name)).filter(|file| file.is_file())
 }
 
-/// Opens whatever capture is at `path`; the format is recognized by what is on disk. In this order:
+/// Opens the capture at `path`. The format is recognized by the files on disk, in this order:
 ///
-/// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk; `CHUNK.torch` where it has one alone;
+/// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk, or `CHUNK.torch` if it holds a single scene;
 /// 2. a folder with a `cameras.json`, or that file;
-/// 3. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named
-///    `transforms_train.json` and the like; or a folder with NeRF's `transforms_train.json`, and `transforms_test.json`, whose views
-///    [`Capture::split`] holds out;
+/// 3. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named `transforms_train.json` or
+///    similar; or a folder with NeRF's `transforms_train.json` and `transforms_test.json`, whose views [`Capture::split`] holds
+///    out;
 /// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `colmap/sparse/0`, `dense/0/sparse`, `dense/sparse` or
-///    the folder itself, and the photos in `images` beside it, or in the folder itself. Of several the one with the most photos.
+///    the folder itself, and the photos in `images` next to it, or in the folder itself. If there are several models, the one with
+///    the most photos.
 ///
-/// Of several formats the first that can be read is taken. Photos that aren't there are left out, and cameras are scaled to photos
-/// that are smaller or larger than they say: [`Capture::warnings`] names whatever is left out or changed.
+/// If several formats match, the first that can be read is used. Missing photos are left out, and cameras are scaled to photos
+/// whose size differs from the declared one. [`Capture::warnings`] lists everything that is left out or changed.
 ///
 /// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
 ///
 /// # Errors
-/// Nothing that is known there, or a capture that breaks its format's rules.
+/// Fails if nothing of a known format is at `path`, or if a capture violates its format.
 pub fn open_capture(path: &Path) -> Result<Capture> {
     open_for(path, Purpose::Photos)
 }
@@ -88,45 +89,45 @@ fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
     }
 }
 
-/// The name of the last folder in `path`, which may be empty for the working directory.
+/// Returns the name of the last folder in `path`. An empty path stands for the working directory.
 pub(in crate::data) fn folder_name(path: &Path) -> String {
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     let folder = path.canonicalize().unwrap_or(path.to_owned());
     folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// How many folders deep captures are looked for.
+/// Maximum depth of folders that are searched for captures.
 const DEPTH: usize = 2;
 
-/// Captures below a folder.
+/// Captures found below a folder.
 #[derive(Debug)]
 pub struct FoundCaptures {
-    /// In the order of their paths, numbers in them by value.
+    /// Captures ordered by path, with numbers in paths compared by value.
     pub captures: Vec<Capture>,
-    /// Folders that couldn't be looked into, a line each.
+    /// Warnings about folders that couldn't be read, one line each.
     pub warnings: Vec<String>,
 }
 
-/// Opens every capture in `path`: itself, or those in the folders up to two levels below it. Hidden folders aren't looked into, as
-/// those are that interrupted work leaves, nor those that can't be read.
+/// Opens every capture in `path`: `path` itself, or those in folders up to two levels below it. Skips hidden folders, such as those
+/// left by interrupted work, and folders that can't be read.
 ///
 /// # Errors
-/// `path` can't be read or holds no capture, or a capture breaks its format's rules.
+/// Fails if `path` can't be read or holds no capture, or if a capture violates its format.
 pub fn find_captures(path: &Path) -> Result<FoundCaptures> {
     let CaptureFolders { folders, warnings } = capture_folders(path)?;
     let captures = folders.iter().map(|folder| open_capture(folder)).collect::<Result<_>>()?;
     Ok(FoundCaptures { captures, warnings })
 }
 
-/// Where [`find_captures`] finds them.
+/// Folders of the captures that [`find_captures`] opens.
 #[derive(Debug, Default)]
 pub(in crate::data) struct CaptureFolders {
     pub folders: Vec<PathBuf>,
-    /// As [`FoundCaptures::warnings`].
+    /// Warnings as in [`FoundCaptures::warnings`].
     pub warnings: Vec<String>,
 }
 
-/// Finds the folders of [`find_captures`].
+/// Finds the folders for [`find_captures`].
 pub(in crate::data) fn capture_folders(path: &Path) -> Result<CaptureFolders> {
     let mut found = CaptureFolders::default();
     found.collect(path, DEPTH)?;

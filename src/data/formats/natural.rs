@@ -1,15 +1,16 @@
-//! The order of names as people number them: `r_2` comes before `r_10`.
+//! Natural order of names: `r_2` comes before `r_10`.
 
 use std::cmp::Ordering;
 use std::ffi::OsStr;
 
-/// Compares names or paths folder by folder; there, runs of digits by the number they stand for, however long, and all else
-/// byte by byte. Those that differ in leading zeros alone are told apart by these.
+/// Compares names or paths folder by folder. Within a folder's name, runs of digits are compared by their numeric value, however
+/// long, and everything else byte by byte. Leading zeros break ties.
 pub(super) fn natural_order<Name: AsRef<OsStr> + ?Sized>(a: &Name, b: &Name) -> Ordering {
     let [mut folders_of_a, mut folders_of_b] =
         [a, b].map(|name| name.as_ref().as_encoded_bytes().split(|&byte| byte == b'/'));
     loop {
-        // A folder is settled, zeros included, before what is in it, so that nothing of another comes between.
+        // Compare a folder completely, including zeros, before its contents, so that the contents of different folders never
+        // interleave.
         match (folders_of_a.next(), folders_of_b.next()) {
             (Some(a), Some(b)) if a == b => {}
             (Some(a), Some(b)) => return tokens(a).cmp(tokens(b)).then_with(|| a.cmp(b)),
@@ -18,8 +19,8 @@ pub(super) fn natural_order<Name: AsRef<OsStr> + ?Sized>(a: &Name, b: &Name) -> 
     }
 }
 
-/// What a name is compared by: bytes, and numbers, which stand where their digits would and hold their length and digits
-/// without leading zeros.
+/// Splits a name into tokens to compare: bytes, and numbers. A number has the byte `0`, its number of digits, and its digits, the
+/// latter two without leading zeros.
 fn tokens(mut rest: &[u8]) -> impl Iterator<Item = (u8, usize, &[u8])> {
     std::iter::from_fn(move || {
         let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();

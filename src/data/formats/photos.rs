@@ -1,19 +1,20 @@
-//! Where the photos are that a capture's file names.
+//! Search for the photos that a capture's file names.
 
 use crate::io::PHOTO_EXTENSIONS;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Factors of the folders of smaller photos that tools put beside `images`: `images_2` and so on.
+/// Reduction factors of the folders of smaller photos that tools create next to `images`: `images_2` and so on.
 const REDUCED: [u32; 3] = [2, 4, 8];
 
-/// First folders of a name that may be left out.
+/// Maximum number of leading folders of a name that may be skipped.
 const DEEPEST: usize = 16;
 
-/// Photos that a capture needs at least.
+/// Minimum number of photos of a capture.
 const FEWEST: usize = 2;
 
-/// How names become paths: below `base`, without so many of their first folders, in the folder of smaller photos.
+/// Rule for turning names into paths: below `base`, without the first `skipped` folders, in a folder of smaller photos if
+/// `reduced`.
 #[derive(Clone, Copy)]
 struct Rule<'a> {
     base: &'a Path,
@@ -21,11 +22,11 @@ struct Rule<'a> {
     reduced: Option<u32>,
 }
 
-/// Looks for the photos `names` below `bases` and returns the path of each that is there.
+/// Looks for the photos `names` below `bases` and returns the path of each photo that exists.
 ///
-/// A name may be written on another machine: with backslashes, without its extension or with that in other letters, below a
-/// folder that isn't here, or in `images` where only `images_2`, `images_4` or `images_8` are. All names are taken in one way:
-/// the first by which two photos are found, without any two names being one photo.
+/// A name may come from another machine: with backslashes, without its extension or with one in different case, below a folder that
+/// doesn't exist here, or in `images` when only `images_2`, `images_4` or `images_8` exists. One rule applies to all names: the
+/// first that finds two photos without mapping different names to the same photo.
 pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
     let deepest = names.iter().map(|name| parts(name).count()).max().unwrap_or(0);
     let reductions = || std::iter::once(None).chain(REDUCED.map(Some));
@@ -49,7 +50,7 @@ pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathB
     best.1
 }
 
-/// The name with the separator of every system but one.
+/// Returns the name with `/` as the separator.
 pub(super) fn portable(name: &str) -> String {
     name.replace('\\', "/")
 }
@@ -79,7 +80,7 @@ impl Rule<'_> {
     }
 }
 
-/// The file at `path`, or the photo that is called so but for its extension's case, or for an extension that is left out.
+/// Returns the file at `path`, or the photo whose name differs only in the case of its extension or has an additional extension.
 fn file_at(path: PathBuf) -> Option<PathBuf> {
     if path.is_file() {
         return Some(path);
@@ -101,7 +102,7 @@ fn file_at(path: PathBuf) -> Option<PathBuf> {
 mod tests {
     use super::*;
 
-    /// What is found of `names` in a folder with `files`, below it.
+    /// Returns the paths, relative to a folder with `files`, that are found for `names`.
     fn found(files: &[&str], names: &[&str]) -> Vec<Option<String>> {
         let folder = tempfile::tempdir().unwrap();
         for file in files {
@@ -139,7 +140,7 @@ mod tests {
         let names = ["images/1/a.png", "images/1/b.png"];
         let reduced = ["images_8/1/a.png", "images_8/1/b.png", "images_4/1/a.png", "images_4/1/b.png"];
         assert_eq!(found(&reduced, &names), all(&reduced[2..]));
-        // One that was weeded out isn't taken from another folder.
+        // A photo that was removed from one folder isn't taken from another.
         let files = ["images/a.png", "images/b.png", "images_2/a.png", "images_2/b.png", "images_2/c.png"];
         let names = ["images/a.png", "images/b.png", "images/c.png"];
         assert_eq!(found(&files, &names), [all(&names[..2]), vec![None]].concat());

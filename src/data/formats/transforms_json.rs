@@ -1,7 +1,7 @@
-//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with
-//! OpenGL axes}]}, and of the lens, for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x`
-//! and `camera_angle_y` in radians, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes have a file of
-//! this kind for each part.
+//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with OpenGL
+//! axes}]}, and lens parameters for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x` and
+//! `camera_angle_y` in radians, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes have a file of
+//! this kind for each split.
 
 use super::json::null_for_not_a_number;
 use super::natural::natural_order;
@@ -18,31 +18,33 @@ use std::collections::HashSet;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
-/// By which a capture of this format is recognized.
+/// File name that identifies a capture of this format.
 const FILE_NAME: &str = "transforms.json";
 
-/// Files of NeRF's synthetic scenes: views to learn from, and those that are judged, of which the first that is there counts.
+/// Files of NeRF's synthetic scenes: training views, and test views, of which the first existing file is used.
 const TRAIN_FILE: &str = "transforms_train.json";
 const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 
-/// nerfstudio's lists of photos to learn from, and of those that are judged, of which the first that is there counts.
+/// nerfstudio's lists of training photos, and of test photos, of which the first existing list is used.
 const TRAIN_LIST: &str = "train_filenames";
 const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
 
-/// Lenses that [`Distortion`] describes.
+/// Names of the lenses that [`Distortion`] describes.
 const CAMERA_MODELS: [&str; 6] =
     ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", FULL_OPENCV];
 
-/// The lens whose k4 to k6 are a denominator.
+/// Name of the lens model whose k4 to k6 form a denominator.
 const FULL_OPENCV: &str = "FULL_OPENCV";
 
-/// Keys that together say one thing of a frame's lens: where a frame has one of them, those that all frames share don't count.
+/// Groups of keys that together describe one property of a frame's lens. If a frame has one key of a group, the keys shared by all
+/// frames are ignored for this group.
 const FAMILIES: [&[&str]; 2] = [
     &["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"],
     &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params"],
 ];
 
-/// A folder with a `transforms.json`, or with a `transforms_train.json` and others, or a file `transforms….json`.
+/// Recognizes a folder with a `transforms.json`, or with a `transforms_train.json` and optional test files, or a file
+/// `transforms….json`.
 pub(super) fn find(path: &Path) -> Option<Found> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
@@ -76,7 +78,7 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let (frames, changes, lists) = read_frames(file, purpose)?;
     let new = |frames| Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose);
     let Lists { train, test, unread } = lists;
-    // A path of cameras is all of them, in their order.
+    // A camera path consists of all frames in order.
     if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
         return new(frames);
     }
@@ -96,18 +98,18 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
         .with_warnings(warnings.into_iter().collect()))
 }
 
-/// The name of a photo without what lists may write in another way.
+/// Normalizes the name of a photo, which lists may write in several ways.
 fn listed(name: &str) -> String {
     portable(name).trim_start_matches("./").to_owned()
 }
 
 /// Names of photos in nerfstudio's lists.
 struct Lists {
-    /// To learn from, where there is such a list.
+    /// Training photos, if there is such a list.
     train: Option<HashSet<String>>,
-    /// To be judged.
+    /// Test photos.
     test: HashSet<String>,
-    /// For validation, where others are judged.
+    /// Validation photos, if there are also test photos.
     unread: HashSet<String>,
 }
 
@@ -133,8 +135,8 @@ fn root(file: &Path) -> &Path {
     file.parent().unwrap_or(Path::new("."))
 }
 
-/// Reads the frames that `file` describes, in the order of their names, numbers in them by value. Those whose image isn't there are
-/// left out, as nerfstudio and instant-ngp do: photos are weeded out after the poses were found.
+/// Reads the frames that `file` describes, ordered by name, with numbers in names compared by value. Frames with a missing image
+/// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed.
 fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
     let text = read_text(file)?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
@@ -167,7 +169,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
     Ok((frames, changes, Lists::read(file, &json)?))
 }
 
-/// What stands in the file, for an error.
+/// Describes a value of the file for an error message.
 pub(super) fn shown(value: Option<&Value>) -> String {
     match value {
         None => "absent".into(),
@@ -178,19 +180,19 @@ pub(super) fn shown(value: Option<&Value>) -> String {
     }
 }
 
-/// The pose of 16 numbers, row by row, with OpenCV axes: OpenGL's y looks up and its z backward, so those two columns change
-/// sign.
+/// Returns the pose of 16 numbers, row by row, converted to OpenCV axes. OpenGL's y axis points up and its z axis backward, so
+/// those two columns change sign.
 pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
     let opengl = DMat4::from_cols_array(entries).transpose();
     opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
 }
 
-/// Whether `value` names the lens `model`.
+/// Returns `true` if `value` names the lens `model`.
 fn is_model(value: &Value, model: &str) -> bool {
     value.as_str().is_some_and(|value| value.eq_ignore_ascii_case(model))
 }
 
-/// A frame's fields, each its own or else the one shared by all.
+/// Fields of a frame, each either its own or the one shared by all frames.
 struct Fields<'a> {
     file: &'a Path,
     index: usize,
@@ -200,7 +202,7 @@ struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// The value, and what to call it.
+    /// Returns the value, and its name for error messages.
     fn find(&self, key: &str) -> Option<(&'a Value, String)> {
         if let Some(value) = self.frame.get(key) {
             return Some((value, self.name(key)));
@@ -223,7 +225,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// A number of pixels.
+    /// Reads a number of pixels.
     fn size(&self, key: &str) -> Result<Option<u32>> {
         match self.number(key)? {
             None => Ok(None),
@@ -234,7 +236,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// The focal length in pixels that goes with an angle of view over `size` pixels: size / (2 tan(angle/2)).
+    /// Computes the focal length in pixels from an angle of view over `size` pixels: size / (2 tan(angle/2)).
     fn focal_from_angle(&self, key: &str, size: u32) -> Result<Option<f64>> {
         match self.number(key)? {
             None => Ok(None),
@@ -243,7 +245,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// That the value of `key`, which is there, is `found`.
+    /// Returns an error that reports the existing value `found` of `key`.
     fn refuse(&self, key: &str, found: impl std::fmt::Display, expected: &str) -> Error {
         let name = self.find(key).map_or(key.to_string(), |(_, name)| name);
         Error::input(self.file, name, found, expected)
@@ -278,8 +280,8 @@ impl<'a> Fields<'a> {
         Ok(Frame { photo: Photo::File(image), name: portable(name), camera, distortion })
     }
 
-    /// A focal length that isn't given follows from the angle of view, and else equals that of the other axis; a principal
-    /// point that isn't given is the image's centre.
+    /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of
+    /// the other axis. A missing principal point is the image centre.
     fn intrinsics(&self, width: u32, height: u32) -> Result<Intrinsics> {
         let focal = |length: &str, angle: &str, size: u32| match self.number(length)? {
             Some(focal) => Ok(Some(focal)),
@@ -340,7 +342,7 @@ impl<'a> Fields<'a> {
         Ok(())
     }
 
-    /// `transform_matrix` with OpenCV axes, and the factor that was taken out of its rotation.
+    /// Returns `transform_matrix` with OpenCV axes, and the scale factor that was removed from its rotation.
     fn c2w(&self) -> Result<(DMat4, f64)> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");

@@ -1,4 +1,4 @@
-//! Scenes that can't be trained on: counted, skipped, and refused when there are too many of them.
+//! Bookkeeping of scenes that can't be trained on. They are counted and skipped; too many of them are an error.
 
 use super::order::Place;
 use crate::error::{Error, Result};
@@ -7,44 +7,44 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Mutex;
 
-/// What is wrong with a scene.
+/// Kind of defect of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Fault {
-    /// The file that it lies in, together with others.
+    /// The file that holds the scene together with others is broken.
     Group,
-    /// Its cameras, or anything else that all its views share.
+    /// The cameras, or anything else that all views of the scene share, are broken.
     Scene,
-    /// Shorter than the shortest window.
+    /// The scene is shorter than the shortest window.
     Short,
-    /// An image.
+    /// An image is broken.
     Image,
 }
 
 /// Scenes that were skipped so far, each counted once.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct BadData {
-    /// Of these.
+    /// Number of all scenes, skipped or not.
     pub scenes: u64,
-    /// In files that can't be read.
+    /// Number of scenes in files that can't be read.
     pub in_broken_files: u64,
-    /// With cameras that can't be used.
+    /// Number of scenes with cameras that can't be used.
     pub broken: u64,
-    /// Shorter than the shortest window.
+    /// Number of scenes shorter than the shortest window.
     pub too_short: u64,
-    /// With images that can't be read.
+    /// Number of scenes with images that can't be read.
     pub with_broken_images: u64,
-    /// What was wrong with the first of them that was more than too short.
+    /// Error of the first skipped scene that wasn't merely too short.
     pub first: Option<String>,
 }
 
 impl BadData {
-    /// Scenes that were skipped.
+    /// Returns the number of skipped scenes.
     pub fn total(&self) -> u64 {
         self.in_broken_files + self.broken + self.too_short + self.with_broken_images
     }
 }
 
-/// One line.
+/// Formats the counts in one line.
 impl fmt::Display for BadData {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let kinds = [
@@ -63,7 +63,7 @@ impl fmt::Display for BadData {
     }
 }
 
-/// Scenes that were found bad together, for other processes to count.
+/// Bad scenes found together, sent to other processes to be counted there.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct News {
     fault: Fault,
@@ -71,7 +71,7 @@ pub(crate) struct News {
     why: String,
 }
 
-/// Keeps [`BadData`] for all threads.
+/// Collects [`BadData`] from all threads.
 #[derive(Debug)]
 pub(super) struct Ledger {
     largest_share: f64,
@@ -82,18 +82,18 @@ pub(super) struct Ledger {
 struct Entries {
     counts: BadData,
     seen: BTreeSet<Place>,
-    /// What was wrong with the last one that was found.
+    /// Error of the most recent bad scene.
     last: Option<String>,
-    /// What was found here since somebody asked.
+    /// Bad scenes found by this process since the last [`Ledger::take_news`].
     news: Vec<News>,
 }
 
-/// One line.
+/// Formats the counts and the last error in one line.
 impl fmt::Display for Entries {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{}", self.counts)?;
         match &self.last {
-            // Of broken ones the first is named.
+            // The counts already include the first error of a broken scene.
             Some(last) if self.counts.first.is_none() => write!(f, "; the last: {last}"),
             _ => Ok(()),
         }
@@ -101,16 +101,16 @@ impl fmt::Display for Entries {
 }
 
 impl Ledger {
-    /// For `scenes`, of which `largest_share` may be bad.
+    /// Creates a ledger for `scenes` scenes, of which the share `largest_share` may be bad.
     pub fn new(scenes: u64, largest_share: f64) -> Self {
         let counts = BadData { scenes, ..Default::default() };
         Ledger { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
     }
 
-    /// Counts `places`, once each.
+    /// Counts `places` as bad, once each.
     ///
     /// # Errors
-    /// Too many.
+    /// Fails if too many scenes are bad.
     pub fn add(
         &self,
         fault: Fault,
@@ -122,16 +122,16 @@ impl Ledger {
         if places.is_empty() {
             return Ok(());
         }
-        // Decoders break lines.
+        // Decoders' messages contain line breaks.
         let news = News { fault, places, why: why.to_string().replace('\n', " ") };
         entries.news.push(news.clone());
         self.count(&mut entries, news)
     }
 
-    /// Counts what another process has found.
+    /// Counts scenes that another process found.
     ///
     /// # Errors
-    /// Too many.
+    /// Fails if too many scenes are bad.
     pub fn hear(&self, news: News) -> Result<()> {
         self.count(&mut self.entries.lock().expect("no thread panics here"), news)
     }
@@ -167,7 +167,7 @@ impl Ledger {
         std::mem::take(&mut self.entries.lock().expect("no thread panics here").news)
     }
 
-    /// That there is nothing left.
+    /// Returns the error for the case that no usable scene is left.
     pub fn exhausted(&self) -> Error {
         let entries = self.entries.lock().expect("no thread panics here");
         Error::Failed(format!("no scene can be trained on: {entries}"))

@@ -1,5 +1,5 @@
-//! Threads that read, decode, resize and augment ahead of training. Sample i depends on the seed and i alone: every thread
-//! makes each T-th sample, and they are taken from the threads by turns.
+//! Loader threads that read, decode, resize and augment samples ahead of training. Sample i depends on the seed and i alone. Each
+//! of T threads produces every T-th sample, and samples are taken from the threads in turn.
 
 use super::bad_data::{BadData, Fault, Ledger, News};
 use super::open_groups::{OpenGroups, Opened};
@@ -29,37 +29,37 @@ use std::thread::JoinHandle;
 use std::time::Instant;
 use tch::Device;
 
-/// Far end of a frustum in units of the capture: these data sets have no metric scale (spec 2.3).
+/// Far plane of a frustum in units of the capture: these datasets have no metric scale (spec 2.3).
 const FAR: f64 = 4. * 10.;
 
-/// Delivers samples in order.
+/// Source of training samples, delivered in order.
 #[derive(Debug)]
 pub struct Loader {
     shared: Arc<Shared>,
     receivers: Vec<Receiver<Result<LoadedScene>>>,
     threads: Vec<JoinHandle<()>>,
     part: Part,
-    /// The number of the sample that all others come after.
+    /// Index of the first sample.
     first: u64,
-    /// How many the threads have given.
+    /// Number of samples taken from the threads.
     taken: u64,
     upload: Option<Upload>,
     ahead: Option<Ahead>,
 }
 
-/// A batch that was sent ahead.
+/// A prefetched batch.
 #[derive(Debug)]
 struct Ahead {
-    /// The number of its first sample.
+    /// Index of its first sample.
     first: u64,
-    /// What could not be sent is told when its turn comes.
+    /// Sample that is being copied, or the loading error to return when the batch is requested.
     sample: Result<ComingSample>,
 }
 
-/// Decoded photos by place and view.
+/// Decoded photos by scene and view.
 type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
 
-/// What all threads work with.
+/// State shared by all threads.
 #[derive(Debug)]
 struct Shared {
     config: DataConfig,
@@ -67,12 +67,12 @@ struct Shared {
     order: Order,
     groups: OpenGroups,
     ledger: Ledger,
-    /// Where there is memory for all of them.
+    /// Photo cache, if there is memory for all photos.
     photos: Option<Mutex<DecodedPhotos>>,
     stopped: AtomicBool,
 }
 
-/// What a thread keeps from photo to photo.
+/// Per-thread state that is reused from photo to photo.
 #[derive(Debug, Default)]
 struct Tools {
     resampler: Resampler,
@@ -81,11 +81,11 @@ struct Tools {
 }
 
 impl Loader {
-    /// Begins to load `scenes`: of every step `part`, of which a number stands for whole steps of so many samples. The first step
-    /// begins with sample `first`.
+    /// Starts to load the samples of `scenes` that belong to `part` of every step. A number as `part` stands for whole steps of
+    /// that many samples. The first step begins with sample `first`.
     ///
     /// # Errors
-    /// No scenes, or threads that can't be had.
+    /// Fails if there are no scenes, or if a thread can't be started.
     pub fn start(
         config: &DataConfig,
         seed: u64,
@@ -118,7 +118,7 @@ impl Loader {
         let (receivers, spawned) = (vec![], vec![]);
         let mut loader =
             Loader { shared, receivers, threads: spawned, part, first, taken: 0, upload: None, ahead: None };
-        // A thread holds a sample in its hands while its queue is full.
+        // A thread holds one more sample while its queue is full.
         let queue = config.ahead.div_ceil(threads).saturating_sub(1).max(1);
         for thread in 0..threads as u64 {
             let (sender, receiver) = sync_channel(queue);
@@ -129,7 +129,7 @@ impl Loader {
             let work = move || {
                 let mut tools = Tools::default();
                 for (sample, step) in turns {
-                    // Nobody listens any more when the loader is gone.
+                    // Nobody receives samples once the loader is dropped.
                     if shared.stopped.load(Ordering::Relaxed) {
                         return;
                     }
@@ -152,31 +152,31 @@ impl Loader {
         Ok(loader)
     }
 
-    /// Threads that load.
+    /// Returns the number of loader threads.
     pub fn threads(&self) -> usize {
         self.threads.len()
     }
 
-    /// The number of the next sample; one that was sent ahead is still to come.
+    /// Returns the index of the next sample. A prefetched batch counts as not delivered.
     pub fn position(&self) -> u64 {
         self.ahead.as_ref().map_or(self.next(), |ahead| ahead.first)
     }
 
-    /// The number of the sample that the threads give next.
+    /// Returns the index of the sample that the threads deliver next.
     fn next(&self) -> u64 {
         self.part.sample(self.first, self.taken)
     }
 
-    /// The next sample.
+    /// Returns the next sample.
     ///
     /// # Errors
-    /// More bad data than the configuration allows.
+    /// Fails if there is more bad data than the configuration allows.
     ///
     /// # Panics
-    /// It was sent ahead, for [`Loader::next_batch`] to hand out.
+    /// Panics if the next samples were prefetched for [`Loader::next_batch`].
     pub fn next_scene(&mut self) -> Result<LoadedScene> {
         assert!(self.ahead.is_none(), "the next samples were sent ahead");
-        // Thread t made the t-th sample, whatever its number is.
+        // Thread t produced the t-th sample, whatever its index.
         let turn = self.receivers.len();
         let receiver = &self.receivers[0];
         let scene = receiver.recv().map_err(|_| Error::Failed("a loading thread has ended".into()))??;
@@ -185,10 +185,10 @@ impl Loader {
         Ok(scene)
     }
 
-    /// The next `batch` samples side by side: those that were sent ahead, if any were.
+    /// Returns the next `batch` samples as one batch: the prefetched ones, if any.
     ///
     /// # Errors
-    /// As [`Loader::next_scene`].
+    /// Fails like [`Loader::next_scene`].
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
         match self.ahead.take() {
             Some(ahead) => Ok(ahead.sample?.arrive()),
@@ -199,8 +199,8 @@ impl Loader {
         }
     }
 
-    /// Begins to bring the next `batch` samples to `device`, for [`Loader::next_batch`] to hand out, which is asked for the same.
-    /// A GPU copies them while it works; to the CPU nothing has to be brought.
+    /// Starts to copy the next `batch` samples to `device`, for the next [`Loader::next_batch`], which must get the same arguments.
+    /// A GPU copies them while it computes. On the CPU nothing has to be copied.
     pub fn send_ahead(&mut self, batch: usize, device: Device) {
         if self.ahead.is_none() {
             let first = self.next();
@@ -215,25 +215,25 @@ impl Loader {
         (0..count).map(|_| self.next_scene()).collect()
     }
 
-    /// What was skipped so far, with what is ready ahead.
+    /// Returns the scenes skipped so far, including those skipped while prefetching.
     pub fn bad_data(&self) -> BadData {
         self.shared.ledger.counts()
     }
 
-    /// What was skipped since this was asked last, for those that load other parts of the same steps.
+    /// Returns the bad scenes found since the last call, for the processes that load other parts of the same steps.
     pub(crate) fn take_news(&self) -> Vec<News> {
         self.shared.ledger.take_news()
     }
 
-    /// Whether there is something to be told by [`Loader::take_news`].
+    /// Returns `true` if [`Loader::take_news`] would return anything.
     pub(crate) fn has_news(&self) -> bool {
         self.shared.ledger.has_news()
     }
 
-    /// Counts what others have skipped.
+    /// Counts scenes that other processes skipped.
     ///
     /// # Errors
-    /// More bad data, with theirs, than the configuration allows.
+    /// Fails if there is more bad data, including theirs, than the configuration allows.
     pub(crate) fn hear(&self, news: Vec<News>) -> Result<()> {
         news.into_iter().try_for_each(|news| self.shared.ledger.hear(news))
     }
@@ -244,15 +244,15 @@ impl Drop for Loader {
         self.shared.stopped.store(true, Ordering::Relaxed);
         self.receivers.clear();
         for thread in self.threads.drain(..) {
-            // What it panicked with was sent already.
+            // A panic was already sent as an error.
             let _ = thread.join();
         }
     }
 }
 
 impl Shared {
-    /// Sample number `sample`, of step `step`: the scene whose turn it is. In place of one that is bad stands another of its group, or else
-    /// of the groups that come next.
+    /// Loads sample `sample` of step `step`: the scene whose turn it is. A bad scene is replaced by another one of its group, or of
+    /// the following groups if the group has no usable scene.
     fn load(&self, sample: u64, step: u64, tools: &mut Tools) -> Result<LoadedScene> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
@@ -278,7 +278,7 @@ impl Shared {
             }
             let mut shuffled = usize::from(group == first.group);
             for turn in 0..turns.len() {
-                // Scenes are drawn only once they are needed: the first one is almost always good.
+                // The other scenes are shuffled only when needed: the first one is almost always good.
                 if turn == shuffled {
                     turns[turn..].shuffle(&mut random);
                     shuffled = usize::MAX;
@@ -364,8 +364,8 @@ impl Shared {
     }
 }
 
-/// `cameras` in the world that context and target views give together, a view that is both counted twice, and how far their
-/// frusta reach.
+/// Returns `cameras` in the world coordinates normalized over context and target views together, where a view that is both counts
+/// twice, and the distance of the far plane of their frusta.
 fn normalized(cameras: Vec<Camera>, context: &[usize], target: &[usize]) -> Result<(Vec<Camera>, f64)> {
     let positions: Vec<usize> = context.iter().chain(target).copied().collect();
     let poses: Vec<_> = positions.iter().map(|&position| cameras[position].c2w).collect();

@@ -1,4 +1,4 @@
-//! What makes samples of captures, ahead of training: which scenes, which views, on which thread.
+//! Loading of training samples from captures, ahead of training: choice of scenes and views, and the loader threads.
 
 mod bad_data;
 mod loader;
@@ -17,5 +17,5 @@ pub use sample::Sample;
 pub use scene::{LoadTimes, LoadedScene};
 pub use scenes::{SceneGroups, TrainingScenes};
 
-// For processes that tell each other.
+// Exchanged between processes.
 pub(crate) use bad_data::News;

@@ -1,29 +1,29 @@
-//! The groups that are open, shared by all threads: each is read once, by the thread that comes first.
+//! Cache of open groups, shared by all threads. The first thread that needs a group reads it.
 
 use super::scenes::SceneGroups;
 use crate::data::capture::Capture;
 use crate::error::Result;
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// Groups that stay open when no thread works with them: those of a change from one to the next, and one more.
+/// Number of groups that stay open while no thread uses them: two for a transition from one group to the next, and one more.
 const KEPT: usize = 3;
 
-/// A group, or why there is none.
+/// A group, or the reason why it can't be opened.
 #[derive(Debug)]
 pub(super) enum Opened {
     Scenes(Vec<Result<Capture>>),
     Broken(String),
 }
 
-/// Keeps the groups that were opened last.
+/// Holds the most recently used groups.
 #[derive(Debug)]
 pub(super) struct OpenGroups {
     source: Arc<dyn SceneGroups>,
-    /// The last used at the end.
+    /// Groups ordered by last use, the most recent one last.
     kept: Mutex<Vec<(usize, Slot)>>,
 }
 
-/// Filled by the first thread that needs it; the others wait.
+/// Slot that the first thread fills while the others wait.
 type Slot = Arc<OnceLock<Arc<Opened>>>;
 
 impl OpenGroups {

@@ -1,24 +1,24 @@
-//! In which order scenes are shown. Every epoch shows every scene once, group after group, so that what lies in one file is
-//! read together; the place of a sample follows from its number alone (spec 8.1).
+//! Order in which scenes are trained on. Every epoch visits every scene once, group after group, so that scenes in one file are
+//! read together. The scene of a sample follows from the sample's index alone (spec 8.1).
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Sets the order's random numbers apart from those of the samples.
+/// Seed modifier that separates the order's random numbers from those of the samples.
 const ORDER_KEY: u64 = 0x6f72_6465_725f_6f66;
 
-/// A scene's place in the data: its group, and its position in that.
+/// Location of a scene in the data: the index of its group, and its index in that group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Place {
-    /// The group.
+    /// Index of the group.
     pub group: usize,
-    /// The scene in it.
+    /// Index of the scene in the group.
     pub scene: usize,
 }
 
-/// A random order of groups of scenes, another one in every epoch.
+/// A random order of groups of scenes that changes with every epoch.
 #[derive(Debug, Clone)]
 pub struct Order {
     sizes: Vec<usize>,
@@ -27,19 +27,19 @@ pub struct Order {
 }
 
 impl Order {
-    /// `sizes` are the groups' numbers of scenes, at least one of them above 0.
+    /// Creates an order of groups with `sizes` scenes each. At least one size must be above 0.
     pub fn new(sizes: Vec<usize>, seed: u64) -> Self {
         let scenes = sizes.iter().sum::<usize>() as u64;
         assert!(scenes > 0, "an order of nothing");
         Order { sizes, scenes, seed }
     }
 
-    /// Scenes of an epoch.
+    /// Returns the number of scenes of an epoch.
     pub fn scenes(&self) -> u64 {
         self.scenes
     }
 
-    /// Whose turn it is at `sample`, and the groups of its epoch from there on, each of them once.
+    /// Returns the scene of `sample`, and the groups of its epoch from there on, each of them once.
     pub fn turn(&self, sample: u64) -> (Place, Vec<usize>) {
         let (epoch, mut position) = (sample / self.scenes, (sample % self.scenes) as usize);
         let mut groups = self.shuffled(self.sizes.len(), epoch, 0);
@@ -54,12 +54,12 @@ impl Order {
         (Place { group, scene }, groups)
     }
 
-    /// The group's number of scenes.
+    /// Returns the number of scenes of the group.
     pub fn size(&self, group: usize) -> usize {
         self.sizes[group]
     }
 
-    /// 0 to `count` in a random order of `epoch`; `what` sets the orders of one epoch apart.
+    /// Returns 0 to `count` (exclusive) in a random order of `epoch`. `what` distinguishes the orders of one epoch.
     fn shuffled(&self, count: usize, epoch: u64, what: u64) -> Vec<usize> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed ^ ORDER_KEY);
         random.set_stream(epoch << 32 | what);

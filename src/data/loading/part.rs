@@ -1,36 +1,36 @@
-//! Which samples of every step a process loads.
+//! Partition of the samples of a step among processes.
 
-/// One of equal parts of every step. The parts of a step together are the samples that a process alone would load.
+/// One of the equal parts of every step. Together, the parts of a step are the samples that a single process would load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Part {
-    /// Samples of a step in this part.
+    /// Number of samples of a step in this part.
     pub batch: usize,
-    /// Which part it is, from 0.
+    /// Index of this part, starting at 0.
     pub number: usize,
-    /// Of so many.
+    /// Number of parts.
     pub parts: usize,
 }
 
 impl Part {
-    /// Samples of a step in all parts.
+    /// Returns the number of samples of a step in all parts.
     pub fn of_step(self) -> u64 {
         (self.batch * self.parts) as u64
     }
 
-    /// The number of the sample that comes in this part's turn `turn`, of steps from sample `first` on.
+    /// Returns the index of this part's sample number `turn`, where the first step begins with sample `first`.
     pub fn sample(self, first: u64, turn: u64) -> u64 {
         let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
         first + step * self.of_step() + (self.batch * self.number) as u64 + within
     }
 
-    /// The number of that turn's step, by the sample that it begins with: the same for all of its samples, wherever a run goes on with
-    /// another number of them.
+    /// Returns the index of the step of sample number `turn`, computed from the step's first sample. All samples of a step get the
+    /// same index, even if a resumed run uses another batch size.
     pub(super) fn step(self, first: u64, turn: u64) -> u64 {
         (first + turn / self.batch as u64 * self.of_step()) / self.of_step()
     }
 }
 
-/// Whole steps of so many samples.
+/// Converts a batch size to whole steps of that many samples.
 impl From<usize> for Part {
     fn from(batch: usize) -> Self {
         Part { batch, number: 0, parts: 1 }
@@ -45,7 +45,7 @@ mod tests {
     fn all_samples_of_a_step_know_it() {
         let whole = Part::from(6);
         assert_eq!((0..12).map(|turn| whole.step(12, turn)).collect::<Vec<_>>(), [[2; 6], [3; 6]].concat());
-        // Begun where steps of 4 ended.
+        // Resumed after steps of 4 samples.
         assert_eq!((0..12).map(|turn| whole.step(8, turn)).collect::<Vec<_>>(), [[1; 6], [2; 6]].concat());
         for number in 0..3 {
             let part = Part { batch: 2, number, parts: 3 };

@@ -1,4 +1,4 @@
-//! What a training step looks at, as tensors.
+//! Samples: the views of a training step as tensors.
 
 use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
@@ -6,31 +6,31 @@ use crate::data::pixels::CHANNELS;
 use crate::device::{Upload, Uploading};
 use tch::{Device, Kind, Tensor};
 
-/// The largest value of a byte.
+/// Largest value of a byte.
 const LEVELS: f32 = 255.;
 
-/// The views of one training step, B scenes.
+/// Views of one training step for B scenes.
 #[derive(Debug)]
 pub struct Sample {
-    /// The scenes', B.
+    /// Names of the B scenes.
     pub names: Vec<String>,
-    /// What the model sees.
+    /// Context views, the input of the model.
     pub context: ViewBatch,
-    /// What its pictures are compared with.
+    /// Target views, which renderings are compared with.
     pub target: ViewBatch,
-    /// Far end of the input views' frusta in each normalized scene, `[B]`.
+    /// Far plane of the context views' frusta in each normalized scene, `[B]`.
     pub far: Tensor,
-    /// Whether the second half of the batch is the first half's scenes again, seen through other photos.
+    /// `true` if the second half of the batch repeats the scenes of the first half with other context views.
     pub paired: bool,
 }
 
 impl Sample {
-    /// `scenes` with equally many views of one size, side by side.
+    /// Builds a batch of `scenes`, which must have equally many views of one size.
     pub fn of(scenes: &[LoadedScene], device: Device) -> Self {
         Sample::by(scenes, &Upload::to(device))
     }
 
-    /// The same by a way that is kept for more of them.
+    /// Builds a batch like [`Sample::of`], reusing an existing [`Upload`].
     pub(crate) fn by(scenes: &[LoadedScene], upload: &Upload) -> Self {
         match upload.device() {
             Device::Cpu => Sample::on_host(scenes, floats),
@@ -38,7 +38,7 @@ impl Sample {
         }
     }
 
-    /// With the images that `images` makes of those that are chosen, of the shape that it is told.
+    /// Builds a batch on the CPU. `images` makes a tensor of the given shape from the pixel bytes of the chosen images.
     fn on_host(scenes: &[LoadedScene], images: impl Fn(&[&[u8]], &[i64]) -> Tensor) -> Self {
         let far: Vec<f64> = scenes.iter().map(|scene| scene.far).collect();
         let batch = |chosen: fn(&LoadedScene) -> &[usize]| {
@@ -58,7 +58,7 @@ impl Sample {
         }
     }
 
-    /// Every scene twice, along the batch: first with the context views at `subsets[0]`, then with those at `subsets[1]`.
+    /// Returns every scene twice, along the batch dimension: first with the context views `subsets[0]`, then with `subsets[1]`.
     pub fn paired(&self, subsets: &[Vec<usize>; 2]) -> Self {
         let twice = |batch: &ViewBatch| ViewBatch::stack(&[batch, batch]);
         Sample {
@@ -70,12 +70,12 @@ impl Sample {
         }
     }
 
-    /// Scenes, those of a paired sample counted twice.
+    /// Returns the number of scenes. Scenes of a paired sample count twice.
     pub fn scenes(&self) -> usize {
         self.far.size()[0] as usize
     }
 
-    /// `count` scenes from `first` on, or as many as there are, of a sample that isn't paired.
+    /// Returns up to `count` scenes starting at `first`. The sample must not be paired.
     pub fn slice(&self, first: usize, count: usize) -> Self {
         let count = count.min(self.scenes() - first);
         let names = self.names[first..first + count].to_vec();
@@ -89,15 +89,15 @@ impl Sample {
         }
     }
 
-    /// Photos that the model sees of every scene.
+    /// Returns the number of context views per scene.
     pub fn context_views(&self) -> usize {
         self.context.images.size()[1] as usize
     }
 }
 
-/// A sample on its way to a device.
+/// A sample that is being copied to a device.
 ///
-/// Images travel as bytes, and become floats where they arrive.
+/// Images are copied as bytes and converted to floats on the device.
 #[derive(Debug)]
 pub(super) struct ComingSample {
     names: Vec<String>,
@@ -105,7 +105,7 @@ pub(super) struct ComingSample {
 }
 
 impl ComingSample {
-    /// What [`Sample::of`] makes of `scenes`.
+    /// Starts to copy the batch that [`Sample::of`] builds from `scenes`.
     pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Self {
         let Sample { names, context, target, far, .. } =
             Sample::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
@@ -113,7 +113,7 @@ impl ComingSample {
         ComingSample { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
     }
 
-    /// The sample on the device.
+    /// Waits for the copies and returns the sample on the device.
     pub fn arrive(self) -> Sample {
         let [a, b, c, d, e, f, g, h, far] = self.tensors.arrive();
         let in_floats = |bytes: Tensor| {
@@ -127,7 +127,7 @@ impl ComingSample {
     }
 }
 
-/// The chosen images of all scenes, scene by scene, and the shape that they have together, [B, V, 3, H, W].
+/// Returns the chosen images of all scenes, scene by scene, and their common shape `[B, V, 3, H, W]`.
 fn chosen_images(scenes: &[LoadedScene], chosen: fn(&LoadedScene) -> &[usize]) -> (Vec<&[u8]>, [i64; 5]) {
     let (size, views) = (scenes[0].size, chosen(&scenes[0]).len());
     let shape = [scenes.len(), views, CHANNELS, size.height as usize, size.width as usize];
@@ -138,16 +138,16 @@ fn chosen_images(scenes: &[LoadedScene], chosen: fn(&LoadedScene) -> &[usize]) -
     (images, shape.map(|n| n as i64))
 }
 
-/// The scene's image at `position`, of so many bytes.
+/// Returns the scene's image at `position`; each image has `bytes` bytes.
 fn image(scene: &LoadedScene, position: usize, bytes: usize) -> &[u8] {
     &scene.images[position * bytes..][..bytes]
 }
 
-/// `images` one after the other in `memory`, bytes of the host.
+/// Copies `images` one after the other into `memory`, a byte tensor on the CPU.
 fn bytes(images: &[&[u8]], memory: Tensor) -> Tensor {
     let image_bytes = images[0].len();
     assert_eq!(memory.numel(), images.len() * image_bytes, "scenes of one kind");
-    // SAFETY: a new contiguous tensor in the CPU's memory holds as many bytes, and nobody else knows it yet.
+    // SAFETY: `memory` is a new contiguous tensor in CPU memory with exactly this many bytes, and nothing else refers to it yet.
     let places = unsafe { std::slice::from_raw_parts_mut(memory.data_ptr().cast::<u8>(), memory.numel()) };
     for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
         place.copy_from_slice(image);
@@ -155,13 +155,14 @@ fn bytes(images: &[&[u8]], memory: Tensor) -> Tensor {
     memory
 }
 
-/// `images` in [0, 1], made in one pass into the tensor's own memory and without libtorch's threads, which would wait for each
-/// other, spinning, wherever loading keeps all cores busy.
+/// Converts `images` to floats in [0, 1] in one pass, directly into the tensor's memory. It avoids libtorch's threads, which would
+/// spin while waiting for each other whenever loading keeps all cores busy.
 fn floats(images: &[&[u8]], shape: &[i64]) -> Tensor {
     let image_bytes = images[0].len();
     let floats = Tensor::empty(shape, (Kind::Float, Device::Cpu));
     assert_eq!(floats.numel(), images.len() * image_bytes, "scenes of one kind");
-    // SAFETY: a new contiguous tensor in the CPU's memory holds as many float32s, and nobody else knows it yet.
+    // SAFETY: `floats` is a new contiguous tensor in CPU memory with exactly this many float32 values, and nothing else refers to
+    // it yet.
     let places = unsafe { std::slice::from_raw_parts_mut(floats.data_ptr().cast::<f32>(), floats.numel()) };
     for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
         for (float, &byte) in place.iter_mut().zip(*image) {

@@ -1,4 +1,4 @@
-//! Which views of a video a training sample looks at (spec 8.2).
+//! Choice of the views of a video for a training sample (spec 8.2).
 
 use crate::data::config::{DataConfig, Sampling};
 use glam::DVec3;
@@ -6,19 +6,19 @@ use rand::seq::index;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Sets the numbers of views apart from what else is drawn.
+/// Seed modifier that separates the numbers of views from other random draws.
 const COUNT_KEY: u64 = 0x7669_6577_5f63_6e74;
 
-/// Positions in a video, ascending.
+/// Indices of chosen views in a video, ascending.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ChosenViews {
-    /// What the model sees.
+    /// Context views, the input of the model.
     pub context: Vec<usize>,
-    /// What its pictures are compared with; may be among the context.
+    /// Target views, which renderings are compared with. They may overlap the context views.
     pub target: Vec<usize>,
 }
 
-/// How many views the model sees of every scene of step `step`.
+/// Returns the number of context views of every scene in step `step`.
 pub fn context_views(config: &DataConfig, seed: u64, step: u64) -> usize {
     if config.fewest_context_views == 0 {
         return config.context_views;
@@ -28,8 +28,8 @@ pub fn context_views(config: &DataConfig, seed: u64, step: u64) -> usize {
     random.random_range(config.fewest_context_views..=config.context_views)
 }
 
-/// `context` views and the targets of a random window of a video whose cameras stand at `centres`; none where the video is shorter than the shortest
-/// window. The numbers of views are at most that window's length.
+/// Chooses `context` context views and the target views from a random window of a video with camera centres `centres`. Returns
+/// `None` if the video is shorter than the shortest window. The numbers of views must not exceed that window's length.
 pub fn choose_views(
     config: &DataConfig,
     context: usize,
@@ -61,7 +61,7 @@ fn uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usize> {
 
 fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
     let mut chosen = vec![random.random_range(0..centres.len())];
-    // Of each frame to the nearest chosen one; below 0 for those that are chosen.
+    // Squared distance of each frame to the nearest chosen one; below 0 for chosen frames.
     let mut distances = vec![f64::INFINITY; centres.len()];
     while chosen.len() < count {
         let last = chosen[chosen.len() - 1];
@@ -69,7 +69,7 @@ fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize
             *distance = distance.min(centre.distance_squared(centres[last]));
         }
         distances[last] = -1.;
-        // The first of equally far ones, so that nothing is left to the machine.
+        // Take the first of equally distant frames, so that the result is the same on every machine.
         let next = (0..centres.len()).rev().max_by(|&a, &b| distances[a].total_cmp(&distances[b]));
         chosen.push(next.expect("more frames than views"));
     }
@@ -151,7 +151,7 @@ mod tests {
             let widest = context.windows(2).map(|pair| pair[1] - pair[0]).max();
             assert!(widest <= Some(16), "{context:?}");
         }
-        // Cameras in one place are told apart all the same.
+        // Cameras at the same position must not break the choice.
         let still = choose_views(&config, 9, &[DVec3::ONE; 64], &mut random).unwrap();
         assert!(is_ascending(&still.context));
     }

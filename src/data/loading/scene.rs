@@ -1,18 +1,18 @@
-//! A scene on its way from the threads that load to the one that trains.
+//! Scenes as passed from the loader threads to the training thread.
 
 use crate::scene::{Camera, ImageSize};
 use std::ops::AddAssign;
 
-/// Seconds that a thread spent.
+/// Time in seconds that a thread spent on each part of loading.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LoadTimes {
-    /// Reading files that hold several scenes, or waiting until another thread has.
+    /// Time for reading files that hold several scenes, or for waiting until another thread has read them.
     pub read: f64,
-    /// Making pixels of encoded photos; where a photo is a file of its own, with reading it.
+    /// Time for decoding photos, including reading them if each photo is a file of its own.
     pub decode: f64,
-    /// Cropping, resizing and mirroring.
+    /// Time for cropping, resizing and mirroring.
     pub resize: f64,
-    /// Changing colours.
+    /// Time for colour jitter.
     pub augment: f64,
 }
 
@@ -28,20 +28,20 @@ impl AddAssign for LoadTimes {
 /// A scene of a training sample: N photos, each of them context, target or both.
 #[derive(Debug, Clone)]
 pub struct LoadedScene {
-    /// The capture's.
+    /// Name of the capture.
     pub name: String,
-    /// [N, 3, H, W].
+    /// 8-bit pixels, `[N, 3, H, W]`.
     pub images: Vec<u8>,
-    /// Of all images.
+    /// Size of all images.
     pub size: ImageSize,
-    /// Of the images, in the normalized world.
+    /// Cameras of the images, in normalized world coordinates.
     pub cameras: Vec<Camera>,
-    /// Which images the model sees, ascending.
+    /// Indices of the context images, ascending.
     pub context: Vec<usize>,
-    /// Which images its pictures are compared with, ascending.
+    /// Indices of the target images, which renderings are compared with, ascending.
     pub target: Vec<usize>,
-    /// Far end of the frusta in the normalized world.
+    /// Far plane of the frusta in normalized world coordinates.
     pub far: f64,
-    /// What it took.
+    /// Time spent on loading the scene.
     pub times: LoadTimes,
 }

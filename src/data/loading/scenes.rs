@@ -1,4 +1,4 @@
-//! Where scenes come from: groups that are read together.
+//! Sources of scenes: groups of scenes that are read together.
 
 use crate::data::capture::Capture;
 use crate::data::dataset::{Dataset, SceneGroup, Split};
@@ -7,22 +7,22 @@ use crate::io::Inputs;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// Scenes in groups, each of which is opened as a whole, as a file that holds several of them.
+/// Groups of scenes. Each group is opened as a whole, for example as a file that holds several scenes.
 pub trait SceneGroups: Send + Sync + fmt::Debug {
-    /// Scenes in each group.
+    /// Returns the number of scenes in each group.
     fn sizes(&self) -> Vec<usize>;
 
-    /// The scenes of `group`, in an order that is always the same, each of them or what is wrong with it.
+    /// Opens the scenes of `group` in a fixed order. Each item is a scene or the error that prevents its use.
     ///
     /// # Errors
-    /// A group that can't be read at all.
+    /// Fails if the group can't be read at all.
     fn open(&self, group: usize) -> Result<Vec<Result<Capture>>>;
 
-    /// Bytes that all photos take up when they are decoded; none where nobody knows without reading them.
+    /// Returns the number of bytes of all decoded photos, or `None` if it isn't known without reading them.
     fn decoded_bytes(&self) -> Option<u64>;
 }
 
-/// Captures that are open already, a group each.
+/// Open captures, one per group.
 impl SceneGroups for Vec<Capture> {
     fn sizes(&self) -> Vec<usize> {
         vec![1; self.len()]
@@ -43,8 +43,8 @@ fn decoded_bytes(capture: &Capture) -> u64 {
     pixels.fold(0, |sum, pixels| sum.saturating_add(pixels.saturating_mul(3)))
 }
 
-/// What a configuration names: captures, which are opened at once and kept, and the others, chunks and made-up videos, which are
-/// opened as they are needed.
+/// Scenes that a configuration names: captures, which are opened immediately and stay open, and the other groups (chunks and
+/// synthetic videos), which are opened when needed.
 #[derive(Debug)]
 pub struct TrainingScenes {
     captures: Vec<Capture>,
@@ -53,10 +53,11 @@ pub struct TrainingScenes {
 }
 
 impl TrainingScenes {
-    /// Finds them by [`Dataset::open`], where there are parts in the one that is to be learned from.
+    /// Finds the scenes with [`Dataset::open`]. If a dataset is split, the training part is used.
     ///
     /// # Errors
-    /// Nothing known at one of `paths`, or a capture that breaks its format's rules. The others aren't opened yet.
+    /// Fails if nothing of a known format is at one of `paths`, or if a capture violates its format. The other groups aren't opened
+    /// yet.
     pub fn find(paths: &[PathBuf]) -> Result<Self> {
         let mut found = TrainingScenes { captures: vec![], others: vec![], warnings: vec![] };
         for path in paths {
@@ -72,23 +73,24 @@ impl TrainingScenes {
         Ok(found)
     }
 
-    /// Returns a line for each folder that couldn't be looked into.
+    /// Returns a line for each folder that couldn't be read.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Adds the files that they are read from to `inputs`, as far as what is written below the folder `output` could be one of them.
+    /// Adds the files of the captures to `inputs`, and of the other groups the files that writing below the folder `output` could
+    /// overwrite.
     pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
         self.captures.iter().for_each(|capture| capture.add_inputs(inputs));
         self.others.iter().for_each(|group| group.add_inputs(output, inputs));
     }
 
-    /// Those that are kept.
+    /// Returns the open captures.
     pub fn captures(&self) -> &[Capture] {
         &self.captures
     }
 
-    /// The others, in chunks or made up.
+    /// Returns the other groups: chunks and synthetic videos.
     pub fn others(&self) -> &[SceneGroup] {
         &self.others
     }

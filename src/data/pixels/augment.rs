@@ -1,4 +1,4 @@
-//! What training changes about photos, the same for all views of a sample (spec 8.3 and 8.4).
+//! Geometric and colour augmentation in training, identical for all views of a sample (spec 8.3 and 8.4).
 
 use super::jitter::Jitter;
 use super::resample::{Region, Resampler};
@@ -9,24 +9,24 @@ use glam::{DMat4, DVec4};
 use image::RgbImage;
 use rand::Rng;
 
-/// A photo's part around its principal point has at least as many pixels of the photo along either side.
+/// Minimum side length, in pixels of the photo, of the usable rectangle around its principal point.
 const SMALLEST_PART: f64 = 8.;
 
-/// Drawn once for a sample.
+/// Random augmentation parameters, drawn once per sample.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Augmentation {
-    /// The part of the photo that is shown is this much smaller than it could be, 1 or more.
+    /// Factor, 1 or more, by which the visible part of the photo is smaller than the largest possible one.
     pub zoom: f64,
-    /// Where in what could be shown that part lies, from left to right and from top to bottom, 0 to 1.
+    /// Position of the visible part within the largest possible one, horizontally and vertically, from 0 to 1.
     pub shift: [f64; 2],
-    /// Whether left and right are swapped.
+    /// `true` to swap left and right.
     pub flip: bool,
-    /// Of the colours.
+    /// Colour jitter.
     pub jitter: Jitter,
 }
 
 impl Augmentation {
-    /// Within the limits that `config` sets.
+    /// Draws parameters within the limits of `config`.
     pub fn draw(config: &DataConfig, random: &mut impl Rng) -> Self {
         Augmentation {
             zoom: 1. + random.random_range(0. ..=config.extra_crop),
@@ -36,12 +36,12 @@ impl Augmentation {
         }
     }
 
-    /// The part of a photo that is shown, and the camera of an image of `size` that shows it: the largest rectangle of
-    /// `size`'s aspect whose centre is the principal point, less the extra crop. Its edges may lie inside pixels, which
-    /// resampling takes account of, so the intrinsics are exact.
+    /// Returns the visible region of a photo, and the camera of an image of `size` that shows it. The region is the largest
+    /// rectangle with `size`'s aspect ratio centred at the principal point, reduced by the extra crop. Its edges may lie inside
+    /// pixels. Resampling handles that, so the intrinsics are exact.
     ///
     /// # Errors
-    /// A principal point so near to the photo's edge that nothing is left.
+    /// Fails if the principal point is so close to the photo's edge that too little is left.
     pub fn frame(&self, camera: &Camera, size: ImageSize) -> Result<(Region, Camera)> {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let k = camera.intrinsics;
@@ -70,7 +70,7 @@ impl Augmentation {
         Ok((region, if self.flip { mirrored(&shown) } else { shown }))
     }
 
-    /// Writes what `region` of `photo` shows into `planes`, [3, H, W] of `size`, all but the colours changed.
+    /// Writes `region` of `photo` into `planes`, `[3, H, W]` at `size`, with all augmentation except colour jitter.
     pub fn show(
         &self,
         resampler: &mut Resampler,
@@ -86,7 +86,8 @@ impl Augmentation {
     }
 }
 
-/// The camera that sees the mirrored world as `camera` sees the world, mirrored: F·c2w·F with F = diag(−1, 1, 1, 1).
+/// Returns the camera whose image of the mirrored world is the mirror image of `camera`'s: its pose is F·c2w·F with F = diag(−1, 1,
+/// 1, 1).
 fn mirrored(camera: &Camera) -> Camera {
     let mirror = DMat4::from_diagonal(DVec4::new(-1., 1., 1., 1.));
     let mut intrinsics = camera.intrinsics;
@@ -115,14 +116,14 @@ mod tests {
     #[test]
     fn the_principal_point_is_in_the_middle() {
         let (region, shown) = plain().frame(&camera(), SIZE).unwrap();
-        // 170.6 pixels above and 189.4 below: 341.2 high, and by the aspect 454.93 wide.
+        // There are 170.6 pixels above and 189.4 below: the region is 341.2 high, and by the aspect ratio 454.93 wide.
         assert!((region.top - 0.).abs() < 1e-9 && (region.height - 341.2).abs() < 1e-9, "{region:?}");
         assert!((region.width - 341.2 * 128. / 96.).abs() < 1e-9);
         assert!((shown.intrinsics.cx - 64.).abs() < 1e-9 && (shown.intrinsics.cy - 48.).abs() < 1e-9);
         assert!((shown.intrinsics.fx / shown.intrinsics.fy - 500. / 510.).abs() < 1e-9);
     }
 
-    /// A bright dot on black keeps its ray in the world: found in the image by its centroid.
+    /// A bright dot on black keeps its ray in the world. The dot's position in the image is its centroid.
     #[test]
     fn what_a_pixel_sees_does_not_change() {
         let (x, y) = (300u32, 200u32);
@@ -152,7 +153,7 @@ mod tests {
             let (mut origin, mut direction) = ray(&shown, sx / weight, sy / weight);
             check_pose(&shown.c2w).expect("a rigid motion");
             if flip {
-                // The world is mirrored; so mirror what is seen back.
+                // The world is mirrored, so mirror the ray back.
                 (origin.x, direction.x) = (-origin.x, -direction.x);
             }
             let off = (direction - expected.1).length();

@@ -2,7 +2,8 @@
 
 use crate::scene::{Camera, Intrinsics};
 
-/// The OpenCV model. A ray (x, y, 1) in camera axes is seen through the lens where a pinhole camera would see
+/// Lens distortion in the OpenCV model. The lens shows a ray (x, y, 1) in camera axes where a pinhole camera would show the ray
+/// (x', y', 1):
 ///
 /// ```text
 /// r² = x² + y²
@@ -11,28 +12,28 @@ use crate::scene::{Camera, Intrinsics};
 /// y' = yL + p₁(r² + 2y²) + 2p₂xy
 /// ```
 ///
-/// which is pixel (fx·x' + cx, fy·y' + cy). The default, all coefficients 0, is the identity. k₁ and k₂ mean the same in
-/// OpenCV, COLMAP and nerfstudio; k₃ in OpenCV and nerfstudio, k₄ in nerfstudio. The denominator's d₁ to d₃ are k₄ to k₆ of OpenCV's
-/// rational model, which is COLMAP's FULL_OPENCV.
+/// The position in pixels is (fx·x' + cx, fy·y' + cy). The default, with all coefficients 0, is the identity. k₁ and k₂ have the
+/// same meaning in OpenCV, COLMAP and nerfstudio; k₃ in OpenCV and nerfstudio; k₄ in nerfstudio. The denominator's d₁ to d₃ are k₄
+/// to k₆ of OpenCV's rational model, which is COLMAP's FULL_OPENCV.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::data) struct Distortion {
-    /// k₁ to k₄.
+    /// Numerator coefficients k₁ to k₄.
     pub radial: [f64; 4],
-    /// d₁ to d₃.
+    /// Denominator coefficients d₁ to d₃.
     pub denominator: [f64; 3],
-    /// p₁ and p₂.
+    /// Tangential coefficients p₁ and p₂.
     pub tangential: [f64; 2],
 }
 
 impl Distortion {
-    /// (x', y') of (x, y).
+    /// Returns the distorted point (x', y') of (x, y).
     pub(super) fn apply(&self, x: f64, y: f64) -> (f64, f64) {
         let [p1, p2] = self.tangential;
         let (r2, l, _) = self.radial_factor(x, y);
         (x * l + 2. * p1 * x * y + p2 * (r2 + 2. * x * x), y * l + p1 * (r2 + 2. * y * y) + 2. * p2 * x * y)
     }
 
-    /// (r², L, dL/dr²).
+    /// Returns (r², L, dL/dr²).
     fn radial_factor(&self, x: f64, y: f64) -> (f64, f64, f64) {
         let ([k1, k2, k3, k4], r2) = (self.radial, x * x + y * y);
         let above = 1. + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
@@ -42,13 +43,13 @@ impl Distortion {
         (r2, l, (slope - l * slope_below) / below)
     }
 
-    /// The denominator of L, and its derivative by r².
+    /// Returns the denominator of L, and its derivative with respect to r².
     fn divisor(&self, r2: f64) -> (f64, f64) {
         let [d1, d2, d3] = self.denominator;
         (1. + r2 * (d1 + r2 * (d2 + r2 * d3)), d1 + r2 * (2. * d2 + r2 * 3. * d3))
     }
 
-    /// ∂x'/∂x, ∂x'/∂y = ∂y'/∂x, and ∂y'/∂y at (x, y); with L' = dL/dr²:
+    /// Returns ∂x'/∂x, ∂x'/∂y = ∂y'/∂x, and ∂y'/∂y at (x, y). With L' = dL/dr²:
     ///
     /// ```text
     /// ∂x'/∂x = L + 2x²L' + 2p₁y + 6p₂x
@@ -65,13 +66,13 @@ impl Distortion {
         ]
     }
 
-    /// Checks that no two rays of `camera`'s pinhole image meet in one point of the photo, as they do where a polynomial is
-    /// used beyond the image it was fitted to: the Jacobian's determinant and the denominator are above 0 all over the image.
+    /// Checks that no two rays of `camera`'s pinhole image map to one point of the photo, which happens if a polynomial is used
+    /// beyond the image it was fitted to. The Jacobian's determinant and the denominator must be above 0 all over the image.
     ///
     /// # Errors
-    /// (what was found, what was expected).
+    /// Returns (what was found, what was expected).
     pub fn check(&self, camera: &Camera) -> Result<(), (String, String)> {
-        /// Points looked at, along each side of the image.
+        /// Number of sample points along each side of the image.
         const POINTS: u32 = 33;
         let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
         let at = |i: u32, size: u32| f64::from(i) / f64::from(POINTS - 1) * f64::from(size);
@@ -105,7 +106,7 @@ mod tests {
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
 
-    /// The ray that is seen at (x', y'), by Newton's method on the equations and their Jacobian.
+    /// Returns the ray that the lens shows at (x', y'), by Newton's method with the Jacobian.
     fn invert(lens: &Distortion, distorted: (f64, f64)) -> (f64, f64) {
         let (mut x, mut y) = distorted;
         for _ in 0..8 {
@@ -119,7 +120,8 @@ mod tests {
         (x, y)
     }
 
-    /// Newton's method only gets to the last digit within eight rounds if the Jacobian is the equations' own.
+    /// Inverting the distortion gives the original ray. Eight iterations of Newton's method reach full precision only if the Jacobian
+    /// matches the equations.
     #[test]
     fn distorting_and_back_is_the_identity() {
         for (lens, i, j) in
@@ -129,12 +131,12 @@ mod tests {
             let (u, v) = invert(lens, lens.apply(x, y));
             assert!((u - x).abs() < 1e-13 && (v - y).abs() < 1e-13, "({x}, {y}) became ({u}, {v})");
         }
-        // Worked out by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125.
+        // Computed by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125.
         let (x, y) = LENS.apply(0.3, -0.4);
         let l = 0.9729765625;
         assert!((x - (0.3 * l - 0.00072 - 0.002 * 0.43)).abs() < 1e-12, "{x}");
         assert!((y - (-0.4 * l + 0.003 * 0.57 + 0.00048)).abs() < 1e-12, "{y}");
-        // Over 1 + 0.075 − 0.004375 + 0.0003125.
+        // The denominator is 1 + 0.075 − 0.004375 + 0.0003125.
         let (x, _) = RATIONAL.apply(0.3, -0.4);
         assert!((x - (0.3 * l / 1.0709375 - 0.00072 - 0.002 * 0.43)).abs() < 1e-12, "{x}");
     }
@@ -159,14 +161,14 @@ mod tests {
     #[test]
     fn a_lens_that_folds_is_refused() {
         LENS.check(&CAMERA).expect("a good lens");
-        // x − x³ turns back at x = 0.577, which the image reaches.
+        // The map x − x³ turns back at x = 0.577, which lies inside the image.
         for k1 in [-1., f64::NAN, f64::INFINITY] {
             let lens = Distortion { radial: [k1, 0., 0., 0.], ..Distortion::default() };
             let (found, _) = lens.check(&CAMERA).unwrap_err();
             assert!(found.contains(&format!("k1 {k1}")) && found.contains("folds"), "{found}");
         }
         RATIONAL.check(&CAMERA).expect("a good lens");
-        // 1 / (1 − 3r²) has a pole that the image reaches, and is steep on either side of it.
+        // The map 1 / (1 − 3r²) has a pole inside the image, and is steep on either side of it.
         let pole = Distortion { denominator: [-3., 0., 0.], ..Distortion::default() };
         let (found, _) = pole.check(&CAMERA).unwrap_err();
         assert!(found.contains("over [-3.0, 0.0, 0.0]") && found.contains("folds"), "{found}");

@@ -6,15 +6,15 @@ use crate::scene::{Camera, ImageSize};
 use image::RgbImage;
 use std::ops::Range;
 
-/// The width after the first resize is a multiple of it.
+/// Divisor of the width after the first resize.
 const WIDTH_MULTIPLE: f64 = 8.;
 
-/// The largest centred rectangle of a size's aspect that a camera's image has, and how it is resized first.
+/// The largest centred rectangle of a target aspect ratio in a camera's image, and the first resize.
 struct Cut {
     region: Region,
-    /// After the first resize.
+    /// Size of the rectangle after the first resize.
     size: ImageSize,
-    /// Of the first resize, along x and y, and the corner of the rectangle after it.
+    /// Scale of the first resize along x and y. `corner` is the top left corner of the rectangle after it.
     scale: (f64, f64),
     corner: (f64, f64),
 }
@@ -28,12 +28,12 @@ impl Cut {
         let (scale_x, scale_y) = (width / full_width, height / full_height);
 
         let aspect = f64::from(size.width) / height;
-        // However long and narrow the size is, something is left of the image.
+        // At least one pixel is left, however elongated the target size is.
         let (cut_width, cut_height) =
             ((height * aspect).min(width).round().max(1.), (width / aspect).min(height).round().max(1.));
         let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
         Cut {
-            // What will be cut away isn't made.
+            // Only the part that is kept is resampled.
             region: Region {
                 left: left / scale_x,
                 top: top / scale_y,
@@ -51,7 +51,7 @@ fn is_as_large(camera: &Camera, size: ImageSize) -> bool {
     (camera.height, camera.width) == (size.height, size.width)
 }
 
-/// The columns and rows of `camera`'s image that [`fit`] looks at.
+/// Returns the columns and rows of `camera`'s image that [`fit`] reads.
 pub fn looked_at(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
     if is_as_large(camera, size) {
         return [0..camera.width as usize, 0..camera.height as usize];
@@ -60,8 +60,8 @@ pub fn looked_at(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
     resample::looked_at((camera.width, camera.height), cut.region, cut.size)
 }
 
-/// Resizes to `size`'s height keeping the aspect (width rounded to a multiple of 8), cuts the largest centred rectangle of
-/// `size`'s aspect, and resizes once more where that isn't `size` yet.
+/// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
+/// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet.
 pub fn fit(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
     if is_as_large(camera, size) {
         return (Planes::from_rgb(image), *camera);
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn what_a_pixel_sees_does_not_change() {
-        // A bright dot on black keeps its ray: find it in the fitted image by its centroid.
+        // A bright dot on black keeps its ray. The dot's position in the fitted image is its centroid.
         let (x, y) = (300u32, 200u32);
         let mut image = RgbImage::new(640, 360);
         for dy in 0..8 {

@@ -1,6 +1,5 @@
-//! Colour jitter with the meaning of torchvision's `ColorJitter` on floating-point images: up to four adjustments in random
-//! order, each with a factor of its own. Every loop goes over whole planes without a branch, so that vectors do it.
-//! (Spec 8.4.)
+//! Colour jitter with the semantics of torchvision's `ColorJitter` on floating-point images: up to four adjustments in random order,
+//! each with its own factor. Every loop runs over whole planes without branches, so that the compiler vectorizes it (spec 8.4).
 
 use super::planes::CHANNELS;
 use crate::data::config::JitterConfig;
@@ -8,32 +7,32 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 
-/// How much of each colour makes grey, as in torchvision.
+/// Weights of the colour channels in the grey value, as in torchvision.
 const GREY: [f32; CHANNELS] = [0.2989, 0.587, 0.114];
 
-/// A change of colours.
+/// A colour adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Adjustment {
-    /// Factor on colours.
+    /// Factor on all colour values.
     Brightness(f32),
     /// Factor on the distance from the image's mean grey.
     Contrast(f32),
-    /// Factor on the distance from a pixel's grey.
+    /// Factor on the distance from the pixel's grey.
     Saturation(f32),
-    /// Turn of the hue, as a share of the circle, −½ to ½.
+    /// Rotation of the hue as a fraction of the full circle, −½ to ½.
     Hue(f32),
 }
 
-/// Adjustments, one after the other.
+/// A sequence of colour adjustments.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jitter {
-    /// In this order.
+    /// Adjustments in the order of application.
     pub adjustments: Vec<Adjustment>,
 }
 
 impl Jitter {
-    /// Factors within `config`'s limits, uniformly, and an order.
+    /// Draws uniform factors within the limits of `config`, and a random order.
     pub fn draw(config: &JitterConfig, random: &mut impl Rng) -> Self {
         let mut factor = |strength: f64| random.random_range((1. - strength).max(0.)..=1. + strength) as f32;
         let mut adjustments = vec![
@@ -52,7 +51,8 @@ impl Jitter {
         Jitter { adjustments }
     }
 
-    /// Changes 8-bit `planes`, [3, H, W], and rounds once, at the end. `scratch` is any memory.
+    /// Adjusts 8-bit `planes`, `[3, H, W]`, and rounds once, at the end. `scratch` is a buffer for reuse; its contents don't
+    /// matter.
     pub fn apply_to_bytes(&self, planes: &mut [u8], scratch: &mut Vec<f32>) {
         if self.adjustments.is_empty() {
             return;
@@ -61,12 +61,12 @@ impl Jitter {
         scratch.extend(planes.iter().map(|&byte| f32::from(byte) / 255.));
         self.apply(scratch);
         for (byte, value) in planes.iter_mut().zip(scratch) {
-            // Adding 2^23 leaves the nearest whole number in a float32's last bits.
+            // Adding 2^23 leaves the nearest integer in the lowest bits of a float32.
             *byte = (*value * 255. + 8_388_608.).to_bits() as u8;
         }
     }
 
-    /// Changes `planes`, [3, H, W] in [0, 1].
+    /// Adjusts `planes`, `[3, H, W]`, values in [0, 1].
     pub fn apply(&self, planes: &mut [f32]) {
         for adjustment in &self.adjustments {
             match *adjustment {
@@ -112,7 +112,7 @@ fn for_pixels(planes: &mut [f32], change: impl Fn([f32; CHANNELS]) -> [f32; CHAN
     }
 }
 
-/// Sums of a few hundred numbers each, so that float32 holds them well.
+/// Returns the mean grey of the image. Each float32 partial sum covers only a few hundred values, which keeps it accurate.
 fn mean_grey(planes: &[f32]) -> f32 {
     const LANES: usize = 16;
     let pixels = planes.len() / CHANNELS;
@@ -134,12 +134,12 @@ fn mean_grey(planes: &[f32]) -> f32 {
     (sum / pixels as f64) as f32
 }
 
-/// Turns by `shift` sixths of the circle, 0 to 6, at the same value and chroma: HSV and back in one formula.
+/// Rotates the hue by `shift` sixths of the circle, 0 to 6, with value and chroma unchanged: HSV and back in one formula.
 fn turn_hue([red, green, blue]: [f32; CHANNELS], shift: f32) -> [f32; CHANNELS] {
     let (value, least) = (red.max(green).max(blue), red.min(green).min(blue));
     let chroma = value - least;
     let inverse = if chroma > 0. { 1. / chroma } else { 0. };
-    // Sixths of the circle: red is at 0, green at 2, blue at 4.
+    // Hues are in sixths of the circle: red is at 0, green at 2, blue at 4.
     let from_red = (green - blue) * inverse;
     let from_green = 2. + (blue - red) * inverse;
     let from_blue = 4. + (red - green) * inverse;
@@ -153,7 +153,7 @@ fn turn_hue([red, green, blue]: [f32; CHANNELS], shift: f32) -> [f32; CHANNELS] 
     let wrap = |sixths: f32| if sixths >= 6. { sixths - 6. } else { sixths };
     let hue = hue + shift;
     let hue = wrap(if hue < 0. { hue + 6. } else { hue });
-    // A channel is at its least within a sixth of the circle, at its largest within two, and goes straight between.
+    // A channel is at its minimum over two sixths of the circle, at its maximum over two sixths, and linear in between.
     [5., 3., 1.].map(|offset: f32| {
         let from = wrap(offset + hue);
         value - chroma * from.min(4. - from).clamp(0., 1.)
@@ -200,7 +200,7 @@ mod tests {
     fn a_third_of_the_circle_swaps_the_colours() {
         let (before, pixels) = (picture(), 40 * 33);
         let after = adjusted(&[Adjustment::Hue(1. / 3.)]);
-        // Red becomes green, green blue, blue red.
+        // Red becomes green, green becomes blue, and blue becomes red.
         for channel in 0..3 {
             let from = &before[channel * pixels..][..pixels];
             let to = &after[(channel + 1) % 3 * pixels..][..pixels];

@@ -1,4 +1,4 @@
-//! Photos without lens distortion (spec 10.5).
+//! Removal of lens distortion from photos (spec 10.5).
 
 use super::distortion::Distortion;
 use crate::scene::{Camera, Intrinsics};
@@ -7,10 +7,11 @@ use image::RgbImage;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// The photo as `camera`, a pinhole camera, would have taken it. Its pixel (i, j) looks along x = (j + ½ − cx)/fx,
-/// y = (i + ½ − cy)/fy, and takes its colour from the photo at (fx·x' + cx, fy·y' + cy), interpolated linearly between the
-/// four pixel centres around; beyond the photo its border goes on. Of pixels beside `window`'s columns and rows, if there are
-/// such, nothing is said.
+/// Returns the photo as `camera`, a pinhole camera, would have taken it.
+///
+/// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its colour from the photo at (fx·x' + cx, fy·y' +
+/// cy), interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is repeated. Pixels outside
+/// `window`'s columns and rows, if it is given, are unspecified.
 pub(in crate::data) fn undistort(
     photo: RgbImage,
     distortion: &Distortion,
@@ -31,24 +32,24 @@ pub(in crate::data) fn undistort(
     picture.finish()
 }
 
-/// All columns and rows of `camera`'s image.
+/// Returns all columns and rows of `camera`'s image.
 fn whole(camera: &Camera) -> [Range<usize>; 2] {
     [camera.width, camera.height].map(|count| 0..count as usize)
 }
 
-/// What all photos that one camera took have in common, looked up once.
+/// Precomputed lookup positions that all photos of one camera share.
 #[derive(Debug)]
 pub(in crate::data) struct Lens {
     distortion: Distortion,
     camera: Camera,
     columns: Range<usize>,
     rows: Range<usize>,
-    /// Row by row.
+    /// Lookup positions, row by row.
     places: Vec<Place>,
 }
 
 impl Lens {
-    /// For `window`'s columns and rows, or all.
+    /// Computes the positions for `window`'s columns and rows, or for the whole image.
     pub fn new(distortion: Distortion, camera: Camera, window: Option<[Range<usize>; 2]>) -> Self {
         let [columns, rows] = window.unwrap_or_else(|| whole(&camera));
         let mut places = vec![Place::default(); columns.len() * rows.len()];
@@ -59,13 +60,13 @@ impl Lens {
         Lens { distortion, camera, columns, rows, places }
     }
 
-    /// Whether `camera`, wherever it is, looks through it.
+    /// Returns `true` if the lens matches `distortion` and `camera`, whatever the camera's pose.
     pub fn is_of(&self, distortion: &Distortion, camera: &Camera) -> bool {
         let known = |camera: &Camera| (camera.intrinsics, camera.width, camera.height);
         self.distortion == *distortion && known(&self.camera) == known(camera)
     }
 
-    /// As the function of this name.
+    /// Removes the distortion from `photo` like the function [`undistort`].
     pub fn undistort(&self, photo: RgbImage) -> RgbImage {
         let mut picture = Picture::of(photo);
         for (i, row) in self.rows.clone().zip(self.places.chunks(self.columns.len())) {
@@ -75,7 +76,7 @@ impl Lens {
     }
 }
 
-/// Where in a photo a colour is: the pixel to the left and above, and how far it is to the next ones, 0 to 1.
+/// Position in a photo to take a colour from: the pixel to the upper left, and the fractional distances to the next ones, 0 to 1.
 #[derive(Debug, Clone, Copy, Default)]
 struct Place {
     left: u32,
@@ -84,13 +85,13 @@ struct Place {
     to_bottom: f32,
 }
 
-/// Where pixels of a pinhole camera look, row by row.
+/// Computes the lookup positions of a pinhole camera's pixels, row by row.
 struct Looks<'a> {
     distortion: &'a Distortion,
     camera: &'a Camera,
-    /// x of the columns.
+    /// Ray coordinate x of each column.
     across: Vec<f64>,
-    /// (x', y') of a row.
+    /// Distorted ray coordinates (x', y') of a row.
     seen: Vec<(f64, f64)>,
 }
 
@@ -102,12 +103,12 @@ impl<'a> Looks<'a> {
         Looks { distortion, camera, across, seen }
     }
 
-    /// Row `i`.
+    /// Computes the lookup positions of row `i`.
     fn fill(&mut self, i: usize, row: &mut [Place]) {
         let Camera { intrinsics: Intrinsics { fx, fy, cx, cy }, width, height, .. } = *self.camera;
         let [last_column, last_row] = [width, height].map(|count| f64::from(count - 1));
         let y = (i as f64 + 0.5 - cy) / fy;
-        // By themselves, as processors do these for several pixels at a time.
+        // A separate loop, so that the compiler vectorizes it over several pixels.
         for (seen, x) in self.seen.iter_mut().zip(&self.across) {
             *seen = self.distortion.apply(*x, y);
         }
@@ -119,26 +120,27 @@ impl<'a> Looks<'a> {
     }
 }
 
-/// The centre, of columns or rows, before `position`, which is in pixels from the image's edge, and how far it is to the next.
+/// Returns the index of the last pixel centre, along columns or rows, at or before `position`, and the fractional distance to the
+/// next one. `position` is in pixels from the image's edge.
 #[inline]
 fn between(position: f64, last: f64) -> (u32, f32) {
-    /// 1.5·2⁵²: adding it rounds to whole numbers, in the lowest bits.
+    /// Constant 1.5·2⁵²: adding it rounds to integers, in the lowest bits.
     const WHOLE: f64 = 6_755_399_441_055_744.;
     let position = position - 0.5;
-    // Not max() and min(), which think of NaN and take longer.
+    // Comparisons instead of max() and min(), which handle NaN and take longer.
     let position = if position > 0. { position } else { 0. };
     let position = if position < last { position } else { last };
-    // Halfway between two, the one or the other, which is the same with a share of 0 or 1.
+    // Halfway between two centres, either one may be chosen; with a fraction of 0 or 1 the result is the same.
     let whole = position - 0.5 + WHOLE;
     (whole.to_bits() as u32, (position - (whole - WHOLE)) as f32)
 }
 
-/// A photo, and what it becomes.
+/// A photo and its undistorted version.
 struct Picture {
     width: usize,
     height: usize,
     photo: Vec<u8>,
-    /// And a byte more, that four can be written where the last pixel begins.
+    /// Undistorted pixels and one more byte, so that four bytes can be written at the last pixel.
     undistorted: Vec<u8>,
 }
 
@@ -149,18 +151,18 @@ impl Picture {
         Picture { width, height, undistorted: vec![0; photo.len() + 1], photo }
     }
 
-    /// Of row `i`, from column `first` on.
+    /// Fills row `i`, starting at column `first`.
     fn fill(&mut self, i: usize, first: usize, row: &[Place]) {
-        /// 2²³: a float32 number this large has no fraction, and what is below 256 in its lowest bits.
+        /// Constant 2²³: a float32 this large has no fraction, and added integers below 256 are in its lowest bits.
         const WHOLE: f32 = 8_388_608.;
         let Picture { width, height, photo, undistorted } = self;
-        // Four bytes for three, which are a vector.
+        // Read four bytes instead of three, to fill a vector.
         let colour = |bytes: &[u8]| {
             let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
             Vec4::from_array(bytes.map(f32::from))
         };
         let mix = |a: Vec4, b: Vec4, share: f32| a + share * (b - a);
-        // Between the pixel that begins at a byte and that to its right, which in the last column nobody asks for.
+        // Interpolate between the pixel that begins at `byte` and the one to its right, which is unused in the last column.
         let along = |byte: usize, share: f32| match photo.get(byte..byte + 7) {
             Some(pair) => mix(colour(&pair[..4]), colour(&pair[3..]), share),
             None => {
@@ -175,7 +177,7 @@ impl Picture {
             let bottom = (top + 1).min(*height - 1);
             let above = along(3 * (top * *width + left), place.to_right);
             let below = along(3 * (bottom * *width + left), place.to_right);
-            // To the nearest of 256 levels. The fourth is the next one's.
+            // Round to the nearest of 256 levels. The fourth byte is overwritten by the next pixel.
             let levels = (mix(above, below, place.to_bottom) + WHOLE).to_array();
             undistorted[3 * j..][..4].copy_from_slice(&levels.map(|level| level.to_bits() as u8));
         }
@@ -206,12 +208,12 @@ mod tests {
     fn no_distortion_changes_no_pixel() {
         let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
         assert_eq!(undistort(photo.clone(), &Distortion::default(), &CAMERA, None), photo);
-        // So little that it goes through the interpolation and changes nothing that is visible.
+        // This distortion is small enough to pass through the interpolation without visible change.
         let tiny = Distortion { radial: [1e-12, 0., 0., 0.], ..Distortion::default() };
         assert_eq!(undistort(photo.clone(), &tiny, &CAMERA, None), photo);
     }
 
-    /// By the formulas of [`undistort`] in float64.
+    /// Colours agree with the formulas of [`undistort`] in float64.
     #[test]
     fn colours_are_between_their_neighbours() {
         let photo = RgbImage::from_fn(64, 48, |x, y| {
@@ -230,7 +232,7 @@ mod tests {
                 let top = level(u, v, k) * (1. - s) + level(right, v, k) * s;
                 let bottom = level(u, below, k) * (1. - s) + level(right, below, k) * s;
                 let exact = top * (1. - t) + bottom * t;
-                // The nearest level, but for float32's last digits.
+                // The nearest level, up to the rounding of float32.
                 assert!((f64::from(found[k]) - exact).abs() < 0.5001, "{found:?} for {exact} at ({j}, {i})");
             }
         }
@@ -246,7 +248,7 @@ mod tests {
             assert_eq!(part.get_pixel(x, y), whole.get_pixel(x, y), "({x}, {y})");
         }
         assert_ne!(part, whole);
-        // And so where many share what is looked up.
+        // The same holds for a shared lens.
         let lens = |window| Lens::new(LENS, CAMERA, window);
         assert_eq!(lens(None).undistort(photo.clone()), whole);
         assert_eq!(lens(window).undistort(photo), part);

@@ -1,4 +1,4 @@
-//! What happens to a photo between its file and the model: lens distortion removed, cut, resized, changed in colour.
+//! Processing of a photo between its file and the model: removal of lens distortion, cropping, resizing, colour jitter.
 
 mod augment;
 mod distortion;

@@ -1,12 +1,12 @@
-//! Images as the model wants them: a plane of each colour.
+//! Images in the layout of the model: one plane per colour channel.
 
 use image::{Rgb, RgbImage};
 use tch::{Kind, Tensor};
 
-/// Colours of an image.
+/// Number of colour channels of an image.
 pub(in crate::data) const CHANNELS: usize = 3;
 
-/// An 8-bit image, [3, H, W].
+/// An 8-bit image, `[3, H, W]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Planes {
     width: usize,
@@ -15,20 +15,20 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Black.
+    /// Creates a black image.
     pub(super) fn new(width: u32, height: u32) -> Self {
         let (width, height) = (width as usize, height as usize);
         Planes { width, height, bytes: vec![0; CHANNELS * width * height] }
     }
 
-    /// The same image, pixels taken apart.
+    /// Converts an interleaved image to planes.
     pub(in crate::data) fn from_rgb(image: &RgbImage) -> Self {
         let mut planes = Planes::new(image.width(), image.height());
         take_apart(image, &mut planes.bytes);
         planes
     }
 
-    /// The same image, a pixel's colours together.
+    /// Converts the planes to an interleaved image.
     pub(super) fn to_rgb(&self) -> RgbImage {
         let pixels = self.width * self.height;
         let at = |x: u32, y: u32| y as usize * self.width + x as usize;
@@ -37,22 +37,22 @@ impl Planes {
         })
     }
 
-    /// [3, H, W], row by row.
+    /// Returns the pixels, `[3, H, W]`, row by row.
     pub(super) fn bytes_mut(&mut self) -> &mut [u8] {
         &mut self.bytes
     }
 
-    /// [3, H, W] in [0, 1].
+    /// Returns the pixels as a float tensor, `[3, H, W]`, values in [0, 1].
     pub fn to_tensor(&self) -> Tensor {
         let bytes = Tensor::from_slice(&self.bytes);
         let mut values =
             bytes.view([CHANNELS as i64, self.height as i64, self.width as i64]).to_kind(Kind::Float);
-        // In its place: a second copy of a photo of 16 million pixels is 192 MB.
+        // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
         values.divide_scalar_(255.)
     }
 }
 
-/// Writes `image` into `planes`, [3, H, W].
+/// Writes the channels of `image` into `planes`, `[3, H, W]`.
 pub(super) fn take_apart(image: &RgbImage, planes: &mut [u8]) {
     let pixels = planes.len() / CHANNELS;
     let (red, rest) = planes.split_at_mut(pixels);

@@ -1,11 +1,12 @@
-//! Antialiased Lanczos resampling with the results of Pillow, which the published evaluations resize with (spec 9.3).
+//! Antialiased Lanczos resampling that reproduces Pillow, which the published evaluations use for resizing (spec 9.3).
 //!
-//! Pillow filters rows first, rounds to 8 bits, and filters columns then. Where an image is saturated the order shows: filters
-//! ring, and what rings out of range is cut off after either pass, so columns before rows is up to 41 levels off. With
-//! Pillow's order and weights in float32 the results are its own up to one level, in one of ten thousand values.
+//! Pillow filters rows first, rounds to 8 bits, and then filters columns. The order matters in saturated images: the filters
+//! overshoot, and values out of range are clamped after either pass, so filtering columns before rows differs by up to 41 levels.
+//! With Pillow's order and weights in float32, the results differ from Pillow's by at most one level, in one of ten thousand
+//! values.
 //!
-//! Eight rows are filtered at once, a lane each, so that every multiplication is one of vectors of any width, without a word
-//! about instruction sets. The pass leaves planes behind, which the second pass goes through row by row.
+//! Eight rows are filtered at once, one per lane, so that the compiler can vectorize every multiplication for any instruction set.
+//! The first pass outputs planes, which the second pass reads row by row.
 
 use super::planes::{CHANNELS, take_apart};
 use crate::scene::ImageSize;
@@ -13,35 +14,35 @@ use image::RgbImage;
 use std::f64::consts::PI;
 use std::ops::Range;
 
-/// Lobes of the filter to either side.
+/// Number of lobes of the filter on either side.
 const LOBES: f64 = 3.;
-/// Rows that are filtered at once.
+/// Number of rows that are filtered at once.
 const ROWS: usize = 8;
 const LANES: usize = CHANNELS * ROWS;
 
-/// A rectangle of an image, in pixels from its corner; its edges may lie inside pixels.
+/// A rectangle of an image, in pixels from the image's corner. Its edges may lie inside pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
-    /// Of the left edge.
+    /// Position of the left edge.
     pub left: f64,
-    /// Of the upper edge.
+    /// Position of the upper edge.
     pub top: f64,
-    /// Above 0.
+    /// Width, above 0.
     pub width: f64,
-    /// Above 0.
+    /// Height, above 0.
     pub height: f64,
 }
 
-/// Which inputs make the outputs along one axis, and with what weights.
+/// Filter taps along one axis: the inputs that contribute to each output, and their weights.
 #[derive(Debug, Clone, PartialEq)]
 struct Taps {
     /// Input size, start and extent of the region, output size.
     key: (usize, f64, f64, usize),
-    /// The first input of each output.
+    /// Index of the first input of each output.
     first: Vec<usize>,
-    /// Inputs of each output, some of them with weight 0.
+    /// Number of inputs of each output, some of them with weight 0.
     count: usize,
-    /// [outputs, count].
+    /// Weights, `[outputs, count]`.
     weights: Vec<f32>,
 }
 
@@ -49,7 +50,7 @@ impl Taps {
     fn new(key: (usize, f64, f64, usize)) -> Self {
         let (inputs, start, extent, outputs) = key;
         let scale = extent / outputs as f64;
-        // Enlarging interpolates, reducing averages over as many inputs as an output covers.
+        // Enlarging interpolates; reducing averages over as many inputs as an output covers.
         let stretch = scale.max(1.);
         let support = LOBES * stretch;
         let count = ((2. * support).ceil() as usize + 1).min(inputs);
@@ -61,7 +62,7 @@ impl Taps {
             let high = ((centre + support + 0.5) as usize).clamp(low + 1, inputs).min(low + count);
             let raw = |input: usize| lanczos((input as f64 + 0.5 - centre) / stretch);
             let sum: f64 = (low..high).map(raw).sum();
-            // All windows have one length, so the last ones begin earlier than they would have to.
+            // All windows have the same length, so the last ones begin earlier than necessary.
             let begin = low.min(inputs - count);
             for input in low..high {
                 weights[input - begin] = (raw(input) / sum) as f32;
@@ -71,7 +72,7 @@ impl Taps {
         Taps { key, first, count, weights }
     }
 
-    /// Inputs that any output looks at.
+    /// Returns the range of inputs that any output reads.
     fn range(&self) -> Range<usize> {
         let (first, last) = (self.first.iter().min(), self.first.iter().max());
         *first.expect("an output")..last.expect("an output") + self.count
@@ -83,15 +84,15 @@ fn lanczos(x: f64) -> f64 {
     if x.abs() < LOBES { sinc(x) * sinc(x / LOBES) } else { 0. }
 }
 
-/// Adding and subtracting it leaves a float32 rounded to a whole number, which vectors of every instruction set can do.
+/// Constant whose addition and subtraction rounds a float32 to an integer, in a way that vectorizes on every instruction set.
 const ROUNDING: f32 = 12_582_912.;
 
-/// The nearest of 0 to 255.
+/// Rounds `value` to the nearest integer and clamps it to 0 to 255.
 fn to_level(value: f32) -> f32 {
     ((value + ROUNDING) - ROUNDING).clamp(0., 255.)
 }
 
-/// The columns and rows of an image of `width` × `height` that [`Resampler::resample`] looks at.
+/// Returns the columns and rows of an image of `width` × `height` that [`Resampler::resample`] reads.
 pub fn looked_at((width, height): (u32, u32), region: Region, size: ImageSize) -> [Range<usize>; 2] {
     [(width, region.left, region.width, size.width), (height, region.top, region.height, size.height)].map(
         |(inputs, start, extent, outputs)| {
@@ -100,20 +101,20 @@ pub fn looked_at((width, height): (u32, u32), region: Region, size: ImageSize) -
     )
 }
 
-/// Resamples images one after the other, and keeps what the next one can use.
+/// Resampler for a sequence of images. It keeps taps and buffers for the next image.
 #[derive(Debug, Default)]
 pub struct Resampler {
     columns: Option<Taps>,
     rows: Option<Taps>,
-    /// Eight rows of the image, [W][3, 8].
+    /// Eight rows of the image, `[W][3, 8]`.
     tile: Vec<[f32; LANES]>,
-    /// After the first pass, [3, rows, output width], levels.
+    /// Levels after the first pass, `[3, rows, output width]`.
     filtered: Vec<f32>,
 }
 
 impl Resampler {
-    /// Resamples `region` of `image` to `size` and writes it into `planes`, [3, H, W]. Pixels beside the region count, too,
-    /// where the filter reaches them.
+    /// Resamples `region` of `image` to `size` and writes it into `planes`, `[3, H, W]`. Pixels outside the region contribute if
+    /// the filter reaches them.
     pub fn resample(&mut self, image: &RgbImage, region: Region, size: ImageSize, planes: &mut [u8]) {
         let (width, height) = (image.width() as usize, image.height() as usize);
         let (out_width, out_height) = (size.width as usize, size.height as usize);
@@ -156,7 +157,7 @@ impl Resampler {
                     }
                 }
                 for (byte, &sum) in line.iter_mut().zip(&sum) {
-                    // The last byte of a float32 of 2^23 and more is its units.
+                    // The lowest byte of a float32 of at least 2^23 is its integer value modulo 256.
                     *byte = (sum.clamp(0., 255.) + ROUNDING).to_bits() as u8;
                 }
             }
@@ -164,7 +165,7 @@ impl Resampler {
     }
 }
 
-/// Those of `key`, which are the last ones for most images.
+/// Returns the taps for `key`. For most images these are the ones of the previous image.
 fn taps(kept: &mut Option<Taps>, key: (usize, f64, f64, usize)) -> &Taps {
     if kept.as_ref().is_none_or(|taps| taps.key != key) {
         *kept = None;
@@ -172,7 +173,7 @@ fn taps(kept: &mut Option<Taps>, key: (usize, f64, f64, usize)) -> &Taps {
     kept.get_or_insert_with(|| Taps::new(key))
 }
 
-/// The pixels in `columns` of the rows from `top`; below the image its last row stands.
+/// Copies the pixels in `columns` of the rows starting at `top`. Rows below the image repeat its last row.
 fn fill_tile(tile: &mut [[f32; LANES]], image: &RgbImage, columns: Range<usize>, top: usize) {
     let (width, height) = (image.width() as usize, image.height() as usize);
     for row in 0..ROWS {
@@ -204,7 +205,7 @@ mod tests {
         Region { left: 0., top: 0., width: f64::from(image.width()), height: f64::from(image.height()) }
     }
 
-    /// Levels from 64 to 191, so that nothing rings out of range.
+    /// Test image with levels from 64 to 191, so that no overshoot is clamped.
     fn waves(width: u32, height: u32) -> RgbImage {
         RgbImage::from_fn(width, height, |x, y| {
             let wave = |step: u32| 127.5 + 63. * (f64::from(x * step + y * (7 - step)) * 0.13).sin();
@@ -214,7 +215,7 @@ mod tests {
 
     #[test]
     fn results_are_those_of_another_lanczos() {
-        // The image crate keeps floating point between its passes.
+        // The image crate keeps floating-point values between its passes.
         for ([width, height], [out_height, out_width]) in [
             ([64, 36], [26, 46]),
             ([41, 37], [36, 40]),

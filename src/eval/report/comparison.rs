@@ -1,4 +1,4 @@
-//! Measured rows among the published ones: a table for each data set and number of context views.
+//! Tables that compare measured and published scores: one for each dataset and number of context views.
 
 use super::entry::{Entry, dataset_name};
 use super::numbers::{count, decimal, short};
@@ -16,7 +16,7 @@ const HEAD: [Head; 6] = [
     Head::Number("Gaussians (K)\u{a0}↓"),
 ];
 
-/// A section for each data set, those with something measured first.
+/// Renders a section for each dataset. Datasets with measured scores come first.
 pub fn comparisons(entries: &[Entry]) -> Markup {
     let mut datasets: Vec<&str> = vec!["re10k", "acid"];
     for entry in entries {
@@ -54,7 +54,7 @@ fn comparison(entries: &[Entry], dataset: &str, views: usize) -> Markup {
     let table = table(&caption, &HEAD, body);
     let published = rows.len() - measured;
     html! {
-        // What nothing was measured for is there for reference, and stays out of the way.
+        // Tables without measured scores are there for reference, so they are collapsed.
         details.views open[measured > 0] {
             summary {
                 h3 { (count(views, "context view")) }

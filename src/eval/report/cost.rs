@@ -1,4 +1,4 @@
-//! What a reconstruction costs, and what the paper says of the model's size and parts.
+//! Cost of a reconstruction, and the paper's tables of model sizes and ablations.
 
 use super::entry::Entry;
 use super::numbers::{self, decimal, short, thousands};
@@ -9,7 +9,7 @@ use maud::{Markup, html};
 const GIGA: f64 = 1e-9;
 const MEGA: f64 = 1e-6;
 
-/// Time, memory and size: the paper's table and what was measured, fastest first.
+/// Renders the table of time, memory and size, with published and measured rows, fastest first.
 pub fn efficiency(entries: &[Entry]) -> Markup {
     let head = [
         Head::Text("Method"),
@@ -73,7 +73,7 @@ pub fn efficiency(entries: &[Entry]) -> Markup {
     }
 }
 
-/// The paper's sizes of the model.
+/// Renders the paper's table of model sizes.
 pub fn compactness() -> Markup {
     let head = [
         Head::Number("Gaussians"),
@@ -101,7 +101,7 @@ pub fn compactness() -> Markup {
     }
 }
 
-/// The paper's ablations.
+/// Renders the paper's table of ablations.
 pub fn ablations() -> Markup {
     let head = [
         Head::Text("Variant"),

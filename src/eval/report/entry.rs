@@ -1,25 +1,25 @@
-//! What was measured, and how the page calls and colours it.
+//! Evaluations on the page, with their names and colours.
 
 use super::super::evaluation::Evaluation;
 use super::super::published::{DATASETS, known_dataset};
 use std::path::{Path, PathBuf};
 
-/// Colours that the style sheet has for what was measured; further ones begin again.
+/// Number of colours for measured results in the style sheet. Further entries start again with the first colour.
 const COLOURS: usize = 6;
 
 /// One evaluation on the page.
 pub struct Entry<'a> {
     pub folder: &'a Path,
     pub evaluation: &'a Evaluation,
-    /// The method, and the folder where that alone doesn't tell it from another.
+    /// Name of the method, followed by the folder if several evaluations would have the same name.
     pub name: String,
-    /// `re10k`, `acid`, `dl3dv`, or another name as it was found.
+    /// Key of the dataset: `re10k`, `acid`, `dl3dv`, or the name in the evaluation if it isn't a known one.
     pub dataset: String,
-    /// Class that gives it its colour: one for each name, so that a method keeps its own over data sets and view counts.
+    /// CSS class of the colour. It depends on the name alone, so that a method has the same colour for all datasets and view counts.
     pub colour: String,
 }
 
-/// In the order given.
+/// Creates the entries of `evaluations`, in the same order.
 pub fn entries(evaluations: &[(PathBuf, Evaluation)]) -> Vec<Entry<'_>> {
     let mut names: Vec<String> = vec![];
     let mut entries = vec![];
@@ -52,23 +52,23 @@ fn dataset_key(name: &str) -> String {
     known_dataset(name).map_or(name.into(), String::from)
 }
 
-/// A data set as people call it.
+/// Returns the name of a dataset for readers.
 pub fn dataset_name(key: &str) -> &str {
     DATASETS.iter().find(|(file, _)| *file == key).map_or(key, |(_, people)| people)
 }
 
 impl Entry<'_> {
-    /// Scenes that were scored.
+    /// Returns the number of scenes that were scored.
     pub fn scored(&self) -> usize {
         self.evaluation.scenes.len()
     }
 
-    /// Whether the mean is of all scenes that the index names.
+    /// Returns `true` if the means are over all scenes that the index names.
     pub fn is_whole(&self) -> bool {
         self.scored() >= self.evaluation.indexed_scenes
     }
 
-    /// Data set and number of context views.
+    /// Returns the dataset and the number of context views, as text.
     pub fn setting(&self) -> String {
         format!("{}, {} context views", dataset_name(&self.dataset), self.evaluation.context_views)
     }

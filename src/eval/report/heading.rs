@@ -1,14 +1,14 @@
-//! What the page is about, the means at a glance, and what failed.
+//! Head of the page: title, mean scores, and scenes that failed.
 
 use super::entry::{Entry, dataset_name};
 use super::numbers::{self, count, decimal, thousands};
 use super::table::{partial_badge, share, swatch};
 use maud::{Markup, html};
 
-/// Failures of one evaluation that are listed openly; a longer list is folded.
+/// Maximum number of failures of one evaluation that are listed openly; a longer list is collapsed.
 const OPEN_FAILURES: usize = 20;
 
-/// Of the page.
+/// Returns the title of the page.
 pub fn title(entries: &[Entry]) -> String {
     match entries {
         [one] => format!("{} on {}", one.name, dataset_name(&one.dataset)),
@@ -19,7 +19,7 @@ pub fn title(entries: &[Entry]) -> String {
     }
 }
 
-/// Title, and a card for each evaluation.
+/// Renders the title, and a card for each evaluation.
 pub fn heading(title: &str, entries: &[Entry]) -> Markup {
     html! {
         header {
@@ -80,7 +80,7 @@ fn tile(name: &str, value: Option<String>, unit: &str) -> Markup {
     }
 }
 
-/// Scenes that couldn't be scored, and why; nothing where all could.
+/// Renders the list of scenes that couldn't be scored, with the reasons; nothing if there are none.
 pub fn failures(entries: &[Entry]) -> Markup {
     let failed: Vec<_> = entries.iter().filter(|s| !s.evaluation.failures.is_empty()).collect();
     html! {

@@ -1,4 +1,4 @@
-//! One page that shows evaluations beside what the paper published: a file that needs no other, nor a network.
+//! Report: a self-contained HTML page that shows evaluations next to the paper's published results, without other files or network access.
 
 mod comparison;
 mod cost;
@@ -20,14 +20,14 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::{Path, PathBuf};
 
 const STYLE: &str = include_str!("style.css");
-/// Sorts tables by a click on a heading; the page is whole without it.
+/// Script that sorts a table when a heading is clicked. The page is complete without it.
 const SORTING: &str = include_str!("sorting.js");
 
-/// Writes the page that shows `evaluations` at `path`. Each comes with the folder it was written to, which holds the
-/// pictures of its scenes.
+/// Writes the page that shows `evaluations` to `path`. Each evaluation comes with the folder that it was written to, which holds the
+/// comparison images of its scenes.
 ///
 /// # Errors
-/// No evaluation, a picture that is there but can't be read, or the system's refusal to write.
+/// Fails if there is no evaluation, if an existing image can't be read, or if the file can't be written.
 pub fn write_report(path: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
     if evaluations.is_empty() {
         return Err(Error::Request("a report shows one evaluation or more, found none".into()));
@@ -45,7 +45,7 @@ fn page(entries: &[Entry]) -> Result<Markup> {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
                 meta name="color-scheme" content="light dark";
-                // Without it a browser asks the server for an icon.
+                // Without this link a browser asks the server for an icon.
                 link rel="icon" href="data:,";
                 title { (title) }
                 style { (PreEscaped(STYLE)) }

@@ -1,8 +1,8 @@
-//! Numbers as people read them.
+//! Formatting of numbers for readers.
 
 use maud::{Markup, html};
 
-/// `5601` as `5,601`.
+/// Formats an integer with thousands separators: `5601` as `5,601`.
 pub fn thousands(value: u64) -> String {
     let digits = value.to_string();
     let mut text = String::new();
@@ -15,7 +15,7 @@ pub fn thousands(value: u64) -> String {
     text
 }
 
-/// With so many digits after the point, and commas before it.
+/// Formats a number with `digits` decimal places and thousands separators.
 pub fn decimal(value: f64, digits: usize) -> String {
     let text = format!("{:.digits$}", value.abs());
     let (whole, rest) = text.split_at(text.find('.').unwrap_or(text.len()));
@@ -23,22 +23,22 @@ pub fn decimal(value: f64, digits: usize) -> String {
     format!("{sign}{}{rest}", whole.parse().map_or(whole.to_string(), thousands))
 }
 
-/// Without digits that say nothing: `16.4`, `393`, `0.1`.
+/// Formats a number with one decimal place, or with none if it is a whole number or at least 100: `16.4`, `393`, `0.1`.
 pub fn short(value: f64) -> String {
     decimal(value, if value.fract() == 0. || value.abs() >= 100. { 0 } else { 1 })
 }
 
-/// The mean of no scene is no number.
+/// Returns `value` if it is finite. The mean over no scenes is not a number.
 pub fn mean(value: f64) -> Option<f64> {
     Some(value).filter(|value| value.is_finite())
 }
 
-/// A count, as `1 scene` or `5,601 scenes`.
+/// Formats a count with its noun, such as `1 scene` or `5,601 scenes`.
 pub fn count(number: usize, one: &str) -> String {
     format!("{} {one}{}", thousands(number as u64), if number == 1 { "" } else { "s" })
 }
 
-/// What was not measured or not published is told in a word: an empty cell or a zero could be taken for a result.
+/// Renders the word for a value that was not measured or not published. An empty cell or a zero could be mistaken for a result.
 pub fn absent() -> Markup {
     html! { span.absent { "absent" } }
 }

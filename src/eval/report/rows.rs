@@ -1,4 +1,4 @@
-//! What is compared: measured scores and published ones, of one data set and number of context views.
+//! Rows of a comparison: measured and published scores of one dataset and number of context views.
 
 use super::entry::Entry;
 use super::numbers;
@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 /// A row of a comparison.
 pub struct Row<'a> {
     pub name: &'a str,
-    /// `None` where the paper has it.
+    /// Evaluation that was measured; `None` for a published row.
     pub measured: Option<&'a Entry<'a>>,
     pub psnr: Option<f64>,
     pub ssim: Option<f64>,
@@ -17,13 +17,13 @@ pub struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// Whether it is the paper's own method, as published.
+    /// Returns `true` if this is the published row of the paper's own method.
     pub fn is_published_globalsplat(&self) -> bool {
         self.measured.is_none() && self.name.starts_with("GlobalSplat")
     }
 }
 
-/// Everything known of one data set and number of context views, best PSNR first.
+/// Returns all measured and published rows of one dataset and number of context views, best PSNR first.
 pub fn rows<'a>(entries: &'a [Entry<'a>], dataset: &str, views: usize) -> Vec<Row<'a>> {
     let methods = published().novel_views.iter().filter(|method| method.dataset == dataset);
     let theirs = methods.filter_map(|method| {
@@ -55,7 +55,7 @@ pub fn rows<'a>(entries: &'a [Entry<'a>], dataset: &str, views: usize) -> Vec<Ro
     rows
 }
 
-/// Numbers of context views that were published or measured.
+/// Returns the numbers of context views with published or measured scores.
 pub fn view_counts(entries: &[Entry], dataset: &str) -> BTreeSet<usize> {
     let methods = published().novel_views.iter().filter(|method| method.dataset == dataset);
     let theirs = methods.flat_map(|method| method.scores.keys().copied());

@@ -1,4 +1,4 @@
-//! Scene by scene, the worst first: pictures of the worst, numbers of all.
+//! Scores scene by scene, worst first: comparison images of the worst scenes, and the scores of all.
 
 use super::entry::{Entry, dataset_name};
 use super::numbers::{absent, count, decimal, thousands};
@@ -13,13 +13,13 @@ use base64::prelude::BASE64_STANDARD;
 use maud::{Markup, html};
 use std::collections::BTreeMap;
 
-/// The page carries no more pictures than this: they are most of its bytes.
+/// Maximum number of comparison images on the page: they are most of its bytes.
 const PICTURES: usize = 60;
-/// Views of one scene whose scores are told one by one.
+/// Maximum number of views of one scene whose scores are listed.
 const LISTED_VIEWS: usize = 12;
 const PARTS: [&str; 4] = ["Photo", "Render", "Error", "Depth"];
 
-/// A scene in every evaluation that scored it.
+/// A scene, with every evaluation that scored it.
 struct Scene<'a> {
     name: &'a str,
     dataset: &'a str,
@@ -32,7 +32,8 @@ impl Scene<'_> {
     }
 }
 
-/// Evaluations of one data set share their scenes, so that pictures of one scene stand together.
+/// Returns all scenes, the worst first. Evaluations of the same dataset share their scenes, so that images of one scene are next to each
+/// other.
 fn worst_first<'a>(entries: &'a [Entry<'a>]) -> Vec<Scene<'a>> {
     let mut scenes: BTreeMap<(&str, &str), Vec<_>> = BTreeMap::new();
     for entry in entries {
@@ -47,7 +48,7 @@ fn worst_first<'a>(entries: &'a [Entry<'a>]) -> Vec<Scene<'a>> {
     scenes
 }
 
-/// Cards with pictures for the worst scenes, a table for the others.
+/// Renders cards with comparison images for the worst scenes, and a table for the others.
 pub fn scenes(entries: &[Entry]) -> Result<Markup> {
     let scenes = worst_first(entries);
     let mut pictures = 0;
@@ -81,7 +82,7 @@ fn card(scene: &Scene, compares: bool) -> Result<Markup> {
     })
 }
 
-/// One scene of one evaluation.
+/// Renders one scene of one evaluation.
 fn scored(entry: &Entry, scene: &SceneScores, compares: bool) -> Result<Markup> {
     Ok(html! {
         div.scored {
@@ -115,7 +116,7 @@ fn measures(scores: &CaptureScores) -> Markup {
     }
 }
 
-/// The picture, in the page itself.
+/// Renders the comparison image, embedded in the page.
 fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
     let path = comparison_path(entry.folder, &scores.scene);
     if !path.is_file() {
@@ -138,7 +139,7 @@ fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
     })
 }
 
-/// Scores of the views, the worst first: the one that the picture shows.
+/// Renders the scores of the views, worst first. The worst view is the one that the comparison image shows.
 fn views(views: &[ViewScore]) -> Markup {
     let mut views: Vec<&ViewScore> = views.iter().collect();
     views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));

@@ -1,16 +1,16 @@
-//! Parts that tables share.
+//! Building blocks of tables.
 
 use super::entry::Entry;
 use super::numbers::absent;
 use maud::{Markup, html};
 
-/// What heads a column, which is aligned as its cells are.
+/// Heading of a column, which is aligned like its cells.
 pub enum Head {
     Text(&'static str),
     Number(&'static str),
 }
 
-/// A table that scrolls by itself where it is wider than the screen.
+/// Renders a table that scrolls on its own if it is wider than the screen.
 pub fn table(caption: &str, head: &[Head], rows: Markup) -> Markup {
     html! {
         div.scroll tabindex="0" role="region" aria-label=(caption) {
@@ -32,17 +32,17 @@ pub fn table(caption: &str, head: &[Head], rows: Markup) -> Markup {
     }
 }
 
-/// A cell with a number, or the word for none.
+/// Renders a cell with a number, or with the word for a missing value.
 pub fn cell(value: Option<String>) -> Markup {
     html! { td.number { @match value { Some(text) => (text), None => (absent()) } } }
 }
 
-/// Marks a row that the paper has.
+/// Renders the badge of a published row.
 pub fn published_badge() -> Markup {
     html! { span.badge.published { "published" } }
 }
 
-/// Marks a row that was measured, with what keeps its numbers from being compared to published ones.
+/// Renders the badges of a measured row: its origin, and what makes its scores incomparable with published ones.
 pub fn measured_badges(entry: &Entry) -> Markup {
     let [height, width] = entry.evaluation.image_size;
     html! {
@@ -54,18 +54,18 @@ pub fn measured_badges(entry: &Entry) -> Markup {
     }
 }
 
-/// How many scenes a mean is of, where it isn't of all.
+/// Renders the badge of a mean that isn't over all scenes: the number of its scenes.
 pub fn partial_badge(entry: &Entry) -> Markup {
     html! { span.badge.partial { (share(entry)) } }
 }
 
-/// `2 of 5,601 scenes`.
+/// Returns the number of scored scenes, as `2 of 5,601 scenes`.
 pub fn share(entry: &Entry) -> String {
     let of = super::numbers::count(entry.evaluation.indexed_scenes, "scene");
     format!("{} of {of}", super::numbers::thousands(entry.scored() as u64))
 }
 
-/// A name with the colour that plots show it in.
+/// Renders a swatch of the colour that plots use for the entry.
 pub fn swatch(entry: &Entry) -> Markup {
     html! { span.swatch.(entry.colour) aria-hidden="true" {} }
 }

@@ -1,4 +1,4 @@
-//! antimatter15's `.splat`, 32 bytes a Gaussian and nothing else (spec 10.14).
+//! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
 use super::invalid::InvalidGaussians;
 use super::values::{Values, normalized};
@@ -9,13 +9,13 @@ use crate::render::HarmonicLimits;
 use crate::scene::SH_C0;
 use std::path::Path;
 
-/// Of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
+/// Number of bytes of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
 const BYTES: usize = 32;
 
-/// Reads a `.splat`, whose colours are the same from every side.
+/// Reads a `.splat`, whose colours don't depend on the view direction.
 ///
 /// # Errors
-/// A file that isn't made of whole Gaussians.
+/// Returns an error if the file doesn't consist of whole Gaussians.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
@@ -43,15 +43,15 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(values.into_contents(InvalidGaussians::default()))
 }
 
-/// Colours are those that a screen shows, the same from every side.
+/// Returns the limits of coefficients: colours that a screen shows, independent of the view direction.
 pub(super) fn limits() -> HarmonicLimits {
     HarmonicLimits { degree: 0, constant: -0.5 / SH_C0..=0.5 / SH_C0, others: 0. ..=0. }
 }
 
-/// Writes a `.splat`: the Gaussians that cover most come first, for viewers that show what has arrived.
+/// Writes a `.splat`. The Gaussians of the largest volume times opacity come first, for viewers that show a file while it loads.
 ///
 /// # Errors
-/// No Gaussian at all, numbers that aren't finite, or the system's refusal to write.
+/// Returns an error if there is no Gaussian, a value isn't finite, or the file can't be written.
 pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let values = Values::of(path, splat)?;
     if values.count() == 0 {
@@ -76,8 +76,8 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
             gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((values.opacities[index] * 255.).round() as u8);
             gaussian.extend(values.quaternions[index].map(|part| (part * 128. + 128.).round() as u8));
-            // A position whose bytes are another format's magic number has its lowest bit flipped, so that readers don't take the file for
-            // that format.
+            // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't
+            // take the file for that format.
             if place == 0 && recognize(&gaussian).is_some() {
                 gaussian[0] ^= 1;
             }

@@ -1,5 +1,5 @@
-//! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits a Gaussian, of numbers between the bounds of 256 of them, and
-//! a byte for each spherical harmonic above degree 0.
+//! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits per Gaussian, with values between the bounds of a chunk of 256 Gaussians,
+//! and a byte for each spherical harmonic above degree 0.
 
 use super::invalid::InvalidGaussians;
 use super::morton::morton_order;
@@ -15,31 +15,31 @@ use crate::scene::SH_C0;
 use std::f64::consts::SQRT_2;
 use std::path::Path;
 
-/// Gaussians that share their bounds.
+/// Number of Gaussians that share their bounds.
 const CHUNK: usize = 256;
-/// What is bounded: position, logarithm of the scale, colour.
+/// Names of the bounded values: position, logarithm of the scale, colour.
 const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"]];
-/// Of a Gaussian.
+/// Names of the words of a Gaussian.
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Bits of a position's or scale's three parts, of a rotation's three and of a colour's four.
+/// Numbers of bits of the three components of a position or scale, the three of a rotation and the four of a colour.
 const WIDE: [u32; 3] = [11, 10, 11];
 const ROTATION: [u32; 3] = [10, 10, 10];
 const COLOUR: [u32; 4] = [8, 8, 8, 8];
-/// Logarithms of scales beyond would widen the bounds of their chunk for nothing that is seen.
+/// Largest magnitude of the logarithm of a scale. Larger ones would widen the bounds of their chunk without a visible effect.
 const MAX_LOG_SCALE: f32 = 20.;
-/// Spherical harmonics are within ± half of this.
+/// Width of the range of spherical harmonics, which is centred on 0.
 const SH_RANGE: f64 = 8.;
 
-/// Whether `bytes` are a compressed PLY's.
+/// Returns `true` if `bytes` are a compressed PLY.
 pub(super) fn recognizes(bytes: &[u8]) -> bool {
     let header = Header::begins(bytes).then(|| Header::parse(Path::new(""), bytes).ok()).flatten();
     header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
 }
 
-/// Reads a compressed PLY of any SH degree; older ones have no bounds of colours.
+/// Reads a compressed PLY of any SH degree; older files have no bounds of colours.
 ///
 /// # Errors
-/// Anything that is missing or of another type, a file cut short.
+/// Returns an error if anything is missing or of another type, or if the file is truncated.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
@@ -93,8 +93,8 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(values.into_contents(invalid))
 }
 
-/// The bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and how many of all degrees a
-/// channel has.
+/// Returns the bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and the number of spherical
+/// harmonics of all degrees per channel.
 fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result<(Vec<u8>, usize)> {
     let Some(element) = header.element("sh") else { return Ok((vec![], 1)) };
     let names: Vec<String> =
@@ -108,7 +108,7 @@ fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result
     Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, bases))
 }
 
-/// What is packed is numbers of one type.
+/// Checks that the packed properties have the type `scalar`.
 fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], scalar: Scalar) -> Result<()> {
     let properties = header.element(element).into_iter().flat_map(|element| &element.properties);
     for property in properties.filter(|property| names.contains(&property.name)) {
@@ -124,15 +124,15 @@ fn bound_names(of: &[&str; 3]) -> Vec<String> {
     ["min", "max"].iter().flat_map(|end| of.map(|name| format!("{end}_{name}"))).collect()
 }
 
-/// Colours of a chunk are between bounds of their own.
+/// Returns the limits of coefficients. Degree 0 has none, because each chunk has its own bounds of colours.
 pub(super) fn limits() -> HarmonicLimits {
     HarmonicLimits { others: -SH_RANGE / 2. ..=SH_RANGE / 2., ..HarmonicLimits::up_to(3) }
 }
 
-/// Writes a compressed PLY: Gaussians in Morton order, so that those of a chunk are near each other.
+/// Writes a compressed PLY, with Gaussians in Morton order, so that those of a chunk are near each other.
 ///
 /// # Errors
-/// Gaussians with numbers that aren't finite, or the system's refusal to write.
+/// Returns an error if a value isn't finite, or if the file can't be written.
 pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let values = Values::of(path, splat)?;
     let order = morton_order(&values.means);
@@ -189,7 +189,7 @@ fn header(count: usize, bases: usize) -> String {
     lines.join("\n")
 }
 
-/// Numbers of a chunk, and what they are between.
+/// Values of a chunk, and their bounds.
 struct Bounded {
     numbers: Vec<[f32; 3]>,
     low: [f32; 3],
@@ -206,7 +206,7 @@ impl Bounded {
         Bounded { low: extreme(f32::min), high: extreme(f32::max), numbers }
     }
 
-    /// How far from the lower bound to the upper one, in [0, 1].
+    /// Returns the fraction of the way from the lower bound to the upper one, in [0, 1].
     fn parts(&self, row: usize) -> [f64; 3] {
         std::array::from_fn(|axis| {
             let (low, high) = (f64::from(self.low[axis]), f64::from(self.high[axis]));
@@ -215,7 +215,7 @@ impl Bounded {
     }
 }
 
-/// Parts of 1, the first in the highest of as many `bits`.
+/// Packs values in [0, 1] into a word, each in its number of `bits`, the first in the highest bits.
 fn pack<const N: usize>(parts: [f64; N], bits: [u32; N]) -> u32 {
     parts.iter().zip(bits).fold(0, |word, (part, bits)| {
         let largest = (1u32 << bits) - 1;
@@ -233,7 +233,8 @@ fn unpack<const N: usize>(mut word: u32, bits: [u32; N]) -> [f64; N] {
     parts
 }
 
-/// Which part is the largest, in two bits, and the other three of the quaternion or its opposite where that one is positive.
+/// Packs the index of the largest component, in two bits, and the other three of the quaternion or its negative, whichever has a positive
+/// largest component.
 fn pack_rotation(quaternion: [f32; 4]) -> u32 {
     let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
     let largest = (0..4).rev().max_by(larger).expect("four parts");
@@ -258,7 +259,7 @@ fn pack_sh(value: f32) -> u8 {
     ((f64::from(value) / SH_RANGE + 0.5) * 256.) as u8
 }
 
-/// The middle of what packs to the same byte, but the ends of the range for the first and the last.
+/// Returns the middle of the values that pack to `byte`, or the end of the range for the first and the last byte.
 fn unpack_sh(byte: u8) -> f32 {
     let part = match byte {
         0 => 0.,

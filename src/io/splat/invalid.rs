@@ -1,4 +1,4 @@
-//! Gaussians of a file that can't be drawn: which are refused, and which are left out and counted (spec 10.9).
+//! Gaussians of a file that can't be drawn, which are either refused, or left out and counted (spec 10.9).
 
 use crate::error::{Error, Result};
 use crate::scene::Gaussians;
@@ -6,20 +6,20 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use tch::Tensor;
 
-/// Properties that a warning names.
+/// Maximum number of properties that a warning names.
 const NAMED: usize = 6;
 
-/// The Gaussians of a file that hold an invalid number, one that isn't finite or is out of its range.
+/// Gaussians of a file that have an invalid value, one that isn't finite or is out of its range.
 #[derive(Debug, Default)]
 pub(super) struct InvalidGaussians {
     rows: BTreeSet<usize>,
     properties: Vec<String>,
-    /// The field, what was found there, and what was expected, of the first of them.
+    /// Field, found value and expected value of the first invalid Gaussian.
     first: Option<[String; 3]>,
 }
 
 impl InvalidGaussians {
-    /// Adds Gaussian `row`, whose `property` is `found`; `field` is what an error calls it.
+    /// Adds Gaussian `row`, whose `property` is `found`; `field` is its name in errors.
     pub fn add(
         &mut self,
         row: usize,
@@ -35,15 +35,15 @@ impl InvalidGaussians {
         self.first.get_or_insert_with(|| [field(), found.to_string(), expected.into()]);
     }
 
-    /// Whether Gaussian `row` is one of them.
+    /// Returns `true` if Gaussian `row` is invalid.
     pub fn contains(&self, row: usize) -> bool {
         self.rows.contains(&row)
     }
 
-    /// Refuses the file at `path` if there are any.
+    /// Refuses the file at `path` if it has invalid Gaussians.
     ///
     /// # Errors
-    /// The first one's, which names the command that leaves them out.
+    /// Returns an error for the first one, which names the command that leaves them out.
     pub fn refuse(self, path: &Path) -> Result<()> {
         match self.first {
             Some([field, found, expected]) => {
@@ -54,7 +54,7 @@ impl InvalidGaussians {
         }
     }
 
-    /// Takes them out of `gaussians`, which were read at `path`, and says so in `warnings`.
+    /// Removes the invalid ones from `gaussians`, which were read from `path`, and reports them in `warnings`.
     pub fn leave_out(self, path: &Path, gaussians: &Gaussians, warnings: &mut Vec<String>) -> Gaussians {
         let all = gaussians.count();
         if self.rows.is_empty() {

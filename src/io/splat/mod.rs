@@ -1,5 +1,5 @@
-//! Splats as files: a file a format, and a line in [`FORMATS`]. The ending of a name says what is written; what is read says so
-//! itself, where it can.
+//! File formats of splats: a module for each format, and an entry in [`FORMATS`]. The extension determines the format that is written; a
+//! file that is read is recognized by its contents, where that is possible.
 
 mod antimatter;
 mod compressed_ply;
@@ -27,18 +27,18 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
-/// What a splat's file holds: the Gaussians of one scene.
+/// Contents of a splat file: the Gaussians of one scene.
 #[derive(Debug)]
 pub struct Splat {
-    /// [1, N, ..], float32 on the host, with means relative to `origin`.
+    /// Gaussians [1, N, ..], float32 on the host, with means relative to `origin`.
     pub gaussians: Gaussians,
-    /// Where in the world the coordinates of the means begin: world = origin + mean.
+    /// Origin of the means in world coordinates: world = origin + mean.
     pub origin: DVec3,
-    /// What was left out or changed when the splat was read or made, a sentence each. What is made of it has none.
+    /// Messages about what was left out or changed when the splat was read or created, a sentence each. Splats derived from it have none.
     pub warnings: Vec<String>,
 }
 
-/// What a format's reader makes of a file, before its Gaussians are checked.
+/// Contents of a file as a format's reader returns them, before its Gaussians are checked.
 struct Contents {
     gaussians: Gaussians,
     invalid: InvalidGaussians,
@@ -46,14 +46,14 @@ struct Contents {
 }
 
 impl Splat {
-    /// Float32 positions that are this share of the scene's typical size apart show in pictures.
+    /// Ratio of the spacing of float32 positions to the scene's typical distance above which rounding is visible in rendered images.
     const COARSE: f64 = 1e-4;
 
-    /// `gaussians` of one scene, in world coordinates, without their gradients. Those whose quaternion has length 0 are left out,
-    /// and counted in [`Splat::warnings`].
+    /// Creates a splat from `gaussians` of one scene in world coordinates, without their gradients. Gaussians whose quaternion has length 0
+    /// are left out, and counted in [`Splat::warnings`].
     ///
     /// # Errors
-    /// More scenes than one.
+    /// Returns an error if there isn't exactly one scene.
     pub fn of(gaussians: &Gaussians) -> Result<Self> {
         match gaussians.means.size()[0] {
             1 => {
@@ -64,7 +64,7 @@ impl Splat {
         }
     }
 
-    /// Leaves out the Gaussians without a rotation, and counts them; `name` is what the warning calls the splat.
+    /// Creates a splat without the Gaussians that have no rotation, and counts them in a warning that calls the splat `name`.
     fn of_rotated(gaussians: Gaussians, name: impl Display, mut warnings: Vec<String>) -> Self {
         let all = gaussians.count();
         let (gaussians, left_out) = with_rotation(&gaussians);
@@ -76,12 +76,12 @@ impl Splat {
         Splat { gaussians, origin: DVec3::ZERO, warnings }
     }
 
-    /// Degree of the spherical harmonics, 0 to 3.
+    /// Returns the degree of the spherical harmonics, 0 to 3.
     pub fn sh_degree(&self) -> i64 {
         self.bases().isqrt() - 1
     }
 
-    /// The same with spherical harmonics up to `degree`: those above are left out, those that weren't there are 0.
+    /// Returns the splat with spherical harmonics up to `degree`: higher coefficients are dropped, missing ones are 0.
     pub fn with_sh_degree(&self, degree: i64) -> Self {
         let bases = (degree + 1) * (degree + 1);
         let more = (bases - self.bases()).max(0);
@@ -90,7 +90,7 @@ impl Splat {
         Splat { gaussians: Gaussians { sh, ..gaussians }, origin: self.origin, warnings: vec![] }
     }
 
-    /// Returns the same splat with means relative to `origin`, rounded to float32.
+    /// Returns the splat with means relative to `origin`, rounded to float32.
     pub fn with_origin(&self, origin: DVec3) -> Self {
         let mut gaussians = self.gaussians.map(Tensor::shallow_clone);
         if origin != self.origin {
@@ -100,17 +100,17 @@ impl Splat {
         Splat { gaussians, origin, warnings: vec![] }
     }
 
-    /// Returns the local frame that the splat is rendered in (spec 2.5).
+    /// Returns the local frame in which the splat is rendered (spec 2.5).
     pub fn frame(&self) -> LocalFrame {
         LocalFrame::from_gaussians(&self.gaussians, self.origin)
     }
 
-    /// Returns what renders the splat from cameras of the world.
+    /// Returns a renderer of the splat for cameras in world coordinates.
     pub fn renderer(&self) -> SplatRenderer {
         SplatRenderer::new(&self.gaussians, self.origin, self.frame())
     }
 
-    /// Says what float32 loses of the positions in world coordinates, where that shows in pictures.
+    /// Returns a message about the rounding of positions to float32 in world coordinates, if it is visible in rendered images.
     pub fn world_loss(&self) -> Option<String> {
         let frame = self.frame();
         let farthest = frame.origin.abs().max_element();
@@ -125,29 +125,29 @@ impl Splat {
         })
     }
 
-    /// Spherical harmonics of a colour channel.
+    /// Returns the number of spherical harmonics per colour channel.
     fn bases(&self) -> i64 {
         self.gaussians.sh.size()[2]
     }
 
-    /// Bytes of its file in the format that everyone reads, a 3DGS PLY.
+    /// Returns the size in bytes of the splat as a 3DGS PLY, the format that every program reads.
     pub fn ply_bytes(&self) -> u64 {
         ply::size(self)
     }
 }
 
-/// A format.
+/// A splat file format.
 struct Format {
-    /// Of file names, in small letters.
+    /// Suffix of file names, in lower case.
     ending: &'static str,
-    /// Whether bytes are of it, without a doubt.
+    /// Function that returns `true` if bytes are certainly in this format.
     recognizes: fn(&[u8]) -> bool,
     read: fn(&Path, &[u8]) -> Result<Contents>,
     write: fn(&Path, &Splat) -> Result<()>,
     limits: fn() -> HarmonicLimits,
 }
 
-/// The first whose ending fits, or that recognizes a file, is it.
+/// All formats. The first one whose suffix matches, or that recognizes a file, is used.
 const FORMATS: [Format; 4] = [
     Format {
         ending: ".compressed.ply",
@@ -179,7 +179,7 @@ const FORMATS: [Format; 4] = [
     },
 ];
 
-/// The format that the ending of `path` tells.
+/// Returns the format that belongs to the extension of `path`.
 fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
@@ -188,42 +188,42 @@ fn format_of(path: &Path) -> Result<&'static Format> {
     })
 }
 
-/// Whether the ending of `path` is that of a splat's format.
+/// Returns `true` if `path` has the extension of a splat format.
 pub fn is_splat_name(path: &Path) -> bool {
     format_of(path).is_ok()
 }
 
-/// The splat called `name` in `folder`, of whatever format; where there is none, the PLY that is missing.
+/// Returns the path of the splat `name` in `folder`, in any format, or if there is none, the path of the missing PLY.
 pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
     let candidates = FORMATS.map(|format| folder.join(format!("{name}{}", format.ending)));
     candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| folder.join(format!("{name}.ply")))
 }
 
-/// Whether a splat could be written at `path`. Call it before the work, not after.
+/// Checks that a splat could be written at `path`. Call it before the work starts.
 ///
 /// # Errors
-/// An ending that is no format's, or a request error that names the path.
+/// Returns an error for an unknown extension, or a request error that names the path.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
     format_of(path)?;
     check_writable_file(path)
 }
 
-/// Reads a splat of the format that it is recognized by, else of the one that the ending of `path` tells. Gaussians whose
-/// quaternion has length 0 are left out, and counted in [`Splat::warnings`].
+/// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
+/// length 0 are left out, and counted in [`Splat::warnings`].
 ///
 /// # Errors
-/// An ending that is no format's, a file that can't be read or breaks its format's rules, a Gaussian with a number that isn't
-/// finite or is out of its range, and a file without a Gaussian that can be drawn.
+/// Returns an error for an unknown extension, or if the file can't be read or violates its format, a Gaussian has a value that isn't finite
+/// or is out of range, or no Gaussian can be drawn.
 pub fn read_splat(path: &Path) -> Result<Splat> {
     let Contents { gaussians, invalid, warnings } = read_contents(path)?;
     invalid.refuse(path)?;
     drawable(path, gaussians.count(), gaussians, warnings)
 }
 
-/// Reads a splat as [`read_splat`] does, but leaves out the Gaussians with invalid numbers, too.
+/// Reads a splat like [`read_splat`], but also leaves out the Gaussians with invalid values.
 ///
 /// # Errors
-/// As there, but for invalid numbers.
+/// Returns the errors of [`read_splat`], except for invalid values.
 pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
     let Contents { gaussians, invalid, mut warnings } = read_contents(path)?;
     let valid = invalid.leave_out(path, &gaussians, &mut warnings);
@@ -241,7 +241,7 @@ fn recognize(bytes: &[u8]) -> Option<&'static Format> {
     FORMATS.iter().find(|format| (format.recognizes)(bytes))
 }
 
-/// The splat of those of `all` Gaussians in the file that are valid, less those without a rotation.
+/// Creates the splat from the valid Gaussians of a file that has `all` in total, without those that have no rotation.
 fn drawable(path: &Path, all: i64, valid: Gaussians, warnings: Vec<String>) -> Result<Splat> {
     let splat = Splat::of_rotated(valid, path.display(), warnings);
     if splat.gaussians.count() == 0 && all > 0 {
@@ -252,21 +252,20 @@ fn drawable(path: &Path, all: i64, valid: Gaussians, warnings: Vec<String>) -> R
     Ok(Splat { origin: read_origin(path)?, ..splat })
 }
 
-/// Writes a splat in world coordinates, in the format that the ending of `path` tells, whole or not at all. The origin of an
-/// older splat there is removed. Gaussians whose quaternion has length 0 are left out; [`Splat::of`] counts them.
+/// Writes a splat atomically in world coordinates, in the format of the extension of `path`. The origin file of an older splat there is
+/// removed. Gaussians whose quaternion has length 0 are left out; [`Splat::of`] counts them.
 ///
 /// # Errors
-/// An ending that is no format's, Gaussians that the format can't hold, such as those with numbers that aren't finite, or the
-/// system's refusal to write.
+/// Returns an error for an unknown extension, or if the format can't hold the Gaussians, for example because a value isn't finite, or the
+/// file can't be written.
 pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
     write_local_splat(path, &splat.with_origin(DVec3::ZERO))
 }
 
-/// Writes a splat as [`write_splat`] does, with coordinates relative to its origin, which goes to [`origin_file`] unless it is
-/// zero.
+/// Writes a splat like [`write_splat`], but with coordinates relative to its origin, which is written to [`origin_file`] unless it is zero.
 ///
 /// # Errors
-/// As [`write_splat`].
+/// Returns the errors of [`write_splat`].
 pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
     let format = format_of(path)?;
     let (gaussians, _) = with_rotation(&splat.gaussians);
@@ -274,10 +273,10 @@ pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
     write_with_origin(path, splat.origin, || (format.write)(path, &rotated))
 }
 
-/// Returns `splat` in spherical harmonics within `limits` that the format of `path` holds, too, and that show `cameras` the same.
+/// Returns `splat` with spherical harmonics within `limits` and those of the format of `path`, which look the same from `cameras`.
 ///
 /// # Errors
-/// An ending that is no format's.
+/// Returns an error for an unknown extension.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.and(&(format_of(path)?.limits)());
     let frame = splat.frame();
@@ -287,7 +286,7 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &
     Ok(Splat { gaussians: Gaussians { opacities, sh, ..gaussians }, origin: splat.origin, warnings: vec![] })
 }
 
-/// Whether all of `numbers`, which are to be written at `path`, are finite.
+/// Checks that all of `numbers`, which are to be written at `path`, are finite.
 fn all_finite(path: &Path, numbers: &Tensor) -> Result<()> {
     match numbers.isfinite().all().int64_value(&[]) {
         0 => Err(Error::Failed(format!("{}: the splat has numbers that aren't finite", path.display()))),

@@ -1,9 +1,9 @@
-//! An order in which neighbours in space are mostly neighbours in a file.
+//! Morton order, in which points that are close in space are mostly close in a file.
 
-/// Cells along an axis, as a power of two: three of them fill 63 bits.
+/// Number of bits of a cell's index along an axis: three of them fill 63 bits.
 const BITS: u32 = 21;
 
-/// The indices of `means` along Morton's curve through their bounding box; of the same cell, the lower comes first.
+/// Returns the indices of `means` along Morton's curve through their bounding box. In the same cell, the lower index comes first.
 pub(super) fn morton_order(means: &[[f32; 3]]) -> Vec<usize> {
     let bounds: [(f64, f64); 3] = std::array::from_fn(|axis| {
         means.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), mean| {

@@ -1,4 +1,4 @@
-//! The origin of a splat's coordinates, in a file beside it (spec 10.18): `room.ply.origin.json` for `room.ply`.
+//! Origin of a splat's coordinates, in a file beside it (spec 10.18): `room.ply.origin.json` for `room.ply`.
 
 use crate::error::{Error, Result};
 use crate::io::atomic::{PartialFile, check_writable_file};
@@ -9,7 +9,7 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What is added to the splat's name.
+/// Suffix that is added to the splat's name.
 const ENDING: &str = ".origin.json";
 
 #[derive(Serialize, Deserialize)]
@@ -17,25 +17,25 @@ struct Contents {
     origin: [f64; 3],
 }
 
-/// Returns the path of the file that has the origin of the splat at `path`.
+/// Returns the path of the origin file of the splat at `path`.
 pub fn origin_file(path: &Path) -> PathBuf {
     let mut name = OsString::from(path);
     name.push(ENDING);
     name.into()
 }
 
-/// Checks that the origin of a splat at `path` could be written beside it: its name is longer. Call it before the work, not after.
+/// Checks that the origin file of a splat at `path`, whose name is longer, could be written. Call it before the work starts.
 ///
 /// # Errors
-/// A request error that names the file.
+/// Returns a request error that names the file.
 pub fn check_writable_origin(path: &Path) -> Result<()> {
     check_writable_file(&origin_file(path))
 }
 
-/// Returns the origin of the splat at `path`: zero where there is no such file.
+/// Returns the origin of the splat at `path`, or zero if it has no origin file.
 ///
 /// # Errors
-/// A file that can't be read or has no origin.
+/// Returns an error if the file can't be read or has no origin.
 pub(super) fn read_origin(path: &Path) -> Result<DVec3> {
     let path = origin_file(path);
     if !path.is_file() {
@@ -48,11 +48,11 @@ pub(super) fn read_origin(path: &Path) -> Result<DVec3> {
     Ok(DVec3::from_array(origin))
 }
 
-/// Writes the splat at `path` by `write`, and its `origin` beside it; of an origin of zero, an older file is removed. The new
-/// file is written before the splat and renamed after it, so that a full disk leaves both files as they were.
+/// Writes the splat at `path` with `write`, and its `origin` in a file beside it. If the origin is zero, an older origin file is removed.
+/// The new origin file is written before the splat and renamed after it, so that a full disk leaves both files unchanged.
 ///
 /// # Errors
-/// What `write` returns, or the system's refusal to write.
+/// Returns the error of `write`, or an error if the origin file can't be written.
 pub(super) fn write_with_origin(
     path: &Path,
     origin: DVec3,

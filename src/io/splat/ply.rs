@@ -1,7 +1,7 @@
 //! Splats in the PLY layout of 3DGS, which every viewer reads (spec 10.9).
 //!
-//! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z).
-//! f_rest is channel-major: all reds, all greens, all blues. Written is float32, binary, little-endian.
+//! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
+//! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
 use super::invalid::InvalidGaussians;
 use super::ply_body::columns;
@@ -14,24 +14,24 @@ use crate::scene::{MIN_SCALE, RawGaussians, SH_C0};
 use std::path::Path;
 use tch::{Device, Kind, Tensor};
 
-/// Larger logarithms of scales aren't those of a float32.
+/// Maximum logarithm of a scale: larger scales exceed float32.
 const MAX_LOG_SCALE: f32 = 88.;
 
 /// Names of colour channels in point clouds.
 const COLOURS: [[&str; 3]; 3] =
     [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
-/// Whether `bytes` are a PLY's.
+/// Returns `true` if `bytes` begin like a PLY.
 pub(super) fn recognizes(bytes: &[u8]) -> bool {
     Header::begins(bytes)
 }
 
-/// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order,
-/// and others beside them, don't matter. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without
-/// `f_dc_*` their colours are those of `red`, `green` and `blue`.
+/// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order doesn't
+/// matter, and others may be present. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without `f_dc_*` their
+/// colours are those of `red`, `green` and `blue`.
 ///
 /// # Errors
-/// A missing property, a point cloud, a file cut short.
+/// Returns an error if a property is missing, or if the file is a point cloud or truncated.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let vertex = header.element("vertex");
@@ -85,8 +85,8 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(Contents { gaussians: raw.activate(), invalid, warnings })
 }
 
-/// Turns the colours in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, into spherical harmonics of
-/// degree 0. Bytes are of 255, 16 bits without a sign of 65,535; other numbers of 1, or of 255 where one is above 1.
+/// Converts the colours in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, to spherical harmonics of degree 0.
+/// White is 255 for bytes and 65,535 for unsigned 16-bit numbers; for other numbers it is 1, or 255 if any is above 1.
 fn harmonics_from_colours(scalar: Option<Scalar>, width: usize, values: &mut [f32]) {
     let colours = values.chunks_exact(width).flat_map(|vertex| &vertex[3..6]);
     let brightest = colours.filter(|colour| colour.is_finite()).fold(0f32, |a, &b| a.max(b));
@@ -101,7 +101,7 @@ fn harmonics_from_colours(scalar: Option<Scalar>, width: usize, values: &mut [f3
     }
 }
 
-/// Spherical harmonics of a colour channel, where there are so many f_rest.
+/// Returns the number of spherical harmonics per colour channel for a number of f_rest properties.
 pub(super) fn bases_of_rest(path: &Path, rest: usize) -> Result<i64> {
     match rest {
         0 | 9 | 24 | 45 => Ok(rest as i64 / 3 + 1),
@@ -112,7 +112,8 @@ pub(super) fn bases_of_rest(path: &Path, rest: usize) -> Result<i64> {
     }
 }
 
-/// Numbers have to be finite, but for logits of 0 and 1 and the logarithm of 0, which other programs write.
+/// Finds Gaussians with values that aren't finite or scales that are too large. Logits of 0 and 1 and the logarithm of 0, which other
+/// programs write, are valid.
 fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
     let mut invalid = InvalidGaussians::default();
     for (row, vertex) in values.chunks_exact(names.len()).enumerate() {
@@ -131,15 +132,15 @@ fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
     invalid
 }
 
-/// Any number is one of a PLY.
+/// Returns the limits of coefficients: a PLY can hold any number.
 pub(super) fn limits() -> HarmonicLimits {
     HarmonicLimits::up_to(3)
 }
 
-/// Writes one scene, [1, N, ..], whole or not at all.
+/// Writes one scene, [1, N, ..], atomically.
 ///
 /// # Errors
-/// Gaussians with numbers that aren't finite, or the system's refusal to write.
+/// Returns an error if a value isn't finite, or if the file can't be written.
 pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let (n, bases) = (splat.gaussians.count(), splat.bases());
     let g = RawGaussians::of(&splat.gaussians);
@@ -160,7 +161,7 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     })
 }
 
-/// What [`write`] writes before the numbers of `n` Gaussians with `bases` spherical harmonics.
+/// Returns the header that [`write`] writes before the values of `n` Gaussians with `bases` spherical harmonics.
 fn header(n: i64, bases: i64) -> String {
     let means_and_normals = owned(["x", "y", "z", "nx", "ny", "nz"]);
     let names = [means_and_normals, sh_names(bases), shape_names()].concat();
@@ -186,9 +187,9 @@ fn shape_names() -> Vec<String> {
     owned(names)
 }
 
-/// Bytes of the file that [`write`] would write.
+/// Returns the size in bytes of the file that [`write`] would write.
 pub(super) fn size(splat: &Splat) -> u64 {
-    /// Position, normal, opacity, scale and rotation.
+    /// Number of values of position, normal, opacity, scale and rotation.
     const NUMBERS: i64 = 14;
     let (n, bases) = (splat.gaussians.count(), splat.bases());
     header(n, bases).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64

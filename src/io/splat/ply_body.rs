@@ -1,14 +1,15 @@
-//! The rows of a PLY, whatever else stands among them (spec 10.9).
+//! Rows of a PLY, among any other elements and properties (spec 10.9).
 
 use super::ply_header::{Element, Encoding, Header, Kind, Scalar};
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// The numbers of the properties `names` of an element, row by row, each as `convert` has it. Other elements and properties are
-/// passed over.
+/// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. Other elements and properties are
+/// skipped.
 ///
 /// # Errors
-/// An element or a property that is absent, a list where a number should be, a file cut short, text that is no number.
+/// Returns an error if an element or a property is missing, a property is a list instead of a number, the file is truncated, or a text is
+/// no number.
 pub fn columns<T>(
     path: &Path,
     bytes: &[u8],
@@ -24,7 +25,7 @@ pub fn columns<T>(
     let Some(element) = header.element(element) else {
         return Err(Error::input(path, format!("the element {element}"), "absent", "the Gaussians"));
     };
-    // Where a row has what is asked for, property by property.
+    // Index in `names` of each property of the element.
     let mut places: Vec<Option<usize>> = vec![None; element.properties.len()];
     for (place, name) in names.iter().enumerate() {
         let at = element.properties.iter().position(|property| property.name == *name);
@@ -56,7 +57,7 @@ pub fn columns<T>(
     Ok(values)
 }
 
-/// What is left to read.
+/// The part of the file that is still to be read.
 struct Body<'a> {
     path: &'a Path,
     rest: &'a [u8],
@@ -64,15 +65,15 @@ struct Body<'a> {
 }
 
 impl Body<'_> {
-    /// Whether as many rows could be there as the header claims: nothing is made room for before.
+    /// Checks that the file is long enough for the rows that the header claims. No memory is allocated for them before this check.
     fn check_length(&self, element: &Element) -> Result<()> {
         let smallest = |kind: Kind| match (self.encoding, kind) {
-            (Encoding::Ascii, _) => 2, // a digit, and what parts it from the next
+            (Encoding::Ascii, _) => 2, // a digit and a separator
             (_, Kind::Number(scalar) | Kind::List(scalar, _)) => scalar.size(),
         };
         let row: usize = element.properties.iter().map(|property| smallest(property.kind)).sum();
         let needed = row as u128 * element.count as u128;
-        // What parts the last from the next may be absent.
+        // The separator after the last number may be missing.
         let there = self.rest.len() as u128 + u128::from(self.encoding == Encoding::Ascii);
         if there < needed {
             let found = format!("cut short: {} bytes of the element {}", self.rest.len(), element.name);
@@ -85,7 +86,7 @@ impl Body<'_> {
     fn pass(&mut self, element: &Element) -> Result<()> {
         self.check_length(element)?;
         if element.properties.is_empty() {
-            return Ok(()); // however many
+            return Ok(()); // however many rows there are
         }
         for row in 0..element.count {
             for property in &element.properties {
@@ -112,7 +113,7 @@ impl Body<'_> {
         }
     }
 
-    /// The next number. `element`, `row` and `name` are for the error.
+    /// Reads the next number. `element`, `row` and `name` are for the error message.
     fn number(&mut self, scalar: Scalar, element: &Element, row: usize, name: &str) -> Result<f64> {
         let cut_short = || {
             let found = format!("cut short: at {name} in row {row} of {}", element.name);
@@ -136,7 +137,7 @@ impl Body<'_> {
         }
         let (number, rest) = self.rest.split_at_checked(scalar.size()).ok_or_else(cut_short)?;
         self.rest = rest;
-        // Eight bytes hold any of them, the lowest first.
+        // Eight bytes hold any type, lowest byte first.
         let mut bytes = [0; 8];
         bytes[..number.len()].copy_from_slice(number);
         if self.encoding == Encoding::BigEndian {

@@ -1,9 +1,9 @@
-//! What stands before the numbers of a PLY: how they are written, and of which elements and properties they are (spec 10.9).
+//! Header of a PLY: the encoding of its numbers, and its elements and properties (spec 10.9).
 
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// How numbers are written.
+/// Encoding of numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Encoding {
     Ascii,
@@ -11,7 +11,7 @@ pub enum Encoding {
     BigEndian,
 }
 
-/// A number type.
+/// Type of a number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Scalar {
     I8,
@@ -39,7 +39,7 @@ impl Scalar {
         })
     }
 
-    /// In bytes, where numbers are binary.
+    /// Returns the size of a binary number in bytes.
     pub fn size(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
@@ -50,11 +50,11 @@ impl Scalar {
     }
 }
 
-/// What a row has of a property.
+/// Type of a property in a row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Kind {
     Number(Scalar),
-    /// A number of this type says how many of that type follow.
+    /// List: a number of the first type is the number of items of the second type that follow.
     List(Scalar, Scalar),
 }
 
@@ -63,10 +63,10 @@ pub struct Property {
     pub kind: Kind,
 }
 
-/// Rows of the same properties.
+/// Rows with the same properties.
 pub struct Element {
     pub name: String,
-    /// Rows, as the file claims.
+    /// Number of rows, as the file claims.
     pub count: usize,
     pub properties: Vec<Property>,
 }
@@ -76,7 +76,7 @@ impl Element {
         self.properties.iter().any(|property| property.name == name)
     }
 
-    /// The number type of the property `name`, unless it is a list.
+    /// Returns the number type of the property `name`, or `None` if it is a list or missing.
     pub fn scalar(&self, name: &str) -> Option<Scalar> {
         let property = self.properties.iter().find(|property| property.name == name)?;
         match property.kind {
@@ -87,14 +87,14 @@ impl Element {
 }
 
 pub struct Header {
-    /// Bytes up to the first row.
+    /// Number of bytes up to the first row.
     pub length: usize,
     pub encoding: Encoding,
     pub elements: Vec<Element>,
 }
 
 impl Header {
-    /// Whether `bytes` are those of a PLY.
+    /// Returns `true` if `bytes` begin like a PLY.
     pub fn begins(bytes: &[u8]) -> bool {
         bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
     }

@@ -1,13 +1,13 @@
-//! Quaternions of any length: whose length is 0 has no rotation, and whose length is far from 1 overflows where it is squared.
+//! Quaternions of any length: one of length 0 has no rotation, and one whose length is far from 1 overflows when it is squared.
 
 use crate::scene::Gaussians;
 use tch::{Kind, Tensor};
 
-/// Quaternions whose largest part is within 2^±10 keep their length.
+/// Maximum binary exponent: quaternions whose largest component is within 2^±10 keep their length.
 const MAX_EXPONENT: f64 = 10.;
 
-/// Returns the Gaussians that have a rotation, their quaternions near length 1 by a power of two where they were far from it, and
-/// how many were left out: those whose quaternion is 0 or subnormal, which the rasterizer doesn't draw (spec 6.2).
+/// Returns the Gaussians that have a rotation, and the number of those left out: Gaussians whose quaternion is 0 or subnormal, which the
+/// rasterizer doesn't draw (spec 6.2). Quaternions whose length is far from 1 are brought near it by a power of two.
 pub(super) fn with_rotation(gaussians: &Gaussians) -> (Gaussians, i64) {
     let largest_part = |g: &Gaussians| g.quaternions.abs().amax([-1i64].as_slice(), true);
     let absent = largest_part(gaussians).less(f64::from(f32::MIN_POSITIVE)).flatten(0, -1);

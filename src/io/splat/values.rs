@@ -1,4 +1,4 @@
-//! A splat's numbers on the host, as the formats take and give them that pack each Gaussian into bytes.
+//! Values of a splat on the host, for the formats that pack each Gaussian into bytes.
 
 use super::invalid::InvalidGaussians;
 use super::{Contents, Splat, all_finite};
@@ -7,23 +7,23 @@ use crate::scene::Gaussians;
 use std::path::Path;
 use tch::Tensor;
 
-/// A list has an entry a Gaussian, unless it says otherwise.
+/// Values of Gaussians. Each list has one entry per Gaussian, unless noted otherwise.
 pub(super) struct Values {
     pub means: Vec<[f32; 3]>,
-    /// Linear.
+    /// Linear scales.
     pub scales: Vec<[f32; 3]>,
-    /// (w, x, y, z), of length 1.
+    /// Quaternions (w, x, y, z), of length 1.
     pub quaternions: Vec<[f32; 4]>,
-    /// In [0, 1].
+    /// Opacities in [0, 1].
     pub opacities: Vec<f32>,
-    /// Spherical harmonics of a colour channel.
+    /// Number of spherical harmonics per colour channel.
     pub bases: usize,
-    /// Gaussian by Gaussian, basis by basis: red, green and blue.
+    /// Spherical harmonics, Gaussian by Gaussian, basis by basis: red, green and blue.
     pub sh: Vec<[f32; 3]>,
 }
 
 impl Values {
-    /// Room for so many Gaussians.
+    /// Creates empty lists with capacity for `count` Gaussians.
     pub fn with_capacity(count: usize, bases: usize) -> Self {
         Values {
             means: Vec::with_capacity(count),
@@ -35,10 +35,10 @@ impl Values {
         }
     }
 
-    /// The numbers of `splat`, which is to be written at `path`.
+    /// Returns the values of `splat`, which is to be written at `path`.
     ///
     /// # Errors
-    /// Numbers that aren't finite.
+    /// Returns an error if a value isn't finite.
     pub fn of(path: &Path, splat: &Splat) -> Result<Self> {
         let g = &splat.gaussians;
         for tensor in [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh] {
@@ -55,18 +55,18 @@ impl Values {
         })
     }
 
-    /// Gaussians.
+    /// Returns the number of Gaussians.
     pub fn count(&self) -> usize {
         self.means.len()
     }
 
-    /// The spherical harmonics of Gaussian `index`.
+    /// Returns the spherical harmonics of Gaussian `index`.
     pub fn sh_of(&self, index: usize) -> &[[f32; 3]] {
         &self.sh[index * self.bases..][..self.bases]
     }
 
-    /// The Gaussians as they were read. To the invalid ones that its reader knows are added those with a number that isn't finite,
-    /// or a scale below zero.
+    /// Returns the Gaussians as they were read. Gaussians with a value that isn't finite, or a negative scale, are added to the `invalid`
+    /// ones that the reader has found.
     pub fn into_contents(self, mut invalid: InvalidGaussians) -> Contents {
         for row in 0..self.count() {
             if invalid.contains(row) {
@@ -99,7 +99,7 @@ fn grouped<const N: usize>(values: &[f32]) -> Vec<[f32; N]> {
     values.as_chunks().0.to_vec()
 }
 
-/// The quaternion at length 1; of length 0 it stays so.
+/// Normalizes a quaternion to length 1; a quaternion of length 0 is unchanged.
 pub(super) fn normalized(quaternion: [f32; 4]) -> [f32; 4] {
     let length = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum::<f64>().sqrt();
     match length > 0. {

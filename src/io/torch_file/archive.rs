@@ -1,4 +1,4 @@
-//! The zip archive that torch.save writes: a pickle, and the bytes of its tensors, all of it stored as it is.
+//! The zip archive that torch.save writes: a pickle, and the bytes of its tensors, all stored without compression.
 
 use super::Storages;
 use crate::error::{Error, Result};
@@ -9,15 +9,15 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::read::ZipArchive;
 
-/// How an archive begins.
+/// First bytes of an archive.
 pub(super) const MAGIC: &[u8] = b"PK\x03\x04";
 
-/// An archive's parts, as places in its file. None overlaps another.
+/// Parts of an archive, as byte ranges in its file. No two of them overlap.
 #[derive(Debug)]
 pub(crate) struct Archive {
-    /// Of data.pkl.
+    /// Byte range of `data.pkl`.
     pub pickle: Range<usize>,
-    /// Of the tensors' storages, by the keys under which the pickle asks for them.
+    /// Byte ranges of the tensors' storages, by the keys under which the pickle refers to them.
     pub storages: Storages,
 }
 
@@ -29,12 +29,12 @@ struct Entry {
 }
 
 impl Archive {
-    /// Finds the parts of `bytes`, which `file` holds, and checks their checksums. Whatever the archive claims, nothing is
-    /// larger than the file, nor all of it together: compressed entries, which could inflate without end, are refused, and so
-    /// are those that share bytes.
+    /// Finds the parts of `bytes`, the contents of `file`, and verifies their checksums. Whatever the archive claims, no part is larger
+    /// than the file, nor are all parts together: compressed entries, which could inflate without limit, are refused, and so are entries
+    /// that share bytes.
     ///
     /// # Errors
-    /// A file that is no such archive, was cut off, or has changed since it was written.
+    /// Returns an error if the file is no such archive, is truncated, or has changed since it was written.
     pub fn open(file: &Path, bytes: &[u8]) -> Result<Self> {
         let refuse = |field: &str, found: &dyn Display, expected: &str| {
             Err(Error::input(file, field, found, expected))
@@ -75,7 +75,7 @@ impl Archive {
             if crc32fast::hash(&bytes[contents.clone()]) != crc32 {
                 return refuse(&name, &"damaged: its checksum differs", "the bytes that were written");
             }
-            // The first folder is the archive's own name.
+            // The first folder has the name of the archive.
             match name.split_once('/').map(|(_, inside)| inside) {
                 Some("data.pkl") => pickle = Some(contents),
                 Some("byteorder") if &bytes[contents.clone()] != b"little" => {

@@ -1,26 +1,27 @@
-//! A tensor in a file of torch.save's, as a place.
+//! Location of a tensor in a file.
 
 use super::Storages;
 use super::value::{Id, Value, Values};
 use std::ops::Range;
 use tch::Kind;
 
-/// Numbers in a file.
+/// Type, layout and location of a tensor in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Array {
     pub dtype: Kind,
     pub size: Vec<usize>,
-    /// In elements.
+    /// Strides in elements.
     pub stride: Vec<usize>,
-    /// From the first element to the last.
+    /// Byte range in the file, from the first element to the last.
     pub bytes: Range<usize>,
 }
 
 impl Array {
-    /// Where `tensor` lies. Whatever it says, that is inside its storage, and it has no more elements than there are.
+    /// Locates `tensor` in its file. Whatever the file claims, the array lies inside the tensor's storage and has no more elements than the
+    /// storage.
     ///
     /// # Errors
-    /// What is wrong with it, to be read behind its name.
+    /// Returns a description of the problem, phrased to follow the name of the tensor.
     pub fn of(values: &Values, storages: &Storages, tensor: &Value) -> Result<Self, String> {
         let &Value::Tensor { storage, offset, size, stride } = tensor else {
             return Err(format!("has {}, expected a tensor", tensor.name()));
@@ -48,7 +49,7 @@ impl Array {
         Ok(Array { dtype, bytes: place().ok_or_else(beyond)?, size, stride })
     }
 
-    /// Whether the elements lie one after the other, in row-major order.
+    /// Returns `true` if the elements are contiguous, in row-major order.
     pub fn is_contiguous(&self) -> bool {
         let steps = self.stride.iter().zip(row_major(&self.size));
         self.bytes.is_empty()
@@ -56,8 +57,8 @@ impl Array {
     }
 }
 
-/// Returns the strides of a contiguous tensor, last dimension fastest. Without elements strides are meaningless; one whose product
-/// overflows is 1.
+/// Returns the strides of a contiguous tensor, last dimension fastest. The strides of a tensor without elements are meaningless; a stride
+/// whose product overflows is 1.
 pub(crate) fn row_major(size: &[usize]) -> Vec<usize> {
     let mut stride = vec![1usize; size.len()];
     for i in (1..size.len()).rev() {
@@ -66,7 +67,7 @@ pub(crate) fn row_major(size: &[usize]) -> Vec<usize> {
     stride
 }
 
-/// How many elements a tensor has, and how many there are from its first to its last; none where that overflows.
+/// Returns the number of elements of a tensor, and the number of elements of memory from its first to its last, or `None` on overflow.
 fn extent(size: &[usize], stride: &[usize]) -> Option<(usize, usize)> {
     let count = size.iter().try_fold(1usize, |count, &size| count.checked_mul(size))?;
     if count == 0 {
@@ -84,7 +85,8 @@ fn number(values: &Values, id: Id) -> Option<usize> {
 }
 
 fn numbers(values: &Values, tuple: Id) -> Option<Vec<usize>> {
-    /// Weights have fewer dimensions. The limit keeps what a pickle makes as short as what it says.
+    /// Maximum number of dimensions, which weights don't reach. The limit keeps the size of the result in proportion to the length of the
+    /// pickle.
     const MOST: usize = 8;
     match values.get(tuple) {
         Value::Tuple(items) if items.len() <= MOST => {

@@ -1,9 +1,9 @@
-//! What a pickle may name, and what may be made by calling it.
+//! Names that a pickle may use, and those that it may call.
 
 use super::value::{Rebuild, Value};
 use tch::Kind;
 
-/// What tensors are put together by.
+/// Functions and types that tensors are assembled from.
 const KNOWN: [(&str, &str, Value); 23] = [
     ("torch._utils", "_rebuild_tensor", Value::Rebuild(Rebuild::View)),
     ("torch._utils", "_rebuild_tensor_v2", Value::Rebuild(Rebuild::View)),
@@ -30,8 +30,7 @@ const KNOWN: [(&str, &str, Value); 23] = [
     ("torch.storage", "UntypedStorage", Value::Dtype(Kind::Uint8)),
 ];
 
-/// Functions and classes that put data together and do nothing else when Python calls them: what settings, optimizers and the state
-/// of a training are made of.
+/// Functions and classes that only assemble data when Python calls them: the parts of settings, optimizers and training states.
 const HARMLESS: [(&str, &[&str]); 19] = [
     ("__builtin__", BUILTINS),
     ("builtins", BUILTINS),
@@ -72,16 +71,16 @@ const BUILTINS: &[&str] = &[
     "tuple",
 ];
 
-/// Packages whose classes, told by their capitals, hold settings and the state of a training.
+/// Packages whose classes, recognized by their initial capital letter, hold settings and training states.
 const LIBRARIES: [&str; 6] =
     ["lightning", "lightning_fabric", "omegaconf", "pytorch_lightning", "torchmetrics", "yacs"];
 
-/// What tensors are put together by, of that name.
+/// Returns the function or type with this name that tensors are assembled from.
 pub(super) fn known(module: &str, name: &str) -> Option<Value<'static>> {
     KNOWN.into_iter().find(|(m, n, _)| (*m, *n) == (module, name)).map(|(.., value)| value)
 }
 
-/// Whether a call does nothing but put data together.
+/// Returns `true` if a call of this function or class does nothing but assemble data.
 pub(super) fn makes_data(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     let is_class = name.starts_with(|first: char| first.is_ascii_uppercase()) && !name.contains('.');

@@ -1,31 +1,31 @@
-//! What torch.save wrote before torch 1.6, and writes still where it is told to (`_use_new_zipfile_serialization=False`): four
-//! pickles, which are a magic number, a version, the system, and the contents; one with the storages' keys; and the storages in
-//! their order, each behind the number of its elements, of eight bytes.
+//! Reader for the format of torch.save before torch 1.6, which later versions still write on request
+//! (`_use_new_zipfile_serialization=False`): four pickles, which are a magic number, a version, the system, and the contents; a pickle with
+//! the keys of the storages; and the storages in that order, each preceded by its number of elements in eight bytes.
 
 use super::pickle::{Strangers, unpickle};
 use super::value::Value;
 use super::{Storages, TorchFile};
 use std::collections::HashMap;
 
-/// The magic number, of ten bytes, as a pickle of any protocol has it.
+/// Magic number of ten bytes, as a pickle of any protocol contains it.
 const MAGIC: &[u8] = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
-/// Bytes among which it ends, behind what tells the protocol.
+/// Number of bytes at the start of a file that contain the magic number, which follows the protocol.
 const HEAD: usize = 32;
-/// How a pickle begins.
+/// First byte of a pickle.
 const PICKLE: u8 = 0x80;
-/// Of the format, not of torch.
+/// Version of the format, not of torch.
 const VERSION: i64 = 1001;
 
-/// Whether `bytes` begin with the magic number.
+/// Returns `true` if `bytes` begin with the magic number.
 pub(super) fn is_one(bytes: &[u8]) -> bool {
     let head = &bytes[..bytes.len().min(HEAD)];
     head.first() == Some(&PICKLE) && head.windows(MAGIC.len()).any(|window| window == MAGIC)
 }
 
-/// What `bytes` hold.
+/// Parses `bytes`, the contents of a file.
 ///
 /// # Errors
-/// What is wrong with them.
+/// Returns a description of what is wrong with the file.
 pub(super) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
     let mut rest = bytes;
     unpickle(&mut rest, Strangers::Refused)?;

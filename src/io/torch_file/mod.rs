@@ -1,5 +1,5 @@
-//! What torch.save writes, read without torch: a pickle, and the bytes of the tensors that it describes. Nothing that a file says is
-//! run, and nothing that it says about sizes is believed (spec 10.16).
+//! Reader and writer for files of torch.save, without torch: a pickle, and the bytes of the tensors that it describes. Nothing that a file
+//! contains is executed, and none of its sizes is trusted (spec 10.16).
 
 mod archive;
 mod array;
@@ -20,10 +20,10 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::path::Path;
 
-/// Where tensors' bytes lie in a file, by the keys under which its pickle asks for them.
+/// Byte ranges of tensors' storages in a file, by the keys under which its pickle refers to them.
 pub(crate) type Storages = HashMap<String, Range<usize>>;
 
-/// What a file of any kind holds beside the tensors that are wanted of it: strangers are kept.
+/// Contents of a file in either format. Values of unknown types beside the tensors are kept.
 #[derive(Debug)]
 pub(crate) struct TorchFile<'a> {
     pub values: Values<'a>,
@@ -31,15 +31,15 @@ pub(crate) struct TorchFile<'a> {
 }
 
 impl<'a> TorchFile<'a> {
-    /// Whether `bytes` begin as torch.save's files do, today's or those before torch 1.6.
+    /// Returns `true` if `bytes` begin like a file of torch.save, in the current format or in that before torch 1.6.
     pub fn is_one(bytes: &[u8]) -> bool {
         bytes.starts_with(archive::MAGIC) || legacy::is_one(bytes)
     }
 
-    /// Reads `bytes`, which `file` holds.
+    /// Parses `bytes`, the contents of `file`.
     ///
     /// # Errors
-    /// A file that is damaged, or would run code in Python.
+    /// Returns an error if the file is damaged, or if it would run code in Python.
     pub fn parse(file: &Path, bytes: &'a [u8]) -> Result<Self> {
         let expected = "numbers, strings and tensors, as in a checkpoint that runs nothing; nothing was run";
         let refuse = |found: String| Error::input(file, "the pickle", found, expected);

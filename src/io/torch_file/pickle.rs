@@ -1,27 +1,27 @@
-//! A pickle of tensors, lists, dicts, strings and numbers, as values.
+//! Interpreter for pickles of tensors, lists, dicts, strings and numbers.
 //!
-//! A pickle is a program for a small stack machine, and Python's machine calls whatever the program names. This one calls
-//! nothing: it knows the instructions that torch.save needs, and the functions that data are put together by are words to it. Values
-//! refer to each other by their numbers, so one that is part of itself does no harm, and each takes a byte of the
-//! program at least: what a pickle makes grows with its length, whatever it says.
+//! A pickle is a program for a small stack machine, and Python's machine calls whatever the program names. This one calls nothing: it knows
+//! the instructions that torch.save needs, and treats the functions that assemble data as names. Values refer to each other by index, so a
+//! value that contains itself is harmless. Each value takes at least one byte of the program, so the size of the result is proportional to
+//! the length of the pickle, whatever it contains.
 
 use super::globals::{known, makes_data};
 use super::value::{Id, Rebuild, Value, Values};
 
-/// What to do with values that aren't tensors, lists, dicts, strings or numbers.
+/// Treatment of values that aren't tensors, lists, dicts, strings or numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Strangers {
-    /// For files that need none.
+    /// Error, for files that need no such values.
     Refused,
-    /// Taken for data, of which nothing is known; but a pickle that would have Python call a function, other than those that are
-    /// known to put data together, is refused.
+    /// Kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is known to
+    /// only assemble data.
     Kept,
 }
 
-/// Follows the pickle that `rest` begins with, and leaves there what is behind it.
+/// Executes the pickle at the start of `rest`, and leaves in `rest` the bytes after it.
 ///
 /// # Errors
-/// What it asks for that it may not, or what is broken about it.
+/// Returns a description of what the pickle requests but may not, or of what is broken in it.
 pub(crate) fn unpickle<'a>(rest: &mut &'a [u8], strangers: Strangers) -> Result<Values<'a>, String> {
     let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
     let mut machine = Machine { rest, strangers, values, stack, marks, memo };
@@ -38,7 +38,7 @@ struct Machine<'a> {
     strangers: Strangers,
     values: Vec<Value<'a>>,
     stack: Vec<Id>,
-    /// Lengths of the stack.
+    /// Lengths of the stack at the marks.
     marks: Vec<usize>,
     memo: Vec<Id>,
 }
@@ -50,12 +50,12 @@ impl<'a> Machine<'a> {
         Ok(taken)
     }
 
-    /// Little-endian.
+    /// Reads an unsigned little-endian number of `bytes` bytes.
     fn unsigned(&mut self, bytes: usize) -> Result<usize, String> {
         Ok(self.take(bytes)?.iter().rev().fold(0, |number, &byte| number << 8 | usize::from(byte)))
     }
 
-    /// Little-endian, in two's complement, of up to eight bytes.
+    /// Reads a little-endian number of up to eight bytes, in two's complement.
     fn signed(&mut self, bytes: usize) -> Result<Value<'a>, String> {
         let taken = self.take(bytes)?;
         let mut wide = [if taken.last().is_some_and(|&byte| byte >= 0x80) { 0xff } else { 0 }; 8];
@@ -80,25 +80,25 @@ impl<'a> Machine<'a> {
     }
 
     fn pop(&mut self) -> Result<Id, String> {
-        // What lies below a mark belongs to somebody else.
+        // An instruction may not pop values below the last mark.
         if self.marks.last().is_some_and(|&mark| self.stack.len() <= mark) {
             return Err("a pickle that takes what isn't there".into());
         }
         self.stack.pop().ok_or("a pickle that takes what isn't there".into())
     }
 
-    /// The values above the last mark.
+    /// Pops the values above the last mark.
     fn pop_to_mark(&mut self) -> Result<Vec<Id>, String> {
         let mark = self.marks.pop().ok_or("a pickle without a mark")?;
         Ok(self.stack.split_off(mark))
     }
 
-    /// Adds `values` to the list on top of the stack.
+    /// Appends `values` to the list on top of the stack.
     fn append(&mut self, values: &[Id]) -> Result<(), String> {
         let list = self.pop()?;
         match &mut self.values[list] {
             Value::List(items) => items.extend_from_slice(values),
-            // Of a class that is a list, or of a set.
+            // An instance of a subclass of list, or a set.
             Value::Object(_) => {}
             other => return Err(format!("a pickle that appends to {}", other.name())),
         }
@@ -106,7 +106,7 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Adds `values`, keys and values by turns, to the dict on top of the stack.
+    /// Adds `values`, alternating keys and values, to the dict on top of the stack.
     fn set_items(&mut self, values: &[Id]) -> Result<(), String> {
         if !values.len().is_multiple_of(2) {
             return Err("a pickle with a key without a value".into());
@@ -139,7 +139,7 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// What has this name, in Python or in ours.
+    /// Pushes the value of a global name: a known one, or with [`Strangers::Kept`] one that has just its name.
     fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
         let value = match (known(module, name), self.strangers) {
             (Some(value), _) => value,
@@ -157,8 +157,8 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// What a persistent id stands for: ("storage", its type, its key, the device, the number of its elements); in files that are no
-    /// archives one thing more, what it is a part of, if it is.
+    /// Returns the storage of a persistent id: ("storage", its type, its key, the device, its number of elements). Files that are no
+    /// archives have one more item, the storage that this one is a part of, which must be None.
     fn storage(&self, id: Id) -> Result<Value<'a>, String> {
         let strange = || "a pickle with a persistent id that is no storage".to_string();
         let of = |id: &Id| &self.values[*id];
@@ -181,7 +181,7 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// What `function` makes of the tuple `arguments`.
+    /// Returns the result of `function` for the tuple `arguments`.
     fn call(&self, function: Id, arguments: Id) -> Result<Value<'a>, String> {
         let is = |id: Id, what: fn(&Value) -> bool| what(&self.values[id]);
         let is_object = |id: Id| is(id, |v| matches!(v, Value::Object(_)));
@@ -218,7 +218,7 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// An instance of `class`, which Python makes without calling anything.
+    /// Pushes an instance of `class`, which Python creates by `__new__` alone.
     fn instance(&mut self, class: Id) -> Result<(), String> {
         let made = match &self.values[class] {
             Value::Named { .. } => Value::Object(vec![]),
@@ -229,16 +229,16 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Follows one instruction; what the pickle was made for at its end.
+    /// Executes one instruction. At the end of the pickle, returns the index of its result.
     fn instruction(&mut self) -> Result<Option<Id>, String> {
-        // Named as in Python's pickletools.
+        // Instructions are named as in Python's pickletools.
         match self.take(1)?[0] {
             // PROTO
             0x80 => match self.unsigned(1)? {
                 2..=5 => {}
                 other => return Err(format!("a pickle of protocol {other}")),
             },
-            // FRAME: what follows is read one by one all the same.
+            // FRAME: ignored, because instructions are read one by one anyway.
             0x95 => {
                 self.take(8)?;
             }
@@ -366,7 +366,7 @@ impl<'a> Machine<'a> {
                 let (_arguments, class) = (self.pop()?, self.pop()?);
                 self.instance(class)?;
             }
-            // BUILD, which gives an object its fields
+            // BUILD, which sets the fields of an object
             b'b' => {
                 self.pop()?;
             }
@@ -389,7 +389,7 @@ impl<'a> Machine<'a> {
     }
 }
 
-/// Bytes of the length that stands before a string or bytes.
+/// Returns the number of bytes of the length that precedes a string or bytes.
 fn length_bytes(opcode: u8) -> usize {
     match opcode {
         0x8c | b'C' => 1,

@@ -1,35 +1,35 @@
-//! What a pickle makes.
+//! Values that a pickle creates.
 
 use tch::Kind;
 
-/// A value's number among [`Values`].
+/// Index of a value in [`Values`].
 pub(crate) type Id = usize;
 
-/// What a pickle makes.
+/// A value that a pickle creates.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Value<'a> {
-    /// None, a fraction, or a number that is too long: no field has one.
+    /// None, a floating-point number, or an integer of more than 64 bits. No field that is read has such a value.
     Constant,
     Truth(bool),
     Integer(i64),
     Text(&'a str),
-    /// A function that makes a tensor.
+    /// Function that creates a tensor.
     Rebuild(Rebuild),
-    /// A dict that remembers an order, and is called to be made.
+    /// Class of dicts that keep their order, which is called to create one.
     OrderedDict,
-    /// The type of a storage: what its numbers are.
+    /// Type of a storage: the type of its elements.
     Dtype(Kind),
-    /// Anything else that has a name: a class, most often.
+    /// Anything else that has a name, usually a class.
     Named {
         module: &'a str,
         name: &'a str,
     },
-    /// Bytes in the file. On which device they were when they were saved doesn't matter.
+    /// Bytes in the file. The device on which they were when they were saved is ignored.
     Storage {
         dtype: Kind,
         key: &'a str,
     },
-    /// A view of a storage, in its elements.
+    /// View of a storage, in elements of the storage.
     Tensor {
         storage: Id,
         offset: Id,
@@ -38,25 +38,25 @@ pub(crate) enum Value<'a> {
     },
     Tuple(Vec<Id>),
     List(Vec<Id>),
-    /// Keys and values by turns; of equal keys the last one counts.
+    /// Keys and values, alternating; the last of equal keys counts.
     Dict(Vec<Id>),
-    /// Data of a class of which nothing is known. If it is a dict, too: keys and values by turns.
+    /// Data of an unknown class. If it is also a dict: keys and values, alternating.
     Object(Vec<Id>),
 }
 
-/// What makes a tensor of other values.
+/// Function that creates a tensor from other values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Rebuild {
-    /// Of a storage, an offset, a size and a stride; more may follow, such as whether it needs a gradient, and its hooks.
+    /// View from a storage, an offset, a size and a stride. More arguments may follow, such as `requires_grad` and hooks.
     View,
-    /// Of a tensor: a parameter of a model.
+    /// Parameter of a model, from a tensor.
     Parameter,
-    /// Of what makes a tensor, a class, the arguments for the first, and attributes.
+    /// Tensor from a function that creates one, a class, the arguments of the function, and attributes.
     OfClass,
 }
 
 impl Value<'_> {
-    /// As errors call it.
+    /// Returns the name of the value's type for error messages.
     pub fn name(&self) -> &'static str {
         match self {
             Value::Constant | Value::Truth(_) => "a constant",
@@ -74,7 +74,7 @@ impl Value<'_> {
         }
     }
 
-    /// The number, of an integer.
+    /// Returns the number if the value is an integer.
     pub fn integer(&self) -> Option<i64> {
         match self {
             &Value::Integer(number) => Some(number),
@@ -83,26 +83,26 @@ impl Value<'_> {
     }
 }
 
-/// Everything that a pickle made.
+/// All values that a pickle created.
 #[derive(Debug)]
 pub(crate) struct Values<'a> {
     pub(super) values: Vec<Value<'a>>,
-    /// What it was made for.
+    /// Index of the pickle's result.
     pub root: Id,
 }
 
 impl<'a> Values<'a> {
-    /// Value number `id`.
+    /// Returns the value with index `id`.
     pub fn get(&self, id: Id) -> &Value<'a> {
         &self.values[id]
     }
 
-    /// All of them.
+    /// Returns an iterator over all values.
     pub fn iter(&self) -> impl Iterator<Item = &Value<'a>> {
         self.values.iter()
     }
 
-    /// What `items`, keys and values by turns, have under `key`.
+    /// Returns the value under `key` in `items`, which are alternating keys and values.
     pub fn entry(&self, items: &[Id], key: &str) -> Option<&Value<'a>> {
         let mut pairs = items.chunks_exact(2).rev();
         pairs.find(|pair| self.values[pair[0]] == Value::Text(key)).map(|pair| &self.values[pair[1]])

@@ -1,4 +1,4 @@
-//! A checkpoint as torch.save writes it, for `torch.load`, which needs nothing of ours to read it: pickle protocol 2, and the bytes
+//! Writer for checkpoints in the format of torch.save, which `torch.load` reads without any of our code: pickle protocol 2, and the bytes
 //! of each tensor in a stored entry of a zip archive.
 
 use super::array::row_major;
@@ -13,20 +13,20 @@ use zip::CompressionMethod;
 use zip::result::ZipError;
 use zip::write::{FileOptions, ZipWriter};
 
-/// Where tensors' bytes begin is a multiple of it, as in torch's own files.
+/// Alignment of tensors' bytes in the file, as in torch's own files.
 const ALIGNMENT: u16 = 64;
-/// Of the archive's layout.
+/// Version of the archive's layout.
 const VERSION: &[u8] = b"3\n";
 
-/// Lightning asks for them, and takes what it finds for a checkpoint of its own.
+/// Entries that Lightning requires. With them it accepts the file as a checkpoint of its own.
 const OF_LIGHTNING: &str = "pytorch-lightning_version";
 const LIGHTNING_VERSION: &str = "2.0.0";
 const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 
-/// Writes a checkpoint with `weights` as its state dict and their metadata beside it, whole or not at all. Lightning reads it, too.
+/// Writes a checkpoint atomically, with `weights` as its state dict and their metadata beside it. Lightning can read it too.
 ///
 /// # Errors
-/// A type of numbers that isn't stored, or the system's refusal to write.
+/// Returns an error if a tensor's type can't be stored, or if the file can't be written.
 pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
     let tensors = Stored::all(&weights.tensors)?;
     let pickle = pickle(&tensors, &weights.metadata)?;
@@ -78,7 +78,7 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
         p.text("cpu");
         p.integer(shape.iter().product());
         p.0.extend(b"tQ");
-        // Its offset, size and stride, whether it needs a gradient (NEWFALSE), and no hooks.
+        // The offset, size and stride, requires_grad (NEWFALSE), and no hooks.
         p.integer(0);
         p.tuple(shape);
         p.tuple(&row_major(shape));
@@ -105,36 +105,36 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
     Ok(p.0)
 }
 
-/// A program for Python's stack machine, instruction by instruction.
+/// A program for Python's stack machine, built instruction by instruction.
 struct Pickle(Vec<u8>);
 
 impl Pickle {
-    /// BINUNICODE
+    /// Appends a string: BINUNICODE.
     fn text(&mut self, text: &str) {
         self.0.push(b'X');
         self.0.extend((text.len() as u32).to_le_bytes());
         self.0.extend(text.as_bytes());
     }
 
-    /// LONG1 of eight bytes.
+    /// Appends an integer: LONG1 of eight bytes.
     fn integer(&mut self, number: usize) {
         self.0.extend([0x8a, 8]);
         self.0.extend((number as u64).to_le_bytes());
     }
 
-    /// MARK and TUPLE
+    /// Appends a tuple of integers: MARK and TUPLE.
     fn tuple(&mut self, numbers: &[usize]) {
         self.0.push(b'(');
         numbers.iter().for_each(|&number| self.integer(number));
         self.0.push(b't');
     }
 
-    /// GLOBAL
+    /// Appends a global name: GLOBAL.
     fn global(&mut self, module: &str, name: &str) {
         self.0.extend(format!("c{module}\n{name}\n").as_bytes());
     }
 
-    /// An empty one: EMPTY_TUPLE, REDUCE
+    /// Appends an empty OrderedDict: GLOBAL, EMPTY_TUPLE, REDUCE.
     fn ordered_dict(&mut self) {
         self.global("collections", "OrderedDict");
         self.0.extend(b")R");

@@ -1,45 +1,45 @@
-//! What families paint on.
+//! Pixel buffer that texture families paint on.
 
 use glam::{IVec2, Vec2, Vec3};
 
 use super::field::Field;
 
-/// A square of linear-light RGB, a power of two wide.
+/// A square image of linear RGB whose width is a power of two.
 #[derive(Clone)]
 pub(super) struct Canvas {
-    /// Pixels in a row.
+    /// Number of pixels in a row.
     pub size: usize,
-    /// Row by row, the top one first.
+    /// Pixels row by row, the top row first.
     pub pixels: Vec<Vec3>,
-    /// Whether what leaves it at one side comes in at the other.
+    /// `true` if shapes that leave the canvas on one side enter it on the other.
     pub repeats: bool,
 }
 
 impl Canvas {
-    /// Of a function of each pixel's middle, in repeats.
+    /// Creates a canvas from a function of each pixel's centre, in repeats.
     pub fn of(size: usize, mut colour: impl FnMut(Vec2) -> Vec3) -> Canvas {
         let mut canvas = Canvas::filled(size, Vec3::ZERO);
         canvas.change(|uv, _| colour(uv));
         canvas
     }
 
-    /// Of a field, number by number.
+    /// Creates a canvas from a field, value by value.
     pub fn of_field(field: &Field, colour: impl FnMut(f32) -> Vec3) -> Canvas {
         let pixels = field.values.iter().copied().map(colour).collect();
         Canvas { size: field.size, pixels, repeats: true }
     }
 
-    /// Of one colour.
+    /// Creates a canvas of one colour.
     pub fn filled(size: usize, colour: Vec3) -> Canvas {
         Canvas { size, pixels: vec![colour; size * size], repeats: true }
     }
 
-    /// Of one colour, with edges at which shapes end.
+    /// Creates a canvas of one colour whose edges clip shapes.
     pub fn bounded(size: usize, colour: Vec3) -> Canvas {
         Canvas { repeats: false, ..Canvas::filled(size, colour) }
     }
 
-    /// Changes every pixel, by its middle and what it was.
+    /// Changes every pixel by a function of its centre and its previous colour.
     pub fn change(&mut self, mut colour: impl FnMut(Vec2, Vec3) -> Vec3) {
         let scale = 1. / self.size as f32;
         for (y, row) in self.pixels.chunks_exact_mut(self.size).enumerate() {
@@ -49,15 +49,15 @@ impl Canvas {
         }
     }
 
-    /// Multiplies pixels by 1 and `strength` times a field of the same size.
+    /// Multiplies each pixel by 1 + `strength` times the value of a field of the same size, at least 0.1.
     pub fn shade(&mut self, field: &Field, strength: f32) {
         for (pixel, value) in self.pixels.iter_mut().zip(&field.values) {
             *pixel *= (1. + strength * value).max(0.1);
         }
     }
 
-    /// Paints over the pixels at most `reach` from `centre`, by a colour and how much of it, of the offset from there in
-    /// repeats.
+    /// Paints over the pixels within `reach` of `centre`. `paint` returns the colour and its coverage for the offset from `centre`
+    /// in repeats.
     pub fn stamp(&mut self, centre: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
         let scale = self.size as f32;
         let mask = self.size as i32 - 1;
@@ -79,13 +79,13 @@ impl Canvas {
         }
     }
 
-    /// Fills a shape, told by its signed distance in repeats, with an edge one pixel soft.
+    /// Fills a shape given by its signed distance in repeats, with an edge that is one pixel soft.
     pub fn fill(&mut self, centre: Vec2, reach: Vec2, colour: Vec3, distance: impl Fn(Vec2) -> f32) {
         let scale = self.size as f32;
         self.stamp(centre, reach, |offset| (colour, (0.5 - distance(offset) * scale).clamp(0., 1.)));
     }
 
-    /// Between four pixels, at `uv` in repeats.
+    /// Returns the bilinear interpolation of four pixels at `uv` in repeats.
     pub fn sample(&self, uv: Vec2) -> Vec3 {
         let at = uv * self.size as f32 - 0.5;
         let floor = at.floor();

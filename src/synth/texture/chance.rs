@@ -1,32 +1,32 @@
-//! Draws in the words of the families.
+//! Random draws for texture families.
 
 use glam::Vec2;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-/// What families ask a generator for.
+/// Random draws that texture families need from a generator.
 pub(super) trait Chance {
-    /// In [0, 1).
+    /// Returns a uniform random value in [0, 1).
     fn unit(&mut self) -> f32;
-    /// Evenly in [low, high).
+    /// Returns a uniform random value in [low, high).
     fn between(&mut self, low: f32, high: f32) -> f32;
-    /// In [low, high), the lower the likelier: the square of an even draw between the roots.
+    /// Returns a random value in [low, high) that favours low values: the square of a uniform draw between the square roots.
     fn leaning_low(&mut self, low: f32, high: f32) -> f32;
-    /// In (-1, 1), the nearer to 0 the likelier.
+    /// Returns a random value in (-2, 2) with a bell-shaped distribution around 0.
     fn bell(&mut self) -> f32;
-    /// Whether something of this probability happens.
+    /// Returns `true` with the given probability.
     fn happens(&mut self, probability: f32) -> bool;
-    /// A whole number, both ends among them.
+    /// Returns a uniform random integer from `low` to `high`, both inclusive.
     fn count(&mut self, low: usize, high: usize) -> usize;
-    /// One of them, all alike likely.
+    /// Returns one of the choices, all equally likely.
     fn one_of<T: Copy>(&mut self, choices: &[T]) -> T;
-    /// One of them, by weights that needn't add up to 1.
+    /// Returns one of the choices with the given weights, which needn't add up to 1.
     fn weighted<T: Copy>(&mut self, choices: &[(T, f32)]) -> T;
-    /// Anywhere in the repeat.
+    /// Returns a uniformly random position in the repeat.
     fn spot(&mut self) -> Vec2;
-    /// A direction of length 1.
+    /// Returns a random direction of length 1.
     fn direction(&mut self) -> Vec2;
-    /// A seed for [`unit_of`].
+    /// Returns a seed for [`unit_of`].
     fn seed(&mut self) -> u32;
 }
 
@@ -64,7 +64,7 @@ impl Chance for ChaCha8Rng {
         let sum: f32 = choices.iter().map(|(_, weight)| weight).sum();
         let mut left = self.unit() * sum;
         let mut chosen = None;
-        // What rounding leaves over belongs to the last that is possible at all.
+        // Rounding errors fall to the last choice with a weight above 0.
         for &(choice, weight) in choices.iter().filter(|(_, weight)| *weight > 0.) {
             chosen = Some(choice);
             left -= weight;
@@ -88,7 +88,7 @@ impl Chance for ChaCha8Rng {
     }
 }
 
-/// A number in [0, 1) that `seed` and `id` decide, for pieces that are met in no order.
+/// Returns a pseudo-random value in [0, 1) determined by `seed` and `id`, for pieces that are visited in no fixed order.
 pub(super) fn unit_of(seed: u32, id: u32) -> f32 {
     let mut bits = seed ^ id.wrapping_mul(0x9e37_79b9);
     for multiplier in [0x7feb_352d_u32, 0x846c_a68b] {

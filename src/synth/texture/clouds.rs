@@ -1,4 +1,4 @@
-//! Noise through a ramp of colours.
+//! Noise textures coloured by a palette ramp.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -9,7 +9,7 @@ use super::palette::Palette;
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Noise of any kind.
+/// Draws a texture of a random kind of noise.
 pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
@@ -20,7 +20,7 @@ pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     }
     let mut field = field.stretched();
     if random.happens(0.2) {
-        // Flat patches, as of camouflage or flaking paint.
+        // Flat patches, like camouflage or flaking paint.
         let steps = random.count(2, 6) as f32;
         field = field.map(|value| {
             super::shape::smoothstep(0.42, 0.58, (value * steps).fract()) + (value * steps).floor()

@@ -1,18 +1,18 @@
-//! Scalars over one repeat.
+//! Scalar fields over one repeat of a texture.
 
 use glam::Vec2;
 
-/// A square of numbers, a power of two wide, that repeats in both directions.
+/// A square of values whose width is a power of two. It repeats in both directions.
 #[derive(Clone)]
 pub(super) struct Field {
-    /// Numbers in a row.
+    /// Number of values in a row.
     pub size: usize,
-    /// Row by row.
+    /// Values row by row.
     pub values: Vec<f32>,
 }
 
 impl Field {
-    /// Of a function of the middle of each number's square, in repeats.
+    /// Creates a field from a function of the centre of each value's square, in repeats.
     pub fn of(size: usize, mut value: impl FnMut(Vec2) -> f32) -> Field {
         let mut values = Vec::with_capacity(size * size);
         for y in 0..size {
@@ -23,7 +23,7 @@ impl Field {
         Field { size, values }
     }
 
-    /// Each number by itself.
+    /// Applies `change` to each value.
     pub fn map(mut self, change: impl Fn(f32) -> f32) -> Field {
         for value in &mut self.values {
             *value = change(*value);
@@ -31,7 +31,7 @@ impl Field {
         self
     }
 
-    /// This and `factor` times another of the same size.
+    /// Adds `factor` times another field of the same size.
     pub fn plus(mut self, other: &Field, factor: f32) -> Field {
         for (value, more) in self.values.iter_mut().zip(&other.values) {
             *value += factor * more;
@@ -39,7 +39,7 @@ impl Field {
         self
     }
 
-    /// Stretched to [0, 1].
+    /// Returns the field rescaled to [0, 1].
     pub fn stretched(self) -> Field {
         let low = self.values.iter().copied().fold(f32::INFINITY, f32::min);
         let high = self.values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
@@ -47,7 +47,7 @@ impl Field {
         self.map(|value| (value - low) * scale)
     }
 
-    /// Between four numbers, at `uv` in repeats.
+    /// Returns the bilinear interpolation of four values at `uv` in repeats.
     pub fn sample(&self, uv: Vec2) -> f32 {
         let at = uv * self.size as f32 - 0.5;
         let floor = at.floor();
@@ -62,7 +62,7 @@ impl Field {
         above + (below - above) * part.y
     }
 
-    /// How steeply it rises towards `direction`, per number.
+    /// Returns the slope in `direction`, per distance between values.
     pub fn slope(&self, direction: Vec2) -> Field {
         let mut values = Vec::with_capacity(self.values.len());
         for y in 0..self.size {

@@ -1,4 +1,4 @@
-//! How pieces are laid over one repeat: bricks, tiles, planks, stones.
+//! Layouts of pieces over one repeat: bricks, tiles, planks, stones.
 
 use glam::{Vec2, Vec2Swizzles};
 use rand_chacha::ChaCha8Rng;
@@ -6,36 +6,37 @@ use rand_chacha::ChaCha8Rng;
 use super::chance::Chance;
 use super::voronoi::Voronoi;
 
-/// A way to lay pieces.
+/// Arrangement of pieces.
 pub(super) enum Layout {
-    /// Rows of pieces from cut to cut: rows' tops in [0, 1], and the cuts of each.
+    /// Rows of pieces separated by cuts: the rows' tops in [0, 1], and the cuts of each row.
     Courses { tops: Vec<f32>, cuts: Vec<Vec<f32>>, upright: bool },
-    /// Strips `long` times as long as wide, in a zigzag; `across` strips' widths to a repeat, a multiple of 2 `long`.
+    /// Strips `long` times as long as wide, in a zigzag. A repeat is `across` strip widths wide, a multiple of 2 `long`.
     Herringbone { across: usize, long: usize },
-    /// Squares of `long` strips each, by turns level and upright; `squares` to a repeat, an even number.
+    /// Squares of `long` strips each, alternately horizontal and upright. A repeat has `squares` of them per side, an even number.
     Basket { squares: usize, long: usize },
-    /// Squares on their tips; `across` to a repeat.
+    /// Squares standing on their corners, `across` per repeat.
     Diamonds { across: usize },
     /// Cells around points.
     Cells(Voronoi),
-    /// Rectangles of whole squares: which one each square belongs to, and their corners and extents.
+    /// Rectangles of whole squares: the rectangle that each square belongs to, and the rectangles' corners and extents.
     Quilt { squares: usize, owners: Vec<u32>, pieces: Vec<(Vec2, Vec2)> },
 }
 
-/// The piece that a place is on.
+/// The piece at a position.
 pub(super) struct Piece {
-    /// Alike all over the piece.
+    /// Identifier that is constant over the piece.
     pub id: u32,
-    /// From the piece's corner, or its point, in repeats; x along its length.
+    /// Offset from the piece's corner, or from its point for cells, in repeats; x is along its length.
     pub at: Vec2,
-    /// Its length and width, in repeats; roughly, for cells.
+    /// Length and width of the piece in repeats; approximate for cells.
     pub extent: Vec2,
-    /// To its nearest edge, in repeats.
+    /// Distance to the nearest edge of the piece, in repeats.
     pub edge: f32,
 }
 
 impl Layout {
-    /// Rows of equal pieces, each row `shift` of a piece further than the one above, which has to come round.
+    /// Creates rows of equal pieces, each row shifted by `shift` of a piece relative to the one above. All shifts together must be
+    /// a whole number.
     pub fn courses(rows: usize, columns: usize, shift: f32, upright: bool) -> Layout {
         let tops = (0..=rows).map(|row| row as f32 / rows as f32).collect();
         let cuts = |row: usize| {
@@ -45,7 +46,7 @@ impl Layout {
         Layout::Courses { tops, cuts: (0..rows).map(cuts).collect(), upright }
     }
 
-    /// Rows about equally high, of about `columns` pieces of different lengths each.
+    /// Creates rows of about equal height, each with about `columns` pieces of different lengths.
     pub fn ragged(
         random: &mut ChaCha8Rng,
         rows: usize,
@@ -74,7 +75,7 @@ impl Layout {
         Layout::Courses { tops, cuts: cuts.collect(), upright }
     }
 
-    /// Rectangles of up to `largest` squares each way that fill a repeat.
+    /// Creates rectangles of up to `largest` squares per side that fill a repeat.
     pub fn quilt(random: &mut ChaCha8Rng, squares: usize, largest: usize) -> Layout {
         const FREE: u32 = u32::MAX;
         let mut owners = vec![FREE; squares * squares];
@@ -103,7 +104,7 @@ impl Layout {
         Layout::Quilt { squares, owners, pieces }
     }
 
-    /// The piece at `uv`.
+    /// Returns the piece at `uv`.
     pub fn piece(&self, uv: Vec2) -> Piece {
         let uv = uv - uv.floor();
         match self {

@@ -1,4 +1,4 @@
-//! Writing that says nothing, and scribbles.
+//! Meaningless writing, and scribbles.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -8,23 +8,23 @@ use super::palette::{self, Palette, luminance};
 use super::shape;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Glyphs that look like one script: strokes between points of a grid in a box one high.
+/// Glyphs of one invented script: strokes between points of a grid in a box of height 1.
 pub(super) struct Script {
     glyphs: Vec<Vec<(Vec2, Vec2)>>,
     /// Width of a glyph's box.
     aspect: f32,
-    /// Half a stroke's width.
+    /// Half the width of a stroke.
     weight: f32,
 }
 
 impl Script {
-    /// A script of its own.
+    /// Draws a random script.
     pub fn draw(random: &mut ChaCha8Rng) -> Script {
         let aspect = random.between(0.4, 0.8);
         let rounded = random.happens(0.5);
         let glyph = |random: &mut ChaCha8Rng| {
             let mut strokes = Vec::new();
-            // Most letters stand on a stem.
+            // Most letters have a stem.
             if random.happens(0.7) {
                 strokes.push((Vec2::new(0., -0.5), Vec2::new(0., 0.5)));
             }
@@ -43,7 +43,7 @@ impl Script {
         Script { glyphs, aspect, weight: random.between(0.05, 0.14) }
     }
 
-    /// Writes words of `height` from `start`, the left end of a line's middle, over `length`; all in repeats.
+    /// Writes words of `height` over `length` from `start`, the left end of the line's centre; all in repeats.
     pub fn write(
         &self,
         random: &mut ChaCha8Rng,
@@ -65,7 +65,7 @@ impl Script {
             }
             letters -= 1;
             let glyph = random.count(0, self.glyphs.len() - 1);
-            // Small letters are shorter.
+            // Lowercase letters are shorter.
             let small = if glyph.is_multiple_of(3) { 1. } else { 0.65 };
             for &(from, to) in &self.glyphs[glyph] {
                 let place = |point: Vec2| {
@@ -83,7 +83,7 @@ impl Script {
         }
     }
 
-    /// Fills a rectangle with lines of so high letters.
+    /// Fills a rectangle with lines of letters of `height`.
     pub fn paragraph(
         &self,
         random: &mut ChaCha8Rng,
@@ -110,14 +110,14 @@ impl Script {
     }
 }
 
-/// A colour to be read on another.
+/// Returns a colour that is legible on `paper`.
 pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
     let theme = random.weighted(&[(palette::GREYS, 4.), (palette::VIVID, 1.), (palette::ACCENTS, 1.)]);
     let ink = palette::colour_of(random, theme);
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
-/// Lines of writing all over, as of newspapers, labels and notices.
+/// Draws a texture of lines of writing, like newspapers, labels and notices.
 pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let paper = if random.happens(0.6) {
         palette::colour_of(random, palette::WHITES)
@@ -151,7 +151,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
 }
 
-/// Curly lines drawn by hand, as of chalk, crayons and graffiti.
+/// Draws a texture of curly hand-drawn lines, like chalk, crayons and graffiti.
 pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);

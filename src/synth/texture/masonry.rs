@@ -1,4 +1,4 @@
-//! Bricks, tiles, paving, walls of stone.
+//! Textures of bricks, tiles, paving and stone walls.
 
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
@@ -12,23 +12,23 @@ use super::shape::smoothstep;
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// What pieces and the joints between them look like; lengths in repeats.
+/// Appearance of pieces and of the joints between them; lengths in repeats.
 struct Finish {
     /// Colours of the pieces.
     palette: Palette,
     /// Colour of the joints.
     joint: glam::Vec3,
-    /// Half a joint's width.
+    /// Half the width of a joint.
     joint_width: f32,
-    /// How far from a joint pieces are rounded.
+    /// Distance from a joint over which pieces are rounded.
     rounding: f32,
-    /// How much brighter their middle is.
+    /// Extra brightness of the middle of a piece.
     bulge: f32,
-    /// How different pieces are from each other.
+    /// Difference in lightness between pieces.
     spread: f32,
-    /// How rough they are.
+    /// Roughness of the pieces.
     roughness: f32,
-    /// How crooked edges are.
+    /// Crookedness of the edges.
     crookedness: f32,
 }
 
@@ -66,7 +66,7 @@ fn joint_colour(random: &mut ChaCha8Rng, theme: palette::Theme) -> glam::Vec3 {
     palette::colour_of(random, other) * random.between(0.5, 1.)
 }
 
-/// Courses of bricks.
+/// Draws a texture of courses of bricks.
 pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::BRICKS, 6.),
@@ -99,7 +99,7 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: rows as f32 * random.between(0.065, 0.1) }
 }
 
-/// Glazed or stone tiles with grout, as of kitchens, baths and halls.
+/// Draws a texture of glazed or stone tiles with grout, as in kitchens, bathrooms and halls.
 pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::WHITES, 3.),
@@ -141,7 +141,7 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: (across as f32 * tile).clamp(0.3, 4.) }
 }
 
-/// Cobbles, flagstones, dry walls: stones of all shapes.
+/// Draws a texture of stones of all shapes: cobbles, flagstones, dry walls.
 pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::STONES, 5.),
@@ -181,7 +181,7 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: across as f32 * random.between(0.08, 0.4) }
 }
 
-/// Roof tiles and shingles: rows that overlap the one below.
+/// Draws a texture of roof tiles or shingles: rows that overlap the one below.
 pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::BRICKS, 3.),
@@ -210,7 +210,7 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             (down, 1. - round, part, id)
         };
         let current = (uv.y * rows as f32).floor() as i32;
-        // Where this row's shingle has ended, the next one's begins, which lies below it.
+        // The next row's shingle, which lies below, is visible where this row's shingle has ended.
         let (mut down, mut end, mut part, mut id) = row(current);
         if down > end {
             (down, end, part, id) = row(current + 1);
@@ -226,7 +226,7 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: rows as f32 * random.between(0.1, 0.3) }
 }
 
-/// Mosaic of small stones in many colours.
+/// Draws a mosaic of small stones in many colours.
 pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let across = random.count(16, 40);
     let count = random.count(2, 5);

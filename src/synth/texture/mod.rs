@@ -1,6 +1,7 @@
-//! Procedural reflectance: what made-up surfaces are covered with.
+//! Procedural reflectance textures of synthetic surfaces.
 //!
-//! A texture is drawn from a family (bricks, planks, wallpaper), by the chances that it has where it will be, and then weathered.
+//! A texture is drawn from a random family (bricks, planks, wallpaper), with probabilities that depend on its purpose, and then
+//! weathered.
 
 mod canvas;
 mod chance;
@@ -31,50 +32,50 @@ use canvas::Canvas;
 use chance::Chance;
 use field::Field;
 
-/// Pixels in a row of all but pictures.
+/// Width in pixels of all textures except pictures.
 const SIZE: usize = 256;
 
-/// The least and the greatest reflectance: nothing is quite black, nothing quite white.
+/// Minimum and maximum reflectance: no surface is perfectly black or white.
 const REFLECTANCE: (f32, f32) = (0.02, 0.95);
 
-/// Bits after the point of a place in repeats: as many as a float in [½, 1) has.
+/// Number of fractional bits of a position in repeats: as many as a float in [½, 1) has.
 const PLACE_BITS: u32 = 24;
 
-/// Reflectance that repeats in both directions: linear-light RGB of a square, a power of two wide, and its halvings.
+/// Reflectance that repeats in both directions: a mipmap of linear RGB squares whose widths are powers of two.
 ///
-/// u goes to the right and v down, as in an image; (0, 0) is the upper left corner.
+/// The coordinate u points right and v down, as in an image; (0, 0) is the upper left corner.
 #[derive(Debug)]
 pub struct Texture {
-    /// Each half as wide as the one before, down to a single texel: roots of red, green and blue in bytes, and a fourth
-    /// that is 0.
+    /// Mipmap levels, each half as wide as the previous one, down to a single texel. A texel holds the square roots of red, green
+    /// and blue in bytes, and a fourth byte that is 0.
     levels: Vec<Vec<[u8; 4]>>,
-    /// How wide one repeat typically is, in metres.
+    /// Typical width of one repeat in metres.
     pub repeat_metres: f32,
 }
 
-/// What a texture will cover. Families differ in how likely they are for each.
+/// Kind of surface that a texture covers. The probabilities of the families depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// Indoors, underfoot.
+    /// Indoor floor.
     Floor,
-    /// Indoors, upright.
+    /// Indoor wall.
     Wall,
-    /// Indoors, overhead.
+    /// Indoor ceiling.
     Ceiling,
-    /// Outdoors, underfoot: grass, gravel, earth, asphalt, paving.
+    /// Outdoor ground: grass, gravel, earth, asphalt, paving.
     Ground,
-    /// Outdoors, upright: walls of houses, fences, roofs.
+    /// Outdoor upright surface: walls of houses, fences, roofs.
     Facade,
-    /// Furniture and whatever stands about.
+    /// Furniture and other objects.
     Thing,
     /// Leaves of trees and hedges.
     Foliage,
-    /// Pictures, signs, screens: one repeat is the whole of it.
+    /// Pictures, signs and screens, where one repeat is the whole image.
     Poster,
 }
 
 impl Purpose {
-    /// All of them, pictures last.
+    /// All purposes, pictures last.
     pub const ALL: [Purpose; 8] = [
         Purpose::Floor,
         Purpose::Wall,
@@ -87,16 +88,16 @@ impl Purpose {
     ];
 }
 
-/// What a family paints, and how wide that is in metres.
+/// Output of a family: the painted canvas and its width in metres.
 struct Surface {
     canvas: Canvas,
     repeat_metres: f32,
 }
 
-/// A way to paint surfaces.
+/// A family of textures: a function that paints a surface.
 type Family = fn(&mut ChaCha8Rng, Purpose) -> Surface;
 
-/// Families, and their weights by purpose in the order of [`Purpose::ALL`], without pictures.
+/// All families and their weights by purpose, in the order of [`Purpose::ALL`] without pictures.
 #[rustfmt::skip]
 const FAMILIES: [(Family, [f32; 7]); 41] = [
     //                            floor wall ceil grnd faca thing leaf
@@ -143,7 +144,7 @@ const FAMILIES: [(Family, [f32; 7]); 41] = [
     (rows_of_things,             [0.1, 0.2, 2.0, 0.2, 0.7, 1.3, 0.0]),
 ];
 
-/// Boards on ceilings; keys and grids elsewhere.
+/// Draws boards for ceilings, and keys or grids for other purposes.
 fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let family: Family = match purpose {
         Purpose::Ceiling => panels::ceiling_boards,
@@ -153,7 +154,7 @@ fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     family(random, purpose)
 }
 
-/// A house's wall, for what is set into one.
+/// Draws a house wall that other elements are set into.
 fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
     let family: Family = random.one_of(&[
         masonry::bricks as Family,
@@ -165,13 +166,13 @@ fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
     family(random, Purpose::Facade)
 }
 
-/// One surface of one family.
+/// Draws one surface of one family.
 fn surface(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let family = random.weighted(&FAMILIES.map(|(family, weights)| (family, weights[purpose as usize])));
     family(random, purpose)
 }
 
-/// Two surfaces: one shows where the other has worn off, or tints it.
+/// Draws two surfaces, where one shows through worn parts of the other, or tints it.
 fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let Surface { mut canvas, repeat_metres } = surface(random, purpose);
     let other = surface(random, purpose).canvas;
@@ -192,7 +193,7 @@ fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 impl Texture {
-    /// Draws one of all families. The state of `random` alone decides.
+    /// Draws a texture of a random family. The result depends only on `purpose` and the state of `random`.
     pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
         if purpose == Purpose::Poster {
             return Texture::of_surface(pictures::picture(random));
@@ -203,15 +204,15 @@ impl Texture {
         Texture::of_surface(surface)
     }
 
-    /// Of a photo or picture in sRGB: the largest square of its middle, and its mirror images to the right and below, so
-    /// that it repeats.
+    /// Creates a texture from a photo or image in sRGB: its largest centred square, mirrored to the right and below so that the
+    /// texture repeats.
     pub fn of_picture(picture: &RgbImage) -> Texture {
         let side = picture.width().min(picture.height());
         let corner = Vec2::new((picture.width() - side) as f32, (picture.height() - side) as f32) * 0.5;
         let step = side as f32 / SIZE as f32;
         let linear: Vec<f32> = (0..=255).map(palette::linear_of_byte).collect();
         let quarter = Canvas::of(SIZE, |uv| {
-            // The mean of the photo's pixels that a texel covers, at least of one.
+            // The mean of the photo's pixels that a texel covers, at least one.
             let middle = corner + uv * side as f32;
             let [low, high] = [-0.5, 0.5].map(|half| (middle + half * step).max(Vec2::ZERO).as_uvec2());
             let mut sum = Vec3::ZERO;
@@ -233,11 +234,11 @@ impl Texture {
         Texture::of_surface(Surface { canvas, repeat_metres: 2. })
     }
 
-    /// Trilinear, at `uv` in repeats, for a footprint so many repeats wide.
+    /// Samples trilinearly at `uv` in repeats, for a footprint of width `footprint` in repeats.
     pub fn sample(&self, uv: Vec2, footprint: f32) -> Vec3 {
         let last = self.levels.len() - 1;
         let texels = (footprint * (1u32 << last) as f32).clamp(1., (1u32 << last) as f32);
-        // The logarithm, straight between powers of two: the exponent, and the mantissa as what follows the point.
+        // Logarithm, linear between powers of two: the exponent, with the mantissa as the fractional part.
         let level = (texels.to_bits() - 1f32.to_bits()) as f32 * (1. / (1 << 23) as f32);
         let finer = (level as usize).min(last);
         let part = level - finer as f32;
@@ -247,22 +248,22 @@ impl Texture {
         if part == 0. { fine } else { fine.lerp(self.bilinear(finer + 1, x, y), part) }
     }
 
-    /// Mean reflectance.
+    /// Returns the mean reflectance.
     pub fn mean(&self) -> Vec3 {
         self.bilinear(self.levels.len() - 1, 0, 0)
     }
 
-    /// Between four texels of a level, at a place in 2⁻²⁴ repeats.
+    /// Interpolates four texels of a level bilinearly, at a position in units of 2⁻²⁴ repeats.
     #[inline]
     fn bilinear(&self, level: usize, x: u32, y: u32) -> Vec3 {
         let shift = (self.levels.len() - 1 - level) as u32;
         let texels = self.levels[level].as_slice();
         let mask = (1usize << shift) - 1;
         let texel_bits = PLACE_BITS - shift;
-        // From the middle of a texel to that of the next.
+        // Shift from texel corners to texel centres.
         let half = 1 << (texel_bits - 1);
         let (x, y) = (x.wrapping_sub(half), y.wrapping_sub(half));
-        // 2^-texel_bits by its exponent, since a division would take as long as all the rest.
+        // 2^-texel_bits is built from its exponent, because a division would take as long as everything else.
         let texels_per_place = f32::from_bits((127 - texel_bits) << 23);
         let within = (1 << texel_bits) - 1;
         let right = (x & within) as i32 as f32 * texels_per_place;
@@ -300,7 +301,7 @@ impl Texture {
     }
 }
 
-/// Roots, since eyes and cameras tell dark colours apart more finely.
+/// Encodes a colour as square roots, because eyes and cameras resolve dark colours more finely.
 fn texel_of(colour: Vec3) -> [u8; 4] {
     let root = (colour.map(f32::sqrt) * 255. + 0.5).as_u8vec3();
     [root.x, root.y, root.z, 0]

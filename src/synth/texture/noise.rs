@@ -1,4 +1,4 @@
-//! Fields of noise that repeat: lattices of random numbers, smoothly interpolated, and sums of them.
+//! Noise fields that repeat: smoothly interpolated lattices of random values, and sums of them.
 
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
@@ -6,10 +6,10 @@ use rand_chacha::ChaCha8Rng;
 use super::chance::Chance;
 use super::field::Field;
 
-/// Between a lattice of random numbers by cubic B-splines, about in [-1, 1], `cells` to a repeat in x and y.
+/// Interpolates a lattice of random values by cubic B-splines: about in [-1, 1], with `cells` per repeat in x and y.
 pub(super) fn smooth(random: &mut ChaCha8Rng, size: usize, cells: [usize; 2]) -> Field {
     let [columns, rows] = cells.map(|count| count.clamp(1, size));
-    // The spline makes of even noise one half as wide; stretched, few numbers leave [-1, 1].
+    // The spline halves the spread of uniform noise. With doubled lattice values, few results leave [-1, 1].
     let lattice: Vec<f32> = (0..columns * rows).map(|_| random.between(-2., 2.)).collect();
     let mut wide = vec![0f32; rows * size];
     for x in 0..size {
@@ -32,7 +32,7 @@ pub(super) fn smooth(random: &mut ChaCha8Rng, size: usize, cells: [usize; 2]) ->
     Field { size, values }
 }
 
-/// The first of four lattice points that a cubic B-spline weighs for a number of a row, and their weights.
+/// Returns the first of the four lattice points of a cubic B-spline for element `index` of a row, and their weights.
 fn spline(index: usize, size: usize, points: usize) -> (usize, [f32; 4]) {
     let at = (index as f32 + 0.5) / size as f32 * points as f32;
     let floor = at.floor();
@@ -47,7 +47,7 @@ fn spline(index: usize, size: usize, points: usize) -> (usize, [f32; 4]) {
     (floor as usize + points - 1, weights)
 }
 
-/// Octaves of [`smooth`], each twice as fine and `gain` times as strong as the one before; about in [-1, 1].
+/// Sums octaves of [`smooth`], each with twice the frequency and `gain` times the amplitude of the previous one; about in [-1, 1].
 pub(super) fn fractal(
     random: &mut ChaCha8Rng,
     size: usize,
@@ -58,7 +58,7 @@ pub(super) fn fractal(
     octaves_of(random, size, cells, octaves, gain, |value| value)
 }
 
-/// As [`fractal`], of octaves folded at 0: creases of 1 between valleys.
+/// Sums octaves like [`fractal`], each folded at 0: ridges of 1 between valleys.
 pub(super) fn ridged(
     random: &mut ChaCha8Rng,
     size: usize,
@@ -93,7 +93,7 @@ fn octaves_of(
     sum.map(|value| value * scale)
 }
 
-/// A field whose places were pushed about by `reach` repeats, in patches of which `cells` fit into a repeat.
+/// Returns a field whose positions are displaced by about `reach` repeats, in patches of which `cells` fit into a repeat.
 pub(super) fn warped(random: &mut ChaCha8Rng, field: &Field, cells: usize, reach: f32) -> Field {
     let [right, down] = [(); 2].map(|()| fractal(random, field.size, [cells; 2], 3, 0.5));
     let mut index = 0;

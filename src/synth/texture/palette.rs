@@ -1,4 +1,4 @@
-//! Colours that things in the world have, and few of which go together.
+//! Realistic colours, and palettes of a few that go together.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
@@ -6,57 +6,57 @@ use rand_chacha::ChaCha8Rng;
 use super::Purpose;
 use super::chance::Chance;
 
-/// Colours of one kind, as sRGB.
+/// Colours of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];
 
-/// Painted walls, ceilings, paper.
+/// Colours of painted walls, ceilings and paper.
 pub(super) const WHITES: Theme =
     &[0xe6e3dc, 0xdcd8ce, 0xebe9e4, 0xd3d1cc, 0xe0d9cb, 0xd2d6d7, 0xf0eee8, 0xd9d3c4];
-/// Between white and brown.
+/// Colours between white and brown.
 pub(super) const BEIGES: Theme = &[0xd9c8ac, 0xcbb994, 0xe2d3b7, 0xc4ae8b, 0xb9a58a, 0xd8cbb8, 0xc9b7a0];
-/// From nearly white to nearly black.
+/// Colours from nearly white to nearly black.
 pub(super) const GREYS: Theme =
     &[0xb8b6b2, 0x9a9a98, 0x7d7d7b, 0x5f6062, 0xcac9c5, 0x434547, 0x8d9296, 0x2b2c2e, 0xa8a49c];
-/// Leather, dark wood, old fabric.
+/// Colours of leather, dark wood and old fabric.
 pub(super) const BROWNS: Theme = &[0x6b4a32, 0x86613f, 0x4d3524, 0x9c7a55, 0x3b2a1f, 0x7a5a48, 0xa98763];
-/// Wood from birch to wenge, varnished or weathered.
+/// Colours of wood from birch to wenge, varnished or weathered.
 pub(super) const WOODS: Theme = &[
     0xb98a56, 0xa06d3c, 0xd3ac77, 0x7b4e2b, 0x5a3a22, 0xc79d6b, 0xe0c295, 0x8c5a34, 0x9b8a75, 0x3a281c,
     0xb0794a, 0xcfb48c, 0x84807a,
 ];
-/// Grass and leaves.
+/// Colours of grass and leaves.
 pub(super) const GREENS: Theme =
     &[0x5d7a35, 0x47632b, 0x7f9447, 0x3a5127, 0x8a9a5b, 0x647f4d, 0xa3a860, 0x2f3f22, 0x4f7040, 0x6e8b3d];
-/// Dry grass and fallen leaves.
+/// Colours of dry grass and fallen leaves.
 pub(super) const AUTUMN: Theme =
     &[0xb0803a, 0x8f5a2b, 0xc7a24f, 0x7a4526, 0xa8432a, 0xbfa56c, 0x6b5a33, 0xd4b878];
-/// Soil and sand.
+/// Colours of soil and sand.
 pub(super) const EARTHS: Theme =
     &[0x8a6f4e, 0x6e573d, 0xa58a64, 0x55442f, 0xb99f78, 0x9a6b48, 0xc2a67c, 0x7b6a58];
-/// Stone, concrete, gravel.
+/// Colours of stone, concrete and gravel.
 pub(super) const STONES: Theme =
     &[0xa7a29a, 0x8b867d, 0xc1bab0, 0x6d6a66, 0xb3a58f, 0x94897b, 0xd2ccc2, 0x7c8083, 0x55534f];
-/// Fired clay, and what is laid like it.
+/// Colours of fired clay and other bricks.
 pub(super) const BRICKS: Theme =
     &[0x9a4b35, 0xa85c42, 0x7f3d2e, 0xb5714f, 0xc08a66, 0x6b4038, 0xb8a48c, 0x8c8680, 0xd8cfc2, 0xa3705a];
-/// Fabric and paint with some colour.
+/// Moderately saturated colours of fabric and paint.
 pub(super) const ACCENTS: Theme = &[
     0x2f4560, 0x5c7a8c, 0x8aa0a3, 0x7d8f6e, 0xa4b494, 0xc59a3f, 0xa8523c, 0x7a2e3a, 0xc7a0a0, 0x6a5a78,
     0x35605a, 0xd7b98e, 0x94b0c2, 0x3f5d45, 0xb57f6a, 0xdcc7c0, 0x4b6a8f,
 ];
-/// Print, plastic, toys.
+/// Saturated colours of print, plastic and toys.
 pub(super) const VIVID: Theme = &[
     0xd22f27, 0x1f5fbf, 0xf2b90c, 0x1f9d55, 0xe8671b, 0x8e2fa8, 0x12a3b8, 0xe84a8a, 0x161616, 0xfafafa,
     0x7ac143, 0x0b3c7d,
 ];
 
-/// A few colours, linear light.
+/// A few colours in linear RGB.
 pub(super) struct Palette {
     colours: Vec<Vec3>,
 }
 
 impl Palette {
-    /// So many colours of what is likely for the purpose.
+    /// Draws `count` colours that are likely for `purpose`.
     pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose, count: usize) -> Palette {
         let themes: &[(Theme, f32)] = match purpose {
             Purpose::Floor => &[
@@ -102,7 +102,7 @@ impl Palette {
         Palette::of_theme(random, theme, count)
     }
 
-    /// So many colours of one kind: shades of one, several, one with accents, or, seldom, anything at all.
+    /// Draws `count` colours of one theme: shades of one colour, several colours, one with accents, or rarely arbitrary colours.
     pub fn of_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
         let base = colour_of(random, theme);
         let kind = random.unit();
@@ -126,17 +126,18 @@ impl Palette {
         Palette { colours }
     }
 
-    /// One of the colours.
+    /// Returns a random colour of the palette.
     pub fn any(&self, random: &mut ChaCha8Rng) -> Vec3 {
         random.one_of(&self.colours)
     }
 
-    /// The colour of this number, the first one following the last.
+    /// Returns the colour at `index`, wrapping around after the last one.
     pub fn colour(&self, index: usize) -> Vec3 {
         self.colours[index % self.colours.len()]
     }
 
-    /// The colour at `t` in [0, 1], from the first to the last, at roots: half way looks half as bright as that.
+    /// Returns the colour at `t` in [0, 1], from the first to the last. Interpolates square roots, so that midpoints look halfway
+    /// between in brightness.
     pub fn ramp(&self, t: f32) -> Vec3 {
         let last = self.colours.len() - 1;
         if last == 0 {
@@ -150,43 +151,43 @@ impl Palette {
     }
 }
 
-/// One colour of a theme, a little off.
+/// Returns a random colour of a theme, slightly varied.
 pub(super) fn colour_of(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
     let colour = linear_of(random.one_of(theme));
     shade(random, colour, 0.12)
 }
 
-/// The colour made brighter or darker by about `spread`, a bit more or less saturated, a bit off in hue.
+/// Returns `colour` made brighter or darker by about `spread`, with small random changes of saturation and hue.
 pub(super) fn shade(random: &mut ChaCha8Rng, colour: Vec3, spread: f32) -> Vec3 {
     let grey = Vec3::splat(luminance(colour));
     let saturation = random.between(0.65, 1.2);
     let hue = Vec3::new(random.bell(), random.bell(), random.bell()) * 0.05 + 1.;
     let light = random.bell() * 1.8 * spread;
-    // Darkening and brightening by the same share, and never beyond white.
+    // Darken and brighten by the same ratio, and never beyond white.
     let factor = if light < 0. { 1. / (1. - light) } else { 1. + light };
     let shaded = (grey + (colour - grey) * saturation) * hue * factor;
     shaded.clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
-/// Any hue, any brightness, any saturation.
+/// Returns a colour of random hue, brightness and saturation.
 pub(super) fn random_colour(random: &mut ChaCha8Rng) -> Vec3 {
     let colour = Vec3::new(random.unit(), random.unit(), random.unit());
     let grey = Vec3::splat(luminance(colour));
     (grey + (colour - grey) * random.between(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
-/// How bright a linear colour is, by Rec. 709's weights.
+/// Returns the luminance of a linear colour, with Rec. 709's weights.
 pub(super) fn luminance(colour: Vec3) -> f32 {
     colour.dot(Vec3::new(0.2126, 0.7152, 0.0722))
 }
 
-/// Linear light of sRGB as in 0xrrggbb.
+/// Converts sRGB 0xrrggbb to linear RGB.
 pub(super) fn linear_of(srgb: u32) -> Vec3 {
     let [_, red, green, blue] = srgb.to_be_bytes();
     Vec3::new(linear_of_byte(red), linear_of_byte(green), linear_of_byte(blue))
 }
 
-/// Linear light of one sRGB byte.
+/// Converts an sRGB byte to a linear value.
 pub(super) fn linear_of_byte(byte: u8) -> f32 {
     let value = f32::from(byte) / 255.;
     if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }

@@ -1,4 +1,4 @@
-//! What is made in rows: windows of a house, books on shelves, doors of cupboards, keys, slats, grids.
+//! Textures of regular arrangements: windows of a house, books on shelves, doors of cupboards, keys, slats, grids.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -10,7 +10,7 @@ use super::palette::{self, Palette};
 use super::shape::{self, smoothstep};
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// A rectangle filled with a colour, its upper left edges lit and its lower right ones dark by `relief` over `bevel` repeats.
+/// Paints a rectangle with its upper left edges lit and its lower right edges darkened by `relief` over `bevel` repeats.
 fn panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, colour: Vec3, bevel: f32, relief: f32) {
     let pixels = canvas.size as f32;
     canvas.stamp(middle, half, |offset| {
@@ -22,7 +22,7 @@ fn panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, colour: Vec3, bevel: f32
     });
 }
 
-/// Storeys of windows with frames and reflections.
+/// Draws a texture of storeys of windows with frames and reflections.
 pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let wall = super::masonry_or_paint(random);
     let mut canvas = wall.canvas;
@@ -78,7 +78,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: rows as f32 * random.between(2.5, 3.5) }
 }
 
-/// Books, folders or boxes upright on boards.
+/// Draws a texture of books, folders or boxes upright on boards.
 pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::WOODS, 4.), (palette::WHITES, 2.), (palette::GREYS, 1.)]);
     let wood = palette::colour_of(random, theme);
@@ -137,7 +137,7 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: rows as f32 * random.between(0.25, 0.4) }
 }
 
-/// Doors and drawers with frames in relief and handles.
+/// Draws a texture of doors and drawers with frames in relief and handles.
 pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::WHITES, 4.),
@@ -164,7 +164,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         for inset in 0..insets {
             half -= random.between(0.1, 0.25) * cell.min_element();
             if half.min_element() > 2. * bevel {
-                // By turns sunk and raised.
+                // The first inset is sunk, the others are raised.
                 panel(
                     &mut canvas,
                     middle,
@@ -194,7 +194,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: columns as f32 * random.between(0.35, 0.7) }
 }
 
-/// Keys, switches, buttons, vents: small rounded boxes in rows, some marked.
+/// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
 pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).colour(0);
     let count = random.count(1, 3);
@@ -226,7 +226,7 @@ pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.2, 2.) }
 }
 
-/// Blinds, shutters, siding, radiators, corrugated sheets: one profile over and over.
+/// Draws a texture of one repeated profile: blinds, shutters, siding, radiators, corrugated sheets.
 pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let colour = Palette::draw(random, purpose, 1).colour(0);
     let count = random.leaning_low(4., 40.).floor();
@@ -251,7 +251,7 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: count * random.leaning_low(0.02, 0.15) }
 }
 
-/// Suspended ceilings: boards in a grid, with holes or lamps.
+/// Draws a suspended ceiling: boards in a grid, with holes or lamps.
 pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let board = palette::colour_of(random, palette::WHITES);
     let rail = board * random.between(0.7, 1.1);
@@ -277,7 +277,7 @@ pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: columns as f32 * 0.6 }
 }
 
-/// Bars and wires over something: fences, grates, nets, trellis.
+/// Draws a texture of bars or wires over a background: fences, grates, nets, trellis.
 pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 3);
     let palette = Palette::draw(random, purpose, count);

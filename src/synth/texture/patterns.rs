@@ -1,4 +1,4 @@
-//! Wallpaper, fabric and print: flat colours in figures that come again.
+//! Textures of wallpaper, fabric and print: repeated figures in flat colours.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -10,7 +10,7 @@ use super::shape;
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Stripes of different widths, level, upright or oblique.
+/// Draws stripes of different widths, horizontal, upright or oblique.
 pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
@@ -33,7 +33,7 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
 }
 
-/// Stripes both ways, woven into each other.
+/// Draws stripes in both directions, woven into each other.
 pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 4);
     let palette = Palette::draw(random, purpose, count);
@@ -51,7 +51,7 @@ pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
 }
 
-/// Stripes in a row: where each ends, in [0, 1], and its colour.
+/// A sequence of stripes: the end of each in [0, 1], and its colour.
 type Bands = Vec<(f32, Vec3)>;
 
 fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
@@ -65,7 +65,7 @@ fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
     widths.iter().enumerate().map(band).collect()
 }
 
-/// The colour at a place, softened by a pixel where `times` of the bands make a repeat.
+/// Returns the colour at position `at`, blended over one pixel at edges. A repeat contains the bands `times` times.
 fn band_at(bands: &Bands, at: f32, times: f32) -> Vec3 {
     let at = at.rem_euclid(1.);
     let index = bands.partition_point(|(end, _)| *end <= at).min(bands.len() - 1);
@@ -74,7 +74,7 @@ fn band_at(bands: &Bands, at: f32, times: f32) -> Vec3 {
     bands[index].1.lerp(next, (1. - (bands[index].0 - at) / soft).clamp(0., 1.))
 }
 
-/// Flat pieces: checks, hexagons, diamonds, zigzags, patchwork.
+/// Draws flat pieces: checks, hexagons, diamonds, zigzags, patchwork.
 pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
@@ -102,7 +102,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         if checks {
             number = ((piece.id / 64 + piece.id % 64) % 2) as usize;
         }
-        // Half a piece in another colour makes triangles of squares.
+        // A second colour for half of a piece turns squares into triangles.
         if halved && piece.at.x * piece.extent.y > piece.at.y * piece.extent.x {
             number += 1;
         }
@@ -115,7 +115,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
 }
 
-/// Dots, rings, stars, flowers and polygons on a grid, straight, staggered or loose.
+/// Draws dots, rings, stars, flowers and polygons on a straight, staggered or loose grid.
 pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
@@ -152,7 +152,7 @@ enum Figure {
 }
 
 impl Motif {
-    /// One to four figures; the radius is a share of the cell's width.
+    /// Draws one to four figures whose radii are fractions of the cell's width.
     pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
         let mut radius = random.between(0.15, 0.5);
         let mut layers = Vec::new();
@@ -170,11 +170,11 @@ impl Motif {
         Motif { layers }
     }
 
-    /// Paints it into a cell so wide, turned.
+    /// Paints the motif into a cell of width `cell`, rotated by `turn`.
     pub fn paint(&self, canvas: &mut Canvas, centre: Vec2, cell: f32, turn: Vec2) {
         for &(figure, share, colour) in &self.layers {
             let radius = share * cell;
-            // A triangle's tips are twice its inner radius away.
+            // A triangle's corners are at twice its inner radius.
             canvas.fill(centre, Vec2::splat(2. * radius), colour, |offset| {
                 let offset = turn.rotate(offset);
                 match figure {
@@ -189,7 +189,7 @@ impl Motif {
     }
 }
 
-/// Ornaments mirrored left and right, as of old wallpaper: tendrils, leaves and flowers.
+/// Draws ornaments with mirror symmetry, as on old wallpaper: tendrils, leaves and flowers.
 pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 4);
     let palette = Palette::draw(random, purpose, count);
@@ -212,7 +212,7 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     }
     let every = random.count(2, 4);
     for index in 0..2 * columns * columns {
-        // The second half sits between the first.
+        // The second half of the ornaments lies between the first half.
         let half = if index >= columns * columns { 0.5 } else { 0. };
         let place = Vec2::new((index % columns) as f32, (index / columns % columns) as f32) + half + 0.25;
         let centre = place * cell;

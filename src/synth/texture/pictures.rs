@@ -1,4 +1,4 @@
-//! What hangs on walls and stands on sills: paintings, prints, photos, signs. One repeat is the whole picture.
+//! Pictures for walls and sills: paintings, prints, photos, signs. One repeat is the whole picture.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -10,10 +10,10 @@ use super::palette::{self, Palette};
 use super::shape::{self, smoothstep};
 use super::{Canvas, Purpose, Surface};
 
-/// Pixels in a row: finer than other textures, since none repeats over a picture.
+/// Width in pixels, larger than that of other textures because nothing repeats within a picture.
 const SIZE: usize = 512;
 
-/// A picture of any kind, often in a mat or a frame.
+/// Draws a picture of a random kind, often with a mat or a frame.
 pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
     let kind: fn(&mut ChaCha8Rng) -> Canvas = random.weighted(&[
         (landscape as _, 3.),
@@ -33,7 +33,7 @@ pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.25, 1.4) }
 }
 
-/// Sky over hills, water or roofs.
+/// Draws a landscape: sky over hills, water or roofs.
 fn landscape(random: &mut ChaCha8Rng) -> Canvas {
     let skies = [
         [0x5f93c9, 0xd6e4ee],
@@ -106,7 +106,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Somebody: shoulders, neck, head, hair, a face.
+/// Draws a portrait: shoulders, neck, head, hair, face.
 fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     let backdrop = Palette::draw(random, Purpose::Poster, 2);
     let drift = smooth(random, SIZE, [2, 2]);
@@ -149,7 +149,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Abstract: big flat shapes.
+/// Draws an abstract picture of large flat shapes.
 fn shapes(random: &mut ChaCha8Rng) -> Canvas {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, Purpose::Poster, count);
@@ -181,7 +181,7 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// A poster or a sign: a heading, a picture, paragraphs.
+/// Draws a poster or a sign: a heading, a picture, paragraphs.
 fn print(random: &mut ChaCha8Rng) -> Canvas {
     let paper = if random.happens(0.5) {
         palette::colour_of(random, palette::WHITES)
@@ -214,7 +214,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 canvas.change(|uv, below| {
                     let at = (uv - low) / extent;
                     let inside = at.cmpge(Vec2::ZERO).all() && at.cmplt(Vec2::ONE).all();
-                    // Cropped, not squeezed: as wide a part of it as is high.
+                    // Crop instead of squeezing, keeping the aspect ratio.
                     if inside { inner.sample(Vec2::new(at.x, (at.y - 0.5) * height + 0.5)) } else { below }
                 });
                 top += height + 0.03;
@@ -246,7 +246,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Brush strokes that follow a field, over a picture whose colours they take.
+/// Draws brush strokes that follow a field, in the colours of an underlying picture.
 fn painting(random: &mut ChaCha8Rng) -> Canvas {
     let model = random.one_of(&[landscape, portrait, dead_leaves, flowers, shapes])(random);
     let flow = smooth(random, SIZE, [3; 2]);
@@ -268,7 +268,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Shapes of all sizes over each other, as things lie in photos: the smaller the more.
+/// Draws overlapping shapes of all sizes, more of the small ones, as in the statistics of photos (dead leaves model).
 fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, Purpose::Thing, count);
@@ -277,7 +277,7 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     let light = random.direction();
     let decline = random.leaning_low(0.02, 0.3);
     for step in 0..random.count(40, 250) {
-        // Large ones first, lest they hide everything.
+        // Large shapes first, so that they don't hide everything.
         let size = 0.4 / (1. + decline * step as f32) * random.between(0.6, 1.5);
         let own = if random.happens(0.8) { palette.ramp(random.unit()) } else { other.any(random) };
         let colour = own * random.between(0.5, 1.3);
@@ -298,7 +298,7 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Flowers with stems and leaves before a plain ground.
+/// Draws flowers with stems and leaves in front of a plain background.
 fn flowers(random: &mut ChaCha8Rng) -> Canvas {
     let ground = Palette::draw(random, Purpose::Wall, 1).colour(0);
     let mut canvas = Canvas::bounded(SIZE, ground);
@@ -338,7 +338,7 @@ fn palette_shade(random: &mut ChaCha8Rng, palette: &Palette) -> Vec3 {
     palette.ramp(random.unit()) * random.between(0.5, 1.1)
 }
 
-/// A window, and what is to be seen through it, in bright light.
+/// Draws a window and the view through it, in bright light.
 fn window(random: &mut ChaCha8Rng) -> Canvas {
     let mut canvas = landscape(random);
     let light = random.between(1., 1.8);
@@ -361,7 +361,7 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// What a television or a monitor shows: windows, or nothing but a glimmer.
+/// Draws the screen of a television or a monitor: windows, or only a faint reflection.
 fn screen(random: &mut ChaCha8Rng) -> Canvas {
     if random.happens(0.35) {
         let glimmer = random.between(0.02, 0.12);
@@ -392,7 +392,7 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Puts a mat and a frame around.
+/// Adds a mat and a frame around the picture.
 fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let wood = random.weighted(&[
         (palette::WOODS, 3.),
@@ -415,7 +415,7 @@ fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
             return inner.sample((uv - all) / (1. - 2. * all));
         }
         if near >= bar {
-            // The frame's shadow, and the cut of the mat.
+            // The shadow of the frame, and the cut edge of the mat.
             let cut = smoothstep(all - 0.004, all, near);
             return mat * (0.7 + 0.3 * smoothstep(bar, bar + 0.015, near)) * (1. - 0.25 * cut);
         }

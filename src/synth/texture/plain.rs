@@ -1,4 +1,4 @@
-//! Paint, plastic, metal: one colour, and what keeps it from being quite one.
+//! Textures of paint, plastic and metal: one colour with small variations.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
@@ -8,7 +8,7 @@ use super::noise::{fractal, smooth};
 use super::palette::{self, Palette};
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Even paint with a slightly uneven coat.
+/// Draws an even colour with a slightly uneven coat of paint.
 pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let colour = Palette::draw(random, purpose, 1).colour(0);
     let mut canvas = Canvas::filled(SIZE, colour);
@@ -22,7 +22,7 @@ pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(2., 4.) }
 }
 
-/// From one colour softly to others and back.
+/// Draws a soft gradient from one colour to others and back.
 pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 4);
     let palette = Palette::draw(random, purpose, count);
@@ -37,7 +37,7 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
-/// Metal brushed one way.
+/// Draws metal brushed in one direction.
 pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREYS, 4.), (palette::BEIGES, 1.), (palette::ACCENTS, 0.5)]);
     let colour = palette::colour_of(random, theme);
@@ -45,7 +45,7 @@ pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let cells = random.one_of(&[[2, 128], [128, 2], [4, 64], [64, 4], [1, 256]]);
     canvas.shade(&fractal(random, SIZE, cells, 2, 0.7), random.between(0.04, 0.2));
     canvas.shade(&smooth(random, SIZE, cells.map(|count| count.div_ceil(24))), random.between(0., 0.25));
-    // Outdoors, rust eats in.
+    // Rust, mostly outdoors.
     if matches!(purpose, Purpose::Facade | Purpose::Ground) || random.happens(0.15) {
         let rust = palette::linear_of(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
         let patches = fractal(random, SIZE, [3; 2], 6, 0.65);
@@ -57,7 +57,7 @@ pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.5, 1.5) }
 }
 
-/// Bright spots and dull ones as on polished or wet surfaces: soft lights smeared one way.
+/// Draws bright and dull spots as on polished or wet surfaces.
 pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let colour = Palette::draw(random, purpose, 1).colour(0);
     let cells = [random.count(1, 3), random.count(1, 3)];

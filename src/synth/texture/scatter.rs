@@ -1,4 +1,4 @@
-//! What lies or grows about in numbers: leaves, grass, gravel, chips, flowers.
+//! Textures of many scattered small objects: leaves, grass, gravel, chips, flowers.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -9,7 +9,7 @@ use super::palette::{self, Palette};
 use super::shape;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Ground of one theme, dark enough to lie below something.
+/// Draws ground of one theme, dark enough to lie below other objects.
 fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
     let palette = Palette::of_theme(random, theme, 2);
     let cells = random.count(2, 12);
@@ -20,7 +20,7 @@ fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
     canvas
 }
 
-/// Leaves over each other, the upper ones brighter.
+/// Draws overlapping leaves, the upper ones brighter.
 pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let fallen = !matches!(purpose, Purpose::Foliage) && random.happens(0.5);
     let theme = if fallen {
@@ -61,7 +61,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.06, 0.15) / length * 0.6 }
 }
 
-/// Blades of grass, needles, straw.
+/// Draws blades of grass, needles or straw.
 pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.5), (palette::EARTHS, 0.5)]);
     let below = random.one_of(&[palette::EARTHS, theme]);
@@ -102,7 +102,7 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.8, 3.) }
 }
 
-/// Pebbles, gravel, bark, rubble: rounded bits with a lit side and a shadow.
+/// Draws pebbles, gravel, bark or rubble: rounded bits with a lit side and a shadow.
 pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::STONES, 5.),
@@ -146,7 +146,7 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.008, 0.05) / radius }
 }
 
-/// Earth and sand, with tracks, clods and a bit of green.
+/// Draws earth or sand, with tracks, clods and some green.
 pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::EARTHS, 5.), (palette::BEIGES, 1.5), (palette::BROWNS, 1.)]);
     let mut canvas = ground(random, theme);
@@ -166,7 +166,7 @@ pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
-/// Confetti, splashes, brush strokes: bits of any shape in several colours.
+/// Draws confetti, splashes or brush strokes: bits of any shape in several colours.
 pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, purpose, count);

@@ -1,4 +1,4 @@
-//! Marble, terrazzo, concrete, plaster, asphalt.
+//! Textures of marble, terrazzo, concrete, plaster and asphalt.
 
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
@@ -11,7 +11,7 @@ use super::shape::{self, smoothstep};
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Veins, thin and wide, through clouds.
+/// Draws marble: thin and wide veins through clouds.
 pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::WHITES, 4.),
@@ -51,7 +51,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.6, 2.5) }
 }
 
-/// Chips of stone in cement.
+/// Draws terrazzo: chips of stone in cement.
 pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).colour(0);
     let count = random.count(2, 5);
@@ -79,7 +79,7 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: across as f32 * random.between(0.01, 0.04) }
 }
 
-/// Granite, sandstone, worktops: grains of a few colours.
+/// Draws granite, sandstone or worktops: grains of a few colours.
 pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::STONES, 4.),
@@ -106,7 +106,7 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.3, 1.2) }
 }
 
-/// Concrete with stains, pores, and the joints of its form.
+/// Draws concrete with stains, pores and the joints of its formwork.
 pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREYS, 3.), (palette::STONES, 4.), (palette::BEIGES, 1.)]);
     let base = palette::colour_of(random, theme);
@@ -129,7 +129,7 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
-/// Plaster and stucco: relief under light from the side.
+/// Draws plaster or stucco: relief lit from the side.
 pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let colour = Palette::draw(random, purpose, 1).colour(0);
     let mut canvas = Canvas::filled(SIZE, colour);
@@ -150,7 +150,7 @@ pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.8, 3.) }
 }
 
-/// Asphalt, tarmac, worn roads: fine grit, patches and cracks.
+/// Draws asphalt, tarmac or worn roads: fine grit, patches and cracks.
 pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let base = palette::linear_of(random.one_of(&[0x4a4a4b, 0x5f5e5c, 0x6f6c68, 0x3a3a3c, 0x85817b]));
     let base = palette::shade(random, base, 0.15);

@@ -2,7 +2,7 @@ use rand_chacha::rand_core::SeedableRng;
 
 use super::*;
 
-/// Every family for a purpose that it is likely for, drawn with a few seeds.
+/// Returns the output of every family, for a purpose that it is likely for, with a few seeds.
 fn surfaces() -> impl Iterator<Item = (usize, Surface)> {
     FAMILIES.iter().enumerate().flat_map(|(index, (family, weights))| {
         let likely = weights.iter().copied().fold(0., f32::max);
@@ -11,7 +11,7 @@ fn surfaces() -> impl Iterator<Item = (usize, Surface)> {
     })
 }
 
-/// Mean differences between columns, and between rows, from one to the next; the last are those across the border.
+/// Returns the mean differences between adjacent columns and between adjacent rows. The last ones are those across the border.
 fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
     let size = canvas.size;
     let difference = |a: usize, b: usize| (canvas.pixels[a] - canvas.pixels[b]).abs().element_sum();
@@ -79,7 +79,7 @@ fn the_mean_is_what_a_wide_footprint_sees() {
         let texels = &texture.levels[0];
         let mean =
             texels.iter().map(|&texel| linear_of_texel(texel).truncate()).sum::<Vec3>() / texels.len() as f32;
-        // The single texel is rounded to bytes, and so are those that it is compared with.
+        // Both the single texel and the texels that it is compared with are rounded to bytes.
         assert!(
             (texture.mean() - mean).abs().max_element() < 0.006,
             "{purpose:?}: {} for {mean}",
@@ -112,7 +112,7 @@ fn pictures_are_mirrored_at_their_edges() {
         let here = at(u, v);
         assert!((at(1. - u, v) - here).abs().max_element() < 0.01);
         assert!((at(u, 1. - v) - here).abs().max_element() < 0.01);
-        // The middle 200 columns, two repeats of them to a unit.
+        // The middle 200 columns, repeated twice per unit because of the mirror image.
         let expected = palette::linear_of_byte((50. + 400. * u) as u8);
         assert!((here.x - expected.max(0.02)).abs() < 0.02, "{} for {expected}", here.x);
     }

@@ -1,4 +1,4 @@
-//! Weaves, knits, piles, curtains, carpets.
+//! Textures of weaves, knits, piles, curtains and carpets.
 
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
@@ -10,7 +10,7 @@ use super::patterns::Motif;
 use super::shape::{self, smoothstep};
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Threads over and under each other.
+/// Draws threads that pass over and under each other.
 pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(1, 3);
     let palette = Palette::draw(random, purpose, count);
@@ -32,7 +32,7 @@ pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.15, 0.8) }
 }
 
-/// Rows of loops.
+/// Draws knitted rows of loops.
 pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(1, 3);
     let palette = Palette::draw(random, purpose, count);
@@ -42,7 +42,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let canvas = Canvas::of(SIZE, |uv| {
         let at = uv * columns as f32;
         let side = (at.x.fract() - 0.5).abs();
-        // Each loop is a V: two legs that climb outwards.
+        // Each loop is a V: two legs that rise outwards.
         let climbed = at.y + side * 1.4;
         let row = climbed.floor() as u32 % columns;
         let (along, across) = (climbed.fract() - 0.5, side - 0.25);
@@ -53,7 +53,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.1, 0.6) }
 }
 
-/// Carpet pile, felt, fur: fine and soft, brushed here and there.
+/// Draws carpet pile, felt or fur: fine and soft, brushed in some places.
 pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(1, 3);
     let palette = Palette::draw(random, purpose, count);
@@ -68,7 +68,7 @@ pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.4, 1.6) }
 }
 
-/// Cloth hanging in folds, along v.
+/// Draws cloth hanging in folds along v.
 pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(1, 3);
     let palette = Palette::draw(random, purpose, count);
@@ -88,7 +88,7 @@ pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.8, 2.) }
 }
 
-/// Padded leather or cloth, buttoned in diamonds or stitched in channels.
+/// Draws padded leather or cloth, buttoned in diamonds or stitched in channels.
 pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let colour = Palette::draw(random, purpose, 1).colour(0);
     let across = random.count(2, 8) as f32;
@@ -109,7 +109,7 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: across * random.between(0.06, 0.2) }
 }
 
-/// A whole carpet: borders around a field of small figures, a medallion in the middle.
+/// Draws a whole carpet: borders around a field of small figures, with a medallion in the middle.
 pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let count = random.count(3, 5);
     let theme = random.weighted(&[
@@ -122,7 +122,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let palette = Palette::of_theme(random, theme, count);
     let mut canvas = Canvas::filled(SIZE, palette.colour(0));
     let middle = Vec2::splat(0.5);
-    // The middle comes first: borders are painted over what reaches too far.
+    // Paint the middle first, so that the borders cover what extends too far.
     let cells = random.count(4, 14);
     let small = Motif::draw(random, &palette);
     let crowd = random.between(0.3, 1.);

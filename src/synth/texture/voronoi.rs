@@ -1,30 +1,30 @@
-//! Cells around points that repeat.
+//! Voronoi cells around points that repeat.
 
 use glam::{IVec2, Vec2};
 use rand_chacha::ChaCha8Rng;
 
 use super::chance::Chance;
 
-/// One point in each square of a grid over the repeat.
+/// Voronoi diagram of one point in each square of a grid over the repeat.
 pub(super) struct Voronoi {
     columns: i32,
     rows: i32,
     points: Vec<Vec2>,
 }
 
-/// The cell that a place is in.
+/// The cell that contains a position.
 pub(super) struct Cell {
-    /// Which of the grid's squares has its point.
+    /// Index of the grid square that contains the cell's point.
     pub id: u32,
-    /// From its point, in repeats.
+    /// Offset from the cell's point, in repeats.
     pub offset: Vec2,
-    /// To the nearest border, in repeats.
+    /// Distance to the nearest border, in repeats.
     pub edge: f32,
 }
 
 impl Voronoi {
-    /// Points at most `jitter` (0 to 1) of a square off its middle; with `staggered` every other row is half a square
-    /// further, which without jitter makes hexagons, and needs an even number of rows.
+    /// Places points at random offsets from the centres of squares, with `jitter` from 0 to 1 of a square. With `staggered`, every
+    /// other row is shifted by half a square, which makes hexagons if there is no jitter and requires an even number of rows.
     pub fn new(
         random: &mut ChaCha8Rng,
         columns: usize,
@@ -43,7 +43,7 @@ impl Voronoi {
         Voronoi { columns: columns as i32, rows: rows as i32, points }
     }
 
-    /// The point of a grid square, which may be one of another repeat, and the square's number.
+    /// Returns the point of a grid square, which may lie in another repeat, and the square's index.
     fn point(&self, square: IVec2) -> (Vec2, u32) {
         let (x, y) = (square.x.rem_euclid(self.columns), square.y.rem_euclid(self.rows));
         let index = (y * self.columns + x) as usize;
@@ -51,7 +51,7 @@ impl Voronoi {
         (self.points[index] + repeat, index as u32)
     }
 
-    /// The cell at `uv`.
+    /// Returns the cell at `uv`.
     pub fn cell(&self, uv: Vec2) -> Cell {
         let home = (uv * Vec2::new(self.columns as f32, self.rows as f32)).floor().as_ivec2();
         let mut nearest = (f32::INFINITY, Vec2::ZERO, 0, home);
@@ -69,7 +69,7 @@ impl Voronoi {
         let mut edge = f32::INFINITY;
         for y in -2..=2i32 {
             for x in -2..=2i32 {
-                // The corners' cells hardly ever touch.
+                // Cells at the corners of this block hardly ever touch.
                 if (x, y) == (0, 0) || x.abs() + y.abs() == 4 {
                     continue;
                 }

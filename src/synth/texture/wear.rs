@@ -1,4 +1,4 @@
-//! What happens to surfaces after they are made: dirt, scratches, sun; and how a camera's grain and light may show them.
+//! Weathering of surfaces: dirt, scratches, fading by the sun; and variations like those of a camera's grain and lighting.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
@@ -10,7 +10,7 @@ use super::palette;
 use super::shape::smoothstep;
 use super::{Canvas, SIZE};
 
-/// Some of all that, each by its own chance.
+/// Applies some of these effects, each with its own probability.
 pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Purpose) {
     let outdoors = matches!(purpose, Purpose::Ground | Purpose::Facade | Purpose::Foliage);
     let often = if outdoors { 1.5 } else { 1. };
@@ -44,7 +44,7 @@ pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Pur
     }
 }
 
-/// Patches of dust, moss or soot.
+/// Adds patches of dust, moss or soot.
 fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let theme = random.weighted(&[(palette::EARTHS, 4.), (palette::GREYS, 2.), (palette::GREENS, 1.)]);
     let colour = palette::colour_of(random, theme) * random.between(0.2, 1.);
@@ -57,7 +57,7 @@ fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     }
 }
 
-/// Thin lines, brighter or darker.
+/// Adds thin brighter or darker lines.
 fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let cells = random.count(2, 6);
     let lines = ridged(random, SIZE, [cells; 2], 3, 0.6);
@@ -70,7 +70,7 @@ fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     }
 }
 
-/// Distances from the mean colour by a factor.
+/// Scales the distances from the mean colour by a factor.
 fn contrast(canvas: &mut Canvas, factor: f32) {
     let mean = canvas.pixels.iter().sum::<Vec3>() / canvas.pixels.len() as f32;
     canvas.pixels.iter_mut().for_each(|pixel| *pixel = mean + (*pixel - mean) * factor);

@@ -1,4 +1,4 @@
-//! Planks, parquet, veneer.
+//! Textures of planks, parquet and veneer.
 
 use glam::{Vec2, Vec2Swizzles, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -11,7 +11,7 @@ use super::palette;
 use super::shape::smoothstep;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Grain along u, about in [-1, 1]: rings cut lengthwise, drawn out into fibres, with knots.
+/// Returns grain along u, about in [-1, 1]: rings cut lengthwise, stretched into fibres, with knots.
 fn grain(random: &mut ChaCha8Rng) -> Field {
     let rings = random.count(2, 14) as f32;
     let cells = [random.count(1, 2), random.count(2, 5)];
@@ -34,7 +34,7 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
             phase += 2. * near;
             dark += smoothstep(0.5, 0.9, near);
         }
-        // Late wood ends sharply: a sawtooth with a soft flank.
+        // Latewood ends sharply: a sawtooth with a soft flank.
         let ring = phase - phase.floor();
         let ring = ring * ring * (1. - smoothstep(0.88, 1., ring));
         let value = figure * (1.4 * ring - 0.5)
@@ -47,7 +47,7 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
     field.map(|value| value * scale)
 }
 
-/// Two colours of one wood: early and late.
+/// Returns two colours of one wood: earlywood and latewood.
 fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
     let theme = random.weighted(&[
         (palette::WOODS, 10.),
@@ -60,7 +60,7 @@ fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
     (light, light * red * random.between(0.35, 0.85))
 }
 
-/// Boards and parquet with joints.
+/// Draws boards or parquet with joints.
 pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let upright = random.happens(0.5);
     let rows = random.leaning_low(3., 16.) as usize;
@@ -89,7 +89,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let bevel = random.between(0., 0.3);
     let other = palette::colour_of(random, palette::WOODS);
     let mixed = if random.happens(0.25) { random.between(0.2, 1.) } else { 0. };
-    // Fewer boards show the grain larger.
+    // With fewer boards, the grain appears larger.
     let scale = random.between(0.6, 1.6);
     let canvas = Canvas::of(SIZE, |uv| {
         let piece = layout.piece(uv);
@@ -105,7 +105,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(0.07, 0.2) * (1. / wide).min(16.) }
 }
 
-/// Grain without joints, as of doors and tables.
+/// Draws grain without joints, as on doors and tables.
 pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let (light, dark) = tones(random);
     let grain = grain(random);

@@ -1,4 +1,4 @@
-//! What a run's event files tell: its pictures, when which step was done, and where it was begun or resumed.
+//! Contents of a run's event files: its images, the times of its steps, and the steps at which it was started or resumed.
 
 use super::super::tensorboard::event_files;
 use crate::error::Result;
@@ -6,29 +6,29 @@ use crate::io::{EventReader, read_picture};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 
-/// Pictures that are kept in mind.
+/// Maximum number of images that are remembered.
 const PICTURES: usize = 6;
-/// Events by which the speed is told.
+/// Maximum number of steps that the speed is computed from.
 const MARKS: usize = 100;
 
-/// A picture in an event file.
+/// Image in an event file.
 #[derive(Debug)]
 struct Picture {
     step: u64,
     file: PathBuf,
-    /// Where in the file its event begins.
+    /// Offset of its event in the file.
     at: u64,
 }
 
-/// What the event files of a run told so far.
+/// State read from the event files of a run so far.
 #[derive(Debug, Default)]
 pub(super) struct Events {
     readers: BTreeMap<PathBuf, EventReader>,
-    /// Newest last.
+    /// Images, newest last.
     pictures: VecDeque<Picture>,
-    /// Steps since the run was last begun or resumed, and when they were done, in seconds.
+    /// Steps since the run was last started or resumed, and the times at which they were done, in seconds.
     marks: VecDeque<(u64, f64)>,
-    /// At which steps the run was resumed.
+    /// Steps at which the run was resumed.
     pub resumed: Vec<u64>,
 }
 
@@ -36,7 +36,7 @@ impl Events {
     /// Reads what is new in the folder `run`.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if a file can't be read.
     pub fn read(&mut self, run: &Path) -> Result<()> {
         if self.readers.values().any(EventReader::is_void) {
             *self = Events::default();
@@ -64,15 +64,15 @@ impl Events {
         Ok(())
     }
 
-    /// Steps of the pictures, newest first.
+    /// Returns the steps of the images, newest first.
     pub fn picture_steps(&self) -> Vec<u64> {
         self.pictures.iter().rev().map(|picture| picture.step).collect()
     }
 
-    /// The PNG of step `step`, if that is one of the newest.
+    /// Returns the image of step `step` as a PNG, or `None` if it isn't one of the newest.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if the file can't be read.
     pub fn picture(&self, step: u64) -> Result<Option<Vec<u8>>> {
         match self.pictures.iter().find(|picture| picture.step == step) {
             Some(picture) => read_picture(&picture.file, picture.at),
@@ -80,7 +80,7 @@ impl Events {
         }
     }
 
-    /// How long a step took of late, with all that is done between steps.
+    /// Returns the mean duration of the latest steps in seconds, including the time between steps.
     pub fn seconds_per_step(&self) -> Option<f64> {
         let (first, last) = (self.marks.front()?, self.marks.back()?);
         Some((last.1 - first.1) / (last.0.checked_sub(first.0)? as f64)).filter(|s| s.is_finite() && *s > 0.)

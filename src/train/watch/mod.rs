@@ -1,4 +1,4 @@
-//! A run seen from outside, while it goes on or when it is over: its folder is read, and nothing else is done to it.
+//! Observation of a run from outside, while it is running or when it is over. Its folder is only read, never changed.
 
 mod events;
 mod new_lines;
@@ -16,64 +16,64 @@ use series::Series;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-/// Steps over which the speed is averaged.
+/// Number of steps over which the speed is averaged.
 const RECENT: usize = 50;
-/// A run without a new line for so many seconds stands still, and for so many steps' time.
+/// Time without a new line after which a run counts as stalled: this many seconds, or the duration of this many steps if that is longer.
 const STILL: (f64, f64) = (60., 20.);
-/// Scenes of a skipped step that are named, and letters of each.
+/// Maximum number of scenes of a skipped step that are named, and maximum number of characters of each name.
 const NAMED: (usize, usize) = (3, 80);
 
-/// How a run stands.
+/// State of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunState {
-    /// Its folder; what isn't UTF-8 of its name is replaced.
+    /// Folder of the run; characters of its name that aren't UTF-8 are replaced.
     pub run: String,
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Steps in all, by its configuration.
+    /// Total number of steps, by the run's configuration.
     pub steps: Option<u64>,
-    /// Of the last step.
+    /// Curriculum stage of the last step.
     pub stage: Option<u32>,
-    /// How far the transition from the stage before has come, in the last step.
+    /// Progress of the transition from the previous stage in the last step, from 0 to 1.
     pub mix: Option<f64>,
-    /// Of the last step.
+    /// Loss of the last step.
     pub loss: Option<f64>,
-    /// Of the last step, in dB.
+    /// PSNR of the last step, in dB.
     pub psnr: Option<f64>,
-    /// Of the last step.
+    /// Learning rate of the last step.
     pub learning_rate: Option<f64>,
-    /// Mean over the last steps, without what is done between them.
+    /// Mean speed of the latest steps, in samples per second, without the time between steps.
     pub samples_per_second: Option<f64>,
-    /// Until all steps are done, by when the last ones were.
+    /// Estimated time until all steps are done, in seconds, from the speed of the latest steps.
     pub seconds_left: Option<f64>,
-    /// Since something was written down.
+    /// Time since the run last wrote metrics, in seconds.
     pub seconds_since: Option<f64>,
-    /// Curves.
+    /// Training curves.
     pub curves: RunCurves,
-    /// Steps of the newest pictures, newest first.
+    /// Steps of the newest images, newest first.
     pub pictures: Vec<u64>,
-    /// What a person should know, a sentence each.
+    /// Messages for the user, one sentence each.
     pub notices: Vec<String>,
     /// Checkpoints, oldest first.
     pub checkpoints: Vec<Kept>,
-    /// The one that validation found best.
+    /// Checkpoint with the best validation score.
     pub best: Option<Kept>,
 }
 
-/// Curves of at most some hundred points: the last step of some in a row, and the mean over them.
+/// Curves of at most some hundred points. A point is the last of several consecutive steps, and the mean of the values of these steps.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunCurves {
-    /// Of views in training, in dB.
+    /// PSNR of training views, in dB.
     pub psnr: Vec<(u64, f64)>,
-    /// Of held-out views, in dB, by the last step before each validation.
+    /// PSNR of held-out views, in dB, each at the last step before a validation.
     pub held_out: Vec<(u64, f64)>,
-    /// What training minimizes.
+    /// Training loss.
     pub loss: Vec<(u64, f64)>,
-    /// The schedule.
+    /// Learning rate.
     pub learning_rate: Vec<(u64, f64)>,
 }
 
-/// What the lines so far told.
+/// Values collected from the lines read so far.
 #[derive(Debug, Default)]
 struct Told {
     psnr: Series,
@@ -115,14 +115,14 @@ impl Told {
         self.last = Some(line);
     }
 
-    /// The sum of times is what makes a mean of speeds.
+    /// Returns the mean speed of the latest steps in samples per second: the harmonic mean, because the times of steps add up.
     fn samples_per_second(&self) -> Option<f64> {
         let mean = self.speeds.len() as f64 / self.speeds.iter().map(|speed| 1. / speed).sum::<f64>();
         Some(mean).filter(|mean| mean.is_finite())
     }
 }
 
-/// A run's folder, which is read on from where it was left.
+/// Folder of a run. Each read continues where the last one ended.
 #[derive(Debug)]
 pub struct WatchedRun {
     folder: PathBuf,
@@ -132,10 +132,10 @@ pub struct WatchedRun {
 }
 
 impl WatchedRun {
-    /// Reads what the folder `run` has so far.
+    /// Opens the folder `run` and reads what it has so far.
     ///
     /// # Errors
-    /// A folder that no run ever had, or the system's refusal to read.
+    /// Returns an error if no run ever used the folder, or if a file can't be read.
     pub fn open(run: &Path) -> Result<Self> {
         if !RunLock::was_taken(run) && !run.join(METRICS_FILE).is_file() {
             let found = if run.exists() { "a folder without metrics.jsonl" } else { "absent" };
@@ -153,10 +153,10 @@ impl WatchedRun {
         Ok(watched)
     }
 
-    /// Looks again at how the run stands.
+    /// Reads what is new and returns the state of the run.
     ///
     /// # Errors
-    /// The system's refusal to read.
+    /// Returns an error if a file can't be read.
     pub fn look(&mut self) -> Result<RunState> {
         self.read()?;
         let WatchedRun { folder, told, events, lines } = self;
@@ -194,10 +194,10 @@ impl WatchedRun {
         Ok(state)
     }
 
-    /// The picture of step `step`, a PNG, if that is one of the newest when the run was last looked at.
+    /// Returns the image of step `step` as a PNG, or `None` if it wasn't one of the newest when the run was last read.
     ///
     /// # Errors
-    /// The system's refusal to read.
+    /// Returns an error if the file can't be read.
     pub fn picture(&self, step: u64) -> Result<Option<Vec<u8>>> {
         self.events.picture(step)
     }
@@ -248,7 +248,7 @@ impl WatchedRun {
     }
 }
 
-/// `train.steps` of the run's configuration, whatever version of the program wrote it.
+/// Returns `train.steps` of the run's configuration, whichever version of the program wrote the file.
 fn steps(run: &Path) -> Option<u64> {
     #[derive(Deserialize)]
     struct Config {

@@ -1,4 +1,4 @@
-//! A file of lines that another process adds to.
+//! Reader of a text file that another process appends lines to.
 
 use crate::error::{Error, Result};
 use std::fs::File;
@@ -6,41 +6,41 @@ use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// Bytes by which the file is known again.
+/// Maximum number of bytes that are compared to check that the file is still the same.
 const REMEMBERED: usize = 256;
 
-/// What is new in the file.
+/// Change of the file since the last read.
 #[derive(Debug)]
 pub(super) enum News<'a> {
-    /// The file is another one than before, or gone: its lines come from the first one on.
+    /// The file was replaced or removed. Its lines follow from the first one on.
     Anew,
-    /// A whole line.
+    /// A complete line.
     Line(&'a [u8]),
 }
 
-/// A file that is read from where it was left.
+/// File that is read from where the last read ended.
 #[derive(Debug)]
 pub(super) struct NewLines {
     path: PathBuf,
-    /// Behind the last whole line that was read.
+    /// Offset of the end of the last complete line that was read.
     position: u64,
-    /// What stands before `position`. A run that is resumed makes the file shorter, but it may have grown past `position`
-    /// again before anybody looks.
+    /// Bytes before `position`, at most [`REMEMBERED`]. A resumed run truncates the file, but the file may have grown past `position` again
+    /// before the next read.
     before: Vec<u8>,
-    /// When the file was last written.
+    /// Time at which the file was last written.
     pub written: Option<SystemTime>,
 }
 
 impl NewLines {
-    /// Of the file at `path`, which may not be there yet.
+    /// Creates a reader of the file at `path`, which may not exist yet.
     pub fn new(path: &Path) -> Self {
         NewLines { path: path.to_owned(), position: 0, before: vec![], written: None }
     }
 
-    /// Tells what is new. A line that isn't ended is left for the next time.
+    /// Reads what is new in the file and passes it to `tell`. An incomplete line is left for the next read.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if the file can't be read.
     pub fn read(&mut self, mut tell: impl FnMut(News)) -> Result<()> {
         let file = match File::open(&self.path) {
             Err(e) if e.kind() == ErrorKind::NotFound => {
@@ -71,7 +71,7 @@ impl NewLines {
         Ok(())
     }
 
-    /// Whether what was read last still stands where it stood.
+    /// Returns `true` if the bytes before `position` are still those that were read.
     fn knows(&self, file: &mut BufReader<File>) -> std::io::Result<bool> {
         file.seek(SeekFrom::Start(self.position - self.before.len() as u64))?;
         let mut found = vec![];
@@ -105,7 +105,7 @@ mod tests {
             ("1\n2\n34\n", "34 "),
             ("1\n2\n34\n", ""),
             ("1\n2\n", "!1 2 "),
-            // Shorter, and longer than before when it is looked at again.
+            // Truncated, and then longer than before by the next read.
             ("1\n9\n5\n6\n", "!1 9 5 6 "),
         ] {
             std::fs::write(&path, text).unwrap();

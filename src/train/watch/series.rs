@@ -1,14 +1,14 @@
-//! A curve over a run of any length, by some hundred points.
+//! Curve of some hundred points, for a run of any length.
 
-/// As many points make way for half of them. A page with four such curves stays below 100 KB.
+/// Number of points at which adjacent points are merged in pairs. A page with four such curves stays below 100 KB.
 const MOST: usize = 400;
 
-/// Means over as many values in a row, so that there are less than [`MOST`].
+/// Means over equally many consecutive values. There are always fewer than [`MOST`] points.
 #[derive(Debug, Default)]
 pub(super) struct Series {
-    /// The last step, the sum and the number of values of each point.
+    /// Last step, sum and number of values of each point.
     points: Vec<(u64, f64, u64)>,
-    /// Values in all points but the last are 2 to the power of this.
+    /// Base-2 logarithm of the number of values in each point but the last.
     halved: u32,
 }
 
@@ -26,7 +26,7 @@ impl Series {
         }
     }
 
-    /// The last step of some in a row, and the mean over them.
+    /// Returns the last step and the mean value of each point.
     pub fn points(&self) -> Vec<(u64, f64)> {
         self.points.iter().map(|&(step, sum, count)| (step, sum / count as f64)).collect()
     }

@@ -1,4 +1,4 @@
-//! Readers that are given a file's bytes.
+//! Readers whose fuzz input is the content of a file.
 
 use super::{file, folder, load};
 use globalsplat::config::Config;
@@ -19,7 +19,7 @@ pub fn cameras_json(bytes: &[u8]) {
     let _ = read_camera_path(&file, None);
 }
 
-/// A path of nerfstudio's viewer, or what its keys make it.
+/// Reads a camera path of nerfstudio's viewer.
 pub fn camera_path(bytes: &[u8]) {
     let _ = read_camera_path(&file("camera_path", "path.json", bytes), Some([8, 8].into()));
 }
@@ -35,7 +35,7 @@ pub fn chunk(bytes: &[u8]) {
     }
 }
 
-/// Both of a model's files in one: how long the first is, in two bytes, then one after the other.
+/// Reads a COLMAP model whose two files are in one input: the length of the first in two bytes, then one after the other.
 fn colmap(reader: &str, bytes: &[u8], ending: &str) {
     let Some((length, rest)) = bytes.split_first_chunk::<2>() else { return };
     let (cameras, images) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
@@ -52,7 +52,7 @@ pub fn colmap_text(bytes: &[u8]) {
     colmap("colmap_text", bytes, "txt");
 }
 
-/// The points of a model that is right: text where the first byte is even, else binary.
+/// Reads points of an otherwise valid model: text if the first byte is even, else binary.
 pub fn colmap_points(bytes: &[u8]) {
     let Some((first, bytes)) = bytes.split_first() else { return };
     let reader = if first % 2 == 0 { "colmap_points_text" } else { "colmap_points_binary" };
@@ -122,7 +122,8 @@ pub fn compressed_ply(bytes: &[u8]) {
     read_and_repair(&file("compressed_ply", "splat.compressed.ply", bytes));
 }
 
-/// `bytes` are the origin of a splat of one Gaussian; a splat that is read has to come back with it when it was written.
+/// Reads a splat of one Gaussian with the origin file `bytes`; a splat that can be read must survive a round trip with its
+/// origin.
 pub fn splat_origin(bytes: &[u8]) {
     let splat = file("splat_origin", "splat.splat", &[0; 32]);
     std::fs::write(origin_file(&splat), bytes).unwrap();
@@ -138,7 +139,7 @@ pub fn spz(bytes: &[u8]) {
     read_and_repair(&file("spz", "splat.spz", bytes));
 }
 
-/// What is left of a splat whose invalid Gaussians are left out is finite, and all of it where none are.
+/// Checks that after removal of invalid Gaussians all values are finite, and that none is removed if all are valid.
 fn read_and_repair(path: &Path) {
     let Ok(repaired) = read_splat_without_invalid(path) else { return };
     let g = &repaired.gaussians;
@@ -150,7 +151,7 @@ fn read_and_repair(path: &Path) {
     }
 }
 
-/// A `.splat`; one that is read has to come back when it was written.
+/// Reads a `.splat`; one that can be read must survive a round trip.
 pub fn antimatter(bytes: &[u8]) {
     let original = file("antimatter", "splat.splat", bytes);
     read_and_repair(&original);
@@ -166,7 +167,7 @@ pub fn weights(bytes: &[u8]) {
     let _ = load_model(&file, Device::Cpu);
 }
 
-/// `bytes` are an index of one shard, `part.safetensors`, with a tensor `a`.
+/// Reads `bytes` as an index of one shard, `part.safetensors`, with a tensor `a`.
 pub fn shard_index(bytes: &[u8]) {
     let header = r#"{"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#;
     let part = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0; 4]].concat();

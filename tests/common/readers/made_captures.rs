@@ -1,11 +1,11 @@
-//! Captures of other tools, whose files are of the right form.
+//! Captures in other tools' formats, generated with files of the right structure.
 
 use super::{SIDE, file, folder, load};
 use arbitrary::{Arbitrary, Unstructured};
 use globalsplat::data::{open_capture, read_camera_path};
 use serde_json::{Value, json};
 
-/// As JSON of Python may have it.
+/// Number, as Python's JSON may contain it.
 #[derive(Arbitrary, Clone, Copy)]
 enum Number {
     Whole(i16),
@@ -24,16 +24,17 @@ impl Number {
         }
     }
 
-    /// NaN and infinities, which JSON doesn't know, become null: Python's words for them are what the reader makes null of.
+    /// Returns the number as JSON. NaN and infinities, which JSON lacks, become null, as the reader does with Python's spelling
+    /// of them.
     fn json(self) -> Value {
         json!(self.value())
     }
 }
 
-/// What a name may be.
+/// Name of a photo.
 #[derive(Arbitrary)]
 enum Name {
-    /// A photo that is there.
+    /// Name of a photo that exists.
     Photo(u8),
     Any(String),
 }
@@ -47,7 +48,7 @@ impl Name {
     }
 }
 
-/// A pose: turned about y, or any numbers.
+/// Pose: a rotation about y, or arbitrary numbers.
 #[derive(Arbitrary)]
 enum Pose {
     Turned(u8, [i8; 3]),
@@ -80,12 +81,12 @@ struct Cameras {
 #[derive(Arbitrary)]
 struct View {
     name: Name,
-    /// In place of those of a photo.
+    /// Intrinsics that replace those of the photo.
     intrinsics: Option<Vec<Vec<Number>>>,
     pose: Pose,
 }
 
-/// A `cameras.json`.
+/// Reads a generated `cameras.json`.
 pub fn cameras(bytes: &[u8]) {
     let Ok(made) = Cameras::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let side = f64::from(SIDE);
@@ -103,7 +104,7 @@ pub fn cameras(bytes: &[u8]) {
     let _ = read_camera_path(&file, None);
 }
 
-/// What describes a lens, for one frame or all.
+/// Description of a lens, for one frame or all.
 #[derive(Arbitrary)]
 struct Lens {
     numbers: Vec<(u8, Number)>,
@@ -155,14 +156,14 @@ impl Lens {
 struct Transforms {
     lens: Option<Lens>,
     frames: Vec<(Name, Pose, Option<Lens>)>,
-    /// By their numbers in [`LISTS`].
+    /// Name lists, each with its index in [`LISTS`].
     lists: Vec<(u8, Vec<Name>)>,
 }
 
-/// What frames are for.
+/// Keys of the name lists.
 const LISTS: [&str; 3] = ["train_filenames", "test_filenames", "val_filenames"];
 
-/// A `transforms.json`.
+/// Reads a generated `transforms.json`.
 pub fn transforms(bytes: &[u8]) {
     let Ok(made) = Transforms::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let mut json = json!({"w": SIDE, "h": SIDE, "fl_x": SIDE});
@@ -190,7 +191,7 @@ struct Colmap {
     binary: bool,
     cameras: Vec<ColmapCamera>,
     images: Vec<ColmapImage>,
-    /// Bytes that are missing from the end of either file, and others in place of some.
+    /// Number of bytes cut from the end of either file, and bytes that overwrite some.
     cut: Option<(bool, u8)>,
     patch: Option<(bool, u16, [u8; 8])>,
 }
@@ -213,7 +214,7 @@ struct ColmapImage {
     points: u8,
 }
 
-/// In COLMAP's numbering.
+/// Names and parameter counts of camera models, in COLMAP's numbering.
 const COLMAP_MODELS: [(&str, usize); 7] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -225,7 +226,7 @@ const COLMAP_MODELS: [(&str, usize); 7] = [
 ];
 
 impl ColmapCamera {
-    /// Its number and parameters that are right for it, unless others were drawn.
+    /// Returns the index of the model, and parameters that are valid for it, unless others were drawn.
     fn model(&self) -> (usize, Vec<f64>) {
         let model = usize::from(self.model.unsigned_abs()) % COLMAP_MODELS.len();
         let side = f64::from(SIDE);
@@ -241,7 +242,7 @@ impl ColmapCamera {
     }
 }
 
-/// Both files of a model, binary or text.
+/// Reads both files of a generated model, binary or text.
 pub fn colmap(bytes: &[u8]) {
     let Ok(made) = Colmap::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let [mut cameras, mut images] = if made.binary { binary(&made) } else { texts(&made) };

@@ -1,4 +1,4 @@
-//! Chunks whose archives are whole, and whose pickles are any bytes, or describe scenes.
+//! Chunks with intact archives, whose pickles are arbitrary bytes, or describe scenes.
 
 use super::{load, png, root};
 use arbitrary::{Arbitrary, Unstructured};
@@ -8,7 +8,7 @@ use std::io::{Cursor, Write};
 use std::path::Path;
 use zip::write::{FileOptions, ZipWriter};
 
-/// A torch.save archive of `pickle` and of tensors' bytes, numbered.
+/// Returns a torch.save archive of `pickle` and of the numbered storages.
 fn archive(pickle: &[u8], storages: &[&[u8]]) -> Vec<u8> {
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: String, contents: &[u8]| {
@@ -23,18 +23,18 @@ fn archive(pickle: &[u8], storages: &[&[u8]]) -> Vec<u8> {
     zip.finish().unwrap().into_inner()
 }
 
-/// `bytes` are the pickle; storages 0 to 2 are a photo, two cameras and two timestamps.
+/// Reads a chunk with the pickle `bytes`; storages 0 to 2 are a photo, two cameras and two timestamps.
 pub fn chunk_pickle(bytes: &[u8]) {
     let cameras = [camera(0), camera(1)].concat();
     super::files::chunk(&archive(bytes, &[png(), &cameras, &[0; 16]]));
 }
 
-/// `bytes` are the pickle of a checkpoint; storages 0 to 2 have 512, 64 and no bytes.
+/// Reads a checkpoint with the pickle `bytes`; storages 0 to 2 have 512, 64 and no bytes.
 pub fn weights_pickle(bytes: &[u8]) {
     super::files::weights(&archive(bytes, &[&[0; 512], &[0; 64], &[]]));
 }
 
-/// Numbers of a camera, each another one.
+/// Returns the values of a camera, different for each index.
 fn camera(index: u8) -> Vec<u8> {
     let (sin, cos) = (f32::from(index) * 0.1).sin_cos();
     let pose = [cos, 0., sin, f32::from(index), 0., 1., 0., 0., -sin, 0., cos, 0.];
@@ -47,11 +47,11 @@ struct Video {
     key: String,
     url: String,
     views: u8,
-    /// In place of what is right.
+    /// Cameras that replace the valid ones.
     cameras: Option<Cameras>,
     timestamps: Option<Array>,
     images: Vec<Image>,
-    /// A field that is left out, or has something else in it.
+    /// Index of a field that is left out, and one that has a wrong value.
     missing: Option<u8>,
     odd: Option<(u8, Odd)>,
 }
@@ -65,7 +65,7 @@ enum Cameras {
 #[derive(Arbitrary)]
 enum Image {
     Whole,
-    /// A part of the photo.
+    /// Part of the photo's bytes.
     Part(u8, u8),
     Bytes(Vec<u8>),
     Array(Array),
@@ -186,7 +186,7 @@ impl Odd {
 }
 
 impl Video {
-    /// Adds what it needs to `storages`.
+    /// Returns the pickled scene, and adds its data to `storages`.
     fn pickled(&self, storages: &mut Vec<Vec<u8>>) -> Vec<u8> {
         let views = if self.images.is_empty() { self.views % 4 } else { self.images.len() as u8 };
         let mut add = |contents: Vec<u8>| {
@@ -245,7 +245,7 @@ impl Video {
     }
 }
 
-/// Scenes that are nearly right, each of them. What is read is packed anew now and then, and has to come back.
+/// Reads nearly valid scenes. Some inputs also repack them, which must survive a round trip.
 pub fn chunk(bytes: &[u8]) {
     let Ok((packs, videos)) = <(u8, Vec<Video>)>::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let mut storages = vec![];

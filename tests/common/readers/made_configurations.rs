@@ -1,4 +1,4 @@
-//! Configurations of keys that there are, and settings of the command line.
+//! Configurations generated from valid keys, and settings of the command line.
 
 use arbitrary::{Arbitrary, Unstructured};
 use globalsplat::config::Config;
@@ -13,7 +13,7 @@ enum Value {
     Text(String),
     Wholes(Vec<i16>),
     Texts(Vec<String>),
-    /// Of the key's own default.
+    /// The key's own default.
     Default,
     Any(String),
 }
@@ -38,12 +38,12 @@ impl Value {
 
 #[derive(Arbitrary)]
 struct Made {
-    /// In the file, by the number of the key.
+    /// Entries of the file, each with the index of its key.
     file: Vec<(u8, Value)>,
     settings: Vec<(Result<u8, String>, Value)>,
 }
 
-/// Every key, with its default.
+/// Returns every key, with its default.
 fn keys() -> Vec<(String, String, toml::Value)> {
     let defaults: toml::Table = Config::default().to_toml().parse().unwrap();
     let mut keys = vec![];
@@ -75,7 +75,7 @@ pub fn configuration(bytes: &[u8]) {
         let settings: Vec<String> = made.settings.iter().map(setting).collect();
         let Ok(config) = Config::parse(&file, &settings, Path::new("config.toml")) else { return };
         let _ = (config.data.capture_paths(), config.data.validation_paths());
-        // What was resolved is what a run keeps and goes on with.
+        // A run stores the resolved configuration and resumes with it.
         assert_eq!(Config::parse(&config.to_toml(), &[], Path::new("again")).unwrap(), config);
     });
 }

@@ -1,4 +1,4 @@
-//! Splats and weights, whose headers are of the right form.
+//! Splats and weights, generated with headers of the right structure.
 
 use super::file;
 use arbitrary::{Arbitrary, Unstructured};
@@ -15,18 +15,18 @@ const NUMBER_TYPES: [&str; 9] =
 #[derive(Arbitrary)]
 struct Ply {
     degree: u8,
-    /// Types other than float, by the number of the property.
+    /// Types other than float, each with the index of its property.
     types: Vec<(u8, u8)>,
-    /// Properties that are left out, or come twice.
+    /// Index of a property that is left out, and one that occurs twice.
     dropped: Option<u8>,
     added: Option<(u8, u8)>,
     count: Option<u64>,
-    /// A line of the header before that of the number.
+    /// Line inserted into the header, with its position.
     line: Option<(u8, String)>,
     body: Vec<u8>,
 }
 
-/// A splat; one that is read has to come back when it was written.
+/// Reads a generated PLY; a splat that can be read must survive a round trip.
 pub fn ply(bytes: &[u8]) {
     let Ok(made) = Ply::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let rest = [0, 9, 24, 45, 7][usize::from(made.degree) % 5];
@@ -74,7 +74,7 @@ pub fn ply(bytes: &[u8]) {
 struct Weights {
     tensors: Vec<Stored>,
     metadata: Option<Metadata>,
-    /// Instead of the header's own length.
+    /// Length that replaces the header's own.
     length: Option<u64>,
     body: Vec<u8>,
 }
@@ -84,7 +84,7 @@ struct Stored {
     name: Result<u16, String>,
     dtype: u8,
     shape: Vec<Size>,
-    /// Else where the tensor before it ends.
+    /// Data offsets; by default the tensor follows the one before it.
     offsets: Option<[u64; 2]>,
 }
 
@@ -96,7 +96,7 @@ enum Size {
 
 #[derive(Arbitrary)]
 enum Metadata {
-    /// A model that is small, or this text.
+    /// Configuration of a small model.
     Small,
     Key(u8, i64),
     Text(String),
@@ -114,7 +114,7 @@ const DTYPES: [(&str, u64); 9] = [
     ("F8_E4M3", 1),
 ];
 
-/// A configuration of a model with few weights, and their names.
+/// Returns the configuration of a model with few weights, and their names.
 fn small() -> &'static (String, Vec<String>) {
     static SMALL: OnceLock<(String, Vec<String>)> = OnceLock::new();
     SMALL.get_or_init(|| {
@@ -131,7 +131,7 @@ fn small() -> &'static (String, Vec<String>) {
     })
 }
 
-/// Weights, and the model that they may be.
+/// Reads generated weights, and the model if they are one.
 pub fn weights(bytes: &[u8]) {
     let Ok(made) = Weights::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let (config, names) = small();

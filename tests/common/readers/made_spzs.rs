@@ -1,4 +1,4 @@
-//! SPZs of every version, compressed as they should be.
+//! SPZ files of every version, with valid compression.
 
 use super::file;
 use arbitrary::{Arbitrary, Unstructured};
@@ -8,22 +8,22 @@ use std::io::Write;
 #[derive(Arbitrary)]
 struct Spz {
     version: u8,
-    /// Else as many as the streams are for.
+    /// Number of Gaussians; by default the number that the streams contain.
     count: Option<u32>,
     few: u8,
     degree: u8,
     bits: u8,
     flags: u8,
-    /// Of version 4, instead of the right one.
+    /// Offset of the contents in version 4 that replaces the right one.
     contents_at: Option<u32>,
     streams: Option<u8>,
     lengths: Vec<(u8, u64)>,
     extensions: Vec<(u32, u32)>,
-    /// Repeated until the streams are full.
+    /// Bytes repeated until the streams are full.
     body: Vec<u8>,
 }
 
-/// One that is read has to come back when it was written.
+/// Reads a generated SPZ; a splat that can be read must survive a round trip.
 pub fn spz(bytes: &[u8]) {
     let Ok(made) = Spz::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let (version, degree, few) = (made.version % 6, made.degree % 5, usize::from(made.few % 8));

@@ -1,8 +1,8 @@
-//! Every reader of files from elsewhere, on any bytes: for the fuzzers, and for the seeds that they left.
+//! Every reader of external files, callable with arbitrary bytes: for the fuzzers, and for the seeds that they produced.
 //!
-//! A reader may refuse what it gets, or take it, and then what it took has to load or be refused as well. Some are given the
-//! bytes of a file. Others, `made_…`, are given bytes out of which a file of the right form is made, checksums and magic
-//! numbers included, with mistakes only where they were drawn.
+//! A reader may refuse its input or accept it; what it accepts must then load or be refused as well. Some take the bytes of a
+//! file. Others, `made_…`, take bytes from which a file of the right structure is generated, checksums and magic numbers
+//! included, with mistakes only where they were drawn.
 
 mod files;
 mod made_captures;
@@ -16,10 +16,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Reads whatever it is given.
+/// Function that reads arbitrary bytes.
 pub type Reader = fn(&[u8]);
 
-/// By the names of fuzz targets and of the folders of their seeds.
+/// Readers, by the names of fuzz targets and of the folders of their seeds.
 pub const READERS: [(&str, Reader); 30] = [
     ("antimatter", files::antimatter),
     ("camera_path", files::camera_path),
@@ -53,7 +53,7 @@ pub const READERS: [(&str, Reader); 30] = [
     ("weights_pickle", made_chunks::weights_pickle),
 ];
 
-/// Where readers find their files: in memory, where the system has such a place.
+/// Returns the folder of the readers' files: in memory, if the system has such a file system.
 pub fn root() -> &'static Path {
     static ROOT: OnceLock<PathBuf> = OnceLock::new();
     ROOT.get_or_init(|| {
@@ -63,7 +63,7 @@ pub fn root() -> &'static Path {
     })
 }
 
-/// A folder with `images/000.png` to `images/002.png`, 8×8, one for each reader.
+/// Returns the folder of a reader, with `images/000.png` to `images/002.png`, 8×8.
 fn folder(reader: &str) -> PathBuf {
     let folder = root().join(reader);
     let images = folder.join("images");
@@ -76,7 +76,7 @@ fn folder(reader: &str) -> PathBuf {
     folder
 }
 
-/// A photo of [`SIDE`]².
+/// Returns a PNG photo with sides of [`SIDE`].
 fn png() -> &'static [u8] {
     static PNG: OnceLock<Vec<u8>> = OnceLock::new();
     PNG.get_or_init(|| {
@@ -86,10 +86,10 @@ fn png() -> &'static [u8] {
     })
 }
 
-/// Of a photo, in pixels.
+/// Side of a photo, in pixels.
 const SIDE: u32 = 8;
 
-/// `bytes` as a file of `reader`'s folder.
+/// Writes `bytes` to a file in the folder of `reader`.
 fn file(reader: &str, name: &str, bytes: &[u8]) -> PathBuf {
     let file = folder(reader).join(name);
     fs::create_dir_all(file.parent().unwrap()).unwrap();

@@ -1,5 +1,5 @@
-//! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key",
-//! "url", "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
+//! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key", "url",
+//! "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
 
 mod scenes;
 mod write;
@@ -17,12 +17,13 @@ use scenes::{Scene, scenes};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The ending of a chunk's name.
+/// File extension of a chunk.
 const EXTENSION: &str = "torch";
-/// Numbers of a camera: f_x, f_y, c_x, c_y of the image's width and height, 0, 0, w2c's first three rows.
+/// Number of values of a camera: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three rows of
+/// w2c.
 const CAMERA_NUMBERS: usize = 18;
 
-/// A chunk in memory, images still encoded.
+/// A chunk in memory, with images still encoded.
 #[derive(Debug, Clone)]
 pub struct Chunk {
     file: PathBuf,
@@ -30,7 +31,7 @@ pub struct Chunk {
     scenes: Vec<Scene>,
 }
 
-/// `CHUNK.torch#KEY`, or `CHUNK.torch` with one scene alone.
+/// Recognizes `CHUNK.torch#KEY`, or `CHUNK.torch` with a single scene.
 pub(super) fn find(path: &Path) -> Option<Found> {
     if let Some((file, key)) = files_and_keys(path).find(|(file, _)| is_chunk(file)) {
         return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
@@ -39,24 +40,24 @@ pub(super) fn find(path: &Path) -> Option<Found> {
     Some(Box::new(move |purpose| Chunk::read(&file)?.only_capture(purpose)))
 }
 
-/// Whether `path` is a file of scenes, by its name.
+/// Returns `true` if `path` is a file with the extension of a chunk.
 fn is_chunk(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == EXTENSION) && path.is_file()
 }
 
 impl Chunk {
-    /// Reads a chunk, runs nothing that it holds, and believes nothing that it says about sizes.
+    /// Reads a chunk. Executes nothing that it contains and trusts none of the sizes that it declares.
     ///
     /// # Errors
-    /// A file that can't be read, is damaged, or holds anything but scenes.
+    /// Fails if the file can't be read, is damaged, or holds anything other than scenes.
     pub fn read(file: &Path) -> Result<Self> {
         Self::parse(file, std::fs::read(file).map_err(Error::read(file))?)
     }
 
-    /// [`Chunk::read`] of the bytes that `file` holds.
+    /// Parses `bytes`, the contents of the chunk `file`.
     ///
     /// # Errors
-    /// As there.
+    /// Fails like [`Chunk::read`], except for errors of reading the file.
     pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
         let archive = Archive::open(file, &bytes)?;
         let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
@@ -65,15 +66,15 @@ impl Chunk {
         Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
     }
 
-    /// The scenes' names, in order.
+    /// Returns the names of the scenes, in order.
     pub fn keys(&self) -> impl Iterator<Item = &str> {
         self.scenes.iter().map(|scene| scene.key.as_str())
     }
 
-    /// The scene `key`.
+    /// Returns the scene `key`.
     ///
     /// # Errors
-    /// No such scene, or one that breaks what every capture has to hold.
+    /// Fails if there is no such scene, or if it violates the requirements on captures.
     pub fn capture(&self, key: &str) -> Result<Capture> {
         self.capture_for(key, Purpose::Photos)
     }
@@ -90,10 +91,10 @@ impl Chunk {
         }
     }
 
-    /// The scene of a chunk that has one alone.
+    /// Returns the scene of a chunk that has a single scene.
     ///
     /// # Errors
-    /// More scenes, or none; otherwise as [`Chunk::capture`].
+    /// Fails if there are more scenes or none; otherwise like [`Chunk::capture`].
     fn only_capture(&self, purpose: Purpose) -> Result<Capture> {
         match self.scenes.as_slice() {
             [scene] => self.capture_of(scene, purpose),
@@ -108,7 +109,7 @@ impl Chunk {
         }
     }
 
-    /// Which scenes there are, for an error.
+    /// Lists the available scenes for an error message.
     fn choice(&self) -> String {
         const SHOWN: usize = 8;
         let keys: Vec<&str> = self.keys().take(SHOWN).collect();
@@ -118,7 +119,7 @@ impl Chunk {
 
     fn capture_of(&self, scene: &Scene, purpose: Purpose) -> Result<Capture> {
         let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
-        // A frame that is damaged is found when it is loaded; until then it is as large as the others.
+        // A damaged frame is detected when it is loaded. Until then, assume the size of the other frames.
         let sizes: Vec<_> =
             scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
         let undecodable = || Error::input(&named, "every image", "undecodable", "a JPEG or PNG");
@@ -142,7 +143,7 @@ impl Chunk {
     }
 }
 
-/// From a chunk's numbers and (width, height).
+/// Builds a camera from a chunk's values and the image's (width, height).
 fn camera(numbers: &[f32], (width, height): (u32, u32)) -> Camera {
     let at = |i: usize| f64::from(numbers[i]);
     let (w, h) = (f64::from(width), f64::from(height));
@@ -152,7 +153,7 @@ fn camera(numbers: &[f32], (width, height): (u32, u32)) -> Camera {
     Camera { intrinsics, c2w: w2c.inverse(), width, height }
 }
 
-/// What [`camera`] reads.
+/// Returns the values that [`camera`] reads.
 fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     let k = camera.intrinsics;

@@ -1,28 +1,28 @@
-//! The scenes that a chunk's pickle describes, as places in its file.
+//! Parser of a chunk's pickle. It locates scenes by byte ranges in the chunk's file.
 
 use super::CAMERA_NUMBERS;
 use crate::io::{Archive, Array, Id, Strangers, Value, Values, unpickle};
 use std::ops::Range;
 use tch::{Kind, Tensor};
 
-/// A chunk may refer to one image again and again, in a byte or two each time: so many references are always allowed.
+/// Number of views that is always allowed. A chunk may refer to one image repeatedly, in a byte or two each time.
 const VIEWS: usize = 100_000;
-/// Beyond [`VIEWS`], a view for so many bytes of the file: an image with its description takes more.
+/// Minimum number of bytes of the file per view beyond [`VIEWS`]. An image with its description takes more.
 const BYTES_OF_VIEW: usize = 50;
 
 /// A posed video.
 #[derive(Debug, Clone)]
 pub(super) struct Scene {
-    /// By which an index names it.
+    /// Key of the scene in an index.
     pub key: String,
-    /// [views, [`CAMERA_NUMBERS`]].
+    /// Camera values, [views, [`CAMERA_NUMBERS`]].
     cameras: Array,
-    /// Where each view's encoded image lies in the file.
+    /// Byte range of each view's encoded image in the file.
     pub images: Vec<Range<usize>>,
 }
 
 impl Scene {
-    /// The numbers of every view's camera, in `file`.
+    /// Reads the camera values of every view from `file`.
     pub fn cameras(&self, file: &[u8]) -> Vec<f32> {
         let Array { dtype, size, stride, bytes } = &self.cameras;
         let counts = |counts: &[usize]| counts.iter().map(|&count| count as i64).collect::<Vec<_>>();
@@ -33,17 +33,17 @@ impl Scene {
     }
 }
 
-/// The scenes in `archive`, whose file is `bytes`.
+/// Returns the scenes in `archive`, whose file contents are `bytes`.
 ///
 /// # Errors
-/// A pickle that asks for what it may not, or is no list of scenes.
+/// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
 pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
     let values = unpickle(&mut &bytes[archive.pickle.clone()], Strangers::Refused)?;
     let most = VIEWS + bytes.len() / BYTES_OF_VIEW;
     scenes_of(&values, archive, most).map_err(|why| format!("unusable ({why})"))
 }
 
-/// With so many views at `most`.
+/// Parses the scenes, with `most` as the maximum number of views.
 fn scenes_of(values: &Values, archive: &Archive, most: usize) -> Result<Vec<Scene>, String> {
     let Value::List(list) = values.get(values.root) else {
         return Err(format!("{}, expected a list of scenes", values.get(values.root).name()));
@@ -60,7 +60,7 @@ fn scenes_of(values: &Values, archive: &Archive, most: usize) -> Result<Vec<Scen
     Ok(scenes)
 }
 
-/// Keys and values of the scene.
+/// Returns the keys and values of the scene.
 fn dict<'v>(values: &'v Values, index: usize, scene: Id) -> Result<&'v [Id], String> {
     match values.get(scene) {
         Value::Dict(items) => Ok(items),
@@ -68,7 +68,7 @@ fn dict<'v>(values: &'v Values, index: usize, scene: Id) -> Result<&'v [Id], Str
     }
 }
 
-/// A scene's entries. Every message names the scene and the field.
+/// Entries of a scene. Every error message names the scene and the field.
 struct Fields<'v, 'a> {
     values: &'v Values<'a>,
     archive: &'v Archive,
@@ -99,7 +99,7 @@ impl<'v, 'a> Fields<'v, 'a> {
         }
     }
 
-    /// `value`, which is in `field`, as numbers in one dimension or two.
+    /// Returns `value`, which is in `field`, as an array of one or two dimensions.
     fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
         let array = Array::of(self.values, &self.archive.storages, value)
             .map_err(|why| format!("{} {why}", self.name(field)))?;

@@ -1,4 +1,4 @@
-//! Captures into chunks.
+//! Writer of chunks.
 
 use super::{Chunk, EXTENSION, camera_numbers};
 use crate::data::capture::Capture;
@@ -10,14 +10,14 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// By which a folder of chunks is recognized: {key: chunk's file name}.
+/// Name of the index file that identifies a folder of chunks: {key: chunk's file name}.
 pub const INDEX_FILE: &str = "index.json";
 
 /// Writes chunks and their index into a folder.
 #[derive(Debug)]
 pub struct ChunkWriter {
     folder: PathBuf,
-    /// Bytes of images after which a chunk is written.
+    /// Size of the images in bytes after which a chunk is written.
     chunk_bytes: usize,
     waiting: Vec<SceneToPickle>,
     waiting_bytes: usize,
@@ -26,10 +26,10 @@ pub struct ChunkWriter {
 }
 
 impl ChunkWriter {
-    /// Chunks of about `chunk_bytes` in `folder`, which is there already.
+    /// Creates a writer of chunks of about `chunk_bytes` in the existing folder `folder`.
     ///
     /// # Errors
-    /// A folder that holds chunks already.
+    /// Fails if the folder already holds chunks.
     pub fn new(folder: &Path, chunk_bytes: usize) -> Result<Self> {
         let index = folder.join(INDEX_FILE);
         if index.exists() {
@@ -50,11 +50,12 @@ impl ChunkWriter {
         })
     }
 
-    /// Takes over what is left where the same work was interrupted: chunks of the first of its scenes, which are called `keys` in
-    /// their order, and of which `make` makes the first anew, for comparison. `each` sees all that are there. Returns how many.
+    /// Takes over the chunks that an interrupted run of the same work left: those of its first scenes. `keys` are the names of all
+    /// scenes in order. `make` creates the first scene again, for comparison. `each` is called with every existing scene. Returns
+    /// their number.
     ///
     /// # Errors
-    /// Chunks of other work, those of `make` and `each`.
+    /// Fails if the chunks belong to other work, or if `make` or `each` fails.
     pub fn go_on(
         &mut self,
         keys: &[String],
@@ -87,12 +88,12 @@ impl ChunkWriter {
         }
     }
 
-    /// Adds a capture, by its name. JPEG and PNG files are taken as they are, bit for bit, unless their lens distorts, they
-    /// lie on their side, or they have other than three channels of 8 bits; then they are encoded anew, a JPEG as a JPEG of
-    /// high quality, everything else as a PNG. The views of a test part of its own are left out.
+    /// Adds a capture under its name. JPEG and PNG files are copied bit for bit unless their lens distorts, they need rotating, or
+    /// they don't have three channels of 8 bits. Those are encoded again, a JPEG as a JPEG of high quality, everything else as a
+    /// PNG. The views of the capture's own test part are left out.
     ///
     /// # Errors
-    /// A name that is there already, photos that can't be read, the system's refusal to write.
+    /// Fails if the name is already taken, if a photo can't be read, or if a file can't be written.
     pub fn add(&mut self, capture: &Capture) -> Result<()> {
         if let Some(chunk) = self.index.get(&capture.name) {
             let found = format!("{:?}, which {chunk} holds already", capture.name);
@@ -117,10 +118,10 @@ impl ChunkWriter {
         Ok(())
     }
 
-    /// Writes what is left, and the index, without which the chunks aren't found. Returns the number of chunks.
+    /// Writes the remaining scenes and the index, without which the chunks aren't found. Returns the number of chunks.
     ///
     /// # Errors
-    /// The system's refusal to write.
+    /// Fails if a file can't be written.
     pub fn finish(mut self) -> Result<usize> {
         if !self.waiting.is_empty() {
             self.write_chunk()?;
@@ -136,7 +137,7 @@ impl ChunkWriter {
     fn write_chunk(&mut self) -> Result<()> {
         let file = self.folder.join(self.chunk_name());
         let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
-        // The same bytes are what was left when the same work was interrupted.
+        // An existing file with the same bytes was left by an interrupted run of the same work.
         if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes.as_slice() {
             return Err(Error::input(&file, "the output", "a chunk already", "a folder without chunks"));
         }
@@ -146,7 +147,7 @@ impl ChunkWriter {
     }
 }
 
-/// Whether both have as many photos, and the same first one.
+/// Returns `true` if both captures have equally many photos and the same first photo.
 fn is_same(a: &Capture, b: &Capture) -> Result<bool> {
     Ok(a.len() == b.len() && a.encoded(0)? == b.encoded(0)?)
 }

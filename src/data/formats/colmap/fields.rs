@@ -1,18 +1,18 @@
-//! Numbers and names in COLMAP's files, text and binary, each with what is said where it isn't right.
+//! Parsers of numbers and names in COLMAP's text and binary files, with error messages for invalid values.
 
 use crate::error::{Error, Result};
 use std::path::Path;
 use std::str::FromStr;
 
-/// Whether a line of a text file says nothing.
+/// Returns `true` if a line of a text file is blank or a comment.
 pub fn is_comment(line: &str) -> bool {
     line.trim().is_empty() || line.trim_start().starts_with('#')
 }
 
-/// A line, word by word.
+/// A line that is parsed word by word.
 pub struct Words<'a> {
     pub file: &'a Path,
-    /// From 1.
+    /// Line number, starting at 1.
     pub number: usize,
     pub rest: &'a str,
 }
@@ -28,7 +28,7 @@ impl Words<'_> {
     }
 }
 
-/// A file's contents, value by value.
+/// A file's contents that are parsed value by value.
 pub struct Bytes<'a> {
     pub file: &'a Path,
     pub contents: &'a [u8],
@@ -57,7 +57,7 @@ impl Bytes<'_> {
         self.take(field).map(f64::from_le_bytes)
     }
 
-    /// A number of entries of `smallest` bytes or more, for which there is room in the file.
+    /// Reads a number of entries that take at least `smallest` bytes each, and fails if the file can't hold that many.
     pub fn count(&mut self, field: &str, smallest: usize) -> Result<usize> {
         let count = u64::from_le_bytes(self.take(|| field.to_string())?);
         let room = self.left() / smallest;

@@ -1,6 +1,5 @@
-//! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. Pixel
-//! (0, 0) has its centre at (½, ½), as everywhere here. The points are read where they are asked for
-//! (spec 10.4).
+//! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. The centre of
+//! pixel (0, 0) is at (½, ½), as everywhere in this crate. Points are read separately, on request (spec 10.4).
 
 mod fields;
 mod points;
@@ -20,18 +19,18 @@ use glam::{DMat4, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Where models are looked for below a capture's folder, in the place itself or in a numbered folder there, and the folders that
-/// have their photos. Photos of a dense model are other ones: their lens distortion is removed.
+/// Folders below a capture's folder that are searched for models, directly and in numbered subfolders, each with the folders that
+/// contain the model's photos. A dense model has its own photos, whose lens distortion is removed.
 const PLACES: [(&str, &[&str]); 3] =
     [("sparse", &[""]), ("colmap/sparse", &["", "colmap"]), ("dense/sparse", &["dense"])];
 
-/// A folder of numbered ones, each of which has a model and its photos.
+/// Folder of numbered subfolders, and the name of the model's folder in each of them. Each subfolder also has its own photos.
 const DENSE: (&str, &str) = ("dense", "sparse");
 
-/// The folder of photos.
+/// Name of the folder of photos.
 const PHOTOS: &str = "images";
 
-/// Camera models in COLMAP's numbering, and how many parameters each has.
+/// Camera models in COLMAP's numbering, each with its number of parameters.
 const MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -53,20 +52,20 @@ const MODELS: [(&str, usize); 18] = [
     ("EQUIRECTANGULAR", 2),
 ];
 
-/// Those that are read.
+/// Supported camera models.
 const SUPPORTED: [&str; 6] =
     ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
 
-/// A model's files.
+/// Files of a model.
 struct Model {
     cameras: PathBuf,
     images: PathBuf,
-    /// Folders that its photos' names may be below.
+    /// Folders that the names of the photos may be relative to.
     bases: Vec<PathBuf>,
 }
 
 impl Model {
-    /// The model in `folder`, in binary form if it is there in both.
+    /// Returns the model in `folder`, the binary one if both forms exist.
     fn in_folder(folder: &Path, bases: &[PathBuf]) -> Option<Self> {
         ["bin", "txt"].into_iter().find_map(|form| {
             let file = |name: &str| Some(folder.join(format!("{name}.{form}"))).filter(|file| file.is_file());
@@ -74,7 +73,7 @@ impl Model {
         })
     }
 
-    /// Every model of the capture in `folder`.
+    /// Returns every model of the capture in `folder`.
     fn find_all(folder: &Path) -> Vec<Self> {
         let mut models = vec![];
         let mut look = |place: &Path, bases: &[PathBuf]| {
@@ -87,7 +86,7 @@ impl Model {
         for dense in numbered(&folder.join(DENSE.0)) {
             look(&dense.join(DENSE.1), std::slice::from_ref(&dense));
         }
-        // The folder may also be a model, or `sparse` of a capture.
+        // The folder itself may also be a model, or the `sparse` folder of a capture.
         let canonical = folder.canonicalize().unwrap_or(folder.to_owned());
         let bases: Vec<_> = canonical.ancestors().take(3).map(Path::to_owned).collect();
         match canonical.ends_with(PLACES[0].0) {
@@ -106,7 +105,7 @@ impl Model {
     }
 }
 
-/// The folders in `folder` whose names are numbers, by these.
+/// Returns the folders in `folder` whose names are numbers, in numeric order.
 fn numbered(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let is_number = |path: &PathBuf| {
@@ -118,13 +117,13 @@ fn numbered(folder: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// How far a quaternion's length may be from 1 without a word.
+/// Maximum deviation of a quaternion's length from 1 that causes no warning.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// A line of cameras.txt.
 struct CameraEntry {
     id: u32,
-    /// Its name, which may be none of [`SUPPORTED`] where no image is of the camera.
+    /// Name of the camera model. It may be missing from [`SUPPORTED`] if no image uses the camera.
     model: String,
     width: u64,
     height: u64,
@@ -134,20 +133,20 @@ struct CameraEntry {
 /// The first line of an image in images.txt.
 struct ImageEntry {
     id: u32,
-    /// (w, x, y, z), world-to-camera.
+    /// World-to-camera rotation (w, x, y, z).
     quaternion: [f64; 4],
     translation: [f64; 3],
     camera: u32,
     name: String,
 }
 
-/// A folder with a model.
+/// Recognizes a folder that contains a model.
 pub(super) fn find(folder: &Path) -> Option<Found> {
     let (folder, models) = (folder.to_owned(), Model::find_all(folder));
     (!models.is_empty()).then(|| -> Found { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
 }
 
-/// Reads the one of `models` with the most photos, the first of several.
+/// Reads the model with the most photos among `models`, the first one in case of a tie.
 fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Result<Capture> {
     if models.len() == 1 {
         return read(folder, &models[0], models[0].images()?, vec![], purpose);
@@ -156,7 +155,7 @@ fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Resu
         model.images.parent().and_then(|place| place.strip_prefix(folder).ok()?.to_str().map(String::from))
     };
     let names: Vec<String> = models.iter().map(|model| name(model).unwrap_or_default()).collect();
-    // Where none can be read, the first says why.
+    // If no model can be read, the first one reports the error.
     let sizes: Vec<Option<usize>> =
         models.iter().map(|model| model.images().ok().map(|images| images.len())).collect();
     let largest = (0..models.len()).rev().max_by_key(|&model| sizes[model]).expect("a model or more");
@@ -180,8 +179,8 @@ fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Resu
     read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
 }
 
-/// Reads `images` of `model` as the capture in `folder`. Frames come in the order of their names, numbers in them by value; those
-/// whose photo isn't there are left out.
+/// Reads `images` of `model` as the capture in `folder`. Frames are ordered by name, with numbers in names compared by value.
+/// Frames with a missing photo are left out.
 fn read(
     folder: &Path,
     model: &Model,
@@ -243,7 +242,7 @@ fn read(
         if !translation.is_finite() {
             return refuse("translation", format!("{:?}", image.translation), "finite numbers".into());
         }
-        // The inverse of x ↦ Rx + t.
+        // Invert x ↦ Rx + t.
         let inverse = rotation.normalize().conjugate();
         let c2w = DMat4::from_rotation_translation(inverse, -(inverse * translation));
         let camera = Camera { c2w, ..camera };
@@ -253,7 +252,7 @@ fn read(
     Capture::new(folder_name(folder), model.images.clone(), frames, changes, purpose)
 }
 
-/// The camera, at the origin, and its distortion.
+/// Returns the camera, at the origin, and its distortion.
 fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
     let refuse = |name: &str, found: String, expected: String| {
         Error::input(file, format!("{name} of camera {}", entry.id), found, expected)
@@ -297,7 +296,7 @@ fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
     Ok((camera, distortion))
 }
 
-/// CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
+/// Reads lines of the form CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
 fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
     let text = read_text(file)?;
     let mut cameras = vec![];
@@ -316,7 +315,7 @@ fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
     Ok(cameras)
 }
 
-/// IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D as X Y POINT3D_ID, which may be empty.
+/// Reads pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D as X Y POINT3D_ID, which may be empty.
 fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
     let text = read_text(file)?;
     let mut images = vec![];
@@ -336,9 +335,9 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
             *value = words.parse(name, "a number")?;
         }
         let camera = words.parse("CAMERA_ID", "a whole number")?;
-        // A name may have spaces.
+        // A name may contain spaces.
         images.push(ImageEntry { id, quaternion, translation, camera, name: words.rest.trim().to_string() });
-        // Tells where the second line was left away, as an image's own line has ten words.
+        // This detects a missing second line, because an image's own line has ten words.
         if let Some((number, points)) = lines.next()
             && points.split_whitespace().count() % 3 != 0
         {
@@ -350,7 +349,7 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
     Ok(images)
 }
 
-/// The number of cameras (u64), then of each: id (u32), model (i32), width and height (u64), parameters (f64).
+/// Reads the number of cameras (u64), then for each camera: id (u32), model (i32), width and height (u64), parameters (f64).
 fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
     const SMALLEST: usize = 4 + 4 + 8 + 8 + 2 * 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
@@ -360,7 +359,7 @@ fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
         let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
         let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
         let model = usize::try_from(number).ok().and_then(|number| MODELS.get(number));
-        // How many parameters it has isn't known, nor where the next camera begins.
+        // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
         let (model, parameters) = model.ok_or_else(|| {
             let expected = format!("one of {}", SUPPORTED.join(", "));
             Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
@@ -376,8 +375,8 @@ fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
     Ok(cameras)
 }
 
-/// The number of images (u64), then of each: id (u32), quaternion and translation (f64), camera id (u32), name (ended by a
-/// 0), and the number of its points (u64), each x, y (f64) and an id (u64).
+/// Reads the number of images (u64), then for each image: id (u32), quaternion and translation (f64), camera id (u32), name
+/// (terminated by a 0), and the number of its points (u64), each x, y (f64) and an id (u64).
 fn images_of_bytes(file: &Path) -> Result<Vec<ImageEntry>> {
     const POINT: usize = 24;
     const SMALLEST: usize = 4 + 7 * 8 + 4 + 1 + 8;

@@ -1,4 +1,4 @@
-//! The points of a COLMAP model: what it knows of the scene itself.
+//! 3D points of a COLMAP model.
 
 use super::fields::{Bytes, Words, is_comment};
 use crate::data::capture::Capture;
@@ -7,19 +7,20 @@ use crate::io::read_text;
 use glam::DVec3;
 use std::path::Path;
 
-/// Of a scene's surface.
+/// A point on the surface of the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// In the capture's world.
+    /// Position in the capture's world coordinates.
     pub position: DVec3,
-    /// In [0, 1].
+    /// RGB colour, values in [0, 1].
     pub colour: [f32; 3],
 }
 
-/// The points of the COLMAP model that `capture` was read from; none where it was read from something else, or has no file of them.
+/// Returns the points of the COLMAP model that `capture` was read from. Returns none if the capture has another format or the model
+/// has no file of points.
 ///
 /// # Errors
-/// A file that breaks the format's rules.
+/// Fails if the file violates the format.
 pub fn points_of(capture: &Capture) -> Result<Vec<Point>> {
     let images = capture.file();
     let form =
@@ -32,7 +33,7 @@ pub fn points_of(capture: &Capture) -> Result<Vec<Point>> {
     }
 }
 
-/// POINT3D_ID X Y Z R G B ERROR, then the views that see it.
+/// Reads lines of the form POINT3D_ID X Y Z R G B ERROR, followed by the views that see the point.
 fn of_text(file: &Path) -> Result<Vec<Point>> {
     let text = read_text(file)?;
     let mut points = vec![];
@@ -52,8 +53,8 @@ fn of_text(file: &Path) -> Result<Vec<Point>> {
     Ok(points)
 }
 
-/// The number of points (u64), then of each: id (u64), position (f64), colour (u8), error (f64), and the number of views that see
-/// it (u64), each two ids (u32).
+/// Reads the number of points (u64), then for each point: id (u64), position (f64), colour (u8), error (f64), and the number of
+/// views that see it (u64), each two ids (u32).
 fn of_bytes(file: &Path) -> Result<Vec<Point>> {
     const VIEW: usize = 8;
     const SMALLEST: usize = 8 + 3 * 8 + 3 + 8 + 8;

@@ -1,10 +1,10 @@
-//! From values to pixels, and the frame around a plot.
+//! Axes: the mapping from values to pixels, and the frame of a plot.
 
 use super::super::numbers::decimal;
 use super::px;
 use maud::{Markup, html};
 
-/// Room for what is written around the drawing area: left, top, right, bottom.
+/// Margins around the drawing area, in pixels, for labels: left, top, right, bottom.
 #[derive(Clone, Copy)]
 pub struct Margins {
     pub left: f64,
@@ -15,14 +15,14 @@ pub struct Margins {
 
 impl Margins {
     pub const NARROW: Margins = Margins { left: 46., top: 34., right: 16., bottom: 48. };
-    /// With room for names on the right.
+    /// Margins with space for names on the right.
     pub const NAMED: Margins = Margins { right: 138., ..Margins::NARROW };
 }
 
-/// Of a linear axis, in dB or scenes: a smaller difference is none to look at.
+/// Minimum range of a linear axis, in dB or scenes. Smaller differences don't matter.
 const LEAST_SPAN: f64 = 1.;
 
-/// Values of one axis and the pixels they go to.
+/// An axis: a range of values and the range of pixels that they map to.
 pub struct Axis {
     from: f64,
     to: f64,
@@ -33,7 +33,7 @@ pub struct Axis {
 }
 
 impl Axis {
-    /// Even, with round ticks that enclose `from` to `to`.
+    /// Creates a linear axis with round ticks that enclose `from` to `to`.
     pub fn linear(from: f64, to: f64, start: f64, end: f64) -> Self {
         let step = round_step((to - from).max(LEAST_SPAN) / 5.);
         let (first, last) = ((from / step).floor(), (to / step).ceil().max((from / step).floor() + 1.));
@@ -41,28 +41,28 @@ impl Axis {
         Axis { from: first * step, to: last * step, logarithmic: false, start, end, ticks }
     }
 
-    /// Even, with these ticks, and room beyond the outermost.
+    /// Creates a linear axis with the given ticks, and some space beyond the outermost ones.
     pub fn at(ticks: Vec<f64>, start: f64, end: f64) -> Self {
         let (least, most) = (ticks[0], ticks[ticks.len() - 1]);
         let room = ((most - least) * 0.06).max(1.);
         Axis { from: least - room, to: most + room, logarithmic: false, start, end, ticks }
     }
 
-    /// Logarithmic, with powers of ten that enclose `from` to `to`, which are positive.
+    /// Creates a logarithmic axis with powers of ten that enclose `from` to `to`, which are positive.
     pub fn logarithmic(from: f64, to: f64, start: f64, end: f64) -> Self {
         let (first, last) = (from.log10().floor(), to.log10().ceil().max(from.log10().floor() + 1.));
         let ticks = (0..=(last - first) as i32).map(|i| 10f64.powi(first as i32 + i)).collect();
         Axis { from: first, to: last, logarithmic: true, start, end, ticks }
     }
 
-    /// The pixel of a value.
+    /// Returns the pixel coordinate of a value.
     pub fn pixel(&self, value: f64) -> f64 {
         let value = if self.logarithmic { value.log10() } else { value };
         self.start + (value - self.from) / (self.to - self.from) * (self.end - self.start)
     }
 }
 
-/// 1, 2 or 5 times a power of ten, at least `least`.
+/// Returns the smallest step of at least `least` that is 1, 2 or 5 times a power of ten.
 fn round_step(least: f64) -> f64 {
     let power = 10f64.powf(least.log10().floor());
     [1., 2., 5., 10.]
@@ -72,19 +72,19 @@ fn round_step(least: f64) -> f64 {
         .unwrap_or(power)
 }
 
-/// The least and the most of them.
+/// Returns the minimum and the maximum of `values`.
 pub fn bounds(values: impl IntoIterator<Item = f64>) -> (f64, f64) {
     let widen = |(least, most): (f64, f64), value: f64| (least.min(value), most.max(value));
     values.into_iter().fold((f64::INFINITY, f64::NEG_INFINITY), widen)
 }
 
-/// The corners of a polyline through `points`.
+/// Returns the `points` attribute of an SVG polyline through `points`.
 pub fn polyline(points: impl Iterator<Item = (f64, f64)>, x: &Axis, y: &Axis) -> String {
     let corners: Vec<_> = points.map(|(u, v)| format!("{},{}", px(x.pixel(u)), px(y.pixel(v)))).collect();
     corners.join(" ")
 }
 
-/// Grid lines across, ticks of both axes, and what they measure.
+/// Renders the horizontal grid lines, the ticks of both axes, and the titles of the axes.
 pub fn frame(x: &Axis, y: &Axis, x_title: &str, y_title: &str, x_tick: impl Fn(f64) -> String) -> Markup {
     let digits = if y.ticks.iter().all(|tick| tick.fract().abs() < 1e-9) { 0 } else { 1 };
     html! {

@@ -1,4 +1,4 @@
-//! PSNR over the steps of a training run: of what it trains on, and of what is held out.
+//! PSNR over the steps of a training run, for the training views and the held-out views.
 
 use super::super::STYLE;
 use super::super::numbers::decimal;
@@ -12,14 +12,14 @@ use maud::{PreEscaped, html};
 use std::path::Path;
 
 const MARGINS: Margins = Margins::NAMED;
-/// Parts of a run over which training's scores are averaged.
+/// Number of intervals of a run over which the training scores are averaged.
 const PARTS: u64 = 60;
 
-/// Draws the curves of the folder `run` into `path`, an SVG that needs no other file. `nearest` is the score of showing the nearest
-/// photo, for comparison.
+/// Draws the curves of the run in the folder `run` into `path`, a self-contained SVG. `nearest` is the score of showing the nearest photo,
+/// for comparison.
 ///
 /// # Errors
-/// Metrics that can't be read, or the system's refusal to write.
+/// Fails if the metrics can't be read or the file can't be written.
 pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()> {
     let Curves { training, held_out } = Curves::read(run, PARTS)?;
     let last = training.iter().chain(&held_out).map(|point| point.0).fold(0, u64::max) as f64;

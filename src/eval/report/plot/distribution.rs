@@ -1,4 +1,4 @@
-//! How the scenes' PSNR is distributed: one histogram for each evaluation, all over the same values.
+//! Distribution of the scenes' PSNR: one histogram for each evaluation, all with the same bins.
 
 use super::super::entry::Entry;
 use super::super::numbers::{count, decimal, short};
@@ -8,11 +8,11 @@ use super::{HEIGHT, WIDTH, figure, px};
 use maud::{Markup, html};
 
 const MARGINS: Margins = Margins::NARROW;
-/// Widths of a bar in dB, and how many bars there are at most.
+/// Possible widths of a bin in dB, and the maximum number of bins.
 const BIN_WIDTHS: [f64; 5] = [0.2, 0.5, 1., 2., 5.];
 const MOST_BINS: f64 = 28.;
 
-/// One histogram for each evaluation on `dataset`.
+/// Renders one histogram for each evaluation on `dataset`.
 pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
     let entries = entries.iter().filter(|entry| entry.dataset == dataset && entry.scored() > 0);
     let scenes = entries.clone().flat_map(|entry| &entry.evaluation.scenes);

@@ -1,10 +1,10 @@
-//! Names beside points, placed so that they cover neither each other nor the points.
+//! Labels of points, placed so that they cover neither each other nor the points.
 
-/// Of the plots' labels: height of a line, and a character's mean width, which few fonts exceed.
+/// Height of a label's line in pixels, and an upper estimate of a character's mean width, which few fonts exceed.
 const LINE: f64 = 14.;
 const CHARACTER: f64 = 7.9;
 
-/// An upright rectangle in pixels.
+/// An axis-aligned rectangle in pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct Area {
     pub left: f64,
@@ -29,7 +29,7 @@ impl Area {
     }
 }
 
-/// A name of so many characters at most; legends and tooltips have it whole.
+/// Shortens a name to at most `longest` characters. Legends and tooltips show the full name.
 pub fn shortened(name: &str, longest: usize) -> String {
     match name.chars().count() > longest {
         true => name.chars().take(longest - 1).chain(['…']).collect(),
@@ -37,7 +37,8 @@ pub fn shortened(name: &str, longest: usize) -> String {
     }
 }
 
-/// Where each name's text begins, on its base line, for points in the order of their importance.
+/// Returns the start of each label's text on its baseline. The points are in the order of their importance: earlier labels get better
+/// positions.
 pub fn beside_points(points: &[(f64, f64)], names: &[String], within: Area) -> Vec<(f64, f64)> {
     let marks: Vec<Area> = points.iter().map(|&(x, y)| Area::around(x, y, 7.)).collect();
     let mut taken: Vec<Area> = vec![];
@@ -56,7 +57,7 @@ pub fn beside_points(points: &[(f64, f64)], names: &[String], within: Area) -> V
             let others = taken.iter().chain(&marks).map(|other| area.overlap(other)).sum::<f64>();
             others + (area.size() - area.overlap(&within)) * 4.
         };
-        // min_by keeps the first of equals, which is the nearest.
+        // `min_by` returns the first of equal elements, which is the nearest position.
         let best = areas.min_by(|a, b| covered(a).total_cmp(&covered(b))).expect("places");
         begins.push((best.left, best.bottom - 3.));
         taken.push(best);
@@ -64,13 +65,13 @@ pub fn beside_points(points: &[(f64, f64)], names: &[String], within: Area) -> V
     begins
 }
 
-/// Moves heights apart until lines fit between, in their order and no further than need be; lines that would overlap are
-/// centred on where they belong. They stay within `top` to `bottom` where all can.
+/// Moves label heights apart until lines of text fit between them. The order is kept and no label moves further than necessary; labels that
+/// would overlap are centred on the mean of their heights. All stay within `top` to `bottom` if they fit.
 pub fn spread(heights: &[f64], top: f64, bottom: f64) -> Vec<f64> {
     let mut order: Vec<usize> = (0..heights.len()).collect();
     order.sort_by(|&a, &b| heights[a].total_cmp(&heights[b]));
-    // Less the lines above it, each height is to be no less than the one before: isotonic regression, which pools
-    // neighbours (their number and sum) until the means ascend.
+    // After subtracting the lines above it, each height must be at least the previous one. This is isotonic regression: pool adjacent
+    // heights (their count and sum) until the means ascend.
     let mut pools: Vec<(usize, f64)> = vec![];
     for (rank, &i) in order.iter().enumerate() {
         let mut pool = (1, heights[i] - rank as f64 * LINE);

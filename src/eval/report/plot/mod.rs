@@ -1,4 +1,4 @@
-//! Plots as inline SVG. Colours come from the page's style sheet, so that they follow light and dark.
+//! Plots as inline SVG. Their colours come from the page's style sheet, so that they follow the light and dark themes.
 
 mod axes;
 mod curves;
@@ -16,11 +16,11 @@ use super::entry::Entry;
 use super::table::swatch;
 use maud::{Markup, html};
 
-/// A plot's own pixels, which the page scales.
+/// Width of a plot in its own pixels, which the page scales.
 const WIDTH: f64 = 500.;
 const HEIGHT: f64 = 340.;
 
-/// A figure: title, plot, legend. `about` tells what it shows to those who don't see it.
+/// Renders a figure: title, plot, legend. `about` describes the plot for screen readers.
 fn figure(title: &str, about: &str, drawing: Markup, legend: Markup) -> Markup {
     html! {
         figure.plot {
@@ -33,7 +33,7 @@ fn figure(title: &str, about: &str, drawing: Markup, legend: Markup) -> Markup {
     }
 }
 
-/// What the colours stand for, of what is drawn.
+/// Renders the legend of the colours that are in use.
 fn legend<'a>(published: bool, globalsplat: bool, measured: impl Iterator<Item = &'a Entry<'a>>) -> Markup {
     html! {
         @if published { li { span.swatch.published aria-hidden="true" {} "published" } }
@@ -42,7 +42,7 @@ fn legend<'a>(published: bool, globalsplat: bool, measured: impl Iterator<Item =
     }
 }
 
-/// A coordinate: a tenth of a pixel is enough.
+/// Formats a coordinate, rounded to a tenth of a pixel.
 fn px(value: f64) -> String {
     format!("{value:.1}")
 }

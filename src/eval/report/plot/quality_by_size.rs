@@ -1,4 +1,4 @@
-//! PSNR against the number of Gaussians: how much quality a method gets out of its size.
+//! PSNR against the number of Gaussians: the quality that a method achieves for its size.
 
 use super::super::numbers::{decimal, short};
 use super::super::rows::Row;
@@ -8,13 +8,13 @@ use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
 const MARGINS: Margins = Margins::NARROW;
-/// Longer names are cut.
+/// Maximum number of characters of a name; longer names are cut.
 const LONGEST_NAME: usize = 24;
 
-/// A point for each row that has both numbers; nothing where no measured row has, or no other.
+/// Renders a point for each row that has both values. Renders nothing if no measured row has both, or if there is only one point.
 pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
     let point = |row: &'_ Row| Some((row.kilo_gaussians? * 1e3, row.psnr?));
-    // Measured rows first: their names get the best places.
+    // Measured rows come first: their names get the best positions.
     let mut shown: Vec<(&Row, (f64, f64))> = rows.iter().filter_map(|row| Some((row, point(row)?))).collect();
     shown.sort_by_key(|(row, _)| row.measured.is_none());
     if shown.len() < 2 || shown[0].0.measured.is_none() {
@@ -32,13 +32,13 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
 
     let drawing = html! {
         (frame(&x, &y, "Gaussians, logarithmic", "PSNR (dB)", count))
-        // Names first, so that no name covers a point.
+        // Draw the names first, so that no name covers a point.
         @for (((row, _), name), (left, base)) in shown.iter().zip(&names).zip(&begins) {
             text.name.emphasis[row.measured.is_some() || row.is_published_globalsplat()] x=(px(*left)) y=(px(*base)) {
                 (name)
             }
         }
-        // Measured points come first above, and are drawn last.
+        // Measured points come first in `shown`; draw them last, on top.
         @for ((row, (_, psnr)), (cx, cy)) in shown.iter().zip(&points).rev() {
             @let told = format!("{}: {} dB with {}K Gaussians", row.name, decimal(*psnr, 2), short(row.kilo_gaussians.unwrap_or(0.)));
             (mark(row, *cx, *cy, &told))
@@ -64,7 +64,7 @@ fn mark(row: &Row, cx: f64, cy: f64, told: &str) -> Markup {
     }
 }
 
-/// `10K`, `1M`.
+/// Formats a tick, such as `10K` or `1M`.
 fn count(value: f64) -> String {
     match value {
         v if v >= 1e6 => format!("{}M", short(v * 1e-6)),

@@ -1,4 +1,4 @@
-//! PSNR against the number of context views: what more photos bring.
+//! PSNR against the number of context views: the benefit of more photos.
 
 use super::super::entry::{Entry, dataset_name};
 use super::super::numbers::decimal;
@@ -9,10 +9,10 @@ use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
 const MARGINS: Margins = Margins::NAMED;
-/// Names longer than the room for them are cut; the legend and the tooltips have them whole.
+/// Maximum number of characters of a name beside the plot. Longer names are cut; the legend and the tooltips show the full names.
 const LONGEST_NAME: usize = 14;
 
-/// One method over numbers of context views.
+/// Scores of one method for several numbers of context views.
 struct Line<'a> {
     name: &'a str,
     measured: Option<&'a Entry<'a>>,
@@ -20,7 +20,7 @@ struct Line<'a> {
     points: Vec<(usize, f64)>,
 }
 
-/// A line for each method, published and measured; nothing where there is one number of views only.
+/// Renders a line for each published and measured method; nothing if there is only one number of views.
 pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
     let counts = view_counts(entries, dataset);
     if counts.len() < 2 {
@@ -46,7 +46,7 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
             }),
         }
     }
-    // What was measured is drawn last, above the others.
+    // Draw measured lines last, on top of the others.
     lines.sort_by_key(|line| line.measured.is_some());
     let (worst, best) = bounds(lines.iter().flat_map(|line| line.points.iter().map(|point| point.1)));
     let ticks = counts.iter().map(|&views| views as f64).collect();

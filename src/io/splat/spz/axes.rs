@@ -1,9 +1,9 @@
-//! In which directions axes go. Formats of splats have x to the right, y down, z forward; SPZ, as a rule, has y up, z back.
+//! Directions of coordinate axes. Formats of splats have x to the right, y down, z forward; SPZ usually has y up, z back.
 
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// Of which axes a spherical harmonic, in the order of spec 6.3 from degree 1, changes its sign with: y, z, x; xy, yz, …
+/// Axes whose reversal changes the sign of a spherical harmonic, in the order of spec 6.3 from degree 1: y, z, x; xy, yz, …
 const ODD: [[bool; 3]; 15] = {
     const X: [bool; 3] = [true, false, false];
     const Y: [bool; 3] = [false, true, false];
@@ -16,16 +16,16 @@ const ODD: [[bool; 3]; 15] = {
     [Y, Z, X, XY, YZ, NONE, XZ, NONE, Y, XYZ, Y, Z, X, Z, X]
 };
 
-/// Signs by which x, y and z of SPZ's axes become those to the right, down and forward, or the other way round.
+/// Signs that convert x, y and z between SPZ's axes and those to the right, down and forward, in both directions.
 #[derive(Debug, Clone, Copy)]
 pub struct Axes([f32; 3]);
 
 impl Axes {
-    /// Right, up, back: SPZ's own.
+    /// Right, up, back: the default of SPZ.
     pub const RUB: Axes = Axes([1., -1., -1.]);
 
-    /// By its number in the extension SPZ_ADOBE_coordinate_system: 1 to 8 are LDB, RDB, LUB, RUB, LDF, RDF, LUF and RUF, 0 says
-    /// nothing.
+    /// Returns the axes with this number in the extension SPZ_ADOBE_coordinate_system: 1 to 8 are LDB, RDB, LUB, RUB, LDF, RDF, LUF and
+    /// RUF, 0 is unspecified.
     pub fn numbered(path: &Path, number: u32) -> Result<Self> {
         let sign = |positive: bool| if positive { 1. } else { -1. };
         match number {
@@ -42,13 +42,13 @@ impl Axes {
         std::array::from_fn(|axis| self.0[axis] * position[axis])
     }
 
-    /// The rotation (w, x, y, z), which turns about an axis the other way round where just one of the other two is turned back.
+    /// Converts the rotation (w, x, y, z). Its direction about an axis is reversed if exactly one of the other two axes is reversed.
     pub fn rotation(self, [w, x, y, z]: [f32; 4]) -> [f32; 4] {
         let [of_x, of_y, of_z] = self.0;
         [w, of_y * of_z * x, of_x * of_z * y, of_x * of_y * z]
     }
 
-    /// By what spherical harmonics of degree 1 and more are multiplied.
+    /// Returns the factors of the spherical harmonics of degree 1 and more.
     pub fn harmonics(self) -> [f32; 15] {
         ODD.map(|odd| odd.iter().zip(self.0).map(|(&odd, sign)| if odd { sign } else { 1. }).product())
     }

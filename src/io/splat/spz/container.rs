@@ -1,4 +1,4 @@
-//! What SPZ packs Gaussians into: a header and six streams, in gzip up to version 3, in Zstandard each since version 4.
+//! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
 use super::axes::Axes;
 use crate::error::{Error, Result};
@@ -9,44 +9,44 @@ use flate2::write::GzEncoder;
 use std::io::{Read, Write};
 use std::path::Path;
 
-/// What every version begins with, once it is out of its gzip.
+/// First bytes of every version, after gzip is decompressed.
 const MAGIC: [u8; 4] = *b"NGSP";
-/// What gzip begins with. Of the next byte, the flags, the upper three bits are 0.
+/// First bytes of gzip. In the next byte, the flags, the upper three bits are 0.
 const GZIP: [u8; 3] = [0x1f, 0x8b, 8];
-/// Bytes of the header up to version 3, and since.
+/// Size of the header in bytes, up to version 3 (`GZIP_HEADER`) and since version 4 (`PLAIN_HEADER`).
 const GZIP_HEADER: usize = 16;
 const PLAIN_HEADER: usize = 32;
-/// Says that there are extensions: after the streams up to version 3, before them since.
+/// Flag that there are extensions: after the streams up to version 3, before them since version 4.
 const HAS_EXTENSIONS: u8 = 2;
-/// Of the extension that names the axes.
+/// Type of the extension that names the axes.
 const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
-/// Bytes of extensions, at most.
+/// Maximum size of the extensions in bytes.
 const MAX_EXTENSIONS: u64 = 1 << 16;
-/// A file unfolds to at most so many times its bytes, and a little more: real splats do to ten times.
+/// Maximum ratio of decompressed to compressed size, with `MAX_SMALL` bytes allowed in addition. Real splats reach a ratio of ten.
 const MAX_RATIO: u128 = 256;
 const MAX_SMALL: u128 = 1 << 20;
-/// The version that is written.
+/// Version that is written.
 const WRITTEN: u32 = 3;
 
-/// The streams, in the file's order, each with the numbers of all Gaussians.
+/// Streams in the file's order, each with the values of all Gaussians.
 pub struct Streams {
-    /// Three numbers, float16 in version 1, of 24 bits since.
+    /// Three coordinates per Gaussian, float16 in version 1, 24 bits each since version 2.
     pub positions: Vec<u8>,
     pub opacities: Vec<u8>,
     pub colours: Vec<u8>,
     pub scales: Vec<u8>,
-    /// Three bytes up to version 2, four since.
+    /// Three bytes per Gaussian up to version 2, four since version 3.
     pub rotations: Vec<u8>,
     pub harmonics: Vec<u8>,
 }
 
-/// What a file says of its streams.
+/// Properties of the streams, as a file declares them.
 #[derive(Debug, Clone, Copy)]
 pub struct Description {
     pub version: u32,
     pub count: usize,
     pub sh_degree: usize,
-    /// Of positions.
+    /// Number of fractional bits of positions.
     pub fractional_bits: u32,
     pub axes: Axes,
 }
@@ -56,7 +56,7 @@ impl Description {
         Description { version: WRITTEN, count, sh_degree, fractional_bits, axes: Axes::RUB }
     }
 
-    /// The beginning that all versions have in common.
+    /// Parses the part of the header that all versions have in common.
     fn parse(path: &Path, header: &[u8]) -> Result<(Self, u8)> {
         let word = |at: usize| u32::from_le_bytes([0, 1, 2, 3].map(|byte| header[at + byte]));
         if header[..4] != MAGIC {
@@ -77,14 +77,14 @@ impl Description {
         Ok((Description { version, count, sh_degree, fractional_bits, axes: Axes::RUB }, flags))
     }
 
-    /// Bytes of a Gaussian in each stream.
+    /// Returns the number of bytes per Gaussian in each stream.
     fn widths(&self) -> [usize; 6] {
         let position = if self.version == 1 { 6 } else { 9 };
         let rotation = if self.version >= 3 { 4 } else { 3 };
         [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1).pow(2) - 1)]
     }
 
-    /// Whether a file of `length` bytes may unfold to what this one claims: nothing is made room for before.
+    /// Checks that a file of `length` bytes may decompress to the size that it claims. No memory is allocated before this check.
     fn check_claim(&self, path: &Path, length: usize) -> Result<()> {
         let bytes = self.widths().iter().sum::<usize>() as u128 * self.count as u128;
         if bytes > MAX_SMALL + MAX_RATIO * length as u128 {
@@ -96,7 +96,7 @@ impl Description {
     }
 }
 
-/// Whether `bytes` are those of an SPZ of any version.
+/// Returns `true` if `bytes` begin like an SPZ of any version.
 pub fn recognizes(bytes: &[u8]) -> bool {
     bytes.starts_with(&MAGIC) || (bytes.starts_with(&GZIP) && bytes.get(3).is_some_and(|flags| flags < &0x20))
 }
@@ -120,7 +120,7 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     Ok((description, streams))
 }
 
-/// Versions 1 to 3: header, streams and extensions in one gzip.
+/// Reads versions 1 to 3: header, streams and extensions in one gzip.
 fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
     let mut decoder = GzDecoder::new(bytes);
     let mut unfold = |length: u64, what: &str| -> Result<Vec<u8>> {
@@ -150,7 +150,7 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
         }
         streams.push(stream);
     }
-    // Reading to the end also compares gzip's checksum.
+    // Reading to the end also verifies gzip's checksum.
     let extensions = unfold(MAX_EXTENSIONS, "the end")?;
     if flags & HAS_EXTENSIONS != 0 {
         description.axes = axes_of(path, &extensions)?;
@@ -158,7 +158,7 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
     Ok((description, streams))
 }
 
-/// Version 4: header, extensions and a table of contents as they are, then each stream by itself.
+/// Reads version 4: uncompressed header, extensions and table of contents, then each stream compressed separately.
 fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
     if bytes.len() < PLAIN_HEADER {
         let found = format!("{} bytes", bytes.len());
@@ -215,7 +215,7 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> 
     Ok((description, unfolded))
 }
 
-/// The axes that one of the `extensions` names; each is a type, its length and so many bytes.
+/// Returns the axes that one of the `extensions` names. Each extension is a type, a length and that many bytes.
 fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
     let mut axes = Axes::RUB;
     while let Some((head, rest)) = extensions.split_first_chunk::<8>() {
@@ -232,10 +232,10 @@ fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
     Ok(axes)
 }
 
-/// Writes them in gzip, whole or not at all.
+/// Writes the streams in gzip, atomically.
 ///
 /// # Errors
-/// The system's refusal to write.
+/// Returns an error if the file can't be written.
 pub fn write(path: &Path, description: &Description, streams: &Streams) -> Result<()> {
     let mut header = MAGIC.to_vec();
     header.extend(description.version.to_le_bytes());

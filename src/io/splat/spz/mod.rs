@@ -1,5 +1,5 @@
-//! Niantic's SPZ (spec 10.13): a byte for most numbers, all Gaussians' of a kind one after the other, compressed. Versions 1 to 4
-//! are read. Version 3 is written: it is the oldest whose rotations are exact enough, and what reads version 4 reads it, too.
+//! Niantic's SPZ (spec 10.13): a byte for most values, grouped by kind over all Gaussians, compressed. Versions 1 to 4 are read. Version 3
+//! is written: it is the oldest whose rotations are precise enough, and programs that read version 4 read it too.
 
 mod axes;
 mod container;
@@ -17,30 +17,30 @@ use std::path::Path;
 
 pub(super) use container::recognizes;
 
-/// By which an SH coefficient of degree 0 is multiplied, beside ½.
+/// Factor of an SH coefficient of degree 0, to which ½ is added.
 const COLOUR_SCALE: f64 = 0.15;
-/// What a logarithm of a scale is counted in, from where.
+/// Steps per unit of a scale's logarithm, counted from `LOG_SCALE_BEGIN`.
 const LOG_SCALE_STEPS: f64 = 16.;
 const LOG_SCALE_BEGIN: f64 = -10.;
-/// Largest number of 24 bits with a sign.
+/// Largest signed number of 24 bits.
 const MAX_FIXED: f64 = ((1 << 23) - 1) as f64;
-/// Bits after the point of a position, at most.
+/// Maximum number of fractional bits of a position.
 const MAX_FRACTIONAL_BITS: u32 = 24;
-/// Largest part of a rotation but one, in nine bits.
+/// Largest value in nine bits, which hold the magnitude of a rotation's component other than the largest one.
 const MAX_PART: u32 = (1 << 9) - 1;
-/// Bits that are kept of a coefficient's eight, of degree 1 and above. Niantic's library keeps 5 and 4, which costs splats whose
-/// colours depend much on the side 10 dB and more between renders, and saves a third of the file (docs/splats.md).
+/// Number of bits that are kept of the eight of an SH coefficient, for degree 1 and for higher degrees. Niantic's library keeps 5 and 4,
+/// which costs splats with strongly view-dependent colours 10 dB and more between renders, and saves a third of the file (docs/splats.md).
 const SH_BITS: [u32; 2] = [8, 7];
 
 /// Reads an SPZ.
 ///
 /// # Errors
-/// Another version, a higher SH degree, a file that is damaged or cut short, or claims more than it can hold.
+/// Returns an error for another version or a higher SH degree, or if the file is damaged, truncated, or claims more than it can hold.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (description, streams) = container::read(path, bytes)?;
     let Description { version, fractional_bits, axes, .. } = description;
     let fixed = |bytes: &[u8; 3]| {
-        let shifted = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]); // the sign where it belongs
+        let shifted = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]); // moves the sign to the highest bit
         (f64::from(shifted >> 8) / f64::from(1u32 << fractional_bits)) as f32
     };
     let coordinates: Vec<f32> = match version {
@@ -77,21 +77,21 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(values.into_contents(InvalidGaussians::default()))
 }
 
-/// What a byte can say.
+/// Returns the limits of coefficients that a byte can represent.
 pub(super) fn limits() -> HarmonicLimits {
     let largest = f64::from(pack_sh(f32::MAX, SH_BITS[1]));
     let (constant, others) = (0.5 / COLOUR_SCALE, (largest - 128.) / 128.);
     HarmonicLimits { degree: 3, constant: -constant..=constant, others: -1. ..=others }
 }
 
-/// x, y and z of a rotation whose w isn't negative.
+/// Unpacks a rotation from x, y and z; w isn't negative.
 fn first_three(bytes: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.);
     let w = (1. - x * x - y * y - z * z).max(0.).sqrt();
     normalized([w, x, y, z].map(|part| part as f32))
 }
 
-/// All but the largest of x, y, z and w, whose place is in the upper two bits.
+/// Unpacks a rotation from all but the largest of x, y, z and w, whose index is in the upper two bits.
 fn smallest_three(bytes: [u8; 4]) -> [f32; 4] {
     let mut word = u32::from_le_bytes(bytes);
     let largest = (word >> 30) as usize;
@@ -119,10 +119,10 @@ fn pack_smallest_three([w, x, y, z]: [f32; 4]) -> [u8; 4] {
     word.to_le_bytes()
 }
 
-/// Writes an SPZ. Scales, colours and spherical harmonics outside of what a byte can say become what is nearest.
+/// Writes an SPZ. Scales, colours and spherical harmonics outside of the range of a byte are clamped to it.
 ///
 /// # Errors
-/// Numbers that aren't finite, positions too far away for 24 bits, or the system's refusal to write.
+/// Returns an error if a value isn't finite, a position is too far away for 24 bits, or the file can't be written.
 pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let values = Values::of(path, splat)?;
     let farthest = values.means.as_flattened().iter().fold(0f32, |farthest, x| farthest.max(x.abs()));
@@ -135,7 +135,7 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
         )));
     };
     let axes = Axes::RUB;
-    let byte = |number: f64| number.round() as u8; // what is outside becomes 0 or 255
+    let byte = |number: f64| number.round() as u8; // values outside of the range become 0 or 255
     let (mut positions, mut harmonics) = (vec![], vec![]);
     for mean in &values.means {
         for coordinate in axes.position(*mean) {
@@ -164,7 +164,7 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     container::write(path, &description, &streams)
 }
 
-/// The nearest of 2^`bits` numbers, of which 0 is one.
+/// Rounds to the nearest of 2^`bits` values, one of which is 0.
 fn pack_sh(value: f32, bits: u32) -> u8 {
     let step = f64::from(1u32 << (8 - bits));
     ((f64::from(value) * 128. / step).round() * step + 128.) as u8
