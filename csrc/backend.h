@@ -34,7 +34,7 @@ struct Gradients {
 };
 
 // Outputs of splat(), or their gradients: [B, C, 3, H, W], [B, C, H, W], [B, C, H, W].
-struct Pictures {
+struct RenderOutput {
   Tensor rgb, alpha, depth;
 };
 
@@ -52,8 +52,8 @@ struct Kept {
 // return gradients of all five Gaussian tensors, and of w2c if `of_cameras` is set.
 struct Backend {
   at::DeviceType device;
-  Pictures (*splat)(const Inputs&, std::unique_ptr<const Kept>& kept);
-  Gradients (*splat_backward)(const Inputs&, const Pictures& drawn, const Pictures& gradients, const Kept&, bool of_cameras);
+  RenderOutput (*splat)(const Inputs&, std::unique_ptr<const Kept>& kept);
+  Gradients (*splat_backward)(const Inputs&, const RenderOutput& drawn, const RenderOutput& gradients, const Kept&, bool of_cameras);
   Projected (*project)(const Inputs&);
   Gradients (*project_backward)(const Inputs&, const Projected& gradients, bool of_cameras);
 };

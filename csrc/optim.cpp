@@ -38,7 +38,7 @@ void scale(rust::Slice<const size_t> tensors, double factor) {
   at::_foreach_mul_(borrowed(tensors), factor);
 }
 
-void forget_gradients(rust::Slice<const size_t> tensors) {
+void zero_grad(rust::Slice<const size_t> tensors) {
   for (const Tensor& t : borrowed(tensors)) t.mutable_grad().reset();
 }
 

@@ -19,7 +19,7 @@ void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out);
 void scale(rust::Slice<const size_t> tensors, double factor);
 
 // Resets gradients to undefined, as before the first backward pass.
-void forget_gradients(rust::Slice<const size_t> tensors);
+void zero_grad(rust::Slice<const size_t> tensors);
 
 // Runs a step of AdamW (spec 8.5) with libtorch's fused kernel. All tensors must be contiguous, of one type and on one device.
 void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first,

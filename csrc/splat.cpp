@@ -72,7 +72,7 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
                              Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
     std::unique_ptr<const Kept> kept;
-    const Pictures drawn = backend_of(means).splat(in, kept);
+    const RenderOutput drawn = backend_of(means).splat(in, kept);
     save(ctx, in, {drawn.rgb, drawn.alpha, drawn.depth});
     ctx->saved_data["kept"] = c10::IValue::make_capsule(c10::make_intrusive<KeptHolder>(std::move(kept)));
     return {drawn.rgb, drawn.alpha, drawn.depth};

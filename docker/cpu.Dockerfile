@@ -12,6 +12,6 @@ WORKDIR /opt/globalsplat
 COPY . .
 COPY --from=page /web/dist web/dist
 RUN make build
-# The same two commands as everywhere:  docker run --rm --entrypoint make globalsplat:cpu demo   (or test)
+# `make demo` and `make test` work in the image:  docker run --rm --entrypoint make globalsplat:cpu demo   (or test)
 ENTRYPOINT ["/opt/globalsplat/target/release/globalsplat"]
 CMD ["--help"]

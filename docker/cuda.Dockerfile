@@ -1,6 +1,6 @@
 # globalsplat for NVIDIA GPUs.  docker build -f docker/cuda.Dockerfile -t globalsplat:cuda .
 #   docker run --rm --gpus all globalsplat:cuda doctor
-# No CUDA toolkit is needed: libtorch brings the libraries it uses, and the container runtime brings the driver.
+# No CUDA toolkit is needed: libtorch comes with the libraries it uses, and the container runtime provides the driver.
 FROM node:20-bookworm-slim AS page
 WORKDIR /web
 COPY web .
@@ -14,6 +14,6 @@ WORKDIR /opt/globalsplat
 COPY . .
 COPY --from=page /web/dist web/dist
 RUN make build
-# The same two commands as everywhere:  docker run --rm --gpus all --entrypoint make globalsplat:cuda demo   (or test)
+# `make demo` and `make test` work in the image:  docker run --rm --gpus all --entrypoint make globalsplat:cuda demo   (or test)
 ENTRYPOINT ["/opt/globalsplat/target/release/globalsplat"]
 CMD ["--help"]

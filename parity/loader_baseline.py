@@ -1,13 +1,14 @@
-"""The loader beside the usual Python pipeline, on the same chunks, in one run.
+"""Compares the program's data loader with a typical Python pipeline on the same chunks, in one run.
 
-    python parity/loader_baseline.py                      both, by turns, and how many times faster the program is
-    python parity/loader_baseline.py --data ROOT          on a data set of chunks with an index.json
-    python parity/loader_baseline.py --data ROOT --alone  the Python pipeline by itself
+    python parity/loader_baseline.py                      measures both alternately, and prints the speedup
+    python parity/loader_baseline.py --data ROOT          uses a dataset of chunks with an index.json
+    python parity/loader_baseline.py --data ROOT --alone  measures only the Python pipeline
 
-The pipeline: a torch DataLoader with two workers, each with chunks of its own, which torch.load reads; PIL decodes, crops
-and resizes with Lanczos in one call; ImageEnhance and HSV as torchvision's ColorJitter uses them; numpy and torch make
-float tensors. Views and augmentation are drawn as the program draws them: 24 context and 12 target views of a window of
-40 to 220 frames, a frame that is both decoded once, the part around the principal point less up to a tenth.
+The pipeline is a torch DataLoader with two workers, each with its own chunks, which torch.load reads. PIL decodes,
+crops and resizes with Lanczos in one call; ImageEnhance and HSV jitter colours as torchvision's ColorJitter does; numpy
+and torch convert to float tensors. Views and augmentation are sampled as in the program: 24 context and 12 target views
+from a window of 40 to 220 frames, where a frame in both sets is decoded once, and a crop around the principal point
+that is up to a tenth smaller than the largest one.
 """
 
 import argparse
@@ -33,14 +34,14 @@ BRIGHTNESS, CONTRAST, SATURATION, HUE = 0.3, 0.4, 0.3, 0.1
 
 
 def turn_hue(image, turn):
-    """As torchvision does on PIL images: an addition to the 8-bit hue that wraps around."""
+    """Adds to the 8-bit hue with wraparound, as torchvision does for PIL images."""
     hue, saturation, value = image.convert("HSV").split()
     shifted = np.array(hue, dtype=np.uint8) + np.array(turn * 255).astype(np.uint8)
     return Image.merge("HSV", (Image.fromarray(shifted), saturation, value)).convert("RGB")
 
 
 def draw_jitter():
-    """A list of functions image -> image, the same for all views of a sample."""
+    """Samples the colour jitter: a list of functions image -> image, to be applied to all views of a sample."""
 
     def enhance(enhancer, strength):
         factor = random.uniform(1 - strength, 1 + strength)
@@ -58,7 +59,10 @@ def draw_jitter():
 
 
 def sample(scene):
-    """A dict of tensors: images [V, 3, H, W] in [0, 1] and intrinsics of context and target, w2c."""
+    """Samples views of a scene. Returns a dict of tensors.
+
+    "context" and "target" are images [V, 3, H, W] in [0, 1]; "intrinsics" and "w2c" are of context, then target views.
+    """
     images, cameras = scene["images"], scene["cameras"]
     length = min(random.randint(*WINDOW), len(images))
     start = random.randint(0, len(images) - length)
@@ -92,7 +96,7 @@ def sample(scene):
 
 
 class Chunks(IterableDataset):
-    """Samples without end: chunks in random order, every scene of a chunk once."""
+    """An endless dataset of samples: chunks in random order, every scene of a chunk once."""
 
     def __init__(self, root):
         self.paths = sorted(root / name for name in set(json.loads((root / "index.json").read_text()).values()))
@@ -130,7 +134,7 @@ def program(binary, *arguments):
 
 
 def compare(options, root):
-    """By turns, so that whatever else the machine does meets both."""
+    """Measures both loaders alternately, so that other load on the machine affects both."""
     ours, theirs = [], []
     for _ in range(options.rounds):
         threads = ["--data", str(root), "--threads", str(options.workers), "--samples", str(options.samples)]
@@ -151,11 +155,11 @@ def compare(options, root):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", metavar="ROOT", type=Path, help="chunks and index.json (default: made up)")
-    parser.add_argument("--alone", action="store_true", help="only the Python pipeline")
-    parser.add_argument("--workers", metavar="N", type=int, default=2, help="of both (default: 2)")
-    parser.add_argument("--samples", metavar="N", type=int, default=40, help="measured, of both (default: 40)")
-    parser.add_argument("--rounds", metavar="N", type=int, default=5, help="by turns (default: 5)")
+    parser.add_argument("--data", metavar="ROOT", type=Path, help="chunks and index.json (default: synthetic)")
+    parser.add_argument("--alone", action="store_true", help="measure only the Python pipeline")
+    parser.add_argument("--workers", metavar="N", type=int, default=2, help="workers of each loader (default: 2)")
+    parser.add_argument("--samples", metavar="N", type=int, default=40, help="measured samples of each (default: 40)")
+    parser.add_argument("--rounds", metavar="N", type=int, default=5, help="alternating measurements (default: 5)")
     parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
     options = parser.parse_args()
     if options.alone:

@@ -1,11 +1,11 @@
-"""The program's forward pass beside the same model in PyTorch, on the CPU, in one run.
+"""Compares the speed of the program's forward pass with the same model in PyTorch, on the CPU, in one run.
 
     python parity/model_speed.py                       24 views of 256x256, 16,384 Gaussians, in f32 and in bf16
     python parity/model_speed.py --views 4 --rounds 2
 
-The model is the parity checks' reference with torch's own fused functions for its layers: linear, layer_norm, gelu,
-scaled_dot_product_attention; bf16 is torch.autocast. Weights and photos are random. What the program measures is
-`globalsplat bench model`; both warm up, and take turns.
+The PyTorch model is the parity checks' reference with PyTorch's fused functions for its layers: linear, layer_norm,
+gelu, scaled_dot_product_attention; bf16 uses torch.autocast. Weights and photos are random. The program is measured
+with `globalsplat bench model`. Both warm up, and are measured alternately.
 """
 
 import argparse
@@ -53,7 +53,7 @@ def attention(q, k, v, heads):
 
 
 def in_float32(function):
-    """Where rays lead, autocast or not."""
+    """Wraps a function to compute in float32 even under autocast; used for rays and camera codes."""
 
     def computed(*inputs):
         with torch.autocast("cpu", enabled=False):
@@ -90,7 +90,7 @@ class Torch:
             return time.perf_counter() - start
 
     def gflop(self):
-        """Of all products. Attention as it is written out, which torch can count."""
+        """Returns the GFLOP of all matrix products. Uses the unfused attention, which PyTorch can count."""
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
             self.run()
         return counter.get_total_flops() * 1e-9
@@ -102,7 +102,7 @@ def program(binary, views, precision):
 
 
 def compare(options):
-    """By turns, so that whatever else the machine does meets both."""
+    """Measures both models alternately, so that other load on the machine affects both."""
     twin, told = Torch(options.views), {}
     for precision in options.precision:
         twin.seconds(precision)
@@ -126,10 +126,10 @@ def compare(options):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", metavar="N", type=int, default=24, help="photos (default: 24)")
-    parser.add_argument("--rounds", metavar="N", type=int, default=3, help="by turns (default: 3)")
+    parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
+    parser.add_argument("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
     parser.add_argument("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
-    parser.add_argument("--gflop", action="store_true", help="only what the model in PyTorch computes, by torch's own count")
+    parser.add_argument("--gflop", action="store_true", help="only print the PyTorch model's FLOP count")
     parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
     options = parser.parse_args()
     if options.gflop:

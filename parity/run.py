@@ -1,10 +1,10 @@
-"""Holds the Rust program against the torch reference, module by module, outputs and gradients, on random numbers.
+"""Compares outputs and gradients of the Rust program with the PyTorch reference, module by module, on random inputs.
 
-    python parity/run.py                         everything, about a minute
-    python parity/run.py --only 'rasterizer*'    the cases of that name
-    python parity/run.py --self-test             are wrong answers noticed?
-    python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    the kernels for GPUs, without a GPU
-    python parity/run.py --self-test --markdown docs/parity.md    the same, written down
+    python parity/run.py                         runs all cases, in about a minute
+    python parity/run.py --only 'rasterizer*'    runs the cases whose names match
+    python parity/run.py --self-test             also checks that wrong results are detected
+    python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    runs the CUDA kernels, emulated on the CPU
+    python parity/run.py --self-test --markdown docs/parity.md     also writes a report
 """
 
 import argparse
@@ -29,19 +29,19 @@ WRONG_REQUEST = 2
 
 def arguments(argv):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", metavar="PATTERNS", default="*", help="cases of these names, by commas; * and ? as in a shell")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the random numbers (default: 0)")
-    parser.add_argument("--repeat", metavar="N", type=int, default=1, help="with N seeds from that one on (default: 1)")
-    parser.add_argument("--device", default="cpu", help="the program's: cpu, cuda or cuda:N (default: cpu)")
+    parser.add_argument("--only", metavar="PATTERNS", default="*", help="comma-separated shell patterns of case names")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the random numbers (default: 0)")
+    parser.add_argument("--repeat", metavar="N", type=int, default=1, help="number of seeds (default: 1)")
+    parser.add_argument("--device", default="cpu", help="device of the program: cpu, cuda or cuda:N (default: cpu)")
     parser.add_argument(
         "--cuda-on-cpu",
         metavar="N",
         type=int,
-        help="draw float32 by the kernels for GPUs, which the CPU runs, blocks and threads in an order drawn from N",
+        help="run float32 with the CUDA kernels, emulated on the CPU; N seeds the order of blocks and threads",
     )
-    parser.add_argument("--self-test", action="store_true", help="disturb right answers and expect each to be noticed")
+    parser.add_argument("--self-test", action="store_true", help="perturb correct results and check detection")
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write docs/parity.md, a line per case, to FILE")
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write every number to FILE")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write all results to FILE")
     parser.add_argument(
         "--binary",
         metavar="PATH",
@@ -53,7 +53,7 @@ def arguments(argv):
 
 
 def command(options):
-    """What was asked for, but for where things are on this machine."""
+    """Returns the command line, without paths that are specific to this machine."""
     words = ["python", "parity/run.py"]
     for name, default in (("only", "*"), ("seed", 0), ("repeat", 1), ("device", "cpu")):
         value = getattr(options, name)
@@ -66,7 +66,7 @@ def command(options):
 
 
 def progress(text):
-    """One line on a terminal, written over."""
+    """Overwrites the progress line, if standard error is a terminal."""
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns - 1
         print(f"\r\x1b[2K{text[:width]}", end="", file=sys.stderr, flush=True)

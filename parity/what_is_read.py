@@ -1,11 +1,11 @@
-"""What scene tokens read of a capture's photos: by what keys are told apart, and how many patches a head looks at.
+"""Analyses the cross-attention of scene tokens to a capture's photos.
 
-    python parity/what_is_read.py --weights models/tiny.safetensors --capture DIR     DIR with a cameras.json
+    python parity/what_is_read.py --weights models/tiny.safetensors --capture DIR     DIR has a cameras.json
 
-The model is the parity checks' reference. A key is linear in an image token after its norm, and so is a value: what
-rays and colours each make of it is the root of its mean square over patches and channels, less what all patches have in
-common. A head looks at as many patches as e^entropy of its weights, the median over scene tokens, and at those of one
-view as if there were no others.
+The model is the parity checks' reference. Keys and values are linear in the normalized image tokens. For each, the
+table shows the contributions of the ray and colour channels: root mean square over patches and channels, after the mean
+over patches is subtracted. It also shows how many patches a head attends to: e^entropy of its attention weights, as the
+median over scene tokens, over all patches and within one view as if there were no other views.
 """
 
 import argparse
@@ -27,14 +27,17 @@ from safetensors import safe_open
 
 
 def read_model(path):
-    """The weights in float32, and the configuration of the whole run that they carry."""
+    """Returns the weights in float32, and the configuration of the training run from their metadata."""
     with safe_open(path, "pt") as file:
         config = tomllib.loads(file.metadata()["globalsplat.config"])
         return {name: file.get_tensor(name).float() for name in file.keys()}, config
 
 
 def read_capture(folder, height, width):
-    """-> images [1, V, 3, H, W], normalized c2w [1, V, 4, 4], intrinsics [1, V, 3, 3] in pixels of these images."""
+    """Reads a capture, resized to height × width.
+
+    Returns images [1, V, 3, H, W], normalized c2w [1, V, 4, 4] and intrinsics [1, V, 3, 3] in pixels of these images.
+    """
     described = json.loads((folder / "cameras.json").read_text())
     views = described["views"]
     photos = [Image.open(folder / view["image"]).convert("RGB").resize((width, height)) for view in views]
@@ -51,9 +54,9 @@ def perplexity(weights):
 
 
 def look(config, params, name, slots, memory, views):
-    """A line about the read of one round of one stream, whose inputs these are."""
+    """Prints a row about the cross-attention of one round of one stream, given its inputs."""
     ray_width, heads = config["dim_rays"], config["num_heads"]
-    normed = layer_norm(params, f"{name}.mem_ln", memory)[0, 4:]  # of patches, without the registers
+    normed = layer_norm(params, f"{name}.mem_ln", memory)[0, 4:]  # patches only, without the registers
     apart = normed - normed.mean(0)
 
     def made_of(layer, half):

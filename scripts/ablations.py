@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""The full model against its four ablations, and in bf16, at small scale: same budget, several seeds each, mean and spread.
+"""Compares the full model with its four ablations, and with bf16: equal small budget, several seeds, mean ± deviation.
 
     .venv/bin/python scripts/ablations.py [--out OUT] [--seeds 3] [--only VARIANT ...]
 
-Films four made-up worlds, trains the model of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's
-consistency loss, and each variant, on two thirds of every video's pictures, scored by the others. Runs in OUT (runs/ablations by
-default), as many side by side as there are cores, and prints two Markdown tables: how good each became, and how it learned. What is
-done stays done: the same command goes on where it was stopped.
+Renders four synthetic scenes, and trains each variant on two thirds of every video's frames; the held-out third scores
+it. The model is that of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's consistency loss.
+Runs are in OUT (by default runs/ablations), as many in parallel as there are cores. Prints two Markdown tables: final
+scores and learning curves. The same command resumes where it was stopped, and does not repeat completed runs.
 """
 
 import argparse
@@ -21,14 +21,15 @@ from pathlib import Path
 from core_runs import PROGRAM, REPOSITORY, row, train
 
 CONFIG = REPOSITORY / "configs/tiny.toml"
-# What all of them have. Small patches, many scene tokens and Muon are for weights that know large and few ones.
+# Settings of all variants. Small patches, many scene tokens and Muon only suit weights trained with large patches and
+# few tokens first.
 SETTINGS = [
     "model.patch_size=16",
     "model.latents=256",
     "data.image_size=[64, 64]",
-    "data.extents=[1]",
+    "data.scene_scales=[1]",
     "data.context_views=8",
-    "data.fewest_context_views=0",
+    "data.min_context_views=0",
     "data.window=[8, 12]",
     "data.holdout=\"every:3+1\"",
     "data.validation=[]",
@@ -41,7 +42,7 @@ SETTINGS = [
     "curriculum.transition=80",
     "train.optimizer=adamw",
     "train.steps=2400",
-    "train.batch=1",
+    "train.batch_size=1",
     "train.learning_rate=2e-3",
     "train.checkpoint_every=400",
     "train.validate_every=0",
@@ -50,12 +51,12 @@ VARIANTS = {
     "full model": [],
     "Plücker only": ["model.camera_code=false"],
     "no consistency": ["loss.consistency_alpha=0", "loss.consistency_depth=0"],
-    # As wide as makes it as large as the two streams.
+    # A width with which the model has as many parameters as with two streams.
     "single stream": ["model.streams=single", "model.width=192"],
     "full capacity": ["curriculum.full_capacity=true"],
     "full model, bf16": ["train.precision=bf16"],
 }
-# Parts of a run over which its curve is averaged.
+# Number of equal parts of a run over which its curve is averaged.
 PARTS = 6
 
 
@@ -64,7 +65,10 @@ def run_folder(out, name, seed):
 
 
 def curve(out, name, seeds):
-    """PSNR in training over equal parts of the runs, each the mean over a part's steps and the seeds, in dB."""
+    """Returns the number of steps, and the training PSNR in dB of each of PARTS equal parts of the runs.
+
+    The PSNR is averaged over a part's steps and the seeds.
+    """
     parts = [[] for _ in range(PARTS)]
     for seed in range(seeds):
         lines = (run_folder(out, name, seed) / "metrics.jsonl").read_text().splitlines()

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Trains configs/first_light.toml, alone and beside other work, and tells what that costs.
+"""Measures the training speed of configs/first_light.toml, alone and beside busy processes.
 
     scripts/busy.py [--steps 60] [--busy 0 1 2] [--binary target/release/globalsplat …]
 
-Each busy process is a loop that never sleeps. Several programs take turns. Prints Markdown: steps a second, and their share of
-the same program's alone.
+Each busy process is a loop that never sleeps. Several binaries are measured in turn. Prints a Markdown table of steps
+per second, absolute and relative to the same binary's first measurement.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Training runs of one core each, as many side by side as there are cores: what scripts that compare variants share."""
+"""Helpers for scripts that compare variants by training runs of one core each, one run per core in parallel."""
 
 import json
 import os
@@ -11,12 +11,12 @@ PROGRAM = REPOSITORY / "target/release/globalsplat"
 
 
 def environment(**more):
-    """For a process that keeps to one core."""
+    """Returns the environment variables of a process that uses one core."""
     return dict(os.environ, OMP_NUM_THREADS="1", **more)
 
 
 def core_seconds(command, **variables):
-    """What a command of the program told, and the seconds for which it kept the core busy."""
+    """Runs a command and returns its standard output and its CPU time in seconds."""
     process = subprocess.Popen(command, env=environment(**variables), stdout=subprocess.PIPE, text=True)
     told = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
@@ -26,7 +26,7 @@ def core_seconds(command, **variables):
 
 
 def train(run, config, settings, **variables):
-    """What a run told at its end, which its folder keeps, and the seconds for which its process kept the core busy."""
+    """Trains a run and returns its JSON result with its CPU time (`core_seconds`), cached in `result.json`."""
     result = run / "result.json"
     if not result.is_file():
         command = [PROGRAM, "train", "--config", config, "--out", run, "--json"]
@@ -43,12 +43,12 @@ def train(run, config, settings, **variables):
 
 
 def told(*command):
-    """What a command of the program told."""
+    """Runs a command of the program and returns its JSON output."""
     return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
 
 
 def files_of(path):
-    """The files that a path stands for: its own, those of a folder, those of weights in shards."""
+    """Returns the files that a path refers to: itself, all files in a folder, or index and shards of weights."""
     index = path if path.name.endswith(".safetensors.index.json") else path.with_name(path.name + ".index.json")
     if path.is_dir():
         return sorted(file for file in path.rglob("*") if file.is_file())
@@ -58,7 +58,7 @@ def files_of(path):
 
 
 def identity(command):
-    """A command's arguments, and a checksum of the files that those which are paths stand for, but for what it writes."""
+    """Returns a command's arguments, and a checksum of the files that they refer to, except the argument of --out."""
     inputs = [Path(str(argument)) for before, argument in zip(("", *command), command) if before != "--out"]
     checksum = 0
     for file in (file for path in inputs for file in files_of(path)):
@@ -69,7 +69,7 @@ def identity(command):
 
 
 def told_once(file, *command):
-    """The same, which `file` keeps: it isn't run again for the same arguments and inputs."""
+    """Returns the JSON output of a command, cached in `file` for the same arguments and inputs."""
     of = identity(command)
     kept = json.loads(file.read_text()) if file.is_file() else {}
     if kept.get("of") != of:
@@ -81,5 +81,5 @@ def told_once(file, *command):
 
 
 def row(*cells):
-    """Of a Markdown table."""
+    """Prints a row of a Markdown table."""
     print("|", " | ".join(cells), "|", flush=True)

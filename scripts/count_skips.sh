@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Runs a command that runs tests, says last how many of them were skipped, and for want of what, and ends with the command's exit code:
+# Runs a command that runs tests, then prints how many tests were skipped and which requirements they lacked, and exits with the
+# command's exit code:
 #   count_skips.sh make checks
-# A test that is skipped adds a line to the file GLOBALSPLAT_SKIPPED, which says what wasn't there.
+# A skipped test appends a line with the missing requirement to the file GLOBALSPLAT_SKIPPED.
 set -euo pipefail
 GLOBALSPLAT_SKIPPED=$(mktemp)
 export GLOBALSPLAT_SKIPPED

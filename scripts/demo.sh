@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Photos to a splat: by the shipped weights, then refined for half a minute, and a page to walk in. Less than 3 minutes on two
-# slow CPU cores.
+# Reconstructs a splat from photos with the shipped weights, refines it for half a minute, and writes an interactive viewer page. Takes
+# less than 3 minutes on two slow CPU cores.
 #   scripts/demo.sh
-#   scripts/demo.sh --training    instead trains the shipped weights on these scenes for some minutes, and compares
-#   scripts/demo.sh [--training] --dry-run    the same commands in small, to see that they work
-#   CAPTURES  a capture, or a folder with captures or chunks up to two folders deep; by default $GLOBALSPLAT_CAPTURES, else synthetic
-#             scenes. The demo refines the first of them
-#   OUT       where everything goes; by default runs/demo, or runs/demo_training. An earlier demo's files there are replaced
-#   DEVICE    what computes, cpu or cuda; by default cpu
+#   scripts/demo.sh --training    fine-tunes the shipped weights on these scenes for some minutes instead, and compares before and after
+#   scripts/demo.sh [--training] --dry-run    runs the same commands at a reduced size, as a smoke test
+#   CAPTURES  a capture, or a folder with captures or chunks up to two folders deep; by default $GLOBALSPLAT_CAPTURES, or else synthetic
+#             scenes. The demo refines the first scene
+#   OUT       output folder; by default runs/demo, or runs/demo_training. Files of an earlier demo in it are replaced
+#   DEVICE    device to compute on, cpu or cuda; by default cpu
 set -euo pipefail
 cd "$(dirname "$0")/.."
 globalsplat="target/release/globalsplat"
@@ -18,7 +18,7 @@ for argument in "$@"; do
     --training) training=true ;;
     --dry-run) small=true ;;
     *)
-        echo "demo: $argument is no argument, expected --training or --dry-run" >&2
+        echo "demo: unknown argument $argument, expected --training or --dry-run" >&2
         exit 2
         ;;
     esac
@@ -35,20 +35,21 @@ captures="${captures%/}"
 frames=32 size=192 seconds=30 settings=()
 if $small; then
     scenes_made=1 frames=9 size=32 seconds=0.1
-    settings=(--set train.steps=2 --set train.validate_every=1 --set data.context_views=2 --set data.fewest_context_views=2)
+    settings=(--set train.steps=2 --set train.validate_every=1 --set data.context_views=2 --set data.min_context_views=2)
 fi
-# Others' scenes and an earlier training would be gone on with. What no demo made is nobody's to remove.
+# Remove an earlier demo's files, because training would resume from them and old scenes would be reused. A folder that no demo created
+# is left alone.
 mark="$out/.made_by_the_demo"
 if [ -e "$mark" ]; then
     rm -rf "$out"/{worlds,evaluation,shipped,refined,training,trained,model.safetensors}
 elif [ -n "$(ls -A "$out" 2>/dev/null)" ]; then
-    echo "demo: $out: it holds other things, expected an empty folder or an earlier demo's" >&2
+    echo "demo: $out: found other files, expected an empty folder or the output of an earlier demo" >&2
     exit 2
 fi
 mkdir -p "$out"
 touch "$mark"
 
-# Captures in the folder $1, and the first scenes of chunks in it; what lies inside of one isn't another.
+# Collects the captures in the folder $1 and the first scenes of each set of chunks in it. Folders inside a capture are not searched.
 find_scenes() {
     local folder what found=""
     scenes=()
@@ -59,7 +60,7 @@ find_scenes() {
         *'"kind":"capture"'*) scenes+=("$folder") ;;
         *)
             [ -e "$folder/index.json" ] || continue
-            # Of {"key": "chunk", …} the first few.
+            # The first few entries of {"key": "chunk", …}.
             while IFS='"' read -r _ key _ chunk _; do
                 scenes+=("$folder/$chunk#$key")
             done < <(grep -o '"[^"]*" *: *"[^"]*\.torch"' "$folder/index.json" | head -n 4)
@@ -69,7 +70,7 @@ find_scenes() {
     done < <(find -L "$1" -maxdepth 2 -type d | LC_ALL=C sort)
 }
 
-# What a scene's files are called.
+# Prints the base name of a scene's files.
 name_of() {
     local name="${1#"$captures"/}"
     [ "$1" != "$captures" ] || name="$(basename "$1")"
@@ -77,7 +78,7 @@ name_of() {
     echo "${name//\//_}"
 }
 
-# Splat, held-out views and orbit of the scene $1, by the weights $2, in the folder $3.
+# Writes the splat, held-out views and orbit of the scene $1, reconstructed with the weights $2, to the folder $3.
 show() {
     local name
     name="$(name_of "$1")"
@@ -90,8 +91,8 @@ show() {
 scenes=()
 [ "$captures" = none ] || find_scenes "$captures"
 if [ ${#scenes[@]} -eq 0 ]; then
-    [ "$captures" = none ] || echo "demo: there is no capture in $captures" >&2
-    echo "demo: synthetic scenes are made" >&2
+    [ "$captures" = none ] || echo "demo: no capture found in $captures" >&2
+    echo "demo: generating synthetic scenes" >&2
     captures="$out/worlds"
     "$globalsplat" synth --out "$captures" --seed 7 --scenes "$scenes_made" --frames "$frames" --size "$size"
     find_scenes "$captures"
@@ -108,12 +109,12 @@ if ! $training; then
     echo "LOOK: $out/refined/${first}_held_out.png has the same views after $seconds s of refinement on these photos, without weights"
     if "$globalsplat" doctor --json | grep -q '"viewer": *true'; then
         "$globalsplat" render --splat "$out/refined/$first.ply" --scene "${scenes[0]}" --html "$out/refined/$first.html" >/dev/null
-        echo "LOOK: $out/refined/$first.html is a page to walk in, for any browser"
+        echo "LOOK: $out/refined/$first.html is an interactive viewer, for any browser"
     fi
     exit
 fi
 
-# Every third view is held out, and training shows six.
+# Every third view is held out, and training takes six context views.
 train_on=()
 for scene in "${scenes[@]}"; do
     photos="$("$globalsplat" inspect "$scene" --json | sed -n 's/.*"views":\([0-9]*\).*/\1/p')"
@@ -126,7 +127,7 @@ fi
 for scene in "${train_on[@]}"; do
     show "$scene" models/tiny.safetensors "$out/shipped"
 done
-echo "demo: the shipped weights are trained for some minutes, on two thirds of these photos" >&2
+echo "demo: fine-tuning the shipped weights on two thirds of these photos, which takes some minutes" >&2
 list="$(printf ', "%s"' "${train_on[@]}")"
 "$globalsplat" train --device "$device" --config configs/fine_tune.toml --from models/tiny.safetensors --set "data.captures=[${list#, }]" \
     ${settings[@]+"${settings[@]}"} --out "$out/training"
@@ -136,7 +137,7 @@ for scene in "${train_on[@]}"; do
 done
 echo "LOOK: $out/training/curves.svg has both curves, in training and held out; $out/trained the same views as $out/shipped, after training"
 if [ -e "$captures/evaluation_index.json" ]; then
-    # All of the synthetic scenes, on one page.
+    # Compare the weights on all synthetic scenes, in one report.
     for weights in shipped:models/tiny.safetensors trained:"$out/model.safetensors"; do
         "$globalsplat" eval --device "$device" --weights "${weights#*:}" --data "$captures" --index "$captures/evaluation_index.json" \
             --name "${weights%%:*} weights" --out "$out/evaluation/${weights%%:*}"

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Fuzzes every reader of files from elsewhere, or those named, under AddressSanitizer and, where there is a clang++,
+# Fuzzes every reader of untrusted files, or the named ones, under AddressSanitizer and, if clang++ is installed,
 # UndefinedBehaviorSanitizer for the C++:
 #   scripts/fuzz.sh [SECONDS each] [READER]…
-# Begins with fuzz/seeds and goes on from fuzz/corpus; a finding is left in fuzz/artifacts, and belongs into fuzz/seeds once
-# it is mended, where `cargo test` reads it for good. fuzz/runs.log has the inputs of each. Needs `cargo install cargo-fuzz`;
-# scripts/fuzz_coverage.sh tells what the corpora reach.
+# Starts from fuzz/seeds and the corpora of earlier runs in fuzz/corpus. A failing input is saved in fuzz/artifacts. Once the bug is
+# fixed, move the input to fuzz/seeds, where `cargo test` reads it from then on. fuzz/runs.log records the number of inputs per reader.
+# Needs `cargo install cargo-fuzz`; scripts/fuzz_coverage.sh reports the code that the corpora reach.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-120}
@@ -12,14 +12,14 @@ shift || true
 readers=("$@")
 [ ${#readers[@]} -gt 0 ] || readers=($(ls fuzz/seeds))
 
-# The sanitizers are unstable features, but they are in the stable toolchain, too.
+# The sanitizers are unstable features, but the stable toolchain contains them.
 export RUSTC_BOOTSTRAP=1
 export LIBTORCH=${LIBTORCH:-$PWD/.venv/libtorch}
 export LD_LIBRARY_PATH="$LIBTORCH/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
-# One reader, one thread. What libtorch keeps until the end is no leak.
+# Each reader runs on one thread. Leak detection is off because libtorch keeps allocations until the process ends.
 export OMP_NUM_THREADS=1 ASAN_OPTIONS="detect_leaks=0:allocator_may_return_null=1${ASAN_OPTIONS:+:$ASAN_OPTIONS}"
 if command -v clang++ >/dev/null; then
-    # Of no bytes, tch copies none from nowhere: nonnull-attribute would tell of each empty tensor.
+    # For an empty tensor, tch copies 0 bytes from a null pointer, which nonnull-attribute would report.
     export CXX=clang++
     export CXXFLAGS="-fsanitize=address,undefined -fno-sanitize=vptr,function,nonnull-attribute -fno-sanitize-recover=undefined \
 -fsanitize-coverage=inline-8bit-counters,pc-table,trace-cmp -fsanitize-coverage-ignorelist=$PWD/fuzz/uninstrumented.txt \
@@ -34,7 +34,7 @@ for reader in "${readers[@]}"; do
     log=$(mktemp)
     "$binaries/$reader" "fuzz/corpus/$reader" "fuzz/seeds/$reader" "-artifact_prefix=fuzz/artifacts/$reader/" \
         -max_total_time="$seconds" -timeout=10 -rss_limit_mb=2048 -print_final_stats=1 -print_funcs=0 >"$log" 2>&1 \
-        || { tail -60 "$log"; echo "$reader: a finding, see fuzz/artifacts/$reader" >&2; exit 1; }
+        || { tail -60 "$log"; echo "$reader: found a failing input, see fuzz/artifacts/$reader" >&2; exit 1; }
     echo "$reader $(sed -n 's/stat::number_of_executed_units: *//p' "$log")" | tee -a fuzz/runs.log
     rm -f "$log"
 done

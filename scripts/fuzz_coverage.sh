@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Tells, in Markdown, how many lines of what reads files from elsewhere the seeds and corpora of fuzzing reach:
+# Prints a Markdown table of the line coverage that the fuzzing seeds and corpora reach in the readers of untrusted files:
 #   scripts/fuzz_coverage.sh [CORPORA]        by default fuzz/corpus
 # Needs `rustup component add llvm-tools` and gcov. Builds in target/coverage.
 set -euo pipefail
@@ -9,7 +9,7 @@ export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target/coverage}
 mkdir -p "$CARGO_TARGET_DIR"
 out=$(cd "$CARGO_TARGET_DIR" && pwd)
 
-# Only our own Rust is instrumented. All C++ is, by its own compiler.
+# In Rust, only our own crates are instrumented; the C++ compiler instruments all C++.
 printf '#!/bin/sh\nexec "$@" -C instrument-coverage -C link-arg=--coverage\n' >"$out/rustc"
 chmod +x "$out/rustc"
 export RUSTC_WORKSPACE_WRAPPER="$out/rustc" CXXFLAGS="--coverage" LLVM_PROFILE_FILE="$out/profile/%m.profraw"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs a command, and says every half minute that it still runs:
-#   heartbeat.sh building cargo build …              where standard error is no terminal: there cargo shows progress itself
+# Runs a command, and prints every 30 seconds that it is still running:
+#   heartbeat.sh building cargo build …              only if standard error is not a terminal, where cargo shows progress itself
 #   heartbeat.sh --always installing pip install …   in a terminal, too
 set -uo pipefail
 always=false
@@ -12,7 +12,7 @@ what=$1
 shift
 [ ! -t 2 ] || $always || exec "$@"
 
-# Crates and C++ files that this command's compilers work on now.
+# Prints the crates and C++ files that this command's compilers are compiling now.
 compiled() {
     ps -eo pgid=,args= | awk -v group="$(ps -o pgid= $$ | tr -d ' ')" '
         $1 != group { next }
@@ -23,7 +23,7 @@ compiled() {
         END { print names }'
 }
 
-# Ends with the command, which holds the other end of this standard input and writes nothing.
+# Prints until the command ends: the command holds the other end of this function's standard input, and writes nothing to it.
 beat() {
     local now
     while read -rt 30; [ $? -gt 128 ] && kill -0 $$ 2>/dev/null; do
@@ -33,5 +33,5 @@ beat() {
 }
 
 exec 9> >(beat >&2)
-# In place of this shell, so that signals and the exit code are the command's own.
+# Replace this shell, so that the command receives signals itself and its exit code is returned.
 exec "$@"

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What the pixels that a model is shown, and those of its pictures, do to its scores: PSNR and SSIM of views held out, and time.
+"""Measures how input and render resolution affect a model's scores: PSNR and SSIM of held-out views, and time.
 
-    .venv/bin/python scripts/high_resolution.py --capture DIR HOLDOUT [--capture …] [--trained 96] [--phase 2] [--pictures 96 192]
-        [--views N] [--weights models/tiny.safetensors] [--out OUT]
+    .venv/bin/python scripts/high_resolution.py --capture DIR HOLDOUT [--capture …] [--trained 96] [--phase 2]
+        [--pictures 96 192] [--views N] [--weights models/tiny.safetensors] [--out OUT]
 
-Prints a Markdown table for each capture. What is done stays done.
+Prints a Markdown table for each capture. Completed evaluations are not repeated.
 """
 
 import argparse
@@ -16,7 +16,7 @@ SETTINGS = {"small": "as in training", "polyphase": "polyphase", "whole": "whole
 
 
 def scored(arguments, capture, setting, phase, pictures):
-    """What `eval` told."""
+    """Returns the JSON output of `eval` for one capture, input setting and render size."""
     folder, holdout = capture
     command = ["eval", "--weights", arguments.weights, "--scene", folder, "--holdout", holdout]
     command += ["--views", str(arguments.views), "--pictures-at", str(pictures)]
@@ -28,7 +28,7 @@ def scored(arguments, capture, setting, phase, pictures):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", nargs=2, action="append", required=True, metavar=("DIR", "HOLDOUT"))
-    parser.add_argument("--trained", type=int, default=96, help="the height of the images that the model was trained with")
+    parser.add_argument("--trained", type=int, default=96, help="height in pixels of the images in training")
     parser.add_argument("--phase", type=int, nargs="+", default=[2])
     parser.add_argument("--pictures", type=int, nargs="+", default=[96, 192])
     parser.add_argument("--views", type=int, default=12)

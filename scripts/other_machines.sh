@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# Runs tests once more as on other machines than this one:
-#   scripts/other_machines.sh            on both of these
+# Runs tests again under the conditions of other machines:
+#   scripts/other_machines.sh            runs both `ordinary` and `small`
 #   scripts/other_machines.sh ordinary   tests on AVX2 without AVX-512 and bf16, as a user who isn't root and has no home, in a
 #                                        folder with a space that only its owner may write to, in another language and time zone,
-#                                        without standard input; then the demo in small
-#   scripts/other_machines.sh small      tests of what computes, on one core with SSE2
-#   scripts/other_machines.sh ordinary view splat    of the former, those of tests/view.rs and tests/splat.rs alone
-# Fails at the end if a test did. As root it lets others pass through the folders above the repository until then.
+#                                        without standard input; then the demo at a reduced size
+#   scripts/other_machines.sh small      tests of numerical code, on one core with SSE2
+#   scripts/other_machines.sh ordinary view splat    only tests/view.rs and tests/splat.rs of the `ordinary` tests
+# Fails at the end if a test failed. If run as root, it makes the folders above the repository accessible to other users until it ends.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 repository=$PWD
-# `make test` proves that nothing is missing; what that user can't reach is skipped here, and said.
+# `make test` checks that no requirement is missing. Tests whose requirements that user can't access are skipped here, and reported.
 unset GLOBALSPLAT_NO_SKIPS
 
 folder="$(mktemp -d)"
@@ -23,7 +23,7 @@ end() {
 }
 trap end EXIT
 
-# The tests that were asked for by name, all if none was; lib and main are those beside the code.
+# The tests given by name, or all if none is given; lib and main are the unit tests of the library and the program.
 chosen=("${@:2}")
 targets=()
 for name in "${chosen[@]}"; do
@@ -37,15 +37,15 @@ built="$("${CARGO:-cargo}" test --release --locked --no-run "${targets[@]}" 2>&1
     echo "$built" >&2
     exit 1
 }
-# A line for each program of tests: its name, which is lib, main or that of a file in tests/, and its path.
+# One line per test binary: its name (lib, main or the name of a file in tests/) and its path.
 tests="$(sed -nE 's|^ *Executable (unittests src/)?(tests/)?([a-z_]+)\.rs \((.*)\)$|\3 \4|p' <<<"$built")"
 
-# Slow tests, or tests of text, that none of these machines' traits decide: compilers' and other programs' answers, sums of processes,
-# memory that runs out. They run here where they are asked for by name.
+# Tests that do not depend on these conditions and are slow or only check text: output of compilers and other programs, reductions across
+# processes, out of memory. They run here only if given by name.
 alike=" architecture citations cuda distributed refused_memory viewers "
 
 failed=()
-# Runs the tests $2…, or all, by the command $1; of these, the chosen ones. Says what they were skipped for want of.
+# Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.
 run() {
     local as=$1 name program ran=false
     shift
@@ -64,13 +64,13 @@ run() {
         "$as" "$program" --quiet </dev/null || failed+=("$as: $name")
     done <<<"$tests"
     $ran || {
-        echo "other_machines: $as runs no test of ${chosen[*]}" >&2
+        echo "other_machines: $as has no test named ${chosen[*]}" >&2
         exit 2
     }
-    [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped for want of $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
+    [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 
-# One whose letters and numbers differ most from English, where it is installed.
+# A locale whose letters and numbers differ most from English, if it is installed.
 language="$(locale -a 2>/dev/null | grep -im1 '^tr_TR' || echo C)"
 as_ordinary() {
     local other_user=()
@@ -89,7 +89,7 @@ as_small() {
     GLOBALSPLAT_SIMD=portable OMP_NUM_THREADS=1 taskset -c "$core" "$@"
 }
 
-# A copy of what git knows, with links to what was built and installed.
+# Copies the files that git tracks, and links what was built and installed.
 make_clone() {
     local made
     mkdir -p "$clone" "$folder/a folder/tmp"
@@ -111,10 +111,10 @@ run_ordinary() {
         fi
         above="$(dirname "$above")"
     done
-    # Tests that need torchrun are left out where Python lies in a folder that is closed to that user, as root's home is. The first
-    # program that setpriv starts reaches more than those after it.
+    # Tests that need torchrun are skipped if Python is in a folder that user can't access, such as root's home. The check runs Python
+    # through `env`, because the first program that setpriv starts can access more than the programs after it.
     as_ordinary env .venv/bin/python -c '' 2>/dev/null || {
-        echo "as_ordinary: without torchrun, as this user can't start .venv/bin/python"
+        echo "as_ordinary: without torchrun, because this user can't run .venv/bin/python"
         local -x TORCHRUN=/nonexistent
     }
     run as_ordinary
@@ -135,7 +135,7 @@ all)
     run_small
     ;;
 *)
-    echo "other_machines: $1 is no machine, expected ordinary or small" >&2
+    echo "other_machines: unknown machine $1, expected ordinary or small" >&2
     exit 2
     ;;
 esac

@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
-"""What `globalsplat refine` makes of captures in which photos are there several times, from one place or from places near each other: PSNR
-of views held out. A burst, a pause of a video and copied files are such captures.
+"""Measures how `globalsplat refine` handles duplicate and near-duplicate photos: PSNR of held-out views.
 
-    .venv/bin/python scripts/refine_copies.py --capture DIR [--holdout 3] [--steps 30] [--size 64x64] [--gaussians 2048] [--out OUT]
+Bursts, pauses of a video and copied files give captures with such photos.
 
-The capture has a cameras.json. Every third of its photos is held out, the others are there 1, 2, 5 or 10 times, shifted at random by parts
-of the cameras' extent. Prints a Markdown table.
+    .venv/bin/python scripts/refine_copies.py --capture DIR [--holdout 3] [--steps 30] [--size 64x64] [--gaussians 2048]
+        [--out OUT]
+
+The capture has a cameras.json. Every third of its photos is held out by default. The others are repeated as CASES says,
+at camera positions shifted at random by a fraction of the cameras' extent. Prints a Markdown table.
 """
 
 import argparse
@@ -17,7 +19,8 @@ from pathlib import Path
 
 from core_runs import row, told
 
-# Copies of each photo, copies of the first besides, and by how much their places differ, in extents of the cameras.
+# Copies of each photo, additional copies of the first photo, and standard deviation of their positions relative to the
+# cameras' extent.
 CASES = [(1, 0, 0.0), (2, 0, 0.0), (2, 0, 1e-7), (5, 0, 1e-4), (10, 0, 1e-3), (3, 0, 1e-2), (1, 40, 1e-4)]
 
 

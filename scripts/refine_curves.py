@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""How `globalsplat refine` goes on, from photos alone and from the weights that come with it: PSNR of views held out over the seconds.
+"""Plots the PSNR of held-out views over time in `globalsplat refine`, from photos alone and from the shipped weights.
 
     .venv/bin/python scripts/refine_curves.py --capture DIR HOLDOUT [VIEWS] [--capture …] [--out OUT] [--seconds 60]
 
-Photos are cut and resized to 256×256. Writes OUT/curves.svg and prints a Markdown table. Nothing else should run meanwhile. What is
-done stays done.
+Photos are cropped and resized to 256×256. Writes OUT/curves.svg and prints a Markdown table. Run nothing else
+meanwhile. Completed runs are not repeated.
 """
 
 import argparse
@@ -15,11 +15,11 @@ from refine_runs import refined
 
 STARTS = {"nothing": "photos alone", "weights": "the shipped weights"}
 SECONDS = [2, 3, 5, 10, 20, 30, 60]
-WIDTH, HEIGHT, LEFT, TOP = 250, 190, 34, 26  # of one capture's plot, pixels
+WIDTH, HEIGHT, LEFT, TOP = 250, 190, 34, 26  # size and margins of one capture's plot, in pixels
 
 
 def curve(out, capture, start, seconds):
-    """[(seconds, PSNR)] of views held out, the first of them of what was begun with."""
+    """Returns [(seconds, PSNR)] of held-out views; the first entry is that of the initial splat."""
     folder, holdout, *views = capture
     more = ["--from", start, *(["--views", views[0]] if views else [])]
     told = refined(out / f"{Path(folder).name}.{start}.json", folder, holdout, seconds, *more)
@@ -27,13 +27,13 @@ def curve(out, capture, start, seconds):
 
 
 def at(marks, seconds):
-    """What was known to be reached by then."""
+    """Returns the last PSNR measured by `seconds`, formatted, or an empty string."""
     reached = [psnr for second, psnr in marks if second <= seconds + 0.05]
     return f"{reached[-1]:.1f}" if reached else ""
 
 
 def plot(name, curves, seconds, left):
-    """One capture's curves as SVG."""
+    """Returns one capture's curves as SVG."""
     values = [psnr for marks in curves.values() for _, psnr in marks]
     low, high = int(min(values)), int(max(values)) + 1
     x = lambda second: left + LEFT + second / seconds * (WIDTH - LEFT - 12)

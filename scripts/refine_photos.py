@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
-"""What `globalsplat refine` reaches with few photos, begun with photos alone or with the weights that come with it, in each space: PSNR
-of views held out.
+"""Measures the PSNR of held-out views that `globalsplat refine` reaches with few photos.
 
-    .venv/bin/python scripts/refine_photos.py --capture DIR HOLDOUT [--capture …] [--photos 4 6 8 12] [--seconds 10] [--out OUT]
+It starts from photos alone or from the shipped weights, in each optimization space (tokens, Gaussians, both).
 
-Photos are cut and resized to 256×256, and spread over the camera's path. Prints a Markdown table. Nothing else should run meanwhile.
-What is done stays done.
+    .venv/bin/python scripts/refine_photos.py --capture DIR HOLDOUT [--capture …] [--photos 4 6 8 12] [--seconds 10]
+        [--out OUT]
+
+Photos are cropped and resized to 256×256, and spread over the camera's path. Prints a Markdown table. Run nothing else
+meanwhile. Completed runs are not repeated.
 """
 
 import argparse
@@ -40,7 +42,7 @@ def main():
                 file = arguments.out / f"{name}.{photos}.{way.replace(', ', '_').replace(' ', '_')}.json"
                 told[way] = refined(file, folder, holdout, arguments.seconds, *options, "--views", str(photos))
             if any(one["photos"] < photos for one in told.values()):
-                continue  # the capture hasn't so many
+                continue  # the capture has fewer photos
             reached = [f"{told[way]['held_out']['after']['psnr']:.2f}" for way in WAYS]
             row(f"{name}, {photos}", *reached)
 

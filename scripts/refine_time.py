@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""How long `globalsplat refine` takes by a wall clock, from the start of the process to its end: for budgets of time, and from Ctrl-C
-to the end.
+"""Measures the wall-clock time of `globalsplat refine`, from start to end for several budgets, and from Ctrl-C to end.
 
-    .venv/bin/python scripts/refine_time.py --capture DIR [--capture …] [--seconds 3 10 60] [--stop 0.3 1 2 5] [--out OUT]
+    .venv/bin/python scripts/refine_time.py --capture DIR [--capture …] [--seconds 3 10 60] [--stop 0.3 1 2 5]
+        [--out OUT]
 
-Prints a Markdown table. Nothing else should run meanwhile.
+Prints a Markdown table. Run nothing else meanwhile.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from core_runs import PROGRAM, row
 
 
 def timed(scene, out, seconds, stop=None, *more):
-    """Seconds by the wall clock (after Ctrl-C, where it is stopped), what the run told, and whether there is a splat."""
+    """Returns wall-clock seconds (from Ctrl-C, if stopped), the JSON output, if a splat exists, and standard error."""
     out.unlink(missing_ok=True)
     command = [PROGRAM, "refine", "--scene", scene, "--out", out, "--seconds", str(seconds), "--json", *more]
     begun = time.monotonic()

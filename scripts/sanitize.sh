@@ -1,17 +1,18 @@
 #!/usr/bin/env bash
-# Runs csrc/checks on the rasterizer as it is released, under ThreadSanitizer, and under AddressSanitizer with
-# UndefinedBehaviorSanitizer, for every instruction set that this machine has, and prints how much was checked:
+# Runs csrc/checks on the rasterizer compiled as in a release, under ThreadSanitizer, and under AddressSanitizer with
+# UndefinedBehaviorSanitizer, for every instruction set that this machine supports, and prints how much was checked:
 #   scripts/sanitize.sh          every degree of spherical harmonics on 1 to 16 threads
-#   scripts/sanitize.sh short    one degree for each scene, on few; what knows no instruction set, with the best alone
-# Fails if anything is found. Needs g++ or the compiler that CXX names; not clang++ 14, whose ThreadSanitizer keeps others from
-# replacing `operator new`, as the checks do.
+#   scripts/sanitize.sh short    one degree per scene, on few threads; checks that don't depend on the instruction set run only with the
+#                                best one
+# Fails if a sanitizer or a check reports an error. Needs g++ or the compiler that CXX names; not clang++ 14, whose ThreadSanitizer
+# prevents the checks from replacing `operator new`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 form=${1:-long}
 out=target/sanitize
 mkdir -p "$out"
 
-# The same as in csrc/build.rs.
+# The instruction sets, as in csrc/build.rs.
 case $(uname -m) in
 x86_64) isas="avx512 avx2 portable" ;;
 aarch64) isas="neon" ;;
@@ -22,7 +23,7 @@ declare -A flags_of=(
     [avx2]="-mavx2 -mfma"
     [plain]="-O3"
     [thread]="-O1 -g1 -fsanitize=thread"
-    # What is left out takes half of the compiler's time, and AddressSanitizer notices it, too.
+    # The disabled checks (null, object-size) take half of the compile time, and AddressSanitizer detects these errors, too.
     [address]="-O1 -g1 -fno-omit-frame-pointer -D_GLIBCXX_ASSERTIONS -fsanitize=address,undefined,float-cast-overflow \
 -fno-sanitize=null,object-size -fno-sanitize-recover=all"
 )
@@ -31,7 +32,7 @@ sanitizers="address thread plain"
 compile() { # OBJECT SOURCE FLAG…
     echo "${CXX:-g++} -std=c++17 -fno-math-errno -Wall -Wextra -Wno-maybe-uninitialized -Wno-unknown-warning-option ${*:3} -c csrc/$2 -o $out/$1.o"
 }
-# Those that take long come first.
+# The slowest compilations come first.
 for sanitizer in $sanitizers; do
     for isa in $isas; do
         compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
@@ -41,7 +42,7 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/raster
     done
     compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/raster
-    # ThreadSanitizer looks at the threads that a GPU would have, not at what makes them take turns.
+    # ThreadSanitizer checks the emulated GPU threads, not the emulator that schedules them.
     case $sanitizer in
     thread) compile thread-emulator cuda/emulator.cpp -O1 -g1 -DGS_UNDER_TSAN -Icsrc/raster ;;
     *) compile "$sanitizer-emulator" cuda/emulator.cpp "${flags_of[$sanitizer]}" -Icsrc/raster ;;
@@ -54,7 +55,7 @@ for sanitizer in $sanitizers; do
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done
 
-# Newer kernels scatter addresses more widely than the sanitizers' shadows are laid out for.
+# Newer Linux kernels randomize addresses over a wider range than the sanitizers' shadow memory supports.
 unscattered=()
 ! setarch -R true 2>/dev/null || unscattered=(setarch -R)
 export TSAN_OPTIONS="halt_on_error=1" UBSAN_OPTIONS="print_stacktrace=1"
@@ -94,16 +95,16 @@ for sanitizer in $sanitizers; do
     done
 done
 
-# Would a barrier be missed? Without any one of those in the kernels for GPUs, threads race.
+# Removes each barrier of the CUDA kernels in turn. ThreadSanitizer must report a data race for each.
 export GLOBALSPLAT_SIMD=portable
 barriers=$("${unscattered[@]}" "$out/thread" barriers)
 missed=0
 for ((n = 0; n < barriers; ++n)); do
     if "${unscattered[@]}" "$out/thread" orders short "$n" >/dev/null 2>&1; then
-        echo "the kernels' barrier number $n can be left out, and nothing is found" >&2
+        echo "ThreadSanitizer reports no data race without barrier $n of the CUDA kernels" >&2
         missed=$((missed + 1))
     fi
 done
 echo
-echo "Of $barriers barriers in the kernels for GPUs, $((barriers - missed)) are missed by ThreadSanitizer when they are left out."
+echo "ThreadSanitizer reports a data race for $((barriers - missed)) of the $barriers barriers in the CUDA kernels if one is removed."
 exit $((found + missed > 0))

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Finds a Rust toolchain, a C++ compiler, Python and libtorch, and says in one clear line which is missing. The weights of
-# LPIPS come along where they can be had; without them evaluation leaves LPIPS out.
-#   setup.sh           what building needs: libtorch comes in .venv, unless LIBTORCH names one already
-#   setup.sh venv      .venv in any case: the parity checks run in it, and packages of Node.js where that is there
-#   setup.sh weights   the weights, or a failure
+# Finds a Rust toolchain, a C++ compiler, Python and libtorch, and reports in one line which is missing. Downloads the LPIPS weights if
+# possible; without them, evaluation omits LPIPS.
+#   setup.sh           prepares the build: installs libtorch in .venv, unless LIBTORCH names one already
+#   setup.sh venv      always creates .venv, in which the parity checks run, and installs Node.js packages if Node.js is installed
+#   setup.sh weights   downloads the LPIPS weights, or fails
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -12,12 +12,12 @@ missing() {
     exit 2
 }
 
-# Runs any Python there is: the script needs no package.
+# Downloads the LPIPS weights with any available Python: the script needs no packages.
 weights() {
     local python=.venv/bin/python
     [ -x "$python" ] || python="${PYTHON:-python3}"
     if ! command -v "$python" >/dev/null; then
-        [ "${1:-}" = --if-possible ] || missing "no Python found, which fetches the weights of LPIPS"
+        [ "${1:-}" = --if-possible ] || missing "no Python found, which is needed to download the LPIPS weights"
         return 0
     fi
     scripts/heartbeat.sh --always weights "$python" scripts/lpips_weights.py "$@"
@@ -25,18 +25,18 @@ weights() {
 
 npm_ci=(npm ci --ignore-scripts --no-audit --no-fund --loglevel=error --no-update-notifier)
 
-# The viewer that `globalsplat view` has in its pages, bundled from what web/ pins. Without npm, or a registry, the program is
-# built without it, and says so when a page is asked for.
+# Bundles the viewer that `globalsplat view` embeds in its pages, from the packages that web/ pins. Without npm or a registry, the
+# program is built without it, and reports this when the user requests a page.
 page() {
     [ -z "$(find web/src web/package-lock.json -newer web/dist/page.js 2>&1 | head -n 1)" ] && return
     if ! command -v npm >/dev/null; then
-        echo "setup: no npm found: the program is built without pages to walk in; install Node.js 20 or newer to have them" >&2
+        echo "setup: no npm found: the program is built without the interactive viewer; install Node.js 20 or newer to include it" >&2
         return
     fi
     echo "setup: bundling the viewer that web/ pins" >&2
     if ! { scripts/heartbeat.sh --always "setup: bundling" "${npm_ci[@]}" --prefix web >/dev/null \
         && npm run --prefix web --silent build; }; then
-        echo "setup: npm can't do it; the program is built without pages to walk in" >&2
+        echo "setup: npm failed; the program is built without the interactive viewer" >&2
     fi
 }
 
@@ -50,7 +50,7 @@ command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g
 
 page
 if [ -n "${LIBTORCH:-}" ]; then
-    [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; name the folder of a libtorch 2.11, or unset it"
+    [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; set it to a libtorch 2.11 folder, or unset it"
     if [ "${1:-}" != venv ]; then
         weights --if-possible
         exit
@@ -67,21 +67,21 @@ fi
 if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
     if [ ! -e .venv/libtorch ]; then
-        # Meanwhile, in the time that this leaves, cargo compiles what needs no libtorch. What does fails, and is built later.
+        # Meanwhile, cargo compiles the crates that don't need libtorch, at low priority. The others fail, and are built later.
         nice "${CARGO:-cargo}" build --release --locked --keep-going >/dev/null 2>&1 &
         early=$!
         trap 'kill "$early" 2>/dev/null || true' EXIT
     fi
-    # Python compiles what it imports when it first does.
+    # --no-compile: Python compiles modules when they are first imported.
     scripts/heartbeat.sh --always "setup: installing" \
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.txt \
-        || missing "requirements.txt can't be installed; pip's message above tells why"
+        || missing "requirements.txt can't be installed; see pip's message above"
     cp requirements.txt .venv/requirements.txt
 fi
-# Cargo looks for libtorch here (.cargo/config.toml), whatever the Python version is called.
+# Cargo looks for libtorch at this path (.cargo/config.toml), which does not depend on the Python version.
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch
 
-# Other programs' readers of splats, which tests compare ours with. Without Node.js, or a registry, these tests are skipped.
+# Third-party readers of splats, which tests compare ours with. Without Node.js or a registry, these tests are skipped.
 if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true ] && command -v npm >/dev/null \
     && ! cmp -s parity/npm/package-lock.json parity/npm/node_modules/.installed; then
     echo "setup: installing what parity/npm pins" >&2
@@ -89,13 +89,13 @@ if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true
         cp parity/npm/package-lock.json parity/npm/node_modules/.installed
     else
         rm -rf parity/npm/node_modules
-        echo "setup: npm can't install it; tests that need it are skipped" >&2
+        echo "setup: npm failed; tests that need these packages are skipped" >&2
     fi
 fi
 
 weights --if-possible
 if [ -n "${early:-}" ]; then
-    echo "setup: compiling what needs no libtorch" >&2
+    echo "setup: compiling the crates that don't need libtorch" >&2
     # shellcheck disable=SC2016
     scripts/heartbeat.sh --always "setup: compiling" bash -c 'while kill -0 "$0" 2>/dev/null; do sleep 0.2; done' "$early"
     wait "$early" || true

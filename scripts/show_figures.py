@@ -1,4 +1,4 @@
-"""Prints a benchmark's JSON as tables.
+"""Prints the JSON output of a benchmark as tables.
 
     globalsplat bench model --json >model.json
     python scripts/show_figures.py model.json

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Trains on several nodes under Slurm, as one run:
+# Trains one run on several nodes under Slurm:
 #   sbatch scripts/slurm_train.sh configs/re10k_16k.toml runs/re10k [any other option of `globalsplat train`]
-# from the folder of the checkout, which all nodes see, after `make build`. Slurm's own options go before the script's name, as in
-# `sbatch --nodes=2 scripts/slurm_train.sh …`. The same command goes on where a job ended, whatever the number of nodes.
-#   PROCESSES  on each node (default: as many as it has GPUs)
+# Run it after `make build`, from the folder of the checkout, which must be on a file system that all nodes share. Slurm's own options
+# go before the script's name, as in `sbatch --nodes=2 scripts/slurm_train.sh …`. The same command resumes where a job ended, with any
+# number of nodes.
+#   PROCESSES  processes per node (default: the node's number of GPUs)
 #   DEVICE     cuda or cpu (default: cuda)
-#   TORCHRUN   by which they are started (default: .venv/bin/torchrun)
+#   TORCHRUN   the torchrun that starts the processes (default: .venv/bin/torchrun)
 #SBATCH --job-name=globalsplat
 #SBATCH --nodes=4
 #SBATCH --ntasks-per-node=1
@@ -22,15 +23,15 @@ if [ $# -lt 2 ]; then
 fi
 config=$1 run=$2
 shift 2
-# Slurm runs a copy of this file, in the folder from which it was submitted.
+# Slurm runs a copy of this file, in the folder from which the job was submitted.
 cd "${SLURM_SUBMIT_DIR:-$PWD}"
 
-# All processes meet at the first node. Jobs that share it are kept apart by their numbers.
+# The rendezvous is on the first node. Jobs that share this node use different ports, derived from the job ID.
 first=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 port=$((20000 + SLURM_JOB_ID % 20000))
 
-# Two minutes before its time is over, Slurm sends TERM: the run saves a checkpoint and ends. A process that dies otherwise is started
-# again with all others, which meet anew, at a port of their own, and go on from the last checkpoint.
+# Two minutes before the time limit, Slurm sends TERM: the run saves a checkpoint and ends. If a process dies for another reason,
+# torchrun restarts all processes, which rendezvous again at a new port and resume from the last checkpoint.
 export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1
 exec srun "${TORCHRUN:-.venv/bin/torchrun}" \
     --nnodes="$SLURM_NNODES" --nproc-per-node="${PROCESSES:-${SLURM_GPUS_ON_NODE:-8}}" \

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Trains a tiny model for a very long time, with validations and checkpoints, and tells whether the process stays as it was.
+"""Trains a tiny model for a very long time, with validations and checkpoints, and checks that no resources leak.
 
     scripts/soak.py [--steps 100000] [--binary target/release/globalsplat] [--out runs/soak]
 
-After each tenth of the steps: resident memory, open files, threads, bytes of the run's folder. Fails where the last tenth has
-more files or threads than the first, or more memory than a twentieth beyond it. Goes on where it was stopped.
+After each tenth of the steps, prints resident memory, open files, threads and the size of the run's checkpoints. Fails
+if the last tenth has more files or threads than the first, or over 5 % more memory. Resumes where it was stopped.
 """
 
 import argparse
@@ -46,7 +46,7 @@ steps = {steps}
 batch = 1
 checkpoint_every = 500
 validate_every = 1000
-pictures_every = 1000
+log_images_every = 1000
 """
 
 
@@ -63,7 +63,7 @@ def state(process: int, run: Path) -> dict[str, float]:
 
 
 def last_step(metrics: Path) -> int:
-    """The number of the last line, which tells a step or a validation after it."""
+    """Returns the step of the last line, which is that of a training step or of a validation after it."""
     try:
         with metrics.open("rb") as file:
             file.seek(max(0, metrics.stat().st_size - 4096))

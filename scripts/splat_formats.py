@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What each format of splats costs: bytes, and dB between renders and against photos.
+"""Measures size and quality of each splat format: bytes, PSNR between renders, and PSNR against photos.
 
     .venv/bin/python scripts/splat_formats.py CAPTURE… [--splat reference.ply] [--out OUT]
 
-A capture is a folder with photos, cameras and a splat. Each is converted with the capture's cameras (`--scene`) and without, and
-scored by the photos. Prints a Markdown table.
+A capture is a folder with photos, cameras and a splat. Each splat is converted with the capture's cameras (`--scene`)
+and without, and scored against the photos. Prints a Markdown table.
 """
 
 import argparse

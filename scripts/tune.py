@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
-"""Which shape and recipe of configs/tiny.toml learns most in equal time: short runs on one core, one thing changed in each.
+"""Compares variants of configs/tiny.toml trained for equal time: short runs on one core, one change in each.
 
-    .venv/bin/python scripts/tune.py --worlds DIR --test DIR [--out OUT] [--seconds 300] [--captures DIR] [--only VARIANT ...]
+    .venv/bin/python scripts/tune.py --worlds DIR --test DIR [--out OUT] [--seconds 300] [--captures DIR]
+        [--only VARIANT ...]
 
-DIR hold videos that `globalsplat synth` made, 96 pixels wide. Every variant gets as many steps as fit in the seconds by its own
-time for a step, or, with --scenes N, as many as show it N scenes: what counts where models are too small to keep a GPU busy. The
-curriculum's stages are at the same shares of them. Prints a Markdown table: PSNR on worlds never seen, and, where
-captures are named, on the held-out views of each, mean over them. What is done stays done.
+--worlds and --test name folders of videos by `globalsplat synth`, 96 pixels wide. Every variant trains for as many
+steps as fit in the seconds at its own time per step or, with --scenes N, until it has seen N scenes, which is the fair
+budget if models are too small to keep a GPU busy. The curriculum's stages begin at the same fractions of the steps.
+Prints a Markdown table: PSNR on unseen synthetic scenes, and mean PSNR on the held-out views of each of the --captures.
+Completed runs are not repeated.
 """
 
 import argparse
@@ -19,13 +21,14 @@ from pathlib import Path
 
 from core_runs import PROGRAM, REPOSITORY, core_seconds, environment, row, train
 
-# Parts of the run at which stages begin, and the length of a transition.
+# Fractions of the run at which stages begin, and the length of a transition.
 STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
-# Where the model begins with nothing; small patches and many scene tokens are for weights that know large and few ones, and Muon is
-# for those. What is judged sees a scene in one size, as a single pass tells more of a shape than the best of several (spec 9.9).
-BASE = ["model.patch_size=16", "model.latents=256", "train.optimizer=adamw", "data.extents=[1]"]
+# Settings for training from scratch: small patches, many scene tokens and Muon only suit weights trained with large
+# patches and few tokens first. The model sees a scene at one scale, because a single pass says more about a shape than
+# the best of several (spec 9.9).
+BASE = ["model.patch_size=16", "model.latents=256", "train.optimizer=adamw", "data.scene_scales=[1]"]
 VARIANTS = {
     "tiny": [],
     "4 to 8 context views": ["data.context_views=8"],
@@ -44,11 +47,11 @@ VARIANTS = {
     "3 rounds": ["model.rounds=3"],
     "4 rounds": ["model.rounds=4"],
     "8 heads": ["model.heads=8"],
-    "batch 1": ["train.batch=1"],
-    "batch 4": ["train.batch=4"],
-    "batch 8": ["train.batch=8"],
+    "batch 1": ["train.batch_size=1"],
+    "batch 4": ["train.batch_size=4"],
+    "batch 8": ["train.batch_size=8"],
     "Muon": ["train.optimizer=muon"],
-    "Muon, batch 8": ["train.optimizer=muon", "train.batch=8"],
+    "Muon, batch 8": ["train.optimizer=muon", "train.batch_size=8"],
     "Muon, 4 rounds": ["train.optimizer=muon", "model.rounds=4"],
     "learning rate 2e-3": ["train.learning_rate=2e-3"],
     "learning rate 4e-3": ["train.learning_rate=4e-3"],
@@ -59,27 +62,31 @@ VARIANTS = {
 
 
 def value_of(name, settings, otherwise):
-    """What the settings, each `NAME=VALUE`, say of a number."""
+    """Returns the number that the settings, each `NAME=VALUE`, assign to `name`, or `otherwise`."""
     return next((float(setting.removeprefix(f"{name}=")) for setting in settings if setting.startswith(f"{name}=")), otherwise)
 
 
 def steps_in(seconds, config, settings, batch):
-    """Steps that fit, by what a core is busy with for ten of them."""
-    # As many views as a step has in the mean: of 4 to 12, where the variant does not say otherwise.
+    """Returns the number of steps that fit in `seconds`, from the measured CPU time of ten steps."""
+    # The mean number of context views of a step, which has 4 to 12 unless the variant sets another maximum.
     views = (4 + int(value_of("data.context_views", settings, 12))) // 2
     command = [PROGRAM, "bench", "train", "--config", config, "--batch", str(batch), "--json"]
     for setting in [*settings, f"data.context_views={views}"]:
-        if not setting.startswith("train.batch="):
+        if not setting.startswith("train.batch_size="):
             command += ["--set", setting]
     few, more = (core_seconds([*command, "--steps", str(steps)])[1] for steps in (5, 15))
     return int(10 * seconds / (more - few))
 
 
 def run(out, name, seconds, scenes, config, worlds, test, captures):
-    """Steps, parameters, and PSNR of a variant: on made-up worlds and on captures."""
+    """Trains and scores a variant.
+
+    Returns the scenes seen, millions of parameters, CPU seconds, PSNR and SSIM on synthetic scenes, and the PSNR of
+    each capture.
+    """
     settings = BASE + [setting for setting in VARIANTS[name] if not setting.startswith("stages=")]
     longer = value_of("stages", VARIANTS[name], 1.0)
-    batch = int(value_of("train.batch", settings, 2))
+    batch = int(value_of("train.batch_size", settings, 2))
     folder = out / name.replace(" ", "_").replace(",", "")
     folder.mkdir(parents=True, exist_ok=True)
     planned = folder / "steps"
@@ -113,8 +120,8 @@ def main():
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/tune"))
     either = parser.add_mutually_exclusive_group()
-    either.add_argument("--seconds", type=float, default=300, help="of a core, for each variant")
-    either.add_argument("--scenes", type=int, help="that each variant is shown")
+    either.add_argument("--seconds", type=float, default=300, help="CPU seconds for each variant")
+    either.add_argument("--scenes", type=int, help="number of scenes that each variant is trained on")
     parser.add_argument("--captures", type=Path, nargs="*", default=[])
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
     arguments = parser.parse_args()

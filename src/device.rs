@@ -1,7 +1,7 @@
 //! Asynchronous copies from the host to a GPU on a stream of their own, and events that time the GPU's work. On the CPU the
 //! same calls run synchronously.
 
-use crate::render::handed_over;
+use crate::render::take_outputs;
 use cxx::UniquePtr;
 use globalsplat_csrc::device as ffi;
 use std::fmt;
@@ -19,36 +19,36 @@ fn gpu(device: Device) -> Option<i32> {
 }
 
 /// Event for timing the work of a device: on a GPU, it is reached when all work queued before it is done.
-pub(crate) enum Moment {
+pub(crate) enum DeviceEvent {
     Host(Instant),
     Gpu(UniquePtr<ffi::Mark>),
 }
 
-impl Moment {
+impl DeviceEvent {
     /// Records an event now, without waiting for the GPU.
     pub fn now(device: Device) -> Self {
         match gpu(device) {
-            Some(gpu) => Moment::Gpu(ffi::mark(gpu).expect("a GPU that works")),
-            None => Moment::Host(Instant::now()),
+            Some(gpu) => DeviceEvent::Gpu(ffi::mark(gpu).expect("a GPU that works")),
+            None => DeviceEvent::Host(Instant::now()),
         }
     }
 
     /// Returns the time elapsed since `earlier`, an event of the same device. Waits until the GPU has reached both events.
-    pub fn since(&self, earlier: &Moment) -> Duration {
+    pub fn since(&self, earlier: &DeviceEvent) -> Duration {
         match (self, earlier) {
-            (Moment::Gpu(mark), Moment::Gpu(earlier)) => {
+            (DeviceEvent::Gpu(mark), DeviceEvent::Gpu(earlier)) => {
                 let milliseconds = mark.since(earlier).expect("a GPU that works");
                 Duration::from_secs_f64(1e-3 * milliseconds.max(0.))
             }
-            (Moment::Host(instant), Moment::Host(earlier)) => *instant - *earlier,
+            (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
             _ => panic!("moments of two devices"),
         }
     }
 }
 
-impl fmt::Debug for Moment {
+impl fmt::Debug for DeviceEvent {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("Moment")
+        f.write_str("DeviceEvent")
     }
 }
 
@@ -77,20 +77,20 @@ impl Upload {
             return Tensor::empty(shape, (Kind::Uint8, Device::Cpu));
         }
         // SAFETY: on success the C++ side has stored a new tensor in `out`.
-        let done = unsafe { handed_over(|out| ffi::page_locked_bytes(shape, out)) };
+        let done = unsafe { take_outputs(|out| ffi::page_locked_bytes(shape, out)) };
         let [bytes] = done.expect("memory");
         bytes
     }
 
     /// Starts copying `tensors` from the host; the caller may drop them immediately.
-    pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> Uploading<N> {
+    pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> PendingCopy<N> {
         match &self.stream {
             Some(stream) => {
                 let addresses = tensors.map(|t| t.as_ptr() as usize);
                 // SAFETY: the tensors outlive the call.
-                Uploading::Gpu(unsafe { stream.copy(&addresses) }.expect("memory"))
+                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }.expect("memory"))
             }
-            None => Uploading::Done(tensors.map(|t| t.to_device(self.device))),
+            None => PendingCopy::Done(tensors.map(|t| t.to_device(self.device))),
         }
     }
 }
@@ -102,27 +102,27 @@ impl fmt::Debug for Upload {
 }
 
 /// Copy of tensors in progress.
-pub(crate) enum Uploading<const N: usize> {
+pub(crate) enum PendingCopy<const N: usize> {
     Done([Tensor; N]),
     Gpu(UniquePtr<ffi::Copies>),
 }
 
-impl<const N: usize> Uploading<N> {
+impl<const N: usize> PendingCopy<N> {
     /// Returns the tensors on the device. Work queued on the device from now on waits for the copy; the host doesn't.
-    pub fn arrive(self) -> [Tensor; N] {
+    pub fn wait(self) -> [Tensor; N] {
         match self {
-            Uploading::Done(tensors) => tensors,
-            Uploading::Gpu(copies) => {
+            PendingCopy::Done(tensors) => tensors,
+            PendingCopy::Gpu(copies) => {
                 // SAFETY: on success the C++ side has stored new tensors in `out`.
-                let done = unsafe { handed_over(|out| copies.hand_over(out)) };
+                let done = unsafe { take_outputs(|out| copies.hand_over(out)) };
                 done.expect("a GPU that works")
             }
         }
     }
 }
 
-impl<const N: usize> fmt::Debug for Uploading<N> {
+impl<const N: usize> fmt::Debug for PendingCopy<N> {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("Uploading")
+        f.write_str("PendingCopy")
     }
 }

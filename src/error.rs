@@ -57,7 +57,9 @@ pub enum Error {
     #[error("{0}")]
     Failed(String),
     /// Failed communication with the other processes, almost always because one of them has ended.
-    #[error("the processes have lost each other ({0}); started again, they go on from what was saved")]
+    #[error(
+        "distributed communication failed ({0}); restart the processes to resume from the last checkpoint"
+    )]
     Ranks(String),
     /// Error reported by libtorch.
     #[error("libtorch: {0}")]

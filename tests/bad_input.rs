@@ -300,12 +300,12 @@ fn numbers_that_make_no_sense() {
         ("train.weight_decay=nan", "train.weight_decay is NaN"),
         ("loss.frustum=-1", "loss.frustum is -1"),
         ("loss.consistency_depth=inf", "loss.consistency_depth is inf"),
-        ("train.batch=0", "train.batch is 0"),
+        ("train.batch_size=0", "train.batch_size is 0"),
     ] {
         assert_says(&told(setting), &["tiny.toml", field]);
     }
-    let error = refuse(&["bench", "train", "--set", "train.batch=4"]);
-    assert_says(&error, &["--set train.batch=4", "--batch N"]);
+    let error = refuse(&["bench", "train", "--set", "train.batch_size=4"]);
+    assert_says(&error, &["--set train.batch_size=4", "--batch N"]);
 }
 
 #[test]

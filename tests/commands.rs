@@ -151,7 +151,7 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
 fn memory_before_is_not_counted() {
     let (large, small) = (100_000, 1_000);
     let working = |gaussians: usize| {
-        let (gaussians, cameras) = globalsplat::bench::made_up_scene(gaussians, 1, [256, 256].into());
+        let (gaussians, cameras) = globalsplat::bench::synthetic_scene(gaussians, 1, [256, 256].into());
         globalsplat::bench::bench_raster(&gaussians, &cameras, 1).expect("a measurement").working_bytes
     };
     // Both in one process, the large one first.
@@ -567,7 +567,7 @@ fn a_run_is_not_begun_anew_over_another() {
 fn memory_of_a_step_is_told_before_and_bench_train_takes_the_batch_that_fits() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
-    let text = succeed(&["doctor", "--config", arg(&config), "--set", "train.batch=3"]);
+    let text = succeed(&["doctor", "--config", arg(&config), "--set", "train.batch_size=3"]);
     assert!(text.contains("3 scenes, 3 at a time") && text.contains("GB: it fits"), "{text}");
     let told: Value =
         serde_json::from_str(&succeed(&["doctor", "--config", arg(&config), "--json"])).expect("JSON");

@@ -53,12 +53,12 @@ fn the_weights_that_come_with_the_program_are_those_of_tiny() {
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
-    assert_eq!(shipped.config.data.extents, tiny.data.extents);
+    assert_eq!(shipped.config.data.scene_scales, tiny.data.scene_scales);
     assert_eq!(shipped.config.data.context_views, 24, "as reconstruct --help says");
     assert_eq!(shipped.stage, tiny.curriculum.final_stage());
     let fine_tune = read("fine_tune");
     assert_eq!(fine_tune.model, tiny.model, "what goes on from them");
-    assert_eq!(fine_tune.data.extents, tiny.data.extents);
+    assert_eq!(fine_tune.data.scene_scales, tiny.data.scene_scales);
     let folder = folder().with_file_name("models");
     let files = std::fs::read_dir(&folder).expect("models/").map(|entry| entry.expect("an entry").path());
     let weights: Vec<PathBuf> =
@@ -92,7 +92,7 @@ const SHRUNKEN: [&str; 17] = [
     "curriculum.boundaries=[1, 2, 2, 2]",
     "curriculum.transition=1",
     "loss.perceptual=none",
-    "train.batch=1",
+    "train.batch_size=1",
     "train.steps=3",
 ];
 

@@ -140,6 +140,6 @@ fn doctor_says_what_is_missing() {
         "{found}"
     );
     assert!(found.contains("this libtorch can't use it"), "{found}");
-    assert!(doctor("no device").contains("it knows no GPU"));
+    assert!(doctor("no device").contains("it reports no GPU"));
     assert!(doctor("mismatch").contains("unsupported display driver"));
 }

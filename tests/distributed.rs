@@ -312,8 +312,8 @@ fn ranks_train_like_one() {
     let [one, two] = ["one", "two"].map(of);
     // At a higher learning rate, AdamW amplifies gradients that are little more than rounding errors.
     let settings = |batch| ["train.steps=12", "train.validate_every=5", "train.learning_rate=2e-4", batch];
-    succeed(&text(&train(&config, &one, &settings("train.batch=2"))));
-    let arguments = train(&config, &two, &settings("train.batch=1"));
+    succeed(&text(&train(&config, &one, &settings("train.batch_size=2"))));
+    let arguments = train(&config, &two, &settings("train.batch_size=1"));
     let ended = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments)).end().remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
     assert!(
@@ -343,9 +343,9 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let (folder, config) = data(5);
     let [one, many] = ["one", "many"].map(|name| folder.path().join(name));
     let settings = |batch| ["train.steps=24", "train.checkpoint_every=100", batch];
-    succeed(&text(&train(&config, &one, &settings("train.batch=6"))));
+    succeed(&text(&train(&config, &one, &settings("train.batch_size=6"))));
 
-    let arguments = train(&config, &many, &settings("train.batch=3"));
+    let arguments = train(&config, &many, &settings("train.batch_size=3"));
     let mut started = Started::by_environment(2, &text(&arguments));
     started.wait_for("a step", || (metrics(&many).0.len() >= 4).then_some(()));
     // A stop request to any rank stops all.
@@ -353,11 +353,11 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let ended = started.end();
     assert_eq!((ended[0].code, ended[1].code), (Some(1), Some(0)), "{}", ended[1].err);
     let [sentence] = sentences(&ended[0].err)[..] else { panic!("one sentence: {}", ended[0].err) };
-    assert!(sentence.starts_with("stopped; ") && sentence.contains("the same command goes on"), "{sentence}");
+    assert!(sentence.starts_with("stopped; ") && sentence.contains("the same command resumes"), "{sentence}");
     let done = metrics(&many).0.len();
     assert!((4..24).contains(&done) && checkpoints(&many) == [done as u64], "{done} steps");
 
-    succeed_together(3, &text(&train(&config, &many, &settings("train.batch=2"))));
+    succeed_together(3, &text(&train(&config, &many, &settings("train.batch_size=2"))));
     assert_same_steps(&many, &one);
 }
 
@@ -406,8 +406,9 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
     let ended = started.end().remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
     let told = sentences(&ended.err);
-    let is_lost =
-        |told: &&str| told.contains("the processes have lost each other") && told.contains("started again");
+    let is_lost = |told: &&str| {
+        told.contains("distributed communication failed") && told.contains("restart the processes")
+    };
     assert!(told.len() == 3 && told.iter().all(is_lost), "one sentence for each: {told:?}");
 
     assert_same_bits(&run, &whole);
@@ -470,7 +471,7 @@ fn a_rank_that_dies_ends_all_with_one_sentence() {
     assert!(begun.elapsed() < PATIENCE && ended.code != Some(0), "{:?}", ended.code);
     let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
     let expected =
-        ["the processes have lost each other (", "); started again, they go on from what was saved"];
+        ["distributed communication failed (", "); restart the processes to resume from the last checkpoint"];
     assert!(expected.iter().all(|part| sentence.contains(part)), "{sentence}");
 
     // One process resumes a run of two.
@@ -550,7 +551,7 @@ fn ranks_that_are_asked_to_stop_save_first() {
     let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
     let done = metrics(&run).0.len();
     let saved = format!("stopped; {}/checkpoints/step-{done:08} holds all of it", arg(&run));
-    assert!(sentence.starts_with(&saved) && sentence.ends_with("the same command goes on"), "{sentence}");
+    assert!(sentence.starts_with(&saved) && sentence.ends_with("the same command resumes"), "{sentence}");
     assert!(done < 100 && checkpoints(&run) == [done as u64]);
     succeed_together(2, &text(&arguments));
     assert_same_bits(&run, &whole);
@@ -576,7 +577,7 @@ fn a_mistake_is_told_once() {
         assert!(ended.iter().all(|of| of.code != Some(0) && of.out.is_empty()), "{setting}");
         let err: String = ended.iter().map(|of| of.err.as_str()).collect();
         let [sentence] = sentences(&err)[..] else { panic!("{setting}: one sentence: {err}") };
-        assert!(sentence.contains(expected) && !sentence.contains("lost each other"), "{sentence}");
+        assert!(sentence.contains(expected) && !sentence.contains("communication failed"), "{sentence}");
     }
 }
 
@@ -686,13 +687,13 @@ fn bad_data_are_told_of_whichever_rank_finds_them() {
         fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
     }
     // One step in which every rank loads one sample, at most two ahead: no rank finds an error in another's sample.
-    let settings = |share, batch| ["train.steps=1", "data.ahead=1", "data.threads=1", share, batch];
+    let settings = |share, batch| ["train.steps=1", "data.prefetch=1", "data.threads=1", share, batch];
     let arguments = |run: &str, share, batch| {
         let mut arguments = train(&config, &folder.path().join(run), &settings(share, batch));
         arguments.push("--json".into());
         arguments
     };
-    let refused = arguments("refused", "data.max_bad_share=0", "train.batch=1");
+    let refused = arguments("refused", "data.max_bad_share=0", "train.batch_size=1");
     let ended = Started::by_environment(2, &text(&refused)).end();
     let err: String = ended.iter().map(|of| of.err.as_str()).collect();
     let [sentence] = sentences(&err)[..] else { panic!("one sentence: {err}") };
@@ -702,8 +703,9 @@ fn bad_data_are_told_of_whichever_rank_finds_them() {
     );
 
     let told = |output: &str| -> Value { serde_json::from_str(output).unwrap() };
-    let one = told(&succeed(&text(&arguments("one", "data.max_bad_share=0.5", "train.batch=2"))));
-    let two = told(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch=1"))));
+    let one = told(&succeed(&text(&arguments("one", "data.max_bad_share=0.5", "train.batch_size=2"))));
+    let two =
+        told(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch_size=1"))));
     assert_eq!(two["skipped_scenes"], one["skipped_scenes"]);
     assert_eq!(two["skipped_scenes"]["with_broken_images"], 1);
     // Its held-out views are not scored, either.

@@ -124,7 +124,7 @@ fn pack_replaces_no_chunk_but_one_that_it_would_write() {
 fn made_up_videos_leave_folders_alone() {
     let folder = tempfile::tempdir().unwrap();
     let file = put(folder.path().join("frames/video_000/0000.jpg"));
-    globalsplat::bench::made_up_videos(folder.path()).unwrap();
+    globalsplat::bench::synthetic_videos(folder.path()).unwrap();
     assert_kept(&file);
     let mut names: Vec<_> =
         std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();

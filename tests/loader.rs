@@ -42,7 +42,7 @@ fn config() -> DataConfig {
         target_views: 2,
         window: [6, 9],
         flip: true,
-        ahead: 5,
+        prefetch: 5,
         max_bad_share: 0.,
         ..Default::default()
     }
@@ -121,8 +121,8 @@ fn decoded_photos_that_are_kept_change_nothing() {
     let captures: Vec<Capture> =
         (0..3).map(|i| write_capture(&folder.path().join(format!("{i}")), i, 12)).collect();
     let data = Arc::new(captures);
-    let load = |photo_megabytes: u64| {
-        let config = DataConfig { photo_megabytes, ..config() };
+    let load = |photo_cache_mb: u64| {
+        let config = DataConfig { photo_cache_mb, ..config() };
         scenes(&mut Loader::start(&config, 0, data.clone(), 1, 0).unwrap(), 9)
     };
     assert_same(&load(0), &load(1));
@@ -132,7 +132,7 @@ fn decoded_photos_that_are_kept_change_nothing() {
 fn the_scenes_of_a_step_show_equally_many_views() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(groups(folder.path(), &[4]));
-    let config = DataConfig { fewest_context_views: 2, ..config() };
+    let config = DataConfig { min_context_views: 2, ..config() };
     let counts = |first: u64| -> Vec<usize> {
         let mut loader = Loader::start(&config, 0, data.clone(), 3, first).unwrap();
         let batches = (0..12).map(|_| loader.next_batch(3, Device::Cpu).unwrap());
@@ -180,8 +180,8 @@ fn batches_that_are_sent_ahead_are_the_same() {
     for step in 0..4 {
         if step != 2 {
             // A second call is a no-op.
-            ahead.send_ahead(2, Device::Cpu);
-            ahead.send_ahead(2, Device::Cpu);
+            ahead.prefetch_to_device(2, Device::Cpu);
+            ahead.prefetch_to_device(2, Device::Cpu);
         }
         assert_eq!(ahead.position(), 4 + 2 * step, "what isn't handed out doesn't count");
         let [expected, found] = [&mut plain, &mut ahead].map(|of| of.next_batch(2, Device::Cpu).unwrap());
@@ -204,7 +204,7 @@ fn errors_come_when_their_samples_would() {
         let mut loader = Loader::start(&config, 0, data.clone(), 1, 0).unwrap();
         let position = (0..24).find_map(|_| {
             if sends_ahead {
-                loader.send_ahead(2, Device::Cpu);
+                loader.prefetch_to_device(2, Device::Cpu);
             }
             let position = loader.position();
             loader.next_batch(2, Device::Cpu).err().map(|error| (position, error.to_string()))

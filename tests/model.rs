@@ -237,9 +237,9 @@ fn weights_that_lie_in_their_file_are_those_that_are_copied() {
         save_model(&path, &vs, &config, stage, dtype).unwrap();
         let open = || ModelFile::open(&path, &[]).unwrap();
         let copied = open().load(Device::Cpu, precision).unwrap();
-        let lies = open().lend(Device::Cpu, precision).unwrap();
-        let lent = lies.lent.expect("a file that was lent");
-        assert!(copied.lent.is_none());
+        let lies = open().load_mmap(Device::Cpu, precision).unwrap();
+        let mapped = lies.mapped.expect("a mapped file");
+        assert!(copied.mapped.is_none());
         let [images, c2w, intrinsics] = inputs(3, 16, 24);
         let same = |loaded: &LoadedModel| {
             let of = |loaded: &LoadedModel| {
@@ -255,7 +255,7 @@ fn weights_that_lie_in_their_file_are_those_that_are_copied() {
         {
             let bytes = std::fs::metadata(&path).unwrap().len();
             let used = resident(&path);
-            lent.let_go();
+            mapped.release_pages();
             let left = resident(&path);
             assert!(2 * used > bytes && 8 * left < bytes, "{dtype:?}: {used} of {bytes} bytes, then {left}");
         }
@@ -264,7 +264,7 @@ fn weights_that_lie_in_their_file_are_those_that_are_copied() {
         let before = std::fs::read(&path).unwrap();
         tch::no_grad(|| lies.vs.variables().values().for_each(|t| drop(t.shallow_clone().fill_(1.))));
         assert!(!same(&lies) && std::fs::read(&path).unwrap() == before);
-        lent.let_go();
+        mapped.release_pages();
     }
 }
 

@@ -21,7 +21,7 @@ fn photos_of(room: &Path, model: &LoadedModel) -> Vec<View> {
 
 /// Reconstructs `photos` normalized to `extents`; the photos are also the targets.
 fn made_of(photos: &[View], model: &mut LoadedModel, extents: &[f64]) -> Reconstruction {
-    model.config.data.extents = extents.to_vec();
+    model.config.data.scene_scales = extents.to_vec();
     let targets: Vec<_> = photos.iter().map(|photo| photo.camera.c2w).collect();
     reconstruct(&*model, photos, &targets).unwrap()
 }
@@ -87,9 +87,9 @@ fn a_scene_has_a_size() {
     let config = tiny_config(folder.path(), &room);
     let run = folder.path().join("run");
     for (extents, found) in [("[]", "[]"), ("[1, 0]", "[1.0, 0.0]"), ("[inf]", "[inf]"), ("[nan]", "[NaN]")] {
-        let set = format!("data.extents={extents}");
+        let set = format!("data.scene_scales={extents}");
         let error = refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", &set]);
-        let expected = format!("data.extents is {found}, expected one or more numbers above 0");
+        let expected = format!("data.scene_scales is {found}, expected one or more numbers above 0");
         assert!(error.contains(&expected), "{error}");
     }
     assert!(!run.exists(), "nothing was begun");

@@ -405,7 +405,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     assert!(with(&["--set", "view=3"]).contains("--set view=3: unknown field"));
     assert!(with(&["--set", "views=\"a\""]).contains("--set views"));
     assert!(with(&["--set", "views"]).contains("expected KEY=VALUE"));
-    for value in ["views=0", "sh_every=0", "sizes=[0.1,0.1]", "means=nan", "dead=-1"] {
+    for value in ["views=0", "sh_every=0", "resolution_schedule=[0.1,0.1]", "means=nan", "prune_opacity=-1"] {
         assert!(with(&["--set", value]).contains(&format!("--set {value}: expected ")));
     }
     assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));

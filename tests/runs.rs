@@ -175,7 +175,7 @@ fn on_a_full_disk(config: &Path, run: &Path) -> (Child, BufReader<std::process::
     let mut said = BufReader::new(child.stderr.take().unwrap());
     let mut line = String::new();
     said.read_line(&mut line).unwrap();
-    assert!(line.starts_with("training pauses: ") && line.contains("can't be written"), "{line}");
+    assert!(line.starts_with("training paused: ") && line.contains("can't be written"), "{line}");
     (child, said, run.join("checkpoints"))
 }
 
@@ -190,7 +190,7 @@ fn a_full_disk_pauses_training_until_there_is_room() {
     set_file_size_limit(&child, libc::RLIM_INFINITY);
     let mut line = String::new();
     said.read_line(&mut line).unwrap();
-    assert_eq!(line, "there is room again: training goes on\n");
+    assert_eq!(line, "disk space is available again: training resumes\n");
     assert!(child.wait().unwrap().success());
     assert_same_bits(&whole, &run);
 }
@@ -216,8 +216,12 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
     let good = tensors(&run);
     // One step is enough to ruin all weights. Without a check, every second step would be saved and would replace good
     // checkpoints.
-    let ruin =
-        ["train.steps=40", "train.learning_rate=1e30", "train.checkpoint_every=2", "train.max_skipped=5"];
+    let ruin = [
+        "train.steps=40",
+        "train.learning_rate=1e30",
+        "train.checkpoint_every=2",
+        "train.max_nonfinite_steps=5",
+    ];
     let output = command(&text(&train(&config, &run, &ruin))).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     let error = String::from_utf8_lossy(&output.stderr);
@@ -260,11 +264,11 @@ fn a_run_that_goes_on_otherwise_says_so_and_keeps_its_place_in_the_data() {
         assert!(output.status.success());
         String::from_utf8(output.stderr).unwrap()
     };
-    assert_eq!(stderr(&["train.steps=3", "train.batch=1"]), "");
-    let same = stderr(&["train.steps=3", "train.batch=1"]);
+    assert_eq!(stderr(&["train.steps=3", "train.batch_size=1"]), "");
+    let same = stderr(&["train.steps=3", "train.batch_size=1"]);
     assert!(!same.contains("configuration"), "{same}");
-    let other = stderr(&["train.steps=5", "train.batch=2"]);
-    let told = "the run goes on with another configuration: train.batch 1 → 2, train.steps 3 → 5\n";
+    let other = stderr(&["train.steps=5", "train.batch_size=2"]);
+    let told = "resuming with a changed configuration: train.batch_size 1 → 2, train.steps 3 → 5\n";
     assert!(other.contains(told), "{other}");
     let state = std::fs::read(run.join("checkpoints/step-00000005/state.json")).unwrap();
     let state: Value = serde_json::from_slice(&state).unwrap();

@@ -3,7 +3,7 @@
 mod common;
 
 use common::{Random, largest_error};
-use globalsplat::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
+use globalsplat::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
 use globalsplat::scene::{Gaussians, ImageSize};
 use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
@@ -51,12 +51,12 @@ fn cameras(scenes: i64, count: i64, width: i64, height: i64, kind: Kind) -> Came
     }
 }
 
-fn draw(g: &Gaussians, c: &Cameras) -> Pictures {
+fn draw(g: &Gaussians, c: &Cameras) -> RenderOutput {
     render(g, c, DEFAULT_EPS2D).expect("shapes that fit")
 }
 
 /// Returns a scalar that weighs every pixel of every image differently, the same on every call.
-fn objective(p: &Pictures) -> Tensor {
+fn objective(p: &RenderOutput) -> Tensor {
     let weigh = |t: &Tensor, phase: f64| {
         let n = t.numel() as i64;
         let weights = (Tensor::arange(n, (Kind::Double, Device::Cpu)) * 0.7 + phase).sin().view_as(t);
@@ -90,7 +90,7 @@ fn of_any_length(g: &Gaussians) -> Gaussians {
 }
 
 /// Returns the rendered images, and the gradients of [`objective`].
-fn differentiated(g: &Gaussians, c: &Cameras) -> (Pictures, [(&'static str, Tensor); 5]) {
+fn differentiated(g: &Gaussians, c: &Cameras) -> (RenderOutput, [(&'static str, Tensor); 5]) {
     let g = leaves(g);
     let p = draw(&g, c);
     objective(&p).backward();
@@ -205,7 +205,7 @@ fn gradients_are_those_of_finite_differences() {
 }
 
 /// Renders by spec 6.2 to 6.4, pixel by pixel over every Gaussian, in float64 and without any culling.
-fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
+fn brute_force(g: &Gaussians, c: &Cameras) -> RenderOutput {
     let values = |t: &Tensor| Vec::<f64>::try_from(t.to_kind(Kind::Double).flatten(0, -1)).expect("numbers");
     let [means, scales, quaternions, opacities, sh] = fields(g).map(|(_, t)| values(t));
     let (w2c, intrinsics) = (values(&c.w2c), values(&c.intrinsics));
@@ -285,7 +285,7 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> Pictures {
         }
     }
     let (s, v, w, h) = (scenes as i64, views as i64, w as i64, h as i64);
-    Pictures {
+    RenderOutput {
         rgb: Tensor::from_slice(&rgb).view([s, v, 3, h, w]),
         alpha: Tensor::from_slice(&alpha).view([s, v, h, w]),
         depth: Tensor::from_slice(&depth).view([s, v, h, w]),
@@ -383,7 +383,7 @@ fn instruction_sets_agree() {
         if globalsplat::render::cpu::simd_level().is_err() {
             std::process::exit(UNSUPPORTED);
         }
-        let (g, c) = globalsplat::bench::made_up_scene(16384, 12, ImageSize { width: 256, height: 256 });
+        let (g, c) = globalsplat::bench::synthetic_scene(16384, 12, ImageSize { width: 256, height: 256 });
         let g = leaves(&of_any_length(&g));
         let p = draw(&g, &c);
         objective(&p).backward();

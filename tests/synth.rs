@@ -4,7 +4,7 @@ mod common;
 
 use common::program::{arg, refuse, succeed, tiny_config};
 use glam::{DMat3, DVec3};
-use globalsplat::data::{Capture, Dataset, MadeUp, SceneGroup, Split};
+use globalsplat::data::{Capture, Dataset, SceneGroup, Split, SyntheticDataset};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
 use npyz::NpyFile;
@@ -281,7 +281,7 @@ fn pictures_that_a_user_names_are_seen() {
 
 #[test]
 fn names_of_made_up_videos_are_checked() {
-    let named = |name: &str| MadeUp::named(Path::new(name));
+    let named = |name: &str| SyntheticDataset::named(Path::new(name));
     assert!(named("captures/synth").unwrap().is_none());
     assert_eq!(named("synth:scenes=3").unwrap().unwrap().keys(), ["0_000000", "0_000001", "0_000002"]);
     assert_eq!(named("synth:seed=4,scenes=1,first=9").unwrap().unwrap().keys(), ["4_000009"]);

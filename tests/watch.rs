@@ -24,7 +24,7 @@ fn run() -> &'static Path {
     let (_, run) = RUN.get_or_init(|| {
         let (folder, capture) = room();
         let (config, run) = (tiny_config(folder.path(), &capture), folder.path().join("my <b>run"));
-        let settings = ["train.pictures_every=2", "train.log_every=1", "train.validate_every=2"];
+        let settings = ["train.log_images_every=2", "train.log_every=1", "train.validate_every=2"];
         succeed(&text(&train(&config, &run, &settings)));
         (folder, run)
     });
@@ -227,7 +227,7 @@ fn what_is_added_or_begun_anew_is_seen() {
 fn a_resumed_run_goes_on_and_its_later_pictures_are_void() {
     let (folder, capture) = room();
     let (config, run) = (tiny_config(folder.path(), &capture), folder.path().join("run"));
-    let settings = |steps| vec![steps, "train.pictures_every=1", "train.log_every=1"];
+    let settings = |steps| vec![steps, "train.log_images_every=1", "train.log_every=1"];
     succeed(&text(&train(&config, &run, &settings("train.steps=3"))));
     let watch = Watch::start(&run);
     assert_eq!(watch.state()["pictures"], json!([2, 1, 0]));
@@ -434,8 +434,8 @@ fn a_browser_shows_it_and_follows_the_run() {
     assert!(told.starts_with(&format!("in training {first:.2} dB (step 0), held out")), "{told}");
 
     assert_eq!(browser.errors(), [&json!(null); 0]);
-    let strangers: Vec<_> = browser.requests().into_iter().filter(|asked| !asked.starts_with(&url)).collect();
-    assert!(strangers.is_empty(), "{strangers:?}");
+    let foreign: Vec<_> = browser.requests().into_iter().filter(|asked| !asked.starts_with(&url)).collect();
+    assert!(foreign.is_empty(), "{foreign:?}");
 
     // The page follows the run without being reloaded.
     let (_folder, run) = copy();

@@ -131,8 +131,8 @@ class Render {
   }
 
   template <class Pixel>
-  static std::vector<raster::Pictures<Pixel>> places(std::vector<Planes>& of) {
-    std::vector<raster::Pictures<Pixel>> out;
+  static std::vector<raster::RenderOutput<Pixel>> places(std::vector<Planes>& of) {
+    std::vector<raster::RenderOutput<Pixel>> out;
     for (Planes& p : of) out.push_back({p.rgb.data(), p.alpha.data(), p.depth.data()});
     return out;
   }

@@ -93,8 +93,8 @@ Left by_cpu(const Scene<float>& scene) {
     out.push_back({left.means.data() + 3 * count * b, left.scales.data() + 3 * count * b, left.quaternions.data() + 4 * count * b,
                    left.opacities.data() + count * b, left.sh.data() + size_t(scene.bases) * 3 * count * b});
   }
-  std::vector<raster::Pictures<float>> drawn;
-  std::vector<raster::Pictures<const float>> pictures, gradients;
+  std::vector<raster::RenderOutput<float>> drawn;
+  std::vector<raster::RenderOutput<const float>> pictures, gradients;
   for (size_t k = 0; k < views; ++k) {
     drawn.push_back({left.rgb.data() + 3 * pixels * k, left.alpha.data() + pixels * k, left.depth.data() + pixels * k});
     pictures.push_back({drawn[k].rgb, drawn[k].alpha, drawn[k].depth});

@@ -27,9 +27,9 @@ struct KeptFrame : Kept {
 
 // Returns the images, one item per view. `Pixel` is T or const T.
 template <class Pixel>
-std::vector<raster::Pictures<Pixel>> pictures_of(const Pictures& p) {
+std::vector<raster::RenderOutput<Pixel>> pictures_of(const RenderOutput& p) {
   using T = std::remove_const_t<Pixel>;
-  std::vector<raster::Pictures<Pixel>> pictures;
+  std::vector<raster::RenderOutput<Pixel>> pictures;
   const int64_t views = p.rgb.size(0) * p.rgb.size(1), pixels = p.rgb.size(3) * p.rgb.size(4);
   for (int64_t k = 0; k < views; ++k)
     pictures.push_back({p.rgb.data_ptr<T>() + k * 3 * pixels, p.alpha.data_ptr<T>() + k * pixels,
@@ -38,7 +38,7 @@ std::vector<raster::Pictures<Pixel>> pictures_of(const Pictures& p) {
 }
 
 template <class T>
-std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, Pictures& out, raster::StageTimes& times) {
+std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, raster::StageTimes& times) {
   const auto options = in.gaussians.means.options();
   out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
@@ -49,16 +49,16 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, Pictures& out, raster::
 
 }  // namespace
 
-Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
   return by_type(in, [&](auto number) {
     using T = decltype(number);
-    Pictures out;
+    RenderOutput out;
     kept = std::make_unique<KeptFrame<T>>(draw<T>(in, out, last_times));
     return out;
   });
 }
 
-Gradients splat_backward(const Inputs& in, const Pictures& drawn, const Pictures& gradients, const Kept& kept,
+Gradients splat_backward(const Inputs& in, const RenderOutput& drawn, const RenderOutput& gradients, const Kept& kept,
                          bool of_cameras) {
   return by_type(in, [&](auto number) {
     using T = decltype(number);
@@ -85,7 +85,7 @@ PairCounts count_pairs(const SplatArguments& of) {
   const Arguments a = borrowed(of);
   a.check();
   TORCH_CHECK(a.means.scalar_type() != at::kDouble, "pairs are counted as float32 sees them");
-  Pictures pictures;
+  RenderOutput pictures;
   raster::StageTimes times;
   const raster::PairCounts counts = cpu::draw<float>(a.on(at::kCPU), pictures, times)->count();
   return {counts.tile_entries, counts.evaluated, counts.contributing};

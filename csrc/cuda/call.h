@@ -16,7 +16,7 @@ using raster::GaussianGradients;
 using raster::Gaussians;
 using raster::Grid;
 using raster::Lens;
-using raster::Pictures;
+using raster::RenderOutput;
 using raster::Splat;
 using raster::SplatGradient;
 using raster::TileEntry;
@@ -74,9 +74,9 @@ __global__ void gs_scan(Counts first, Counts second, uint64_t* total);
 __global__ void gs_sort_lists(Call, const uint32_t* tile_start, uint64_t* keys, uint64_t* spare, const TileEntry* pairs,
                               TileEntry* entries);
 __global__ void gs_blend(Call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
-                         Pictures<float> out);
+                         RenderOutput<float> out);
 __global__ void gs_blend_backward(Call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
-                                  Pictures<const float> pictures, Pictures<const float> gradients,
+                                  RenderOutput<const float> pictures, RenderOutput<const float> gradients,
                                   SplatGradient<float>* records);
 __global__ void gs_project_backward(Call, Gaussians<float>, const Lens<float>* lenses, const Splat<float>* splats,
                                     const SplatGradient<float>* records, const uint32_t* first,

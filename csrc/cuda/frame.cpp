@@ -61,7 +61,7 @@ void Seen::backward(const Device& device, const Arguments& of, const SplatGradie
               warps, as<CameraGradient<float>>(asked), w2c);
 }
 
-Frame::Frame(const Device& device, const Arguments& of, const Pictures<float>& out) : seen_(device, of, true), count_(0) {
+Frame::Frame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : seen_(device, of, true), count_(0) {
   const Call& call = seen_.call;
   const int64_t splats = int64_t(call.views) * call.count, places = places_of_tiles(call);
   const int64_t groups = parts(call.count, kWarp) * int64_t(call.views);
@@ -98,8 +98,8 @@ Frame::Frame(const Device& device, const Arguments& of, const Pictures<float>& o
             as<uint32_t>(tile_start_), out);
 }
 
-void Frame::backward(const Device& device, const Arguments& of, const Pictures<const float>& pictures,
-                     const Pictures<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const {
+void Frame::backward(const Device& device, const Arguments& of, const RenderOutput<const float>& pictures,
+                     const RenderOutput<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const {
   const Call& call = seen_.call;
   const Memory records = room_for<SplatGradient<float>>(device, count_);
   GS_LAUNCH(device, gs_blend_backward, (Blocks{call.grid.tiles(), call.views}), kTileThreads, call,

@@ -35,11 +35,11 @@ struct Seen {
 class Frame {
  public:
   // Renders every view.
-  Frame(const Device&, const Arguments&, const Pictures<float>& out);
+  Frame(const Device&, const Arguments&, const RenderOutput<float>& out);
 
   // Computes gradients as Seen::backward() does. All arguments except `gradients`, `out` and `w2c` must be those of the forward pass.
-  void backward(const Device&, const Arguments&, const Pictures<const float>& pictures,
-                const Pictures<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const;
+  void backward(const Device&, const Arguments&, const RenderOutput<const float>& pictures,
+                const RenderOutput<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const;
 
  private:
   Seen seen_;

@@ -31,7 +31,7 @@ Arguments arguments_of(const Inputs& in) {
 }
 
 template <class Number>
-Pictures<Number> places_of(const globalsplat::Pictures& p) {
+RenderOutput<Number> places_of(const globalsplat::RenderOutput& p) {
   return {data<Number>(p.rgb), data<Number>(p.alpha), data<Number>(p.depth)};
 }
 
@@ -51,23 +51,23 @@ GaussianGradients<float> places_of(const globalsplat::Gaussians& g) {
 float* place_of_cameras(const Gradients& g) { return g.w2c.defined() ? data<float>(g.w2c) : nullptr; }
 
 struct KeptFrame : Kept {
-  KeptFrame(const Device& device, const Arguments& of, const Pictures<float>& out) : frame(device, of, out) {}
+  KeptFrame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : frame(device, of, out) {}
   Frame frame;
 };
 
 template <class On>
-globalsplat::Pictures splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+globalsplat::RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
   const On device(in.gaussians.means);
   const auto options = in.gaussians.means.options();
   const Tensor rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
-  const globalsplat::Pictures out{rgb, alpha, at::empty_like(alpha)};
+  const globalsplat::RenderOutput out{rgb, alpha, at::empty_like(alpha)};
   kept = std::make_unique<KeptFrame>(device, arguments_of(in), places_of<float>(out));
   return out;
 }
 
 template <class On>
-Gradients splat_backward(const Inputs& in, const globalsplat::Pictures& drawn, const globalsplat::Pictures& gradients,
+Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& drawn, const globalsplat::RenderOutput& gradients,
                          const Kept& kept, bool of_cameras) {
   const On device(in.gaussians.means);
   const Gradients out = empty_gradients(in, of_cameras);

@@ -58,7 +58,7 @@ struct Pixel {
 
 // Returns the images of one view.
 template <class Number>
-inline Pictures<Number> pictures_of(const Pictures<Number>& all, const Grid& grid, int64_t view) {
+inline RenderOutput<Number> pictures_of(const RenderOutput<Number>& all, const Grid& grid, int64_t view) {
   const int64_t plane = int64_t(grid.width) * grid.height;
   return {all.rgb + 3 * plane * view, all.alpha + plane * view, all.depth + plane * view};
 }
@@ -92,7 +92,7 @@ extern "C" {
 // Blends tiles. Warps are independent: each loads the items of a batch that touch its pixels.
 __global__ void GS_FORWARD_BOUNDS
     gs_blend(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
-             Pictures<float> pictures) {
+             RenderOutput<float> pictures) {
   struct Shared {
     Splat<float> batch[kBatch + 1];
     Order order;
@@ -119,7 +119,7 @@ __global__ void GS_FORWARD_BOUNDS
     __syncwarp();
   }
   if (!pixel.inside) return;
-  const Pictures<float> out = pictures_of(pictures, call.grid, blockIdx.y);
+  const RenderOutput<float> out = pictures_of(pictures, call.grid, blockIdx.y);
   const int64_t plane = int64_t(call.grid.width) * call.grid.height;
   out.rgb[pixel.place] = sums.red;
   out.rgb[pixel.place + plane] = sums.green;
@@ -132,7 +132,7 @@ __global__ void GS_FORWARD_BOUNDS
 // gradients with respect to them. A splat's sums are added over each block's pixels, then over blocks, always in the same order.
 __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
     gs_blend_backward(Call call, const Splat<float>* splats, const TileEntry* entries, const uint32_t* tile_start,
-                      Pictures<const float> pictures, Pictures<const float> gradients, SplatGradient<float>* records) {
+                      RenderOutput<const float> pictures, RenderOutput<const float> gradients, SplatGradient<float>* records) {
   constexpr int kNumbers = raster::kSplatGradientNumbers;
   // Each thread handles two values of a splat, and of a sum.
   constexpr int kParts = int(sizeof(Splat<float>) / sizeof(Two)), kSums = kNumbers / 2;
@@ -150,8 +150,8 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   const Pixel pixel(call.grid);
   raster::lane::PixelGradients<float> state{};
   if (pixel.inside) {
-    const Pictures<const float> drawn = pictures_of(pictures, call.grid, blockIdx.y);
-    const Pictures<const float> asked = pictures_of(gradients, call.grid, blockIdx.y);
+    const RenderOutput<const float> drawn = pictures_of(pictures, call.grid, blockIdx.y);
+    const RenderOutput<const float> asked = pictures_of(gradients, call.grid, blockIdx.y);
     const int64_t at = pixel.place;
     const float colour[3] = {drawn.rgb[at], drawn.rgb[at + plane], drawn.rgb[at + 2 * plane]};
     const float g_colour[3] = {asked.rgb[at], asked.rgb[at + plane], asked.rgb[at + 2 * plane]};

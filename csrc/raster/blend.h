@@ -117,7 +117,7 @@ class Approach {
 // Blends a tile. The list is processed in parts whose splats fit into the first-level cache. Each vector of pixels goes through the splats
 // that touch its block with all sums in registers.
 template <class T>
-void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
+void blend_tile(const TileJob<T>& job, const RenderOutput<T>& out) {
   using V = Vector<T>;
   constexpr int part = 128;
   uint32_t splats[part], blocks_of[part], list[part + kListRoom];
@@ -182,8 +182,8 @@ void blend_tile(const TileJob<T>& job, const Pictures<T>& out) {
 }
 
 template <class T>
-GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const Pictures<const T>& pictures,
-                              const Pictures<const T>& gradients, PixelGradients<T>* out) {
+GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const RenderOutput<const T>& pictures,
+                              const RenderOutput<const T>& gradients, PixelGradients<T>* out) {
   using V = Vector<T>;
   V transmittance[kVectors<T>], colour[3][kVectors<T>], g_colour[3][kVectors<T>];
   V alpha[kVectors<T>], g_alpha[kVectors<T>], depth[kVectors<T>], g_depth[kVectors<T>];
@@ -214,8 +214,8 @@ GS_INLINE void pass_blocks(const Splat<T>& s, uint32_t blocks, const Evaluated<T
 // Computes gradients of a tile's splats and writes one record per entry. `pictures` are outputs of the forward pass, and `gradients` the
 // loss's gradients with respect to them. Here the outer loop is over splats, so that a splat's ten sums over the tile stay in registers.
 template <class T>
-void blend_tile_backward(const TileJob<T>& job, const Pictures<const T>& pictures,
-                         const Pictures<const T>& gradients, SplatGradient<T>* records) {
+void blend_tile_backward(const TileJob<T>& job, const RenderOutput<const T>& pictures,
+                         const RenderOutput<const T>& gradients, SplatGradient<T>* records) {
   using V = Vector<T>;
   PixelGradients<T> pixels[kBlocks][kVectors<T>];
   V x[4][kVectors<T>], y[4][kVectors<T>];  // pixel centres of the blocks of each column and row

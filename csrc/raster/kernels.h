@@ -13,8 +13,8 @@ struct KernelsOf {
                   Splat<T>* const* splats);
   int64_t (*cover)(const Splat<T>* splats, int64_t begin, int64_t end, const Grid&, TilePair* pairs, int64_t capacity,
                    int64_t& used, uint32_t* first);
-  void (*blend)(const TileJob<T>&, const Pictures<T>&);
-  void (*blend_backward)(const TileJob<T>&, const Pictures<const T>& pictures, const Pictures<const T>& gradients,
+  void (*blend)(const TileJob<T>&, const RenderOutput<T>&);
+  void (*blend_backward)(const TileJob<T>&, const RenderOutput<const T>& pictures, const RenderOutput<const T>& gradients,
                          SplatGradient<T>* records);
   PairCounts (*count)(const TileJob<T>&);
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,

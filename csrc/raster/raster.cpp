@@ -202,7 +202,7 @@ int64_t Frame<T>::chunks() const {
 
 template <class T>
 std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
-                                         const Settings& settings, const std::vector<Pictures<T>>& out,
+                                         const Settings& settings, const std::vector<RenderOutput<T>>& out,
                                          StageTimes& times) {
   Stopwatch watch;
   std::unique_ptr<Frame> frame(new Frame(views, scenes, settings));
@@ -224,8 +224,8 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
 }
 
 template <class T>
-void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
-                        const std::vector<Pictures<const T>>& gradients,
+void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vector<RenderOutput<const T>>& pictures,
+                        const std::vector<RenderOutput<const T>>& gradients,
                         const std::vector<GaussianGradients<T>>& out, CameraGradient<T>* cameras,
                         StageTimes& times) const {
   Stopwatch watch;

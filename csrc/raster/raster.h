@@ -35,14 +35,14 @@ class Frame {
   // Renders every view into its images: `out[k]` for `views[k]`. All scenes must have the same number of Gaussians, and a scene's views
   // must be consecutive.
   static std::unique_ptr<Frame> draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
-                                     const Settings& settings, const std::vector<Pictures<T>>& out,
+                                     const Settings& settings, const std::vector<RenderOutput<T>>& out,
                                      StageTimes& times);
 
   // Computes every gradient of every Gaussian, and of every view's camera if `cameras` isn't null. `scenes` and `pictures` are the
   // unchanged inputs and outputs of draw(). Sums run in order over a scene's cameras, a camera's tiles and, by tasks, its Gaussians, so
   // results are bit-identical for any number of threads.
-  void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<Pictures<const T>>& pictures,
-                const std::vector<Pictures<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
+  void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<RenderOutput<const T>>& pictures,
+                const std::vector<RenderOutput<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
                 CameraGradient<T>* cameras, StageTimes& times) const;
 
   // Counts the pairs that blending all views processes, for benchmarks.

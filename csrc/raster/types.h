@@ -130,7 +130,7 @@ struct SplatRecords {
 
 // Images of one camera, planar: rgb is three planes of width × height. `Pixel` is T or const T.
 template <class Pixel>
-struct Pictures {
+struct RenderOutput {
   Pixel* rgb;
   Pixel* alpha;
   Pixel* depth;

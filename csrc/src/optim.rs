@@ -53,7 +53,7 @@ mod ffi {
         ///
         /// # Safety
         /// `tensors` must be addresses of live tensors.
-        unsafe fn forget_gradients(tensors: &[usize]) -> Result<()>;
+        unsafe fn zero_grad(tensors: &[usize]) -> Result<()>;
 
         /// Runs a step of AdamW; see `csrc/optim.h`.
         ///

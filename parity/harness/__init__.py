@@ -1,1 +1,1 @@
-"""Holds the Rust program against the torch reference: the same numbers in, the same numbers and gradients out."""
+"""Compares the Rust program with the PyTorch reference: equal inputs must give equal outputs and gradients."""

@@ -1,9 +1,9 @@
-"""Where the gradient of a network of convolutions is a step function of its picture: a number before a ReLU changes its
-sign, another one becomes the largest of a pooling window, or a feature the larger of two that are compared. Within
-rounding either side is right.
+"""Close calls: discontinuities of a convolutional network's gradient that rounding can decide either way.
 
-A close call is judged by what the reference says when that number is put on the other side. An answer has to agree,
-within the tolerance, with what the reference says for some choice of sides.
+The gradient is a step function of the image where a value before a ReLU changes its sign, where another value becomes
+the maximum of a pooling window, or where the sign of the difference of two compared features changes. Within rounding,
+either side is correct. The result of the program must agree, within the tolerance, with the reference for some choice
+of sides; for the other side of a close call, the reference is computed with that value moved across the threshold.
 """
 
 from dataclasses import dataclass
@@ -15,25 +15,26 @@ from torch.overrides import TorchFunctionMode
 
 from .compare import norm
 
-# Of a layer's standard deviation: twice what rounding on a CPU moves numbers by, and what a GPU's other algorithms may.
+# Margins relative to a layer's standard deviation: twice the effect of rounding on a CPU, and the possible effect of
+# the other algorithms on a GPU.
 ON_CPU = 5e-6
 ON_GPU = 1e-4
-SWEEPS = 3  # over all close calls, to find the sides on which an answer has them
+SWEEPS = 3  # passes over all close calls to find the sides that the program chose
 
 
 @dataclass(frozen=True)
 class Call:
-    """`amount`, added to number `index` (flat) of what the twin's convolution number `convolution` puts out, turns a
-    decision."""
+    """A close call: adding `amount` to element `index` (flat) of the output of the reference's convolution number
+    `convolution` reverses a decision."""
 
-    share: float  # how close it is, of the layer's standard deviation
+    share: float  # distance from the threshold, relative to the layer's standard deviation
     convolution: int
     index: int
     amount: float
 
 
 class Turned(TorchFunctionMode):
-    """The twin computes within this as if the numbers of `calls` lay on their other sides."""
+    """Context in which the reference computes with the values of `calls` moved across their thresholds."""
 
     def __init__(self, calls):
         super().__init__()
@@ -53,12 +54,12 @@ class Turned(TorchFunctionMode):
 
 
 def before_relu(x):
-    """-> distances, flat indices, amounts."""
+    """Returns the decisions of a ReLU on x: distances, flat indices, amounts."""
     return x.abs().flatten(), torch.arange(x.numel()), -2.0 * x.flatten()
 
 
 def in_windows(x, size):
-    """Of pooling windows that hold two numbers, between the largest."""
+    """Returns the decisions of max pooling between the two largest values of each window with two positive values."""
 
     def windows(t):
         return t.unfold(2, size, 2).unfold(3, size, 2).flatten(4)
@@ -72,15 +73,20 @@ def in_windows(x, size):
 
 
 def between_features(x, other):
-    """Where not both are zero. A feature of zero lets no gradient through, on whichever side it is."""
+    """Returns the decisions on the sign of the difference of two features that are not both zero.
+
+    The amount is 0 for a feature of zero, because no gradient passes through it on either side.
+    """
     difference = (torch.relu(x) - torch.relu(other)).flatten()
     index = difference.nonzero().squeeze(1)
     return difference[index].abs(), index, torch.where(x.flatten()[index] > 0.0, -2.0 * difference[index], 0.0)
 
 
 def calls_within(margin, decisions):
-    """decisions: (convolution, x, (distances, indices, amounts)). -> the calls closer than `margin`, of each number the
-    closest."""
+    """Returns the calls closer than `margin`, at most the closest one per element, sorted by distance.
+
+    `decisions` are (convolution, x, (distances, indices, amounts)).
+    """
     found = {}
     for convolution, x, (distances, indices, amounts) in decisions:
         shares = distances / x.std()
@@ -92,7 +98,7 @@ def calls_within(margin, decisions):
 
 
 def closest(decisions):
-    """The share of the closest call of all, turned or not."""
+    """Returns the distance of the closest decision, relative to its layer's standard deviation."""
     shares = ((distances / x.std()).min().item() for _, x, (distances, *_) in decisions if len(distances))
     return min(shares, default=np.inf)
 
@@ -102,7 +108,7 @@ def doubles(arrays):
 
 
 def decisions_of_lpips(network, params, pictures):
-    """`pictures` [B, 3, H, W] in the order in which the twin looks at them."""
+    """Yields the decisions of an LPIPS network on `pictures` [B, 3, H, W], in the order in which the reference runs."""
     params, pooled = doubles(params), [row[-1][0] for row in lpips.NETWORKS[network][:-1]]
     convolution = 0
     for picture in pictures:
@@ -114,8 +120,11 @@ def decisions_of_lpips(network, params, pictures):
 
 
 def decisions_of_vgg19(params, pairs):
-    """`pairs` of a picture and what it is compared with, which takes no gradient, in the order in which the twin looks
-    at them."""
+    """Yields the decisions of VGG-19 on `pairs` of an image and its ground truth, in the order in which the reference
+    runs.
+
+    The ground truth takes no gradient.
+    """
     params, convolution = doubles(params), 0
     for pair in pairs:
         pictures = (torch.tensor(t).double().flatten(0, -4) for t in pair)
@@ -129,8 +138,11 @@ def decisions_of_vgg19(params, pairs):
 
 
 def settled(answer, expected, calls, turned):
-    """`turned(calls)` gives the reference's gradients with these calls on their other sides. -> what is expected of an
-    answer that has decided some of `calls` otherwise, and how many it has: those that bring the two together."""
+    """Finds which of `calls` the program decided differently: those that bring the reference closest to its gradients.
+
+    `turned(calls)` returns the reference's gradients with these calls on their other sides. Returns the expected
+    tensors for the chosen sides, and the number of calls that differ.
+    """
     gradients = [name for name in expected if name.startswith("grad.") and name in answer]
     lengths = {name: norm(expected[name]) or 1.0 for name in gradients}
 

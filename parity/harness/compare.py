@@ -1,11 +1,12 @@
-"""Judges an answer, tensor by tensor."""
+"""Comparison of the program's result with the reference, tensor by tensor."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# A gradient whose norm is this share of the largest one in the case, or that is zero in exact arithmetic because
-# softmax ignores a constant, is rounding alone: there is no direction to compare. It has to be small in that measure.
+# A gradient is only rounding error, without a direction to compare, if its norm relative to the largest one of the case
+# is at most NOTHING, or if it is zero in exact arithmetic because softmax is invariant to a constant. Then its norm
+# relative to the largest one must be at most ZERO_TOLERANCE.
 NOTHING = 1e-12
 ZERO_IN_EXACT_ARITHMETIC = ("mem_k.bias",)
 ZERO_TOLERANCE = 1e-5
@@ -13,15 +14,15 @@ ZERO_TOLERANCE = 1e-5
 
 @dataclass
 class Finding:
-    """How far one tensor of an answer is from the reference's."""
+    """Difference of one tensor of a result from the reference."""
 
     tensor: str
     shape: tuple
     measure: str  # "relative", "absolute", "zero" or "exact"
     tolerance: float
-    error: float = np.inf  # in that measure
-    largest: float = np.inf  # absolute difference
-    relative: float | None = None  # L2
+    error: float = np.inf  # in units of `measure`
+    largest: float = np.inf  # largest absolute difference
+    relative: float | None = None  # relative L2 error
     problem: str = ""
 
     @property
@@ -30,7 +31,7 @@ class Finding:
 
     @property
     def share(self):
-        """Of the tolerance that is used up."""
+        """Returns the error as a fraction of the tolerance."""
         if self.problem or self.tolerance == 0.0:
             return 0.0 if self.passed else np.inf
         return self.error / self.tolerance
@@ -41,12 +42,12 @@ def norm(array):
 
 
 def gradient_scale(expected):
-    """The largest norm among the gradients: what "zero" is measured by."""
+    """Returns the largest norm of the expected gradients, relative to which "zero" is measured."""
     return max((norm(value) for name, value in expected.items() if name.startswith("grad.")), default=0.0)
 
 
 def judge(name, ours, expected, tolerance, scale, doubtful=None):
-    """`expected` is the reference's; `doubtful` [B, C, H, W] the pixels where pictures can't be compared."""
+    """Compares a tensor with the reference's, `expected`. Pixels in the mask `doubtful` [B, C, H, W] are ignored."""
     is_gradient = name.startswith("grad.")
     allowed = tolerance.gradients if is_gradient else tolerance.outputs
     finding = Finding(name, expected.shape, "relative", allowed)
@@ -64,7 +65,7 @@ def judge(name, ours, expected, tolerance, scale, doubtful=None):
     ours, expected = np.asarray(ours, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     difference = ours - expected
     if doubtful is not None and not is_gradient:
-        # [B, C, H, W] against [B, C, 3, H, W] or itself
+        # broadcast [B, C, H, W] to [B, C, 3, H, W] if needed
         sure = ~doubtful[:, :, None] if difference.ndim == 5 else ~doubtful
         difference, expected = difference * sure, expected * sure
     length = norm(expected)
@@ -89,7 +90,7 @@ def judge(name, ours, expected, tolerance, scale, doubtful=None):
 
 
 def compare(answer, expected, tolerance, doubtful=None):
-    """-> findings, the failures among them included. An answer with tensors that nobody asked for fails, too."""
+    """Returns a finding for every tensor. A result with unexpected tensors fails, too."""
     if "error" in answer:
         return [Finding("answer", (), "exact", 0.0, problem=answer["error"])]
     scale = gradient_scale(expected)

@@ -1,6 +1,6 @@
-"""Which cases hold which of the program's modules."""
+"""Cases that cover each of the program's modules."""
 
-FOLDERS = ("src/model", "src/loss")  # every file of these has a case, or a reason
+FOLDERS = ("src/model", "src/loss")  # every file in these folders must have a case, or a reason for having none
 
 CASES_OF = {
     "src/model/mod.rs": ["model", "model_16k"],
@@ -49,7 +49,7 @@ EXCEPTED = {
     "src/model/config.rs": "a model's numbers; every case of a module reads them",
     "src/model/denormals.rs": "how the processor takes numbers that no result depends on, which its own test looks at",
     "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
-    "src/model/leaves.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
+    "src/model/autograd.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
     "src/model/memory.rs": "what encoder.rs and stream.rs read, and held with them; view by view by its own test",
     "src/model/parts.rs": "tells what is done, and does nothing",
     "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
@@ -61,7 +61,7 @@ EXCEPTED = {
 
 
 def gaps(repository):
-    """What the two maps say wrongly about the files on disk, as sentences."""
+    """Returns the errors of the two maps with respect to the files on disk, as sentences."""
     found = []
     for folder in FOLDERS:
         for path in sorted((repository / folder).rglob("*.rs")):

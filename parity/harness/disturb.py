@@ -1,4 +1,4 @@
-"""Wrong answers made of right ones: each has to be judged a failure, or the comparison is blind to such a mistake."""
+"""Perturbations of correct results. The comparison must reject each of them, or it would miss such an error."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -7,15 +7,15 @@ import numpy as np
 from .compare import gradient_scale, judge, norm
 
 FACTOR = 1.001
-# The slice that is dropped is the least one with at least this share of the tensor's norm.
+# The dropped slice is the smallest one whose norm is at least this fraction of the tensor's norm.
 SMALLEST_SHARE = 1e-2
-# Where the tolerance itself is wide, mistakes are this many times it.
+# Errors are at least this multiple of the tolerance, for wide tolerances.
 BEYOND = 2.0
 THREADS = 2
 
 
 def disturbances(array, tolerance, is_zero, scale):
-    """Yields (what was done, the tensor after it). A tensor that should be zero is measured by `scale`."""
+    """Yields (description, perturbed tensor). For a tensor that should be zero, the error is relative to `scale`."""
     yield "left out", None
     if array.size == 0:
         return
@@ -34,7 +34,7 @@ def disturbances(array, tolerance, is_zero, scale):
 
 
 def without_a_slice(array, share):
-    """A term dropped, along each axis in turn."""
+    """Yields the tensor with a slice set to zero, for each axis in turn."""
     for axis in range(array.ndim):
         if array.shape[axis] == 1:
             continue
@@ -48,7 +48,7 @@ def without_a_slice(array, share):
 
 
 def transposed(array, share):
-    """Two axes of one length swapped, the last such pair."""
+    """Yields the tensor with two axes of equal length swapped: the last such pair, if the change is large enough."""
     for second in reversed(range(array.ndim)):
         for first in reversed(range(second)):
             if array.shape[first] == array.shape[second] > 1:
@@ -59,14 +59,14 @@ def transposed(array, share):
 
 
 def undetected(answer, expected, tolerance, doubtful=None):
-    """`answer` passes. -> (number of disturbed answers, those that pass all the same as "tensor: what was done").
+    """Perturbs a result that passes. Returns the number of perturbations, and those that still pass, as descriptions.
 
-    One tensor is disturbed at a time, so it alone decides.
+    One tensor is perturbed at a time, so only this tensor is compared.
     """
     scale = gradient_scale(expected)
 
     def disturb(name):
-        # judge() computes in float64: converted once for all wrong answers.
+        # judge() computes in float64: convert once for all perturbations.
         value = expected[name] if expected[name].dtype.kind == "i" else np.asarray(expected[name], dtype=np.float64)
         finding = judge(name, answer[name], value, tolerance, scale, doubtful)
         is_zero = finding.measure == "zero" or norm(value) == 0.0
@@ -77,7 +77,7 @@ def undetected(answer, expected, tolerance, doubtful=None):
                 blind.append(f"{name}: {what}")
         return tried, blind
 
-    # Of a large model it is most of the work, and numpy lets other threads run beside it.
+    # For a large model this is most of the work, and numpy releases the GIL.
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(disturb, expected))
     return sum(tried for tried, _ in found), [what for _, blind in found for what in blind]

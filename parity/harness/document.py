@@ -1,5 +1,7 @@
-"""docs/parity.md: what was compared, how, and what came of it, for those who don't run it. The same results make the
-same document, so it holds no times, no dates and no paths of a machine."""
+"""Generation of docs/parity.md, the report of the comparison for readers who don't run it.
+
+The document is reproducible from the results, so it has no times, dates or paths of a machine.
+"""
 
 import platform
 import textwrap
@@ -10,7 +12,7 @@ from .table import by_case, doubtful, failures, is_gradient, is_output, turned, 
 from .tolerance import FLOAT32, FLOAT64
 
 WIDTH = 120
-# What an error is where it isn't relative.
+# Descriptions of the error measures other than the relative error.
 MEASURES = {
     "absolute": "the largest difference of a value, as a share of the largest value where that is below 1",
     "zero": "the norm of what is zero in exact arithmetic, as a share of the case's largest gradient",
@@ -19,7 +21,7 @@ MEASURES = {
 
 
 def processor():
-    """As the program names it in its own reports."""
+    """Returns the name of the processor, as the program's own reports have it."""
     information = Path("/proc/cpuinfo")
     for line in information.read_text().splitlines() if information.exists() else ():
         if line.startswith("model name") and ":" in line:
@@ -28,7 +30,7 @@ def processor():
 
 
 def document(results, command, device):
-    """Markdown. `command` is the one that writes it."""
+    """Returns the Markdown document. `command` is the command line that writes it."""
     sections = [
         ["# What the program is held to", *about(results, command, device)],
         ["## Cases", *cases(results)],
@@ -63,7 +65,7 @@ def about(results, command, device):
 
 
 def cases(results):
-    """A line for each: the worst error of its outputs and of its gradients, with what is allowed."""
+    """Yields the table of cases: the worst errors of outputs and of gradients, with their tolerances."""
     lines, measures = ["| case | draws | outputs | gradients |", "|---|---|---|---|"], set()
     for case, found in by_case(results).items():
         cells = []
@@ -89,7 +91,7 @@ def cell(finding):
 
 
 def whys(results):
-    """Why some cases have tolerances of their own."""
+    """Returns the reasons of cases that have their own tolerances."""
     cases_of = {}
     for result in results:
         if result.tolerance.why:

@@ -1,4 +1,4 @@
-"""Random numbers with the sizes and magnitudes of the model."""
+"""Random parameters and inputs with shapes and magnitudes like those of the model."""
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ MAIN_16K = {
 
 
 def whole(rng, low, high):
-    """A whole number from low to high, both possible."""
+    """Returns a random integer from low to high, inclusive."""
     return int(rng.integers(low, high + 1))
 
 
@@ -38,7 +38,7 @@ def uniform(rng, low, high, *shape):
 
 
 def model_config(rng, **fixed):
-    """A small model, all of its numbers different from each other where they can be."""
+    """Returns the configuration of a random small model, with sizes that mostly differ from each other."""
     heads = whole(rng, 1, 4)
     config = {
         "patch_size": whole(rng, 2, 5),
@@ -61,7 +61,7 @@ def model_config(rng, **fixed):
 
 
 def shapes(config):
-    """Name -> shape of everything that a model trains."""
+    """Returns the shapes of all trainable parameters of a model by name."""
     d, token = config["width"], config["ray_width"] + config["rgb_width"]
     k, bases, pixels = config["candidates"], (config["sh_degree"] + 1) ** 2, config["patch_size"] ** 2
     found = {}
@@ -132,11 +132,11 @@ def shapes(config):
 
 
 def parameters(rng, config, prefix=""):
-    """Those whose name begins with `prefix`, without it.
+    """Returns random parameters whose name begins with `prefix`, by name without the prefix.
 
-    Weights have 0.45 / sqrt(inputs), at 512 inputs the 0.02 that training starts from; LayerScales 0.1 to 1, far above
-    their start, so that every path matters; nothing is exactly 0 or 1. The decoder's biases put some of the candidates
-    beyond each clamp.
+    Weights have a standard deviation of 0.45 / sqrt(inputs), which for 512 inputs is the initial 0.02 of training.
+    LayerScales are from 0.1 to 1, far above their initial value, so that every path matters. No value is exactly 0 or
+    1. The decoder's biases put some of the candidates beyond each clamp.
     """
     drawn = {}
     for name, shape in shapes(config).items():
@@ -164,7 +164,7 @@ def parameters(rng, config, prefix=""):
 
 
 def lpips_parameters(rng, network):
-    """Of such sizes that features neither die out nor grow from layer to layer."""
+    """Returns random parameters of an LPIPS network, scaled so that features neither vanish nor grow between layers."""
     drawn, inputs, compared = {}, 3, COMPARED[network]
     for name, outputs, kernel, _, _ in (layer for row in NETWORKS[network] for layer in row):
         drawn[f"{name}.weight"] = normal(
@@ -178,7 +178,7 @@ def lpips_parameters(rng, network):
 
 
 def vgg19_parameters(rng):
-    """Of such sizes that features stay as large as the input, 0 to 255."""
+    """Returns random parameters of VGG-19, scaled so that features stay as large as the input, 0 to 255."""
     drawn, inputs = {}, 3
     for places, outputs in BLOCKS:
         for place in places:
@@ -189,11 +189,11 @@ def vgg19_parameters(rng):
     return drawn
 
 
-# ---- cameras and pictures --------------------------------------------------------------------------------------------
+# ---- cameras and images ----------------------------------------------------------------------------------------------
 
 
 def poses(rng, *batch, turn=0.15, move=0.4):
-    """Camera-to-world [*batch, 4, 4], float64: near the origin, looking roughly along z."""
+    """Returns random camera-to-world matrices [*batch, 4, 4], float64, near the origin and looking roughly along z."""
     quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + turn * rng.standard_normal((*batch, 4))
     pose = np.zeros((*batch, 4, 4))
     pose[..., :3, :3] = matrix_from_quaternion(torch.tensor(quaternion)).numpy()
@@ -203,7 +203,10 @@ def poses(rng, *batch, turn=0.15, move=0.4):
 
 
 def ring(count, tilt):
-    """Camera-to-world [count, 4, 4], float64: evenly around the origin, 1 away, looking at it from a height."""
+    """Returns camera-to-world matrices [count, 4, 4], float64, of cameras that look at the origin.
+
+    They are evenly spaced on a circle at distance 1 from the origin, elevated by the angle `tilt`.
+    """
     pose = np.zeros((count, 4, 4))
     for i, turn in enumerate(2 * np.pi * np.arange(count) / count):
         level, below = np.array([np.sin(turn), 0.0, np.cos(turn)]), np.array([0.0, 1.0, 0.0])
@@ -220,7 +223,7 @@ def inverse(pose):
 
 
 def intrinsics(rng, *batch, height, width):
-    """[*batch, 3, 3] in pixels, float64."""
+    """Returns random intrinsics [*batch, 3, 3] in pixels, float64."""
     k = np.zeros((*batch, 3, 3))
     k[..., 0, 0] = width * rng.uniform(0.7, 1.3, batch)
     k[..., 1, 1] = height * rng.uniform(0.7, 1.3, batch)
@@ -231,7 +234,7 @@ def intrinsics(rng, *batch, height, width):
 
 
 def views(rng, batch, count, height, width):
-    """c2w and intrinsics of B x V cameras, float32."""
+    """Returns random c2w and intrinsics of B x V cameras, float32."""
     return {
         "c2w": poses(rng, batch, count).astype(np.float32),
         "intrinsics": intrinsics(rng, batch, count, height=height, width=width).astype(np.float32),
@@ -239,7 +242,7 @@ def views(rng, batch, count, height, width):
 
 
 def pictures(rng, config, batch, count):
-    """(image height, width) in whole patches, and images with cameras."""
+    """Returns the image size (height, width), a multiple of the patch size, and random images with cameras."""
     patch = config["patch_size"]
     rows = whole(rng, 1, 4)
     height, width = patch * rows, patch * (rows + whole(rng, 1, 3))

@@ -1,4 +1,4 @@
-"""The reference's answer to a request."""
+"""Evaluation of a request by the reference."""
 
 from contextlib import nullcontext
 
@@ -11,10 +11,10 @@ from .exchange import read_request, write_answer
 
 
 class Evaluation:
-    """Outputs on construction; gradients when their cotangents are known.
+    """Evaluation of the reference: computes outputs on construction, and gradients for given cotangents.
 
-    `dtype` is the precision of the arithmetic; what is not a floating-point number stays what it is. Of the twin's close calls, `calls`
-    are decided otherwise.
+    `dtype` is the precision of floating-point tensors; other tensors keep their dtype. The close calls in `calls` are
+    decided the other way.
     """
 
     def __init__(self, request, dtype, calls=()):
@@ -35,11 +35,11 @@ class Evaluation:
         self.leaves |= {f"grad.in.{name}": inputs[name] for name in request.differentiate}
 
     def output_arrays(self):
-        """As out.Y; a loss, which has no dimension, as one number in a row."""
+        """Returns the outputs as arrays named out.Y; a scalar loss has shape [1]."""
         return {f"out.{name}": np.atleast_1d(value.detach().numpy()) for name, value in self.outputs.items()}
 
     def gradient_arrays(self, cotangents):
-        """As grad.param.X and grad.in.X: of the sum of cotangent times output."""
+        """Returns the gradients of the sum of cotangent times output, as arrays named grad.param.X and grad.in.X."""
         total = 0.0
         for name, cotangent in cotangents.items():
             output = self.outputs[name]
@@ -52,7 +52,7 @@ class Evaluation:
 
 
 def answer_files(requests, answers, on_progress=lambda done: None):
-    """The reference in the program's place: answers a folder of requests, in the precision they are written in."""
+    """Answers a folder of requests with the reference instead of the program, in the precision of the requests."""
     for done, path in enumerate(sorted(requests.glob("*.npz")), start=1):
         request = read_request(path)
         kinds = {array.dtype for array in [*request.params.values(), *request.inputs.values()]}

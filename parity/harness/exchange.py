@@ -1,8 +1,8 @@
-"""What goes to the program and comes back: folders of npz files.
+"""Exchange of requests and answers with the program, as folders of npz files.
 
-A request holds `case` (JSON: the module, its config, the inputs to differentiate), param.X, in.X, and cot.Y for every
-output Y that has a gradient. An answer holds out.Y, and with cotangents grad.param.X and grad.in.X, the gradients of
-sum over Y of sum(cot.Y out.Y); or `error`, a text.
+A request contains `case` (JSON: the module, its config, the inputs to differentiate), param.X, in.X, and cot.Y for
+every output Y that has a gradient. An answer contains out.Y and, if there are cotangents, grad.param.X and grad.in.X,
+the gradients of sum over Y of sum(cot.Y out.Y); or `error`, a text.
 """
 
 import json
@@ -17,7 +17,7 @@ import numpy as np
 
 @dataclass
 class Request:
-    """A question to the program. `module` is the name that both sides know."""
+    """A request to the program. `module` is the name of the computation in the program and in the reference."""
 
     module: str
     config: dict
@@ -28,7 +28,7 @@ class Request:
 
 
 class ProgramError(Exception):
-    """The program did not answer."""
+    """The program ended without answers."""
 
 
 def text(words):
@@ -61,7 +61,7 @@ def write_answer(path, arrays):
 
 
 def read_answer(path):
-    """Name -> array. An answer that is an error, or isn't there, has `error` alone."""
+    """Reads an answer as arrays by name. An error or a missing answer is returned as `error` alone."""
     if not path.exists():
         return {"error": "no answer"}
     with np.load(path) as file:
@@ -72,7 +72,10 @@ def read_answer(path):
 
 
 def program(binary, device="cpu"):
-    """An answerer: (folder of requests, folder for answers, called with the number of answers now and then)."""
+    """Returns a function that runs the program on a folder of requests.
+
+    Its arguments are the folder of requests, the folder for answers, and a callback that gets the number of answers.
+    """
 
     def answer(requests, answers, on_progress):
         command = [binary, "parity", "--requests", requests, "--responses", answers, "--device", device]
@@ -90,7 +93,7 @@ def program(binary, device="cpu"):
 
 
 def exchange(requests, answerer, on_progress=lambda done: None):
-    """Yields the answers to `requests`, in their order, after all of them are there."""
+    """Yields the answers to `requests` in order, after all of them are complete."""
     with tempfile.TemporaryDirectory(prefix="globalsplat-parity-") as folder:
         requests_folder, answers_folder = Path(folder, "requests"), Path(folder, "answers")
         requests_folder.mkdir()

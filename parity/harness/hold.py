@@ -1,4 +1,4 @@
-"""Draws cases, has both sides compute them, and compares."""
+"""Draws random inputs of cases, runs the program and the reference on them, and compares the results."""
 
 import time
 import zlib
@@ -16,24 +16,24 @@ from .exchange import Request, exchange
 from .registry import Draw
 from .tolerance import Tolerance
 
-THREADS = 2  # for large cases; handing out small ones to threads costs more than it gains
+THREADS = 2  # for large cases; small ones are faster on one thread
 
 
 @dataclass
 class Result:
-    """One draw of one case, judged."""
+    """The comparison of one draw of one case."""
 
     case: str
     label: str
     seed: int
     tolerance: Tolerance
     findings: list
-    doubtful: int  # pixels left out
-    seconds: float  # of the reference
-    large: bool = False  # the reference computed in float32, too
-    turned: int = 0  # close calls that the program decided otherwise
-    tried: int = 0  # disturbed answers
-    blind: list = field(default_factory=list)  # those that pass
+    doubtful: int  # number of pixels excluded from the comparison
+    seconds: float  # time of the reference
+    large: bool = False  # whether the reference computed in float32, too
+    turned: int = 0  # number of close calls that the program decided differently
+    tried: int = 0  # number of perturbed results
+    blind: list = field(default_factory=list)  # perturbed results that pass
 
     @property
     def passed(self):
@@ -42,7 +42,7 @@ class Result:
 
 @dataclass
 class Question:
-    """A draw with its request and the reference's answer."""
+    """A draw with its request and the reference's result."""
 
     case: str
     drawn: Draw
@@ -51,7 +51,7 @@ class Question:
     seconds: float
 
     def settled(self, answer):
-        """-> what is expected of an answer that has decided close calls otherwise, and how many of them."""
+        """Returns the expected tensors with the program's choice of close calls, and the number that differ."""
 
         def turned(calls):
             evaluation = Evaluation(self.request, torch.float64, calls)
@@ -61,12 +61,12 @@ class Question:
 
 
 def generator(seed, case):
-    """A case draws the same numbers whether or not others are drawn, too."""
+    """Returns the random generator of a case, which doesn't depend on the other cases that are run."""
     return np.random.default_rng([seed, zlib.crc32(case.encode())])
 
 
 def questions(names, seed):
-    """Draws the named cases and computes the reference's answers."""
+    """Yields the draws of the named cases with the reference's results."""
     for name in names:
         rng = generator(seed, name)
         for drawn in CASES[name](rng):
@@ -84,7 +84,7 @@ def questions(names, seed):
 
 
 def cotangents(rng, request, outputs, doubtful):
-    """Standard normal, for every output that is differentiable; none for pixels that can't be compared."""
+    """Returns standard normal cotangents of every differentiable output, 0 at pixels that can't be compared."""
     double = any(value.dtype == np.float64 for value in request.inputs.values())
     drawn = {}
     for name, value in outputs.items():

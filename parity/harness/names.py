@@ -1,6 +1,6 @@
-"""From the program's names to the reference's, which are those of the published configurations and weights."""
+"""Conversion of the program's names to the reference's, which are those of the published configurations and weights."""
 
-# The program's word: the published one.
+# Configuration keys of the program, and the published keys.
 CONFIG_NAMES = {
     "patch_size": "patch_size",
     "latents": "latent_rep_token_amount",
@@ -22,5 +22,5 @@ def reference_config(config):
 
 
 def under(prefix, params):
-    """A request names parameters from its module on, the reference from the model's root."""
+    """Adds a prefix to parameter names, as requests name them relative to a module, and the reference from the root."""
     return {f"{prefix}.{name}": value for name, value in params.items()}

@@ -1,9 +1,9 @@
-"""Where cases and their twins are entered.
+"""Registry of cases and of their reference functions (twins).
 
-A case is a generator of draws: of configuration, parameters and inputs. Its name is the function's; the program is
-asked for `module`, by default the same name.
+A case is a generator of draws, each a configuration, parameters and inputs. Its name is that of the function; the
+program computes `module`, by default the same name.
 
-The twin of a module is the reference under the names of the exchange: twin(config, params, inputs) -> outputs, all
+The twin of a module calls the reference with the names of the exchange: twin(config, params, inputs) -> outputs, all
 torch tensors. `config` has the program's keys, and parameters have the published names relative to the module, as in a
 request.
 """
@@ -16,12 +16,12 @@ import numpy as np
 from .tolerance import FLOAT32, Tolerance
 
 CASES = {}
-TWINS = {}  # by module
+TWINS = {}  # reference functions by module
 
 
 @dataclass
 class Draw:
-    """One question. `label` tells it from the others of its case."""
+    """The random inputs of one comparison. `label` distinguishes it from the other draws of its case."""
 
     label: str
     inputs: dict = field(default_factory=dict)
@@ -30,24 +30,24 @@ class Draw:
     differentiate: tuple = ()
     module: str = ""
     tolerance: Tolerance = FLOAT32
-    on_gpu: Tolerance | None = None  # instead of `tolerance`, where a library's own rounding is larger there
+    on_gpu: Tolerance | None = None  # replaces `tolerance` on a GPU if a library has larger rounding errors there
     gradients: bool = True
-    large: bool = False  # the reference computes in float32, on more than one core
-    doubtful: np.ndarray | None = None  # pixels on a threshold, [B, C, H, W]
-    close_calls: Callable[[], list] = list  # of a network, which a GPU may decide otherwise
+    large: bool = False  # whether the reference computes in float32, on more than one core
+    doubtful: np.ndarray | None = None  # mask of pixels within rounding of a threshold, [B, C, H, W]
+    close_calls: Callable[[], list] = list  # decisions of a network that a GPU may make differently
 
     def __post_init__(self):
         self.gradients = self.gradients and bool(self.params or self.differentiate)
 
 
 def case(function):
-    """Enters the draws of the case that is called as the function."""
+    """Registers a function as the case of its name (decorator)."""
     enter(CASES, function.__name__, function)
     return function
 
 
 def twin(module):
-    """Enters the reference's answer to `module`, which several cases may ask for."""
+    """Registers a function as the reference of `module`, which several cases may use (decorator)."""
 
     def register(function):
         enter(TWINS, module, function)
@@ -57,11 +57,11 @@ def twin(module):
 
 
 def enter(registry, name, function):
-    """The files of the areas don't see each other's names: a second case of one name would replace the first."""
+    """Adds a function to a registry. Asserts that its name is unique: the modules of `areas` share one registry."""
     assert name not in registry, f"{name} is in {registry[name].__module__} and in {function.__module__}"
     registry[name] = function
 
 
 def by(*sizes):
-    """A shape as text."""
+    """Formats a shape as text."""
     return "×".join(map(str, sizes))

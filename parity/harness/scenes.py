@@ -1,6 +1,6 @@
-"""Gaussians and cameras for the rasterizer, in float64: random ones, and those that break rasterizers.
+"""Gaussians and cameras for the rasterizer, in float64: random and adversarial scenes.
 
-RANDOM, ADVERSARIAL and THIN: label -> ((height, width), function of a random generator and that size).
+RANDOM, ADVERSARIAL and THIN map a label to ((height, width), function of a random generator and that size).
 """
 
 from functools import partial
@@ -17,7 +17,7 @@ def settings(size):
 
 
 def scattered(rng, size, batch, cameras, count, bases):
-    """Gaussians from under a pixel to a third of the image, some outside of it, at all opacities."""
+    """Returns Gaussians of sizes from below a pixel to a third of the image, some outside of it, of all opacities."""
     height, width = size
     depth = rng.uniform(1.0, 5.0, (batch, count, 1))
     pixels = np.exp(rng.uniform(np.log(0.3), np.log(0.3 * max(size) + 1.0), (batch, count, 3)))
@@ -49,7 +49,7 @@ ADVERSARIAL = {
     "1×1": ((1, 1), partial(scattered, batch=2, cameras=2, count=12, bases=4)),
     "3×17": ((3, 17), partial(scattered, batch=1, cameras=2, count=20, bases=16)),
 }
-# Gaussians hundreds of times longer than wide: float32 has few digits left for them.
+# Gaussians hundreds of times longer than wide, for which float32 has few significant digits.
 THIN = {
     "255×257": ((255, 257), partial(scattered, batch=1, cameras=1, count=24, bases=16)),
 }
@@ -64,8 +64,10 @@ def scene(label, family=ADVERSARIAL, size=(33, 48)):
 
 
 def before(rng, size, means, scales, opacities, cameras=1):
-    """Given Gaussians before cameras with w2c = I, a second one 1/4 to the left and 1/2 ahead: depths are exact, in
-    float32 too. Focal length 32, principal point in the middle."""
+    """Places Gaussians in front of cameras with w2c = I; other cameras are 1/4 to the left and 1/2 ahead.
+
+    Depths are exact, also in float32. The focal length is 32 and the principal point is the image centre.
+    """
     height, width = size
     means = np.asarray(means, dtype=np.float64)
     count = len(means)
@@ -84,14 +86,14 @@ def before(rng, size, means, scales, opacities, cameras=1):
 
 
 def around(rng, depth, spread=0.6):
-    """Means at the given depths, within the view of `before` and a little beyond."""
+    """Returns means at the given depths, within the field of view of `before` and a little beyond it."""
     depth = np.asarray(depth, dtype=np.float64)[:, None]
     return np.concatenate([spread * rng.uniform(-1.0, 1.0, (len(depth), 2)) * depth, depth], axis=-1)
 
 
 @scene("near plane")
 def near_plane(rng, size):
-    """Three Gaussians at each depth, some of them in the camera's very centre."""
+    """Three Gaussians at each of several depths around the near plane, some at the camera centre."""
     just_above = np.nextafter(np.float32(0.01), np.float32(1))
     depth = np.repeat([-3.0, -0.01, 0.0, 1e-9, 0.0099, 0.01, just_above, 0.0101, 0.02, 0.1], 3)
     scales = rng.uniform(0.05, 0.4, (len(depth), 3)) * np.maximum(np.abs(depth), 1e-3)[:, None]
@@ -125,7 +127,7 @@ def quaternions_of_length(length):
         return inputs | {"quaternions": length * inputs["quaternions"]}
 
 
-# A draw each: beside the gradients of the shortest, those of others are nothing.
+# One draw per norm, because the gradients of the shortest quaternions dominate those of the others.
 for length in (1e-30, 1e-20, 1e20, 1e30):
     quaternions_of_length(length)
 
@@ -145,7 +147,7 @@ def equal_depths(rng, size):
 
 @scene("tile borders")
 def tile_borders(rng, size):
-    """Centres at multiples of 16 pixels and on the borders of the image: (u, v) = 16 (x, y) + (24, 16.5) at depth 2."""
+    """Centres at multiples of 16 pixels and on the image borders: (u, v) = 16 (x, y) + (24, 16.5) at depth 2."""
     u, v = np.meshgrid([0.0, 16.0, 32.0, 48.0], [0.0, 16.0, 16.5, 32.0, 33.0])
     means = np.stack([(u.ravel() - 24.0) / 16.0, (v.ravel() - 16.5) / 16.0, np.full(u.size, 2.0)], axis=-1)
     scales = np.tile([[0.001], [0.0625], [1.0], [0.5]], (5, 1))

@@ -1,13 +1,13 @@
-"""What a person reads on the terminal, and the same as JSON."""
+"""Report of the results on the terminal and as JSON."""
 
-MOST_FAILURES = 5  # shown of one draw
+MOST_FAILURES = 5  # maximum number of failures shown per draw
 
 HEADER = ("case", "draws", "of", "worst draw", "worst tensor", "max abs", "rel L2", "tolerance", "verdict")
 RIGHT = (1, 5, 6, 7)
 
 
 def table(results):
-    """One line for the outputs of a case and one for its gradients: its worst tensor over all of its draws."""
+    """Returns a table with two rows per case, for outputs and gradients: the worst tensor of all draws."""
     whys = []
     rows = [HEADER]
     for case, found in by_case(results).items():
@@ -63,7 +63,7 @@ def layout(rows):
 
 
 def doubtful(results):
-    """How much of the pictures was not compared."""
+    """Returns lines with the number of pixels that were not compared."""
     lines = []
     for case, found in by_case(results).items():
         counts = {}
@@ -78,7 +78,7 @@ def doubtful(results):
 
 
 def turned(results):
-    """How many of a network's close calls the program decided otherwise than the reference."""
+    """Returns lines with the number of close calls that the program decided differently from the reference."""
     counts = {case: sum(result.turned for result in found) for case, found in by_case(results).items()}
     what = "numbers within rounding of a threshold lie on its other side"
     return [f"{case}: {count} {what}" for case, count in counts.items() if count]
@@ -97,7 +97,7 @@ def failures(results):
 
 
 def undetected(results):
-    """The disturbed answers that pass all the same."""
+    """Returns the perturbed results that pass nevertheless."""
     return [f"{result.case}, {result.label}: {what}" for result in results for what in result.blind]
 
 
@@ -112,7 +112,7 @@ def self_test_report(results):
 
 
 def as_json(results, **about):
-    """Every tensor of every draw."""
+    """Returns the results of every tensor of every draw as a JSON value."""
     draws = [
         {
             "case": result.case,
@@ -146,5 +146,5 @@ def as_json(results, **about):
 
 
 def number(value):
-    """JSON has no infinity: of a tensor that can't be compared there is no error."""
+    """Returns None for infinity, the error of a tensor that can't be compared, because JSON has no infinity."""
     return value if value != float("inf") else None

@@ -1,18 +1,18 @@
-"""Where a picture is a step function of its Gaussians.
+"""Detection of pixels where the rendered image is discontinuous in the Gaussians' parameters.
 
-A pixel is doubtful when an alpha lies within `margin` (relative) of 1/255 or of the cap 0.999, a transmittance within
-`margin` of 1e-4, or the depths of two Gaussians that both reach it within a hundredth of `margin` of each other without
-being equal: rounding may then decide, and neither the pixel nor its gradient can be compared.
+A pixel is doubtful if an alpha is within `margin` (relative) of 1/255 or of the cap 0.999, a transmittance is within
+`margin` of 1e-4, or the depths of two Gaussians that both contribute to it differ by less than a hundredth of `margin`
+without being equal. Rounding may then decide, and neither the pixel nor its gradient can be compared.
 """
 
 import torch
 from reference import splat
 
-MOST_TRIES = 100  # to draw one without a doubt
+MOST_TRIES = 100  # maximum number of attempts to draw inputs without doubtful pixels or close calls
 
 
 def doubtful_pixels(config, inputs, margin):
-    """inputs: arrays of a rasterizer request -> bool [B, C, H, W]."""
+    """Returns the mask of doubtful pixels, bool [B, C, H, W], for the arrays of a rasterizer request."""
     scene = {name: torch.tensor(array).double() for name, array in inputs.items()}
     height, width = config["height"], config["width"]
     batch, cameras = scene["w2c"].shape[:2]
@@ -35,7 +35,7 @@ def doubtful_pixels(config, inputs, margin):
 
 
 def of_view(projected, opacities, pixels, margin):
-    """-> bool [Q]. The rules are those of splat.composite."""
+    """Returns the mask of doubtful pixels of one view, bool [Q], by the rules of splat.composite."""
     order = torch.argsort(projected["depth"], stable=True)
     order = order[projected["visible"][order]]
     depth = projected["depth"][order]

@@ -1,12 +1,15 @@
-"""How far an answer may be from the reference's."""
+"""Tolerances of the comparison with the reference."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Relative L2 errors; `pictures` is a largest absolute difference (of the largest value, where that is below 1),
-    and then holds for outputs instead. `why` says what needs more than FLOAT32 or FLOAT64."""
+    """Maximum relative L2 errors of outputs and gradients.
+
+    `pictures` replaces `outputs` by a maximum absolute difference (relative to the largest value if that is below 1).
+    `why` explains a tolerance larger than FLOAT32 or FLOAT64.
+    """
 
     outputs: float
     gradients: float

@@ -1,9 +1,9 @@
-// Reads or writes a splat by a program that isn't ours, for parity/tests/test_splat_formats.py.
+// Reads or writes a splat with a third-party library, for parity/tests/test_splat_formats.py.
 //
 //     node splats.mjs read  adobe|spz-js FILE NUMBERS.json
 //     node splats.mjs write adobe|spz-js NUMBERS.json FILE [VERSION]
 //
-// Numbers are those of a PLY of 3DGS, all Gaussians' of a kind one after the other; rotations are x, y, z, w.
+// NUMBERS.json has one flat list per property, with the values of a 3DGS PLY for all Gaussians; rotations are x, y, z, w.
 
 import { createReadStream, readFileSync, writeFileSync } from "node:fs";
 import { Readable } from "node:stream";
@@ -12,7 +12,7 @@ import * as spzJs from "spz-js";
 
 const LISTS = ["positions", "scales", "rotations", "alphas", "colors", "sh"];
 
-/** Niantic's own library, compiled; its numbers have a PLY's axes. */
+/** Loads Niantic's own library, compiled to WebAssembly; it converts to and from the axes of a PLY. */
 async function adobe() {
   const spz = await createSpz({ print() {}, printErr() {} });
   const axes = spz.CoordinateSystem.RDF;
@@ -25,7 +25,7 @@ async function adobe() {
   };
 }
 
-/** The same formats once more, in JavaScript, which leaves axes as they are. */
+/** spz-js, an implementation of the same formats in JavaScript, which does not convert axes. */
 const inJavaScript = {
   read: (file) => {
     const stream = Readable.toWeb(createReadStream(file));

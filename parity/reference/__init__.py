@@ -1,1 +1,1 @@
-"""GlobalSplat in plain torch: the mathematics of the system, one module per part, held against the goldens."""
+"""GlobalSplat in plain PyTorch: the system's mathematics, one module per part, checked against golden tensors."""

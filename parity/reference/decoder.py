@@ -1,4 +1,4 @@
-"""The decoder: latent tokens to Gaussians. K candidates per token, merged to G = 2^stage."""
+"""The decoder: latent tokens to Gaussians. K candidates per token are merged to G = 2^stage Gaussians."""
 
 import math
 
@@ -17,7 +17,7 @@ ROTATION_OFFSET = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def heads(config, params, geo, app):
-    """geo, app [B, M, d] -> the raw linear outputs, candidate axis K third."""
+    """Applies the linear readouts to geo, app [B, M, d]. Returns raw outputs [B, M, K, ...]."""
     k = config["M_max"]
     coefficients = (config["sh_degree"] + 1) ** 2
     shape = (geo.shape[0], geo.shape[1], k)
@@ -33,8 +33,10 @@ def heads(config, params, geo, app):
 
 
 def candidates(raw, mix):
-    """Offsets and clamps. mix is the transition coefficient lambda: while it is below 1 opacity starts lower,
-    by ln 2 in the logit at lambda = 0."""
+    """Applies offsets and clamps to the raw outputs.
+
+    mix is the transition coefficient lambda: below 1 it lowers the opacity logit, by ln 2 at lambda = 0.
+    """
     opacity = raw["opacity"] + OPACITY_OFFSET - (1.0 - mix) * math.log(2.0)
     return {
         "position": raw["position"],
@@ -46,15 +48,15 @@ def candidates(raw, mix):
 
 
 def log_transparency(logit):
-    """log u = log(1 - sigmoid(o)) = log sigmoid(-o), never above -1e-12 so that the way back stays finite."""
+    """Returns log u = log(1 - sigmoid(o)) = log sigmoid(-o), clamped to <= -1e-12 so that its inverse stays finite."""
     return torch.nn.functional.logsigmoid(-logit).clamp(max=LARGEST_LOG_U)
 
 
 def logit_of_transparency(log_u):
-    """The logit of 1 - u: log(1 - e^(log u)) - log u.
+    """Returns the logit of 1 - u: log(1 - e^(log u)) - log u.
 
-    log(1 - e^x) is log(-expm1(x)) near zero and log1p(-e^x) elsewhere. Near zero the latter is log 0, so there it is
-    given another argument: a gradient that is not chosen must still be finite.
+    log(1 - e^x) is computed as log(-expm1(x)) near zero and as log1p(-e^x) elsewhere. Near zero the latter would be
+    log 0, so its argument is replaced: the gradient of the branch that is not selected must be finite, too.
     """
     near = log_u > -math.log(2.0)
     log_alpha_near = torch.log(-torch.expm1(log_u))
@@ -63,9 +65,10 @@ def logit_of_transparency(log_u):
 
 
 def merge(full, gate, stage):
-    """Candidates [B, M, K, ...] -> [B, M, G, ...] with G = 2^stage, over groups of b = K / G consecutive candidates.
+    """Merges candidates [B, M, K, ...] to [B, M, G, ...] with G = 2^stage, in groups of b = K / G consecutive
+    candidates.
 
-    Weighted sums with w = softmax(gate) inside the group, except
+    Values are weighted sums with w = softmax(gate) in the group, except
       log-scales:  sum w log s + ln(b) / 3        (the volume of b Gaussians)
       opacities:   log u = sum w log u_i,  u = 1 - alpha
     """
@@ -88,7 +91,7 @@ def merge(full, gate, stage):
 
 
 def expand(parent):
-    """[B, M, G, ...] -> [B, M, 2 G, ...]: every parent twice, in place, with half its volume and half its log u."""
+    """Expands [B, M, G, ...] to [B, M, 2 G, ...]: two children per parent, with half its volume and half its log u."""
     child = {key: value.repeat_interleave(2, dim=2) for key, value in parent.items()}
     child["log_scale"] = child["log_scale"] - math.log(2.0) / 3.0
     child["opacity"] = logit_of_transparency(0.5 * log_transparency(child["opacity"]))
@@ -96,7 +99,7 @@ def expand(parent):
 
 
 def merge_with_transition(full, gate, stage, mix):
-    """(1 - lambda) expand(merge at stage - 1) + lambda (merge at stage), in the space of the merged values."""
+    """Returns (1 - lambda) expand(merge at stage - 1) + lambda (merge at stage), in the space of the merged values."""
     merged = merge(full, gate, stage)
     if stage == 0:
         return merged
@@ -105,10 +108,10 @@ def merge_with_transition(full, gate, stage, mix):
 
 
 def decode(config, params, geo, app, stage, mix):
-    """geo, app [B, M, d] -> dict of Gaussians, N = M G, token-major:
+    """Decodes geo, app [B, M, d] to a dict of N = M G Gaussians, token-major.
 
-    means [B, N, 3], scales [B, N, 3], rotations_6d [B, N, 6], quats_wxyz [B, N, 4], opacities [B, N, 1],
-    sh [B, N, C, 3], and "raw": what the regularizers read, per candidate (before clamps and merging), with the
+    The dict has means [B, N, 3], scales [B, N, 3], rotations_6d [B, N, 6], quats_wxyz [B, N, 4], opacities [B, N, 1],
+    sh [B, N, C, 3], and "raw", the inputs of the regularizers per candidate: values before clamps and merging, and the
     opacity logits "opacity_logit" [B, M, K, 1] after offset and clamp.
     """
     raw = heads(config, params, geo, app)

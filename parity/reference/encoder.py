@@ -1,4 +1,4 @@
-"""The encoder: view tokens to latent scene tokens, in a geometry and an appearance stream."""
+"""The encoder: view tokens to latent scene tokens, in a geometry stream and an appearance stream."""
 
 import torch
 
@@ -7,7 +7,7 @@ from .stream import stream_round
 
 
 def mixer(params, name, geo, app):
-    """m = W2 GELU(W1 [LN(geo) ; LN(app)]); each stream adds its half of m, through its own LayerScale."""
+    """Computes m = W2 GELU(W1 [LN(geo) ; LN(app)]); each stream adds its half of m, through its own LayerScale."""
     both = torch.cat([layer_norm(params, f"{name}.ln_g", geo), layer_norm(params, f"{name}.ln_t", app)], dim=-1)
     to_geo, to_app = mlp(params, f"{name}.mlp.0", f"{name}.mlp.2", both).chunk(2, dim=-1)
     geo = geo + layer_scale(params, f"{name}.ls_g", to_geo)
@@ -16,11 +16,12 @@ def mixer(params, name, geo, app):
 
 
 def encode(config, params, tokens):
-    """tokens [B, V, P, e] -> (geo, app), each [B, M, d].
+    """Encodes view tokens [B, V, P, e] to (geo, app), each [B, M, d].
 
     Slots:  4 auxiliary queries, M scene tokens, 1 global token, 4 registers.
     Memory: 4 memory registers, then all V P view tokens.
-    config["streams"] = "single" is the ablation: one stream under the geometry names, no mixer; both results are it.
+    config["streams"] = "single" is an ablation with one stream under the geometry names and without a mixer; it returns
+    this stream twice.
     """
     batch = tokens.shape[0]
     heads, blocks = config["num_heads"], config["slot_calib_layers_per_round"]
@@ -35,7 +36,7 @@ def encode(config, params, tokens):
     slots = repeat(torch.cat([auxiliary, scene, params["slot_encoder.scale_emb"], registers], dim=1))
     memory = torch.cat([repeat(params["slot_encoder.mem_regs"]), tokens.flatten(1, 2)], dim=1)
 
-    # Registers do not read the memory: only self-attention (and the mixer) changes them.
+    # Registers do not attend to the memory: only self-attention (and the mixer) updates them.
     update_mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype, device=slots.device)
     update_mask[-registers.shape[1] :] = 0.0
 

@@ -4,7 +4,7 @@ import torch
 
 
 def grey(image):
-    """-> [1, H, W]."""
+    """Converts an image to greyscale, [1, H, W]."""
     red, green, blue = image.unbind(0)
     return (0.2989 * red + 0.587 * green + 0.114 * blue)[None]
 
@@ -60,7 +60,7 @@ ADJUSTMENTS = {"brightness": brightness, "contrast": contrast, "saturation": sat
 
 
 def jitter(image, adjustments):
-    """`adjustments`: [(name, factor)], one after the other."""
+    """Applies `adjustments`, [(name, factor)], in order."""
     for name, factor in adjustments:
         image = ADJUSTMENTS[name](image, factor)
     return image

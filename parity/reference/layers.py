@@ -1,4 +1,4 @@
-"""The layers everything else is made of. `params` maps published names to tensors; `name` is a prefix in it."""
+"""Basic layers of the model. `params` maps published names to tensors; `name` is the prefix of a layer's names."""
 
 import math
 
@@ -8,31 +8,34 @@ LAYER_NORM_EPS = 1e-5
 
 
 def linear(params, name, x):
-    """x W^T + b, with weight [out, in]; the bias is left out where the file has none."""
+    """Returns x W^T + b, with weight [out, in]; the bias is omitted if `params` has none."""
     y = x @ params[f"{name}.weight"].T
     bias = params.get(f"{name}.bias")
     return y if bias is None else y + bias
 
 
 def layer_norm(params, name, x):
-    """(x - mean) / sqrt(var + eps) * weight + bias over the last axis; the variance divides by its length."""
+    """Returns (x - mean) / sqrt(var + eps) * weight + bias over the last axis; the variance is the biased one."""
     centred = x - x.mean(-1, keepdim=True)
     variance = (centred * centred).mean(-1, keepdim=True)
     return centred / torch.sqrt(variance + LAYER_NORM_EPS) * params[f"{name}.weight"] + params[f"{name}.bias"]
 
 
 def gelu(x):
-    """The exact one: x Phi(x)."""
+    """Returns the exact GELU, x Phi(x)."""
     return 0.5 * x * (1.0 + torch.erf(x / math.sqrt(2.0)))
 
 
 def mlp(params, first, second, x):
-    """W2 GELU(W1 x + b1) + b2."""
+    """Returns W2 GELU(W1 x + b1) + b2."""
     return linear(params, second, gelu(linear(params, first, x)))
 
 
 def attention(q, k, v, heads):
-    """q [B, Lq, d], k and v [B, Lk, d] -> [B, Lq, d]; per head softmax(q k^T / sqrt(d / heads)) v."""
+    """Computes multi-head attention of q [B, Lq, d] to k and v [B, Lk, d]. Returns [B, Lq, d].
+
+    Each head computes softmax(q k^T / sqrt(d / heads)) v.
+    """
 
     def split(x):  # [B, L, d] -> [B, heads, L, d / heads]
         return x.reshape(x.shape[0], x.shape[1], heads, -1).transpose(1, 2)

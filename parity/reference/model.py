@@ -1,4 +1,4 @@
-"""The whole forward pass: posed views to Gaussians."""
+"""The complete forward pass: posed views to Gaussians."""
 
 from .decoder import decode
 from .encoder import encode
@@ -6,9 +6,10 @@ from .tokens import view_tokens
 
 
 def forward(config, params, images, c2w, intrinsic, stage, mix):
-    """images [B, V, 3, H, W] in [0, 1], normalized c2w [B, V, 4, 4], intrinsic [B, V, 3, 3] in pixels.
+    """Runs the model on images [B, V, 3, H, W] in [0, 1], normalized c2w [B, V, 4, 4] and intrinsic [B, V, 3, 3] in
+    pixels.
 
-    `config` has the keys of a golden's config.json, and two optional ones for ablations: camera_code (true, false)
+    `config` has the keys of a golden's config.json, and two optional keys for ablations: camera_code (true, false)
     and streams ("dual", "single"). `stage` s exposes 2^s Gaussians per token, `mix` is lambda in [0, 1].
     Returns the dict of `decoder.decode`.
     """

@@ -2,8 +2,8 @@
 
 import torch
 
-ROUNDING = 1e-14  # a camera constellation no wider than this share of its largest coordinate keeps its scale
-SMALLEST_DIRECTION = 1e-6  # a mean of directions no longer than this points nowhere
+ROUNDING = 1e-14  # cameras whose extent relative to their largest coordinate is at most this keep their scale
+SMALLEST_DIRECTION = 1e-6  # a mean direction whose norm is at most this is undefined
 METRIC_FAR = 4.0 * 10.0  # far bound of the frustum loss before division by the scene scale
 
 
@@ -12,9 +12,9 @@ def unit(v):
 
 
 def average_pose(c2w):
-    """c2w [C, 4, 4] -> the mean camera [4, 4]: columns (right, down, forward), origin at the mean centre.
+    """Returns the mean camera [4, 4] of c2w [C, 4, 4]: columns (right, down, forward), origin at the mean centre.
 
-    Columns of the first camera where directions cancel out.
+    The columns are those of the first camera if directions cancel out.
     """
     pose = c2w[0].clone()
     pose[:3, 3] = c2w[:, :3, 3].mean(0)
@@ -27,7 +27,7 @@ def average_pose(c2w):
 
 
 def invert_rigid(pose):
-    """[..., 4, 4] -> its inverse: (R, t) -> (R^T, -R^T t)."""
+    """Inverts rigid transforms [..., 4, 4]: (R, t) -> (R^T, -R^T t)."""
     rotation_t = pose[..., :3, :3].transpose(-1, -2)
     inverse = torch.zeros_like(pose)
     inverse[..., :3, :3] = rotation_t
@@ -37,7 +37,7 @@ def invert_rigid(pose):
 
 
 def normalize_scene(c2w):
-    """c2w [C, 4, 4], all context and target cameras of one scene.
+    """Normalizes c2w [C, 4, 4], all context and target cameras of one scene.
 
     Returns the normalized c2w [C, 4, 4], its inverse w2c [C, 4, 4] and the scale s:
         T'_i = T_avg^-1 T_i,   s = max_ab |o'_a - o'_b|,   o'_i <- o'_i / s.
@@ -58,5 +58,5 @@ def normalize_scene(c2w):
 
 
 def frustum_far(scale):
-    """Far bound of the frustum loss, in normalized units."""
+    """Returns the far bound of the frustum loss, in normalized units."""
     return METRIC_FAR / scale

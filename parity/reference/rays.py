@@ -1,4 +1,4 @@
-"""What a token knows of its camera: a Plücker ray for every pixel, and one code for every view."""
+"""Camera inputs of the tokens: a Plücker ray for every pixel, and a camera code for every view."""
 
 import math
 
@@ -10,7 +10,7 @@ CENTRE_FREQUENCIES = (1.0, 2.0, 4.0, 8.0)  # times pi
 
 
 def check_intrinsics(intrinsic, height, width):
-    """intrinsic [..., 3, 3] in pixels. Raises ValueError for a camera that no image of this size can have."""
+    """Checks intrinsic [..., 3, 3] in pixels. Raises ValueError if they are invalid for an image of this size."""
     fx, fy = intrinsic[..., 0, 0], intrinsic[..., 1, 1]
     cx, cy = intrinsic[..., 0, 2], intrinsic[..., 1, 2]
     if not bool(((fx > 0) & (fy > 0)).all()):
@@ -21,7 +21,7 @@ def check_intrinsics(intrinsic, height, width):
 
 
 def plucker_rays(c2w, intrinsic, height, width):
-    """c2w [B, V, 4, 4], intrinsic [B, V, 3, 3] -> [B, V, 6, H, W], channels (o x dir, dir).
+    """Returns the rays [B, V, 6, H, W] of c2w [B, V, 4, 4] and intrinsic [B, V, 3, 3], with channels (o x dir, dir).
 
     dir = normalize(R ((j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy, 1)),  o = camera centre.
     """
@@ -41,14 +41,14 @@ def plucker_rays(c2w, intrinsic, height, width):
 
 
 def centre_features(centre):
-    """centre [..., 3] -> [..., 27]: o, sin(pi f o) for all f, cos(pi f o) for all f; frequency-major, xyz inside."""
+    """Encodes centres o [..., 3] as [..., 27]: o, sin(pi f o) for all f, cos(pi f o) for all f; frequency-major."""
     sines = [torch.sin(math.pi * f * centre) for f in CENTRE_FREQUENCIES]
     cosines = [torch.cos(math.pi * f * centre) for f in CENTRE_FREQUENCIES]
     return torch.cat([centre, *sines, *cosines], dim=-1)
 
 
 def camera_code(params, c2w, intrinsic, height, width):
-    """One vector per view, [B, V, ray width]: W [MLP(log fx/W, log fy/H, cx/W, cy/H) ; features of the centre]."""
+    """Returns a code per view, [B, V, ray width]: W [MLP(log fx/W, log fy/H, cx/W, cy/H) ; features of the centre]."""
     check_intrinsics(intrinsic, height, width)
     features = torch.stack(
         [

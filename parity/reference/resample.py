@@ -1,4 +1,4 @@
-"""Resizing as Pillow does it: Lanczos with three lobes, rows first, 8 bits after either pass."""
+"""Resizing as in Pillow: Lanczos with three lobes, rows first, rounded to 8 bits after each pass."""
 
 import math
 
@@ -16,7 +16,7 @@ def lanczos(x):
 
 
 def weights(inputs, start, extent, outputs):
-    """-> [outputs, inputs], float64: `outputs` pixels of the `extent` input pixels from `start`."""
+    """Returns weights [outputs, inputs], float64, to resize `extent` input pixels from `start` to `outputs` pixels."""
     scale = extent / outputs
     stretch = max(scale, 1.0)
     found = torch.zeros(outputs, inputs, dtype=torch.float64)
@@ -34,7 +34,10 @@ def to_levels(values):
 
 
 def resample(image, region, height, width):
-    """image [H, W, 3] of levels, region (left, top, width, height) -> [3, height, width], float64 levels."""
+    """Resizes a region (left, top, width, height) of an image [H, W, 3] to [3, height, width], float64.
+
+    Input and output are levels from 0 to 255.
+    """
     left, top, region_width, region_height = region
     planes = image.double().movedim(-1, 0)
     across = weights(image.shape[1], left, region_width, width)

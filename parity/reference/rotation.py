@@ -1,15 +1,15 @@
-"""Rotations: six numbers to a matrix, a matrix to a quaternion and back."""
+"""Conversions of rotations: 6D representation to matrix, matrix to quaternion and back."""
 
 import torch
 
 
 def normalize(v, eps):
-    """v / max(|v|, eps) over the last axis."""
+    """Returns v / max(|v|, eps) over the last axis."""
     return v / v.norm(dim=-1, keepdim=True).clamp(min=eps)
 
 
 def matrix_from_6d(six):
-    """[..., 6] -> [..., 3, 3] by Gram-Schmidt; b1, b2, b3 are the rows."""
+    """Converts 6D rotations [..., 6] to matrices [..., 3, 3] by Gram-Schmidt; b1, b2, b3 are the rows."""
     b1 = normalize(six[..., :3], 1e-8)
     b2 = six[..., 3:] - (b1 * six[..., 3:]).sum(-1, keepdim=True) * b1
     b2 = normalize(b2, 1e-8)
@@ -18,10 +18,10 @@ def matrix_from_6d(six):
 
 
 def quaternion_from_matrix(m):
-    """[..., 3, 3] -> [..., 4] as (w, x, y, z), w >= 0.
+    """Converts matrices [..., 3, 3] to quaternions [..., 4] as (w, x, y, z), w >= 0.
 
-    The entries of 4 q q^T are sums of entries of the matrix. Any row of it is q times four of its own component;
-    the row with the largest diagonal is the well-conditioned one.
+    The entries of 4 q q^T are sums of entries of the matrix. Row k of it is 4 q_k q; the row with the largest diagonal
+    entry is the best conditioned.
     """
     m00, m01, m02 = m[..., 0, 0], m[..., 0, 1], m[..., 0, 2]
     m10, m11, m12 = m[..., 1, 0], m[..., 1, 1], m[..., 1, 2]
@@ -47,8 +47,8 @@ def quaternion_from_matrix(m):
 
 
 def matrix_from_quaternion(q):
-    """[..., 4] (w, x, y, z), of any length but zero -> [..., 3, 3]."""
-    q = q / q.detach().abs().amax(-1, keepdim=True)  # squares of what is left neither overflow nor vanish
+    """Converts quaternions [..., 4] (w, x, y, z) of any nonzero norm to matrices [..., 3, 3]."""
+    q = q / q.detach().abs().amax(-1, keepdim=True)  # so that squares neither overflow nor underflow
     w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),

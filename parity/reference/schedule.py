@@ -1,4 +1,4 @@
-"""What changes with the training step: learning rate, stage, and the optimizer's own step."""
+"""Learning rate schedule, curriculum stages, gradient clipping and optimizer steps."""
 
 import math
 
@@ -12,7 +12,7 @@ LEARNABLE_TOKENS = ("scene_tokens", "scale_emb", "aux_query_tokens", "slot_regs"
 
 
 def learning_rate(step, total_steps, peak, warmup_fraction=WARMUP_FRACTION):
-    """Rate of update `step`, from 0: linear from 1e-3 peak to peak, then half a cosine to max(peak / 50, 1e-6)."""
+    """Returns the rate of update `step`, from 0: linear from 1e-3 peak to peak, then cosine to max(peak / 50, 1e-6)."""
     warmup = warmup_fraction * total_steps
     if step < warmup:
         return peak * (WARMUP_START + (1.0 - WARMUP_START) * step / warmup)
@@ -22,7 +22,7 @@ def learning_rate(step, total_steps, peak, warmup_fraction=WARMUP_FRACTION):
 
 
 def stage(step, final_stage, boundaries=STAGE_BOUNDARIES, transition_steps=TRANSITION_STEPS):
-    """-> (s, lambda). s counts the boundaries reached; lambda runs 0 -> 1 over the steps after the last one."""
+    """Returns (s, lambda): s counts the boundaries reached; lambda goes from 0 to 1 in the steps after the last one."""
     reached = [boundary for boundary in boundaries[:final_stage] if step >= boundary]
     if not reached:
         return 0, 1.0
@@ -30,19 +30,19 @@ def stage(step, final_stage, boundaries=STAGE_BOUNDARIES, transition_steps=TRANS
 
 
 def is_decayed(name, parameter):
-    """Weight decay is for weight matrices: not for biases, norms, LayerScale, nor for learnable tokens of any shape."""
+    """Returns `True` for weight matrices, but not for biases, norms, LayerScale or learnable tokens of any shape."""
     return parameter.dim() >= 2 and name.split(".")[-1] not in LEARNABLE_TOKENS
 
 
 def clip_gradients(gradients, largest_norm=1.0):
-    """Scale all gradients (name -> tensor) by one factor so that their joint norm is at most `largest_norm`."""
+    """Scales all gradients (name -> tensor) by one factor so that their global norm is at most `largest_norm`."""
     norm = torch.sqrt(sum((g**2).sum() for g in gradients.values()))
     factor = (largest_norm / (norm + 1e-6)).clamp(max=1.0)
     return {name: g * factor for name, g in gradients.items()}, norm
 
 
 def adamw_step(parameter, gradient, first, second, count, rate, decay, beta1=0.9, beta2=0.999, eps=1e-8):
-    """One AdamW update, `count` from 1 -> new (parameter, first, second).
+    """Computes an AdamW update, with `count` from 1. Returns the new (parameter, first, second).
 
     m <- b1 m + (1 - b1) g,   v <- b2 v + (1 - b2) g^2
     p <- p (1 - rate decay) - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
@@ -54,7 +54,10 @@ def adamw_step(parameter, gradient, first, second, count, rate, decay, beta1=0.9
 
 
 def levelled(matrix):
-    """The matrix with every singular value s, as a share of the norm of all, five times replaced by a s + b s^3 + c s^5."""
+    """Orthogonalizes a matrix approximately, by Muon's Newton-Schulz iteration on its singular values.
+
+    Divides the singular values by the Frobenius norm, and replaces each value s by a s + b s^3 + c s^5 five times.
+    """
     u, s, vh = torch.linalg.svd(matrix, full_matrices=False)
     s = s / (matrix.norm() + 1e-7)
     for _ in range(5):
@@ -63,7 +66,8 @@ def levelled(matrix):
 
 
 def muon_step(parameter, gradient, mean, rate, decay, parts=1, beta=0.95):
-    """One update by Muon of `parts` matrices on one another -> new (parameter, mean).
+    """Computes a Muon update of `parts` matrices that are stacked along the first axis. Returns the new (parameter,
+    mean).
 
     m <- b m + (1 - b) g,   u = (1 - b) g + b m,   p <- p (1 - rate decay) - rate 0.2 sqrt(max(R, C)) levelled(u)
     """

@@ -1,4 +1,4 @@
-"""The rasterizer, dense: every Gaussian at every pixel. Slow, differentiable by autograd, every rule in one place."""
+"""A dense rasterizer that evaluates every Gaussian at every pixel: slow, differentiable by autograd, with all rules."""
 
 import torch
 
@@ -14,26 +14,26 @@ SMALLEST_ACCUMULATION = 1e-10
 
 
 def covariance(scales, quaternions):
-    """scales [N, 3], quaternions [N, 4] of any length -> R S S^T R^T [N, 3, 3]."""
+    """Returns covariances R S S^T R^T [N, 3, 3] of scales [N, 3] and quaternions [N, 4] of any norm."""
     rs = matrix_from_quaternion(quaternions) * scales[:, None, :]
     return rs @ rs.transpose(-1, -2)
 
 
 def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS_2D):
-    """means [N, 3], scales [N, 3], quaternions [N, 4], w2c [4, 4], intrinsic [3, 3] ->
+    """Projects Gaussians (means [N, 3], scales [N, 3], quaternions [N, 4]) to a camera (w2c [4, 4], intrinsic [3, 3]).
 
-    dict of mean2d [N, 2], cov2d [N, 2, 2] (with eps2d), conic [N, 3] = (a, b, c) of [[a, b], [b, c]] = cov2d^-1,
-    depth [N], visible [N]. Values of a Gaussian that is not visible are finite and mean nothing.
+    Returns a dict of mean2d [N, 2], cov2d [N, 2, 2] (with eps2d), conic [N, 3] = (a, b, c) of [[a, b], [b, c]] =
+    cov2d^-1, depth [N], visible [N]. Values of a Gaussian that is not visible are finite and have no meaning.
     """
     rotation, translation = w2c[:3, :3], w2c[:3, 3]
     fx, fy, cx, cy = intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]
     x, y, depth = (means @ rotation.T + translation).unbind(-1)
     in_front = depth > NEAR
-    z = torch.where(in_front, depth, 1.0)  # keeps the division finite where nothing will be drawn
+    z = torch.where(in_front, depth, 1.0)  # keeps the division finite for Gaussians that are not drawn
     x_z, y_z = x / z, y / z
     mean2d = torch.stack([fx * x_z + cx, fy * y_z + cy], dim=-1)
 
-    # J = [[fx / z, 0, -fx (x/z) / z], [0, fy / z, -fy (y/z) / z]], at x/z and y/z held near the image.
+    # J = [[fx / z, 0, -fx (x/z) / z], [0, fy / z, -fy (y/z) / z]], with x/z and y/z clamped to near the image.
     margin_x, margin_y = JACOBIAN_MARGIN * width / fx, JACOBIAN_MARGIN * height / fy
     x_z = torch.clamp(x_z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
     y_z = torch.clamp(y_z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
@@ -60,7 +60,10 @@ def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS
 
 
 def sh_basis(direction, coefficients):
-    """direction [N, 3], unit -> [N, C], C in (1, 4, 9, 16): real spherical harmonics as 3DGS orders and signs them."""
+    """Returns real spherical harmonics [N, C] of unit directions [N, 3], in 3DGS's order and signs.
+
+    `coefficients` is C, one of 1, 4, 9, 16.
+    """
     x, y, z = direction.unbind(-1)
     basis = [torch.full_like(x, 0.28209479177387814)]
     if coefficients > 1:
@@ -88,17 +91,20 @@ def sh_basis(direction, coefficients):
 
 
 def sh_colour(means, sh, w2c):
-    """means [N, 3], sh [N, C, 3], w2c [4, 4] -> [N, 3]: max(0, 0.5 + sum of basis(direction) sh)."""
+    """Returns colours [N, 3] of Gaussians (means [N, 3], sh [N, C, 3]) seen by w2c [4, 4].
+
+    The colour is max(0, 0.5 + sum of basis(direction) sh).
+    """
     centre = -w2c[:3, :3].T @ w2c[:3, 3]
     direction = means - centre
-    # In the camera's very centre nothing is drawn, but a gradient that is not chosen must still be finite.
+    # A Gaussian at the camera centre is not drawn, but the gradient of this branch must be finite, too.
     direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-30)
     colour = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
     return torch.where(colour > 0, colour, 0.0)
 
 
 def pixel_centres(width, height, dtype=torch.float32, device=None):
-    """[H W, 2] as (j + 0.5, i + 0.5), row-major."""
+    """Returns pixel centres [H W, 2] as (j + 0.5, i + 0.5), row-major."""
     i, j = torch.meshgrid(
         torch.arange(height, dtype=dtype, device=device), torch.arange(width, dtype=dtype, device=device), indexing="ij"
     )
@@ -106,10 +112,10 @@ def pixel_centres(width, height, dtype=torch.float32, device=None):
 
 
 def composite(projected, opacities, colours, pixels):
-    """projected: the dict of project(). opacities [N], colours [N, 3], pixels [Q, 2] ->
-    RGB [Q, 3], accumulated opacity [Q], expected depth [Q].
+    """Composites Gaussians at pixels [Q, 2]. projected is the dict of project(); opacities [N], colours [N, 3].
 
-    In order of depth (ties: lower index first), for the Gaussians that count at a pixel:
+    Returns RGB [Q, 3], accumulated opacity [Q], expected depth [Q]. In order of depth (ties: lower index first), for
+    the Gaussians that contribute to a pixel:
         w_i = T_i alpha_i,   T_i = prod_{j<i} (1 - alpha_j)
         RGB = sum w c,   A = sum w = 1 - T,   D = sum w z / A
     """
@@ -125,8 +131,8 @@ def composite(projected, opacities, colours, pixels):
     alpha = opacities[:, None] * torch.exp(-sigma)
     alpha = alpha.masked_fill(alpha > LARGEST_ALPHA, LARGEST_ALPHA)  # no gradient through the cap
 
-    # Which Gaussians count is a choice, not a differentiable value. T falls along the list, so the first Gaussian that
-    # would bring it to 1e-4 or below is also the first of all those after it that would.
+    # The selection of contributing Gaussians is not differentiable. T decreases along the list, so a comparison with
+    # the threshold of 1e-4 also excludes all Gaussians after the first one that would reach it.
     with torch.no_grad():
         counts = alpha >= SMALLEST_ALPHA
         transmittance = torch.cumprod(torch.where(counts, 1.0 - alpha, 1.0), dim=0)
@@ -144,7 +150,10 @@ def composite(projected, opacities, colours, pixels):
 
 
 def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d=EPS_2D):
-    """One scene, one camera -> RGB [H, W, 3], accumulated opacity [H, W], expected depth [H, W]. Background black."""
+    """Renders one scene with one camera on a black background.
+
+    Returns RGB [H, W, 3], accumulated opacity [H, W], expected depth [H, W].
+    """
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d)
     colours = sh_colour(means, sh, w2c)
     pixels = pixel_centres(width, height, means.dtype, means.device)

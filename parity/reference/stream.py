@@ -1,10 +1,10 @@
-"""One stream of the encoder: the slots read the memory, then talk among themselves."""
+"""One stream of the encoder: cross-attention of the slots to the memory, then self-attention among the slots."""
 
 from .layers import attention, layer_norm, layer_scale, linear, mlp
 
 
 def read_memory(params, name, slots, memory, heads, update_mask):
-    """Cross-attention and MLP of a round. slots [B, L, d], memory [B, S, e], update_mask [L, 1].
+    """Applies the cross-attention and MLP of a round to slots [B, L, d], memory [B, S, e], update_mask [L, 1].
 
     slots += mask * LayerScale(Wo Attn(Wq LN(slots), Wk LN(memory), Wv LN(memory)))
     slots += mask * LayerScale(MLP(LN(slots)))
@@ -21,7 +21,10 @@ def read_memory(params, name, slots, memory, heads, update_mask):
 
 
 def self_attention_block(params, name, x, heads):
-    """x += LayerScale(Attn(LN x)); x += LayerScale(MLP(LN x)). q, k, v are the thirds of one linear, in that order."""
+    """Computes x += LayerScale(Attn(LN x)); x += LayerScale(MLP(LN x)).
+
+    q, k, v are the thirds of the output of one linear layer, in this order.
+    """
     q, k, v = linear(params, f"{name}.attn.qkv", layer_norm(params, f"{name}.norm1", x)).chunk(3, dim=-1)
     mixed = linear(params, f"{name}.attn.proj", attention(q, k, v, heads))
     x = x + layer_scale(params, f"{name}.ls1", mixed)
@@ -31,7 +34,7 @@ def self_attention_block(params, name, x, heads):
 
 
 def stream_round(params, name, slots, memory, heads, blocks, update_mask):
-    """[B, L, d] -> [B, L, d]: one round of one stream."""
+    """Applies one round of one stream to slots [B, L, d]. Returns [B, L, d]."""
     slots = read_memory(params, name, slots, memory, heads, update_mask)
     for block in range(blocks):
         slots = self_attention_block(params, f"{name}.tower.{block}", slots, heads)

@@ -1,4 +1,4 @@
-"""Views to tokens: [ray patch + camera code ; RGB patch]."""
+"""Tokens of the views: [ray patch + camera code ; RGB patch]."""
 
 import torch
 
@@ -10,7 +10,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def patchify(image, patch):
-    """[B, V, C, H, W] -> [B, V, P, p p C]: patches row-major, each flattened as (row, column, channel)."""
+    """Splits [B, V, C, H, W] into patches [B, V, P, p p C]: row-major, each flattened as (row, column, channel)."""
     b, v, c, h, w = image.shape
     cut = image.reshape(b, v, c, h // patch, patch, w // patch, patch)
     cut = cut.permute(0, 1, 3, 5, 4, 6, 2)  # B, V, patch row, patch column, row, column, channel
@@ -18,14 +18,14 @@ def patchify(image, patch):
 
 
 def rgb_tokens(params, images, patch):
-    """images [B, V, 3, H, W] in [0, 1] -> [B, V, P, RGB width]."""
+    """Embeds images [B, V, 3, H, W] in [0, 1]. Returns [B, V, P, RGB width]."""
     mean = torch.tensor(IMAGENET_MEAN, dtype=images.dtype, device=images.device)[:, None, None]
     std = torch.tensor(IMAGENET_STD, dtype=images.dtype, device=images.device)[:, None, None]
     return linear(params, "rgb_patch_embeds.1", patchify((images - mean) / std, patch))
 
 
 def ray_tokens(params, c2w, intrinsic, height, width, patch, with_camera_code=True):
-    """-> [B, V, P, ray width]. The camera code is the same for all patches of a view."""
+    """Embeds rays and camera codes. Returns [B, V, P, ray width]; all patches of a view have the same camera code."""
     rays = plucker_rays(c2w, intrinsic, height, width)
     tokens = linear(params, "ray_patch_embeds.1", patchify(rays, patch))
     if with_camera_code:
@@ -34,7 +34,7 @@ def ray_tokens(params, c2w, intrinsic, height, width, patch, with_camera_code=Tr
 
 
 def view_tokens(config, params, images, c2w, intrinsic):
-    """-> [B, V, P, ray width + RGB width]. config["camera_code"] false is the ablation "Plücker only"."""
+    """Returns tokens [B, V, P, ray width + RGB width]. config["camera_code"] false is the ablation "Plücker only"."""
     height, width = images.shape[-2:]
     patch = config["patch_size"]
     ray = ray_tokens(params, c2w, intrinsic, height, width, patch, config.get("camera_code", True))

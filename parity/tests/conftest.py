@@ -1,4 +1,4 @@
-"""What is skipped is counted by `make test`, and is a failure where nothing may be: as by `skip` in tests/common/mod.rs."""
+"""Hooks that count skipped tests for `make test`, or make skips failures, like `skip` in tests/common/mod.rs."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 
 def told(report):
-    """A skip says what it is for want of before a colon."""
+    """Records or fails a skipped test. The reason of a skip names the missing requirement before a colon."""
     if report.skipped and not hasattr(report, "wasxfail"):
         _, _, reason = report.longrepr
         reason = reason.removeprefix("Skipped: ")

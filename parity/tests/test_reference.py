@@ -1,6 +1,7 @@
-"""Holds the torch reference against the goldens, and the parts without a golden against independent arithmetic.
+"""Tests of the PyTorch reference against golden tensors, and of the parts without these against independent
+computations.
 
-Goldens are read from $GLOBALSPLAT_GOLDEN, else from ../shared/golden beside the repository.
+Golden tensors are read from $GLOBALSPLAT_GOLDEN, or else from ../shared/golden next to the repository.
 """
 
 import json
@@ -24,8 +25,8 @@ torch.set_num_threads(1)
 GOLDEN = Path(os.environ.get("GLOBALSPLAT_GOLDEN", REPOSITORY.parent / "shared" / "golden"))
 OUTPUT_TOLERANCE = 1e-5
 GRADIENT_TOLERANCE = 1e-4
-# The gradient of mem_k.bias is zero in exact arithmetic: a float32 residue is all there is to see, and it is measured
-# against the largest gradient of the case.
+# The gradient of mem_k.bias is zero in exact arithmetic, so only rounding error remains in float32. It is compared with
+# the largest gradient of the case.
 ZERO_TOLERANCE = 1e-5
 DTYPES = [torch.float32, torch.float64]
 
@@ -41,7 +42,7 @@ def load(name, dtype=torch.float32):
 
 
 def relative(ours, theirs):
-    """Relative L2 distance, in float64. NaN never passes a comparison with it."""
+    """Returns the relative L2 distance, in float64. With NaN, no comparison with a tolerance passes."""
     ours, theirs = ours.detach().double().flatten(), theirs.double().flatten()
     assert ours.shape == theirs.shape, f"{tuple(ours.shape)} values, expected {tuple(theirs.shape)}"
     return ((ours - theirs).norm() / theirs.norm().clamp(min=1e-30)).item()
@@ -73,7 +74,7 @@ def test_scene_normalization_is_canonical():
     c2w = load("scene_normalization.safetensors", torch.float64)["c2w"]
     normalized, inverse, scale = normalize.normalize_scene(c2w)
     identity = torch.eye(4, dtype=torch.float64)
-    # the file holds float32 rotations, orthogonal to about 1e-7
+    # the file has float32 rotations, which are orthogonal up to about 1e-7
     assert torch.allclose(normalize.average_pose(normalized), identity, atol=1e-6)
     assert torch.allclose(inverse @ normalized, identity.expand_as(normalized), atol=1e-6)
     centres = normalized[:, :3, 3]
@@ -82,7 +83,7 @@ def test_scene_normalization_is_canonical():
 
 
 def test_average_pose_is_a_rotation():
-    """Cameras that look all over: the mean down is then not square to the mean forward, and the frame still is."""
+    """The mean pose is a rotation even if cameras look in all directions, and mean down isn't orthogonal to forward."""
     generator = torch.Generator().manual_seed(3)
     c2w = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
     q = torch.tensor([1.0, 0, 0, 0]) + 0.6 * torch.randn(6, 4, generator=generator, dtype=torch.float64)
@@ -103,7 +104,7 @@ def test_average_pose_is_a_rotation():
 def test_frustum_loss(dtype, record_property):
     g = load("frustum_loss.safetensors", dtype)
     means = g["means"].requires_grad_()
-    size = 2.0 * g["intrinsic"][0, 0, :2, 2]  # the file has no image size; its principal points are central
+    size = 2.0 * g["intrinsic"][0, 0, :2, 2]  # the file has no image size; principal points are its centre
     width, height = int(size[0]), int(size[1])
     loss = frustum.frustum(means, g["w2c"], g["intrinsic"], height, width, g["max_depth"])
     loss.backward()
@@ -112,7 +113,7 @@ def test_frustum_loss(dtype, record_property):
 
 
 def test_frustum_depth_bounds():
-    """On the axis of a camera, where only depth can be violated; then a second camera that sees the point."""
+    """Points on a camera's axis only violate the depth bounds; a second camera that sees the point makes the loss 0."""
     intrinsic = torch.tensor([[[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]]], dtype=torch.float64)
     w2c = torch.eye(4, dtype=torch.float64)[None, None]
     far = torch.tensor([5.0], dtype=torch.float64)
@@ -157,7 +158,7 @@ def test_mse():
 
 
 def lpips_params(network):
-    """Small random weights of that network."""
+    """Returns small random weights of a network."""
     generator, inputs, params = torch.Generator().manual_seed(0), 3, {}
     for name, outputs, kernel, _, _ in (layer for row in lpips.NETWORKS[network] for layer in row):
         params[f"{name}.weight"] = 0.05 * torch.randn(outputs, inputs, kernel, kernel, generator=generator)
@@ -171,7 +172,7 @@ def lpips_params(network):
 
 @pytest.mark.parametrize("network", lpips.NETWORKS)
 def test_lpips(network):
-    """Against its definition written pixel by pixel, on features of torch's own modules in a row."""
+    """LPIPS equals its definition, computed pixel by pixel on features of a sequence of PyTorch modules."""
     params = lpips_params(network)
     pictures = torch.rand(2, 3, 48, 40, generator=torch.Generator().manual_seed(1))
     found = lpips.lpips(network, params, pictures[:1], pictures[1:]).item()
@@ -180,7 +181,7 @@ def test_lpips(network):
     normalized = ((2 * pictures - 1).movedim(1, -1) - torch.tensor(lpips.SHIFT)) / torch.tensor(lpips.SCALE)
     x, expected = normalized.movedim(-1, 1), 0.0
     pools = {"lpips_vgg": torch.nn.MaxPool2d(2, 2), "lpips_alex": torch.nn.MaxPool2d(3, 2)}
-    # torchvision's `features` of the two, by the channels of their convolutions.
+    # Output channels of the convolutions in torchvision's `features` of both networks.
     rows = {
         "lpips_vgg": [(64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512)],
         "lpips_alex": [(64,), (192,), (384, 256, 256)],
@@ -210,7 +211,7 @@ def test_lpips(network):
 
 
 def test_lpips_of_nothing_has_a_gradient():
-    """Where every channel is 0 the norm has no derivative: no NaN may come of it."""
+    """Gradients are finite where every channel is 0, although the norm has no derivative there."""
     params = lpips_params("lpips_alex") | {"conv5.bias": torch.full((256,), -100.0)}
     picture = torch.rand(1, 3, 31, 31).requires_grad_()
     lpips.lpips("lpips_alex", params, picture, torch.zeros(1, 3, 31, 31)).sum().backward()
@@ -247,7 +248,7 @@ def test_subsets():
 
 def model_cases():
     found = sorted(path.parent.name for path in GOLDEN.glob("model_*/config.json"))
-    return found or ["model_small"]  # which then skips or fails, with its line
+    return found or ["model_small"]  # this case is then skipped or fails, and is reported
 
 
 def stage_cases():
@@ -354,7 +355,7 @@ def test_plucker_ray_of_one_pixel():
 
 
 def test_opacity_merge_is_stable():
-    """Both branches of log(1 - e^x), to the clamps' ends: there and back is the identity, with finite gradients."""
+    """The round trip through both branches of log(1 - e^x) is the identity up to the clamps, with finite gradients."""
     logit = torch.tensor([-13.0, -9.0, -1.0, 0.0, 1e-3, 1.0, 6.0], requires_grad=True)
     back = decoder.logit_of_transparency(decoder.log_transparency(logit))
     assert torch.allclose(back, logit, rtol=2e-6, atol=2e-6)
@@ -370,7 +371,7 @@ def test_opacity_merge_is_stable():
 
 
 def small_decoder(log_scale, opacity):
-    """A decoder of one token and two candidates whose raw outputs are its biases."""
+    """Returns a decoder for one token and two candidates whose raw outputs are its biases."""
     config = {"M_max": 2, "sh_degree": 0}
     sizes = {"geo_pos_readout": 6, "geo_param_readout": 20, "sh_readout": 6, "gate_readout": 2}
     params = {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
@@ -405,7 +406,7 @@ def test_decoder_clamps(log_scale, opacity, scale, alpha):
 
 
 def test_opacity_logit_clamp():
-    """The upper end of the logit is hidden behind the largest opacity, and shows in what the regularizer reads."""
+    """The regularizer's input shows both clamps of the opacity logit; the opacity's own maximum hides the upper one."""
     for raw, expected in [(-50.0, -13.0), (0.0, -5.0 - 0.25 * math.log(2.0)), (50.0, 6.0)]:
         config, params, _ = small_decoder(0.0, raw)
         out = decoder.decode(config, params, torch.zeros(1, 1, 2), torch.zeros(1, 1, 2), 1, 0.75)
@@ -413,7 +414,7 @@ def test_opacity_logit_clamp():
 
 
 def test_rotations():
-    """6D -> matrix -> quaternion -> matrix, through all four branches of the quaternion."""
+    """The round trip 6D -> matrix -> quaternion -> matrix is exact for all four branches of the quaternion."""
     generator = torch.Generator().manual_seed(1)
     six = torch.randn(500, 6, generator=generator, dtype=torch.float64)
     half_turns = torch.tensor(
@@ -483,7 +484,7 @@ def test_adamw_and_clipping_against_torch():
 
 
 def test_muon_against_torch():
-    """Torch rounds to bfloat16 on the way."""
+    """Muon agrees with PyTorch's, which rounds intermediate values to bfloat16."""
     generator = torch.Generator().manual_seed(0)
     for shape in [(24, 40), (40, 24), (16, 16)]:
         start = torch.randn(shape, generator=generator)
@@ -514,7 +515,7 @@ WIDTH, HEIGHT = 9, 7
 
 
 def camera(dtype=torch.float64):
-    """A camera turned and moved away from the origin, with unequal focal lengths and an off-centre principal point."""
+    """Returns a rotated camera away from the origin, with unequal focal lengths and an off-centre principal point."""
     q = torch.tensor([0.95, 0.10, -0.25, 0.05], dtype=dtype)
     w2c = torch.eye(4, dtype=dtype)
     w2c[:3, :3] = rotation.matrix_from_quaternion(q)
@@ -524,7 +525,7 @@ def camera(dtype=torch.float64):
 
 
 def scene(in_camera, scales, opacities, w2c, coefficients=16, seed=0):
-    """Gaussians at given camera-space positions, with random unnormalized quaternions and SH."""
+    """Returns Gaussians at the given camera-space positions, with random unnormalized quaternions and SH."""
     generator = torch.Generator().manual_seed(seed)
     in_camera = torch.tensor(in_camera, dtype=torch.float64)
     n = len(in_camera)
@@ -536,8 +537,10 @@ def scene(in_camera, scales, opacities, w2c, coefficients=16, seed=0):
 
 
 def smooth_scene(w2c, coefficients=16):
-    """Every Gaussian is above 1/255 at every pixel, none saturates. The last two lie outside of the image, where the
-    Jacobian is evaluated at a clamped position."""
+    """Returns a scene in which every alpha is above 1/255 at every pixel, and none saturates.
+
+    The last two Gaussians are outside of the image, where the Jacobian is evaluated at a clamped position.
+    """
     in_camera = [[0.1, -0.1, 2.0], [-0.3, 0.2, 2.5], [0.2, 0.3, 3.0], [2.9, 0.1, 3.2], [0.3, -3.0, 3.6]]
     scales = [[1.5, 2.0, 1.8], [1.9, 1.6, 2.2], [2.1, 1.7, 2.0], [2.9, 3.3, 3.1], [3.2, 2.9, 3.4]]
     return scene(in_camera, scales, [0.4, 0.55, 0.3, 0.6, 0.5], w2c, coefficients)
@@ -558,7 +561,7 @@ def test_smooth_scene_is_what_it_says():
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_splat_gradients(coefficients):
-    """gradcheck of each of the three outputs against all five inputs."""
+    """Gradients of all three outputs with respect to all five inputs pass gradcheck."""
     w2c, intrinsic = camera()
     inputs = [value.requires_grad_() for value in smooth_scene(w2c, coefficients)]
 
@@ -582,7 +585,7 @@ def test_splat_parts_gradients():
 
 
 def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d):
-    """The rasterizer once more, with Python numbers and loops: one pixel and one Gaussian at a time."""
+    """Renders with scalar Python arithmetic and loops, one pixel and one Gaussian at a time."""
     n = len(means)
     means, scales, quaternions = means.tolist(), scales.tolist(), quaternions.tolist()
     opacities, sh, w2c, k = opacities.tolist(), sh.tolist(), w2c.tolist(), intrinsic.tolist()
@@ -603,12 +606,12 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
             p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
         )
 
-    def rotate(q, v):  # q v q*, so that no formula is shared with the code under test
+    def rotate(q, v):  # q v q*, which shares no formula with the code under test
         length = math.sqrt(sum(c * c for c in q))
         q = [c / length for c in q]
         return hamilton(hamilton(q, (0.0, *v)), (q[0], -q[1], -q[2], -q[3]))[1:]
 
-    def basis(x, y, z):  # from the definition: real harmonics, 3DGS order and signs
+    def basis(x, y, z):  # from the definition: real harmonics, in 3DGS's order and signs
         pi = math.pi
         first = math.sqrt(3 / (4 * pi))
         second = 0.5 * math.sqrt(15 / pi)
@@ -670,8 +673,11 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
 
 
 def crowded_scene(w2c, seed):
-    """Every rule at work: Gaussians behind the camera and before the near plane, equal depths, opaque ones in front of
-    others, thin ones under a pixel, colours below zero, positions far outside of the image."""
+    """Returns a scene to which every rule of the rasterizer applies.
+
+    It has Gaussians behind the camera and in front of the near plane, equal depths, opaque Gaussians in front of
+    others, thin ones below a pixel, colours below zero, and positions far outside of the image.
+    """
     generator = torch.Generator().manual_seed(seed)
     n = 60
     z = 0.2 + 4.0 * torch.rand(n, generator=generator, dtype=torch.float64)
@@ -698,12 +704,12 @@ def test_splat_against_scalar_loops(seed):
         assert (a - b).abs().max().item() < 1e-10, name
     single = splat.render(*(v.float() for v in values), w2c.float(), intrinsic.float(), WIDTH, HEIGHT)
     assert single[0].dtype == torch.float32
-    close = (single[0].double() - theirs[0]).abs().amax(-1) < 1e-4  # a threshold may fall the other way at a pixel
+    close = (single[0].double() - theirs[0]).abs().amax(-1) < 1e-4  # a threshold may go the other way at a pixel
     assert close.double().mean() > 0.95
 
 
 def flat(opacities, depths, dtype=torch.float64):
-    """Gaussians in one pixel's very centre, as project() would give them."""
+    """Returns Gaussians at the centre of one pixel, in the format of project(), and their opacities."""
     n = len(opacities)
     return {
         "mean2d": torch.full((n, 2), 0.5, dtype=dtype),
@@ -739,7 +745,7 @@ def test_small_alpha_contributes_nothing():
 
 
 def test_a_full_pixel_stops():
-    """After 0.99 the transmittance is 0.01; 0.995 would bring it to 5e-5, so it is not blended and ends the pixel."""
+    """An alpha of 0.995 after 0.99 would reduce the transmittance from 0.01 to 5e-5, so it ends the pixel unblended."""
     weight, _, _, _ = blend([0.99, 0.9895], [1.0, 2.0])  # to 1.05e-4: blended
     assert weight.tolist() == pytest.approx([0.99, 0.009895])
     weight, accumulated, depth, opacities = blend([0.99, 0.995, 0.5], [1.0, 2.0, 3.0])
@@ -773,7 +779,7 @@ def test_near_plane():
     assert projected["visible"].tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize("position", [[0.0, 0.0, -2.0], [50.0, 0.0, 2.0]])  # behind the camera; beside the image
+@pytest.mark.parametrize("position", [[0.0, 0.0, -2.0], [50.0, 0.0, 2.0]])  # behind the camera; outside of the image
 def test_an_empty_view_is_black_with_zero_gradients(position):
     w2c, intrinsic = camera()
     inputs = [value.requires_grad_() for value in scene([position], [[0.5, 0.5, 0.5]], [0.9], w2c)]

@@ -1,4 +1,4 @@
-"""Tests that are skipped are counted by what they are for want of, and fail where nothing may be skipped."""
+"""Tests that skipped tests are counted by missing requirement, and fail if skips are not allowed."""
 
 import os
 import subprocess

@@ -1,5 +1,7 @@
-"""Other programs read the splats that ours writes, in every format, and ours reads theirs: the same numbers up to what each format
-rounds away. The programs are those of parity/npm, pinned; `npm ci` puts them there."""
+"""Tests that third-party programs read the splats that our program writes, in every format, and vice versa.
+
+Values must be equal up to each format's quantization. The programs are pinned in parity/npm, and installed by `npm ci`.
+"""
 
 import json
 import shutil
@@ -14,13 +16,13 @@ PROGRAM = REPOSITORY / "target/release/globalsplat"
 NPM = REPOSITORY / "parity/npm"
 COUNT = 300  # more than a chunk of a compressed PLY
 C0 = 0.28209479177387814
-# Half of what each format counts in: positions, logarithms of scales, rotations, opacities, colours, coefficients.
+# Half of each format's quantization step: positions, logarithms of scales, rotations, opacities, colours, coefficients.
 STEPS = {
     "ply": (1e-6, 1e-5, 1e-5, 1e-5, 1e-6, 1e-6),
     "compressed.ply": (4.1 / 1023, 1.1 / 1023, 0.003, 0.51 / 255, 1 / 255, 0.51 / 32),
     "spz": (1e-6, 0.51 / 16, 0.003, 0.51 / 255, 0.51 / 255 / 0.15, 0.51 / 64),
-    # Niantic's library leaves 12 bits to positions, and rounds coefficients to 8 bits, then to 5 and 4 of them; version 2 has 8
-    # bits for a part of a rotation.
+    # Niantic's library uses 12 fractional bits for positions, and rounds coefficients to 8 bits, then to 5 and 4 of
+    # them; version 2 has 8 bits per component of a rotation.
     "their spz": (0.51 / 4096, 0.51 / 16, 0.003, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "spz of version 2": (0.51 / 4096, 0.51 / 16, 0.12, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "splat": (1e-6, 1e-5, 0.02, 0.51 / 255, 0.51 / 255 / C0, 0),
@@ -36,7 +38,10 @@ def _programs():
 
 
 def made(degree):
-    """A splat that every format holds: logits and logarithms, channel-major coefficients, as a PLY has them."""
+    """Returns a random splat that every format can represent, with a PLY's properties.
+
+    These are opacity logits, logarithms of scales, and channel-major coefficients.
+    """
     random = np.random.default_rng(degree)
     names = ["x", "y", "z", *(f"f_dc_{k}" for k in range(3))]
     names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
@@ -72,7 +77,7 @@ def rest(splat):
 
 
 def assert_same(splat, other, steps):
-    """Whatever the order of the Gaussians: each is compared with the one nearest to it."""
+    """Asserts that two splats are equal up to `steps`, in any order: each Gaussian is compared with the nearest one."""
     places, others = columns(splat, *"xyz"), columns(other, *"xyz")
     nearest = ((places[:, None] - others) ** 2).sum(-1).argmin(1)
     assert len(others) == COUNT and len(set(nearest)) == COUNT
@@ -103,12 +108,12 @@ def ours(source, target, *options):
 
 
 def transformed(source, target, *options):
-    """By PlayCanvas' splat-transform."""
+    """Converts a splat with PlayCanvas' splat-transform."""
     run("node", NPM / "node_modules/@playcanvas/splat-transform/bin/cli.mjs", "-q", "-w", source, target, *options)
 
 
 def cloud(splat):
-    """As Niantic's library has it: basis-major coefficients, the real part of a rotation last."""
+    """Converts a splat to the layout of Niantic's library: basis-major coefficients, real part of a rotation last."""
     count = rest(splat).shape[1]
     turns = columns(splat, "rot_1", "rot_2", "rot_3", "rot_0")
     return {
@@ -186,7 +191,8 @@ def test_niantics_library_reads_and_writes_as_we_do(tmp_path, degree):
         assert_same(splat, read_ply(tmp_path / "c.ply"), expected)
 
 
-# In compressed PLYs, spz-js takes coefficients of degree 1 and 2 for others, and reads their bytes as older viewers did.
+# In compressed PLYs, spz-js mistakes coefficients of degree 1 and 2 for others, and reads their bytes as older viewers
+# did.
 @pytest.mark.parametrize("ending, degree", [*(("ply", degree) for degree in range(4)), ("compressed.ply", 0), ("compressed.ply", 3)])
 def test_another_reader_of_plys_reads_and_writes_as_we_do(tmp_path, ending, degree):
     splat = made(degree)

@@ -1,4 +1,4 @@
-"""TensorBoard's own reader finds in a run's event files what metrics.jsonl tells, each step once."""
+"""Tests that TensorBoard's own reader finds the values of metrics.jsonl in a run's event files, each step once."""
 
 import io
 import json
@@ -19,7 +19,7 @@ CONFIG = """
 model = { latents = 16, width = 32, rgb_width = 32, ray_width = 16, rounds = 1, self_attention_blocks = 1, heads = 4, candidates = 4 }
 curriculum = { final_stage = 2, boundaries = [2, 4], transition = 2 }
 loss = { perceptual = "none", decoder_opacity = true }
-train = { steps = 12, batch = 2, checkpoint_every = 4, validate_every = 4, log_every = 3, pictures_every = 5 }
+train = { steps = 12, batch = 2, checkpoint_every = 4, validate_every = 4, log_every = 3, log_images_every = 5 }
 [data]
 captures = ["CAPTURES"]
 image_size = [32, 32]
@@ -40,7 +40,7 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run that was killed after step 10, and then went on from the checkpoint before step 8."""
+    """Returns a run that was killed after step 10, and then resumed from the checkpoint before step 8."""
     folder = tmp_path_factory.mktemp("tensorboard")
     run("synth", "--gaussians", "--out", folder / "captures", "--frames", 9, "--size", 40)
     (folder / "config.toml").write_text(CONFIG.replace("CAPTURES", str(folder / "captures")))
@@ -56,7 +56,7 @@ def lines(run):
 
 
 def events(run):
-    # 0: everything is kept
+    # 0: keep all events
     found = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
     return found.Reload()
 
@@ -115,7 +115,7 @@ def test_pictures_are_strips_of_five(trained):
         assert photo.std() > 5 and truth.std() > 5 and not np.array_equal(photo, truth)
         assert (alpha == alpha[..., :1]).all(), "grey"
         seen.append([render.any(), depth.any(), alpha.any()])
-    # A model that has learned nothing yet leaves some pictures black.
+    # An untrained model renders some images black.
     assert np.any(seen, axis=0).all()
 
 

@@ -1,13 +1,14 @@
-// Lets system calls that write fail: preloaded by run.py, which tells of it what FAULT_* say here.
+// Injects faults into system calls that write. run.py preloads this library and configures it by environment variables:
 //
-//   FAULT_ROOT    only files below this folder, so that terminals, pipes and libraries' own files are left alone
-//   FAULT_LOG     a line for each such call: "-" done, "!" failed or cut, the call's group, its file
-//   FAULT_CALL    the group that fails: write truncate fsync open mkdir rename link remove, or any of them
-//   FAULT_N       the first of them that fails, from 1; 0 lets all pass
-//   FAULT_KIND    ENOSPC, EIO, EINTR; short: half is written, and that is said; torn, torn-EIO: so, and then ENOSPC or EIO
-//   FAULT_STICKY  1: all that come after it fail, too; torn: the error stays; 2: those on the same file do
+//   FAULT_ROOT    folder below which files are affected, so that terminals, pipes and libraries' own files are left alone
+//   FAULT_LOG     file that gets a line per such call: "-" (succeeded) or "!" (failed or partial), the call's group, its file
+//   FAULT_CALL    group of calls that fail: write truncate fsync open mkdir rename link remove, or any
+//   FAULT_N       index of the first call of the group that fails, from 1; 0 lets all succeed
+//   FAULT_KIND    ENOSPC, EIO, EINTR: the error; short: half is written, and the call returns that count; torn, torn-EIO: half is
+//                 written as for short, and the next call fails with ENOSPC or EIO
+//   FAULT_STICKY  1: all later calls fail, too (torn: the error persists); 2: later calls on the same file fail
 //
-// Files are called by their names when the call is made, a rename by the new one. To open read-only is to write nothing.
+// Files are logged under their names at the time of the call, a rename under the new name. Opening read-only is not a write.
 
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -31,7 +32,7 @@ static const char *root, *call, *kind;
 static long first;
 static int error, sticky, logged = -1;
 static atomic_long seen;
-static char held[2 * PATH_MAX]; // the file of the first that failed
+static char held[2 * PATH_MAX]; // file of the first call that failed
 
 __attribute__((constructor)) static void begin(void) {
     root = getenv("FAULT_ROOT");
@@ -42,10 +43,10 @@ __attribute__((constructor)) static void begin(void) {
     error = strstr(kind, "EIO") ? EIO : !strcmp(kind, "EINTR") ? EINTR : ENOSPC;
     const char *log = getenv("FAULT_LOG");
     if (log) logged = syscall(SYS_openat, AT_FDCWD, log, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0644);
-    unsetenv("LD_PRELOAD"); // what the program starts is not ours to break
+    unsetenv("LD_PRELOAD"); // child processes are not affected
 }
 
-// `name` in the folder that is open as `dir`; without a name, what is open.
+// Writes to `path` the path of `name` in the folder that is open as `dir`; without a name, the path of the open file itself.
 static void resolve(int dir, const char *name, char *path) {
     char link[32];
     ssize_t length = 0;
@@ -59,7 +60,8 @@ static void resolve(int dir, const char *name, char *path) {
     if (name) snprintf(path + strlen(path), PATH_MAX - strlen(path), name[0] == '/' ? "%s" : "/%s", name);
 }
 
-// What becomes of a call of `group` on a file. `bytes`: what it writes, of which a half must be something.
+// Decides the outcome of a call of `group` on a file, and logs it. `bytes` is the number of bytes it writes; only more than one
+// can be halved.
 static int decide(const char *group, int dir, const char *name, size_t bytes) {
     char path[2 * PATH_MAX], line[2 * PATH_MAX + 32];
     int before = errno;
@@ -84,7 +86,7 @@ static int decide(const char *group, int dir, const char *name, size_t bytes) {
 
 #define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
 #define EXPORT __attribute__((visibility("default")))
-// A call that is done or not.
+// Defines a wrapper of a call that succeeds or fails as a whole.
 #define WHOLE(group, name, dir, file, parameters, arguments)                                                          \
     EXPORT int name parameters { return decide(group, dir, file, 0) == FAIL ? -1 : REAL(name) arguments; }
 
@@ -107,7 +109,8 @@ WHOLE("remove", unlinkat, dir, path, (int dir, const char *path, int flags), (di
 WHOLE("open", creat, AT_FDCWD, path, (const char *path, mode_t mode), (path, mode))
 WHOLE("open", creat64, AT_FDCWD, path, (const char *path, mode_t mode), (path, mode))
 
-// The mode is an argument only where a file may be made; passing on what isn't there does no harm on any ABI that Linux has.
+// Defines a wrapper of an open call. The mode is an argument only if the call may create a file; passing 0 otherwise is harmless
+// on every ABI of Linux.
 #define OPEN(name, dir, parameters, arguments)                                                                        \
     EXPORT int name parameters {                                                                                      \
         va_list rest;                                                                                                 \
@@ -123,7 +126,7 @@ OPEN(open64, AT_FDCWD, (const char *path, int flags, ...), (path, flags, mode))
 OPEN(openat, dir, (int dir, const char *path, int flags, ...), (dir, path, flags, mode))
 OPEN(openat64, dir, (int dir, const char *path, int flags, ...), (dir, path, flags, mode))
 
-// A call that may also be done by half.
+// Defines a wrapper of a call that may also be done partially.
 #define PARTLY(name, fd, parameters, bytes, arguments, half)                                                          \
     EXPORT ssize_t name parameters {                                                                                  \
         int what = decide("write", fd, NULL, bytes);                                                                  \
@@ -137,6 +140,6 @@ PARTLY(sendfile, to, (int to, int from, off_t *at, size_t n), n, (to, from, at, 
 PARTLY(sendfile64, to, (int to, int from, off64_t *at, size_t n), n, (to, from, at, n), (to, from, at, n / 2))
 PARTLY(copy_file_range, to, (int from, off64_t *a, int to, off64_t *b, size_t n, unsigned flags), n,
        (from, a, to, b, n, flags), (from, a, to, b, n / 2, flags))
-// A half of several pieces: the first of them, or of a single one all but its last byte.
+// A partial write of several pieces writes the first of them; of a single piece, all but its last byte.
 PARTLY(writev, fd, (int fd, const struct iovec *from, int n), n > 1 ? 2 : from->iov_len, (fd, from, n),
        (fd, n > 1 ? from : &(struct iovec){from->iov_base, from->iov_len - 1}, 1))

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Every system call that writes fails once, in every command that writes; then the files are the old ones or the new ones.
+"""Injects faults into every writing system call of every command that writes files, and checks the files afterwards.
 
     scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...] [--self-test]
 
-Each operation runs undisturbed first, under inject.c, which counts its calls. Then, for every call and everything that can
-happen to it, it runs again from the same state, in which older files lie where it writes, and afterwards
-  - it has ended by itself, without a signal or a panic: with all files new, or with one sentence that names the file;
-  - every file, and every folder that is one thing, is an old one or a new one;
-  - the same command, undisturbed, ends with what it would have ended with, to the bit, and nothing else is left lying about.
-Prints a table in Markdown and every failure with what repeats it. --short takes a fixed sample, in a minute.
---self-test spoils right files instead, one by one, and fails unless every spoiled one is noticed.
+Each operation runs without faults first, under inject.c, which records its calls. Then, for every call and every kind
+of fault, it runs again from the same state, in which older files exist where it writes. Afterwards
+  - it must have ended by itself, without a signal or a panic: with all files new, or one sentence that names the file;
+  - every file, and every folder that is a unit, must be the old one or the new one;
+  - the same command without faults must end bit-identically to the first run, and leave no other files.
+Prints a Markdown table, and every failure with the options that reproduce it. --short runs a fixed sample, in a minute.
+--self-test corrupts correct files instead, one by one, and fails unless every corruption is detected.
 """
 
 import argparse
@@ -30,8 +30,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parents[1]
-# What can happen to a call of each group, and whether it stays so, as in inject.c. A disk that is gone ("any") leaves what a
-# crash leaves.
+# (kind, sticky) of the faults of each group of calls, as in inject.c. A persistent error of all calls ("any", a lost
+# disk) leaves the same state as a crash.
 REFUSED = [("ENOSPC", 0), ("ENOSPC", 1), ("EIO", 0), ("EIO", 1), ("EINTR", 0)]
 FAULTS = {
     "write": REFUSED + [("short", 0), ("short", 1), ("torn", 0), ("torn", 1), ("torn-EIO", 0)],
@@ -44,18 +44,18 @@ FAULTS = {
     "remove": [("EIO", 0), ("EIO", 1)],
     "any": [("EIO", 1)],
 }
-# Calls that are to be repeated when a signal interrupts them. Linux doesn't interrupt the others on a local disk.
+# Calls that must be repeated after EINTR. Linux doesn't interrupt the others on a local disk.
 INTERRUPTIBLE = {"write", "truncate", "fsync", "open"}
-# With --short, of an operation that waits for room, and of another.
+# Number of faults with --short: of an operation that waits for free disk space, and of any other.
 SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
-# Seconds.
+# Timeout of a command, in seconds.
 PATIENCE = 30
-# What a run tells beside how it ended.
+# Lines on standard error that are not error messages.
 NOTICE = re.compile(
-    "training pauses: .* when there is room$|there is room again: training goes on$|.*the checkpoint before it is taken$"
+    "training paused: .* when there is disk space$|disk space is available again: training resumes$|.*the checkpoint before it is taken$"
     "|.*the best checkpoint is looked for anew$|left out: lpips_|.* pixels that the model sees$"
 )
-# Names of what is on its way.
+# Names of temporary files and folders.
 TEMPORARY = re.compile(r"(^|/)\.[^/]+\.globalsplat-(partial(-\d+)?|old)(/|$)")
 VOLATILE = {
     "seconds",
@@ -70,19 +70,19 @@ VOLATILE = {
 
 
 def plain(text):
-    """With the names that files and folders get in the end."""
+    """Replaces names of temporary files and folders in `text` with their final names."""
     text = re.sub(r"/\.([^/ ]+?)\.globalsplat-(partial(-\d+)?|old)(?=[/ :]|$)", r"/\1", text)
     return re.sub(r"/globalsplat-probe", "", text)
 
 
 def steady(value):
-    """JSON without what differs from run to run."""
+    """Returns a JSON value without the fields that differ from run to run."""
     if isinstance(value, dict):
         return {key: steady(of) for key, of in value.items() if key not in VOLATILE}
     return [steady(of) for of in value] if isinstance(value, list) else value
 
 
-# What an operation leaves on disk.
+# Files that an operation leaves on disk.
 
 
 def crc32c(data, table=[]):
@@ -99,7 +99,7 @@ def crc32c(data, table=[]):
 
 
 def events(data):
-    """The step and the contents of every event, without times; SessionLog.START is its step and None."""
+    """Yields the step and a hash of every TensorBoard event, without times; for SessionLog.START, its step and None."""
     while data:
         if len(data) < 16:
             raise ValueError("ends within a record")
@@ -122,7 +122,7 @@ def events(data):
 
 
 class Tree:
-    """Files by their names: a hash, or the records of one that grows; those on their way apart."""
+    """The files below a folder by name: a hash, or the records of a log that grows. Temporary files are kept apart."""
 
     def __init__(self, folder):
         self.files, self.temporary, self.broken = {}, {}, []
@@ -145,7 +145,7 @@ class Tree:
                 self.files[name] = tuple(json.dumps(steady(json.loads(line))) for line in lines)
             else:
                 self.files[name] = hashlib.sha1(path.read_bytes()).hexdigest()
-        # As TensorBoard shows it: a start voids what was told of later steps, and what is told twice is shown once.
+        # The events that TensorBoard shows: a start discards events of later steps, and duplicates are shown once.
         shown = {}
         for step, event in logged:
             if event is None:
@@ -165,15 +165,18 @@ class Tree:
         return units
 
     def differs(self, new):
-        """How it isn't what an undisturbed run leaves."""
+        """Returns the differences from `new`, the tree that a run without faults leaves."""
         names = [name for name in {**self.files, **new.files} if self.files.get(name) != new.files.get(name)]
         wrong = self.broken + [f"{name} isn't the new one" for name in sorted(names)]
         return wrong + [f"{name} is left" for name in sorted(self.temporary)]
 
     def mixes(self, trees, unit_of, crashed=False, completed_by=None):
-        """What is neither old nor new. `trees`: the old one, those between, the new one. After a crash, a folder may lie
-        where it was moved to make room for its successor. The file `completed_by` may be gone: without it, the others are
-        taken for nothing."""
+        """Returns the units that are neither old nor new.
+
+        `trees` are the old tree, those between, and the new one. After a crash, an old folder may still have the
+        temporary name that it was renamed to while being replaced. The file `completed_by` may be missing: readers
+        ignore the other files without it.
+        """
         of = [tree.units(unit_of) for tree in trees]
         wrong = list(self.broken)
         units = self.units(unit_of)
@@ -204,7 +207,7 @@ def whole_checkpoint(name):
 
 
 class Operation:
-    """A command, the state it starts from, and the states it may leave."""
+    """A command, the state that it starts from, and the states that it may leave."""
 
     def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None, once=False, completed_by=None):
         self.bench, self.name, self.unit_of, self.waits, self.into = bench, name, unit_of, waits, into
@@ -215,7 +218,7 @@ class Operation:
         self.between = []
 
     def age(self, keep=(), drop=()):
-        """Other bytes where the command writes, as if from long ago."""
+        """Starts from older files with other contents where the command writes; keeps `keep` and removes `drop`."""
         self.reset()
         done = self.bench.run(self.arguments, into=self.into)
         assert done.code == 0, done.said
@@ -229,7 +232,7 @@ class Operation:
         return self
 
     def take(self):
-        """Begins with what lies there now."""
+        """Starts from the files that are in out/ now."""
         shutil.rmtree(self.old)
         shutil.copytree(self.bench.out, self.old)
         return self
@@ -239,7 +242,7 @@ class Operation:
         shutil.copytree(self.old, self.bench.out)
 
     def undisturbed(self):
-        """Runs it, for what its calls are and what it leaves."""
+        """Runs the command without faults and records its calls, its output and the files that it leaves."""
         self.reset()
         old = Tree(self.bench.out)
         done = self.bench.run(self.arguments, into=self.into)
@@ -250,7 +253,7 @@ class Operation:
         self.ends = {}
 
     def names(self, done):
-        """Whether what is said names a file that a call failed on, or a folder that was to be removed with it."""
+        """Returns `True` if the message names a file on which a call failed, or a folder that was to be removed."""
         if self.into and re.search("stdout|standard output", done.sentence):
             return True
         hit = [(group, Path(file)) for failed, group, file in done.calls if failed]
@@ -259,7 +262,7 @@ class Operation:
         return any(plain(str(name)) in plain(done.sentence) for name in names)
 
     def faults(self, most=None):
-        """(group, n, kind, sticky) for every call, or for at most so many of a group, evenly."""
+        """Returns (group, n, kind, sticky) for every call, or for at most `most` evenly spaced calls of each group."""
         count = Counter(group for _, group, _ in self.calls)
         count["any"] = len(self.calls)
 
@@ -269,7 +272,7 @@ class Operation:
         return [(group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults]
 
     def again(self):
-        """What is wrong after the same command once more. States that were seen before end as before."""
+        """Runs the same command again without faults and returns the errors. Results are cached by initial state."""
         state = Tree(self.bench.out).digest()
         if state not in self.ends:
             done = self.bench.run(self.arguments, into=self.into)
@@ -281,7 +284,7 @@ class Operation:
 
 
 class Done:
-    """How a run ended: exit code or None, what it told and said, and its calls as (whether it failed, group, file)."""
+    """Result of a run: exit code or None, standard output (`told`) and error (`said`), calls (failed, group, file)."""
 
     def __init__(self, code, told, said, calls):
         self.code, self.said, self.calls = code, said, calls
@@ -295,7 +298,7 @@ class Done:
 
 
 class Bench:
-    """A folder for everything: in/ is only read, out/ is where calls fail."""
+    """The working folder: in/ is only read, and faults are injected in out/."""
 
     def __init__(self, program, folder):
         self.program, self.folder = program, folder
@@ -305,7 +308,7 @@ class Bench:
         subprocess.run(["cc", *flags, "-o", self.library, HERE / "inject.c", "-ldl"], check=True)
         for path in (self.inputs, self.out, folder / "bin"):
             path.mkdir()
-        # An encoder for what we do around it; with the weights of LPIPS far away, scores are quick.
+        # A fake encoder is enough to test how the program writes videos. Without LPIPS weights, scoring is fast.
         encodes = 'case $* in *-encoders*) echo libx264; exit;; esac\nfor out; do :; done\nexec cat > "$out"\n'
         (folder / "bin/ffmpeg").write_text(f"#!/bin/sh\n{encodes}")
         (folder / "bin/ffmpeg").chmod(0o755)
@@ -317,7 +320,7 @@ class Bench:
         subprocess.run([self.program, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
 
     def run(self, arguments, fault=None, stop_when_waiting=False, into=None):
-        """Runs the program in out/. `fault`: (group, n, kind, sticky). `into`: a file for what it tells."""
+        """Runs the program. `fault` is (group, n, kind, sticky); `into` is a file that gets standard output."""
         self.log.unlink(missing_ok=True)
         ours = {"LD_PRELOAD": self.library, "FAULT_ROOT": self.out, "FAULT_LOG": self.log}
         environment = {**self.environment, **{key: str(value) for key, value in ours.items()}}
@@ -328,7 +331,7 @@ class Bench:
             process = subprocess.Popen([self.program, *arguments], stdout=out, stderr=err, env=environment)
             begun, code = time.monotonic(), None
             while code is None and time.monotonic() - begun < PATIENCE:
-                if stop_when_waiting and b"training pauses" in said.read_bytes():
+                if stop_when_waiting and b"training paused" in said.read_bytes():
                     process.send_signal(signal.SIGTERM)
                     stop_when_waiting = False
                 try:
@@ -344,7 +347,8 @@ class Bench:
 
 
 def operations(bench, only):
-    """All of them, on rooms and weights that the program makes, by tests/common/program.rs's configuration."""
+    """Yields the operations, on synthetic scenes and weights that the program creates, with the configuration of
+    tests/common/program.rs."""
     inputs, out = bench.inputs, bench.out
     source = (REPOSITORY / "tests/common/program.rs").read_text()
     config = re.search(r'TINY_CONFIG: &str = r#"(.*?)"#', source, re.DOTALL)[1]
@@ -379,7 +383,7 @@ def operations(bench, only):
     orbit = ["render", "--splat", splat, "--size", "24x24", "--orbit", "--frames", 3, "--json", "--out"]
 
     def training(name, stopped):
-        """Begun anew, or where an error ended it within the fourth step, with a checkpoint of the second one."""
+        """Trains from the start, or resumes a run that failed in its fourth step, with a checkpoint of step 2."""
         op = Operation(bench, name, train, whole_checkpoint, waits=True)
         told = [file.endswith("/metrics.jsonl") for _, group, file in bench.run(op.arguments).calls if group == "write"]
         at = [n for n, ours in enumerate(told, 1) if ours]
@@ -396,10 +400,10 @@ def operations(bench, only):
         return op
 
     def packed():
-        # Photos of more than a megabyte, for chunks of one each.
+        # Scenes of more than a megabyte each, so that each chunk has one scene.
         bench.make("synth", "--gaussians", "--out", inputs / "large", "--scenes", 2, "--frames", 9, "--size", 256)
         command = ["pack", inputs / "large", "--out", out, "--chunk-size", 1, "--json"]
-        # No chunk is replaced, so it begins where an earlier one was interrupted.
+        # Existing chunks are never replaced, so start from the state of an interrupted run.
         bench.make(*command)
         (out / "000001.torch").unlink()
         (out / "index.json").unlink()
@@ -413,7 +417,7 @@ def operations(bench, only):
     def filmed():
         more = ["--depth", "--sheet", out / "sheet.png"]
         command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, *more, "--json"]
-        # As if from long ago, and without what says that it is finished.
+        # Older files, without the index that marks the folder as complete.
         return Operation(bench, "synth, videos", command, once=True).age(drop=["000000.torch", "index.json"])
 
     def converted():
@@ -422,7 +426,7 @@ def operations(bench, only):
         return Operation(bench, "convert, in place", command).take()
 
     def over_local_origin():
-        """Onto a splat with an origin, which the new one hasn't."""
+        """Overwrites a splat that has a local origin with one that has none."""
         bench.make(*convert)
         return Operation(bench, "convert, over a local origin", ["convert", splat, out / "far.spz", "--json"]).take()
 
@@ -469,7 +473,7 @@ def operations(bench, only):
 
 
 def check(op, fault):
-    """Injects one fault. Returns what became of it ("right", "refused" or None where nothing was hit) and what was wrong."""
+    """Injects one fault. Returns the outcome ("right", "refused", None if no call was hit), the errors and the run."""
     group, _, kind, sticky = fault
     op.reset()
     room_never_comes = op.waits and sticky and kind in ("ENOSPC", "torn")
@@ -479,7 +483,7 @@ def check(op, fault):
     tree, wrong = Tree(op.bench.out), []
     if done.code is None:
         wrong.append(f"it hasn't ended after {PATIENCE} s")
-    elif done.code not in (0, 1, 2) or "panicked" in done.said or "failed inside" in done.said:
+    elif done.code not in (0, 1, 2) or "panicked" in done.said or "internal error" in done.said:
         wrong.append(f"it ended with {done.code}, by a signal or a panic")
     elif done.code == 0:
         wrong += tree.differs(op.new)
@@ -496,25 +500,26 @@ def check(op, fault):
             wrong.append("it tells a result, and fails")
         if kind == "short" or kind == "EINTR" and group in INTERRUPTIBLE:
             wrong.append("it doesn't go on")
-        # A full disk is waited for, but not by what looks whether the run's folder can be written and is nobody's.
+        # The program waits for space on a full disk, but not when it checks that the folder is writable and not locked.
         looks = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
         if op.waits and not sticky and kind in ("ENOSPC", "torn") and not looks:
             wrong.append("it doesn't wait for room")
-        # Where renames fail for good, of anything or onto this one, nobody can take one back: the next run does.
+        # If renames fail persistently (all, or those onto this file), a rename can't be undone; the next run repairs
+        # it.
         crashed = sticky and group in ("rename", "any")
         wrong += tree.mixes(op.trees, op.unit_of, crashed, op.completed_by)
     return "right" if done.code == 0 else "refused", wrong, done
 
 
 def told_of(op, fault, done, wrong):
-    """A failure, with what repeats it."""
+    """Describes a failure, with the options that reproduce it."""
     how = " ".join(map(str, fault))
     said = done.said.strip().replace("\n", "\n    ") or "nothing said"
     return f"\n--only \"{op.name}\" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  " + "\n  ".join(wrong)
 
 
 def inject(operations, most, short, one):
-    """Injects everything and prints the table. Returns the failures."""
+    """Injects all faults and prints the table. Returns the failures."""
     columns = ["operation", "calls", "faults injected", "ended right at once", "refused, with one sentence"]
     columns += ["second run right", "failures"]
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
@@ -533,7 +538,7 @@ def inject(operations, most, short, one):
                 continue
             count["injected"] += 1
             count[became] += not wrong
-            # Chunks are never written over: a folder that has them all is refused.
+            # Chunks are never overwritten: the command fails on a folder that is complete.
             again = [] if op.once and done.code == 0 else op.again()
             count["again"] += not again
             if wrong or again:
@@ -553,7 +558,7 @@ def inject(operations, most, short, one):
 
 
 def spoil(operations):
-    """Spoils what right runs left, file by file. Returns the number of those that nobody noticed."""
+    """Corrupts the files of correct runs, one by one. Returns the number of corruptions that were not detected."""
     spoiled, unnoticed = 0, 0
     for op in operations:
         op.reset()
@@ -571,7 +576,7 @@ def spoil(operations):
             if older.is_file() and older.read_bytes() != right:
                 ways["older"] = older.read_bytes()
             for way, bytes_ in ways.items():
-                # A file of its own may be the old one, or not be there yet.
+                # A unit of one file may validly be the old one, or be missing.
                 fits_none = way in ("flipped", "cut") or len(units.get(op.unit_of(name), "")) > 1
                 path.unlink() if bytes_ is None else path.write_bytes(bytes_)
                 try:
@@ -596,13 +601,13 @@ def spoil(operations):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--binary", type=Path, default=REPOSITORY / "target/release/globalsplat")
-    parser.add_argument("--short", action="store_true", help="a fixed sample, in about a minute")
-    most = "calls of a group and an operation that fail; of more, so many, evenly"
+    parser.add_argument("--short", action="store_true", help="run a fixed sample, in about a minute")
+    most = "maximum number of failing calls per group and operation, evenly spaced"
     parser.add_argument("--most", type=int, default=60, metavar="N", help=most)
     parser.add_argument("--only", nargs="+", metavar="OPERATION")
     one = ("CALL", "N", "KIND", "STICKY")
-    parser.add_argument("--fault", nargs=4, metavar=one, help="this one alone, as a failure names it")
-    parser.add_argument("--self-test", action="store_true", help="spoil right files instead, and see that it is noticed")
+    parser.add_argument("--fault", nargs=4, metavar=one, help="inject only this fault, as printed with a failure")
+    parser.add_argument("--self-test", action="store_true", help="corrupt correct files and check that it is detected")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         bench = Bench(arguments.binary.resolve(), Path(folder).resolve())

@@ -1,7 +1,7 @@
 //! Benchmark of attention on the CPU: this crate's kernel, libtorch's, and a matrix product for comparison.
 
 use super::Spread;
-use super::yardstick::Yardstick;
+use super::peak_throughput::PeakThroughput;
 use crate::model::{Precision, attention, by_libtorch};
 use crate::optim::Stopwatch;
 use crate::render::cpu::simd_level;
@@ -66,7 +66,7 @@ pub fn bench_attention(
         ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
-    let yardstick = Yardstick::new(precision, Device::Cpu);
+    let yardstick = PeakThroughput::new(precision, Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms up caches and threads.

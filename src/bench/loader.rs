@@ -63,7 +63,7 @@ pub struct StageMilliseconds {
 ///
 /// # Errors
 /// Fails if a file can't be written.
-pub fn made_up_videos(root: &Path) -> Result<()> {
+pub fn synthetic_videos(root: &Path) -> Result<()> {
     write_videos(root, VIDEOS, FRAMES, CHUNK_BYTES)
 }
 

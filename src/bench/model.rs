@@ -2,8 +2,8 @@
 
 use super::Spread;
 use super::parts::{Part, Parts};
-use super::train::made_up_scene;
-use super::yardstick::Yardstick;
+use super::peak_throughput::PeakThroughput;
+use super::train::synthetic_scene;
 use crate::config::Config;
 use crate::data::{Sample, ViewBatch};
 use crate::error::Result;
@@ -52,7 +52,7 @@ pub fn bench_model(
     device: Device,
 ) -> Result<ModelReport> {
     let mut vs = nn::VarStore::new(device);
-    let mut model = GlobalSplat::to_be_filled(&mut vs, &config.model, precision)?;
+    let mut model = GlobalSplat::uninitialized(&mut vs, &config.model, precision)?;
     no_grad(|| {
         for mut weights in vs.variables().into_values().filter(|variable| variable.dim() > 1) {
             let _ = weights.normal_(0., WEIGHTS_STD);
@@ -61,9 +61,9 @@ pub fn bench_model(
     if device != Device::Cpu {
         model.fold_weights();
     }
-    let context = Sample::of(&[made_up_scene(config, 0)], device).context;
+    let context = Sample::of(&[synthetic_scene(config, 0)], device).context;
     let stage = config.curriculum.final_stage();
-    let yardstick = Yardstick::new(precision, device);
+    let yardstick = PeakThroughput::new(precision, device);
     let ViewBatch { images, c2w, intrinsics, .. } = &context;
     let forward = || {
         let mut watch = Stopwatch::of(device);

@@ -1,7 +1,7 @@
 //! Parts of a model's pass: the time, the floating-point operations and the memory traffic of each.
 
 use super::Spread;
-use crate::device::Moment;
+use crate::device::DeviceEvent;
 use crate::model::{Event, told};
 use serde::Serialize;
 use std::cell::RefCell;
@@ -28,10 +28,10 @@ pub struct Part {
 /// One execution of a part in one pass.
 struct Piece {
     name: &'static str,
-    begins: Moment,
-    ends: Option<Moment>,
+    begins: DeviceEvent,
+    ends: Option<DeviceEvent>,
     flops: f64,
-    owed: f64,
+    backward_flops: f64,
     bytes: f64,
 }
 
@@ -46,7 +46,7 @@ struct Sum {
     name: &'static str,
     milliseconds: Vec<f64>,
     flops: f64,
-    owed: f64,
+    backward_flops: f64,
     bytes: f64,
 }
 
@@ -59,13 +59,13 @@ impl Parts {
             let mut pieces = heard.borrow_mut();
             match (event, pieces.last_mut()) {
                 (Event::Begins(name), _) => {
-                    let begins = Moment::now(device);
-                    pieces.push(Piece { name, begins, ends: None, flops: 0., owed: 0., bytes: 0. });
+                    let begins = DeviceEvent::now(device);
+                    pieces.push(Piece { name, begins, ends: None, flops: 0., backward_flops: 0., bytes: 0. });
                 }
-                (Event::Ends, Some(piece)) => piece.ends = Some(Moment::now(device)),
-                (Event::Does { flops, owed, bytes }, Some(piece)) => {
+                (Event::Ends, Some(piece)) => piece.ends = Some(DeviceEvent::now(device)),
+                (Event::Flops { flops, backward_flops, bytes }, Some(piece)) => {
                     piece.flops += flops;
-                    piece.owed += owed;
+                    piece.backward_flops += backward_flops;
                     piece.bytes += bytes;
                 }
                 (_, None) => unreachable!("a part begins before all else"),
@@ -81,7 +81,7 @@ impl Parts {
             });
             sums[known].milliseconds[0] += 1e3 * elapsed.as_secs_f64();
             sums[known].flops += piece.flops;
-            sums[known].owed += piece.owed;
+            sums[known].backward_flops += piece.backward_flops;
             sums[known].bytes += piece.bytes;
         }
         match self.parts.is_empty() {
@@ -101,7 +101,8 @@ impl Parts {
         let part = |sum: Sum| {
             let milliseconds = Spread::of(sum.milliseconds);
             let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
-            let [gflop, backward_gflop, gigabytes] = [sum.flops, sum.owed, sum.bytes].map(|of| 1e-9 * of);
+            let [gflop, backward_gflop, gigabytes] =
+                [sum.flops, sum.backward_flops, sum.bytes].map(|of| 1e-9 * of);
             Part { name: sum.name, milliseconds, gflop, backward_gflop, gigabytes, share_of_peak }
         };
         self.parts.into_iter().map(part).collect()

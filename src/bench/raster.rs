@@ -6,7 +6,7 @@ use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_byte
 use crate::optim::Stopwatch;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
-use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render};
+use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
 use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
@@ -169,7 +169,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
 }
 
 /// Returns an objective that depends on every element of every image.
-fn sum_of_pictures(pictures: &Pictures) -> Tensor {
+fn sum_of_pictures(pictures: &RenderOutput) -> Tensor {
     let [rgb, alpha, depth] = [&pictures.rgb, &pictures.alpha, &pictures.depth].map(|t| t.sum(Kind::Float));
     rgb + alpha + depth
 }
@@ -211,7 +211,7 @@ fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Ve
     let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
     let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
     sum_of_pictures(&pictures).backward();
-    let Pictures { rgb, alpha, depth } = pictures;
+    let RenderOutput { rgb, alpha, depth } = pictures;
     Ok(vec![
         ("rgb", rgb.detach()),
         ("alpha", alpha.detach()),
@@ -254,7 +254,7 @@ fn rates(stages: &[Section], pairs: &Pairs) -> Rates {
 
 /// Returns a synthetic scene that resembles a trained one, and `views` cameras that move past it, from a fixed seed. Projected sizes,
 /// elongations and opacities follow the published 16K splats. With more Gaussians each is smaller, so that they cover the same area.
-pub fn made_up_scene(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
+pub fn synthetic_scene(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (width, height) = (f64::from(size.width), f64::from(size.height));
     let focal = 0.9 * width.max(height);

@@ -1,6 +1,6 @@
 //! Benchmark of a refinement step: the time of its parts, and the share of rendering.
 
-use super::{Spread, made_up_scene};
+use super::{Spread, synthetic_scene};
 use crate::data::ViewBatch;
 use crate::error::Result;
 use crate::optim::Stopwatch;
@@ -51,7 +51,7 @@ pub fn bench_refine(
     steps: u64,
     device: Device,
 ) -> Result<RefineReport> {
-    let (gaussians, cameras) = made_up_scene(count, PHOTOS, size);
+    let (gaussians, cameras) = synthetic_scene(count, PHOTOS, size);
     let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
     let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
     let c2w = cameras.w2c.inverse();

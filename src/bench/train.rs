@@ -1,7 +1,7 @@
 //! Benchmark of a training step: the time of its parts, and its memory use.
 
 use super::parts::{Part, Parts};
-use super::yardstick::Yardstick;
+use super::peak_throughput::PeakThroughput;
 use super::{Measured, Section, Spread};
 use crate::config::Config;
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
@@ -108,17 +108,17 @@ pub fn bench_train(
         true => trainer.with_ranks(group).with_sharded_optimizer(),
         false => trainer.with_ranks(group),
     };
-    trainer.follow_first()?;
-    let seeds = (rank * config.train.batch) as u64..;
+    trainer.broadcast_state()?;
+    let seeds = (rank * config.train.batch_size) as u64..;
     let scenes: Vec<LoadedScene> =
-        seeds.take(config.train.batch).map(|seed| made_up_scene(&config, seed)).collect();
+        seeds.take(config.train.batch_size).map(|seed| synthetic_scene(&config, seed)).collect();
     let upload = Upload::to(device);
     let mut parts = Parts::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
-    let yardstick = Yardstick::new(precision, device);
+    let yardstick = PeakThroughput::new(precision, device);
     tch::set_num_threads(threads / slices_at_once as i32);
     let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
     tch::set_num_threads(threads);
@@ -206,7 +206,7 @@ fn together(
 }
 
 /// Returns a scene of random noise with as many views as a step takes. Context and target views are disjoint.
-pub(super) fn made_up_scene(config: &Config, seed: u64) -> LoadedScene {
+pub(super) fn synthetic_scene(config: &Config, seed: u64) -> LoadedScene {
     let data = &config.data;
     let views = data.context_views + data.target_views;
     let size @ ImageSize { height, width } = data.image_size;
@@ -253,13 +253,13 @@ mod tests {
             "data.target_views=4",
             "loss.perceptual=none",
             "curriculum.full_capacity=true",
-            "train.batch=2",
+            "train.batch_size=2",
         ];
         let all: Vec<String> = base.iter().chain(settings).map(|set| set.to_string()).collect();
         let config = Config::parse("", &all, Path::new("test")).unwrap();
         let ((), found) = peak_tensor_bytes(|| {
             let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
-            let scenes: Vec<_> = (0..2).map(|seed| made_up_scene(&config, seed)).collect();
+            let scenes: Vec<_> = (0..2).map(|seed| synthetic_scene(&config, seed)).collect();
             let sample = Sample::by(&scenes, &Upload::to(Device::Cpu));
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
         });

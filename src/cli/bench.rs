@@ -6,7 +6,7 @@ use super::{device, memory, open_capture, parse_size, print_json, progress, warn
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    RasterReport, Spread, bench_loader, bench_raster, bench_synth, made_up_scene, made_up_videos,
+    RasterReport, Spread, bench_loader, bench_raster, bench_synth, synthetic_scene, synthetic_videos,
 };
 use globalsplat::data::{DataConfig, TrainingScenes, view_batch};
 use globalsplat::error::Error;
@@ -121,7 +121,7 @@ impl Raster {
                 let gaussians = frame.gaussians_to_local(&splat.gaussians, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
-            _ => made_up_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
+            _ => synthetic_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
         let gaussians = gaussians.to_device(device);
         let cameras = cameras.to_device(device);
@@ -168,7 +168,7 @@ impl Loader {
             (None, keep) => {
                 let root = keep.as_deref().unwrap_or(temporary.path());
                 check_writable_dir(root)?;
-                made_up_videos(root)?;
+                synthetic_videos(root)?;
                 root.to_owned()
             }
         };
@@ -217,7 +217,7 @@ impl Raster {
         let bar = progress::bar((GAUSSIANS.len() * SIZES.len()) as u64, "scenes");
         for count in GAUSSIANS {
             for (width, height) in SIZES {
-                let (gaussians, cameras) = made_up_scene(count, 1, ImageSize { width, height });
+                let (gaussians, cameras) = synthetic_scene(count, 1, ImageSize { width, height });
                 let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
                 reports.push(bench_raster(&gaussians, &cameras, self.repeats as usize)?);
                 bar.inc(1);
@@ -257,7 +257,7 @@ fn print_report(r: &RasterReport) {
         "{} Gaussians, {} views of {}x{} in one call, {}, {} threads, {}",
         r.gaussians, r.views, r.width, r.height, r.device, r.threads, r.simd
     );
-    println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "least", "3 of 4");
+    println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "min", "p75");
     let row = |name: &str, s: &Spread| {
         println!("{name:<18} {:>8.3} {:>8.3} {:>8.3}", s.median, s.least, s.upper_quartile);
     };
@@ -315,7 +315,7 @@ pub struct Synth {
 
 impl Synth {
     fn run(self) -> Result<()> {
-        let bar = progress::bar(self.videos, "worlds");
+        let bar = progress::bar(self.videos, "scenes");
         let report = bench_synth(self.videos, self.frames as usize, self.size, || bar.inc(1));
         bar.finish_and_clear();
         if self.json {
@@ -324,7 +324,7 @@ impl Synth {
         }
         let [height, width] = report.size;
         println!(
-            "{} worlds of {} triangles, {} views of {width}x{height}, {} rays a pixel and their shadows",
+            "{} scenes of {} triangles, {} views of {width}x{height}, {} rays a pixel and their shadows",
             report.videos, report.triangles, report.views, report.rays_per_pixel
         );
         println!(

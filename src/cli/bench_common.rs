@@ -15,7 +15,7 @@ pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
 
 /// Prints one line per section, with its share of the whole, and one for the whole.
 pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
-    println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "least", "3 of 4", "share");
+    println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "min", "p75", "share");
     let row = |name: &str, s: &Spread| {
         let share = 1e2 * s.median / whole.median;
         println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);

@@ -31,7 +31,7 @@ pub struct Train {
     /// Override a key of the configuration, as in train.checkpoint_rounds=true
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Number of scenes per step; auto takes the largest of train.batch, half of it, a quarter, … that fits into the device's
+    /// Number of scenes per step; auto takes the largest of train.batch_size, half of it, a quarter, … that fits into the device's
     /// memory without train.micro_batch
     #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
     batch: Batch,
@@ -75,7 +75,7 @@ impl Train {
         memory::keep_for(&config.train);
         let report = match self.batch {
             Batch::Scenes(scenes) => {
-                config.train.batch = scenes;
+                config.train.batch_size = scenes;
                 bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?
             }
             Batch::Auto if group.ranks() > 1 => {
@@ -97,7 +97,7 @@ impl Train {
     /// Runs the benchmark with the batch size that fits by the estimate; if a GPU still runs out of memory, halves it and tries
     /// again.
     fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
-        let wanted = config.train.batch;
+        let wanted = config.train.batch_size;
         let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
         let (fits, refused) = batch_within(&config, bytes, device)?;
         if let Some(refused) = refused {
@@ -107,10 +107,10 @@ impl Train {
                 refused.batch
             );
         }
-        config.train.batch = fits;
+        config.train.batch_size = fits;
         config.train.micro_batch = 0;
         loop {
-            let batch = config.train.batch;
+            let batch = config.train.batch_size;
             let (steps, alone) = (self.steps as usize, Group::alone());
             let bench = || bench_train(&config, steps, device, alone, self.shard_optimizer);
             let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
@@ -120,7 +120,7 @@ impl Train {
                 Err(panic) if is_refused(panic_message(&*panic)) => {}
                 Err(panic) => resume_unwind(panic),
             }
-            config.train.batch = batch / 2;
+            config.train.batch_size = batch / 2;
             eprintln!("--batch auto: {} scenes; there was too little memory for {batch}", batch / 2);
         }
     }

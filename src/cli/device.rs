@@ -15,7 +15,7 @@ pub fn parse(name: &str) -> Result<Device> {
         }
         _ => return Err(refused("expected cpu, cuda or cuda:N")),
     };
-    let why = load_cuda().err().unwrap_or("globalsplat doctor tells what was found".into());
+    let why = load_cuda().err().unwrap_or("run globalsplat doctor for details".into());
     let count = Cuda::device_count();
     if !Cuda::is_available() || index as i64 >= count {
         return Err(refused(&format!("there are {count} CUDA devices that this libtorch can use ({why})")));

@@ -139,10 +139,7 @@ impl Doctor {
                     line("", &state_of_kernels(prepared.get(number), &unusable));
                 }
                 if driver.gpus.is_empty() {
-                    line(
-                        "",
-                        &"it knows no GPU: nvidia-smi tells whether the system sees one, and CUDA_VISIBLE_DEVICES may hide it",
-                    );
+                    line("", &"it reports no GPU: check nvidia-smi and CUDA_VISIBLE_DEVICES");
                 }
             }
         }

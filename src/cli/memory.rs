@@ -197,7 +197,7 @@ fn end(bytes: Option<usize>) -> ! {
     let mut rest = &mut text[..];
     let _ = match bytes {
         Some(bytes) => writeln!(rest, "globalsplat: the system refuses {bytes} bytes of memory"),
-        None => writeln!(rest, "globalsplat: the system refuses memory"),
+        None => writeln!(rest, "globalsplat: out of memory"),
     };
     let left = rest.len();
     let length = text.len() - left;

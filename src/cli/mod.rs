@@ -20,7 +20,7 @@ mod inspect;
 mod memory;
 mod model;
 #[cfg(target_os = "linux")]
-mod neighbours;
+mod oversubscription;
 mod pack;
 mod parity;
 mod progress;
@@ -132,7 +132,7 @@ pub fn main() -> ExitCode {
     // This must precede the start of other threads.
     globalsplat::model::flush_denormals();
     #[cfg(target_os = "linux")]
-    let _heeding = neighbours::heed();
+    let _guard = oversubscription::start_guard();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence.
     panic::set_hook(Box::new(|_| {}));
     let result = panic::catch_unwind(|| {
@@ -149,7 +149,7 @@ pub fn main() -> ExitCode {
             if error_of_ours.is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
         }
         Err(panic) => {
-            tell(&format!("the work failed inside: {}", panic_message(&*panic)), false);
+            tell(&format!("internal error (please report): {}", panic_message(&*panic)), false);
             FAILED
         }
     };
@@ -162,7 +162,7 @@ fn tell(message: &str, others_are_lost: bool) {
     let Some(message) = ranks::what_to_tell(message, others_are_lost) else { return };
     const PRINTING: &str = "failed printing to stdout: ";
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
-        eprintln!("globalsplat: the system refuses memory");
+        eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
         // A reader that closes the pipe early, such as `head`, is no error.
         if !why.contains("Broken pipe") {

@@ -37,7 +37,7 @@ pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) ->
         None => ModelFile::shipped()?,
     };
     let precision = precision(asked, device, file.config.model.width);
-    let loaded = file.lend(device, precision)?;
+    let loaded = file.load_mmap(device, precision)?;
     if !ranks::is_first() {
         return Ok(loaded);
     }

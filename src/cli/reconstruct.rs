@@ -158,7 +158,7 @@ impl Reconstruct {
         } else {
             let megabytes = bytes as f64 / 1e6;
             let passes =
-                if data.extents.len() == 1 { "forward pass" } else { "scene shown in several sizes," };
+                if data.scene_scales.len() == 1 { "forward pass" } else { "scene shown in several sizes," };
             println!(
                 "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {passes} {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),

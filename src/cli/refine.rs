@@ -211,7 +211,7 @@ impl Refine {
         let result = session.run()?;
         bar.bar.finish_and_clear();
         if result.is_initial && result.steps > 0 {
-            eprintln!("the photos were shown better before: what was begun with is kept");
+            eprintln!("the initial splat reproduces the photos better: it is kept");
         }
         let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();

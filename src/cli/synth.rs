@@ -2,7 +2,7 @@ use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::Error;
-use globalsplat::data::{Capture, ChunkWriter, MadeUp, read_pictures, write_room};
+use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
     Inputs, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
@@ -26,26 +26,26 @@ const CHUNK_BYTES: usize = 20_000_000;
 /// Training generates them on the fly if data.captures contains "synth:seed=1,scenes=10000".
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
-    globalsplat synth --out worlds/train --scenes 2000\n  \
-    globalsplat synth --out worlds/test --scenes 50 --first 2000 --sheet worlds.png")]
+    globalsplat synth --out scenes/train --scenes 2000\n  \
+    globalsplat synth --out scenes/test --scenes 50 --first 2000 --sheet scenes.png")]
 pub struct Synth {
     /// Folder for index.json, 000000.torch, …
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Number of videos
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(MadeUp::SCENES))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(SyntheticDataset::SCENES))]
     scenes: u64,
     /// Seed of the scenes
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
     /// Index of the first video, to continue after others of the same seed
-    #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(MadeUp::FIRST))]
+    #[arg(long, value_name = "I", default_value_t = 0, value_parser = clap::value_parser!(u64).range(SyntheticDataset::FIRST))]
     first: u64,
     /// Number of photos per video
-    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u64).range(MadeUp::FRAMES))]
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u64).range(SyntheticDataset::FRAMES))]
     frames: u64,
     /// Side of a photo in pixels
-    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(MadeUp::SIZE))]
+    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(SyntheticDataset::SIZE))]
     size: u64,
     /// Folder of PNG and JPEG files to use as textures of walls and objects
     #[arg(long, value_name = "DIR")]
@@ -88,7 +88,7 @@ impl Synth {
         inputs.check_folder(&self.out)?;
         self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
         let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
-        let videos = MadeUp::new(self.seed, self.first, self.scenes, settings);
+        let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
         let depths = self.out.join("depth");
         if self.depth {

@@ -89,7 +89,7 @@ impl Train {
         if let ([first, others @ ..], true) = (held_out.trained_on(), is_first) {
             let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
             eprintln!(
-                "{first}{more} of data.validation is trained on, too: its score tells nothing of unseen scenes"
+                "{first}{more} of data.validation is also a training scene: its score says nothing about unseen scenes"
             );
         }
         let captures = scenes.captures().iter().flat_map(Capture::warnings);
@@ -127,7 +127,7 @@ impl Train {
                 Resume::Auto => "the same command",
                 Resume::Never | Resume::From(_) => "the same command with --resume auto",
             };
-            anyhow::bail!("stopped; {checkpoint} holds all of it, and {command} goes on");
+            anyhow::bail!("stopped; {checkpoint} is complete; {command} resumes");
         }
         self.report(&outcome, seconds, held_out.scores(), &bad_data)
     }

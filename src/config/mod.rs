@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::loss::LossConfig;
 use crate::model::ModelConfig;
 use crate::scene::ImageSize;
-use keys::override_key;
+use keys::{override_key, rename_former};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -58,6 +58,7 @@ impl Config {
             Error::input(origin, "a key", one_line(&e, text), "a configuration of globalsplat")
         };
         toml::from_str::<Config>(text).map_err(described)?;
+        rename_former(&mut table);
         for assignment in overrides {
             override_key(&mut table, assignment)?;
             let config: std::result::Result<Config, _> = table.clone().try_into();

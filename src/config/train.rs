@@ -23,7 +23,8 @@ pub struct TrainConfig {
     /// Number of optimizer steps.
     pub steps: u64,
     /// Number of scenes in a step. With several processes, the number of scenes of each process.
-    pub batch: usize,
+    #[serde(alias = "batch")]
+    pub batch_size: usize,
     /// Number of scenes that go through the model at a time, or 0 for all scenes of a step at once. A smaller number needs less memory; the
     /// gradient is still that of the whole step. If `loss.consistency_depth` is used, a step in several slices takes one more forward pass:
     /// this term is a mean over pixels that are known only after rendering.
@@ -52,11 +53,13 @@ pub struct TrainConfig {
     pub validate_every: u64,
     /// Maximum number of consecutive steps with a loss or gradient that isn't finite. Such steps are skipped; training fails when this many
     /// have been skipped in a row.
-    pub max_skipped: u64,
+    #[serde(alias = "max_skipped")]
+    pub max_nonfinite_steps: u64,
     /// Number of steps between scalars in the TensorBoard log. `metrics.jsonl` has the values of every step.
     pub log_every: u64,
     /// Number of steps between images in the TensorBoard log, or 0 for no images.
-    pub pictures_every: u64,
+    #[serde(alias = "pictures_every")]
+    pub log_images_every: u64,
 }
 
 impl Default for TrainConfig {
@@ -64,7 +67,7 @@ impl Default for TrainConfig {
         TrainConfig {
             seed: 0,
             steps: 220_000,
-            batch: 16,
+            batch_size: 16,
             micro_batch: 0,
             checkpoint_rounds: false,
             precision: Precision::F32,
@@ -76,9 +79,9 @@ impl Default for TrainConfig {
             checkpoint_every: 1_000,
             keep_checkpoints: 2,
             validate_every: 5_000,
-            max_skipped: 20,
+            max_nonfinite_steps: 20,
             log_every: 10,
-            pictures_every: 1_000,
+            log_images_every: 1_000,
         }
     }
 }
@@ -90,10 +93,10 @@ impl TrainConfig {
     /// Returns an error that names the first invalid field.
     pub(super) fn check(&self) -> Result<()> {
         for (field, value) in [
-            ("train.batch", self.batch as u64),
+            ("train.batch_size", self.batch_size as u64),
             ("train.checkpoint_every", self.checkpoint_every),
             ("train.keep_checkpoints", self.keep_checkpoints as u64),
-            ("train.max_skipped", self.max_skipped),
+            ("train.max_nonfinite_steps", self.max_nonfinite_steps),
             ("train.log_every", self.log_every),
         ] {
             if value == 0 {

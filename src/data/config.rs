@@ -54,11 +54,13 @@ pub struct DataConfig {
     /// Scene scales at inference: the largest distance between two cameras is scaled to each of these values. If there are several,
     /// they and values around the best one are tried, and the splat that reproduces the photos best is kept (spec 9.9). This
     /// applies to validation, too. Training always uses 1.
-    pub extents: Vec<f64>,
+    #[serde(alias = "extents")]
+    pub scene_scales: Vec<f64>,
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
-    pub fewest_context_views: usize,
+    #[serde(alias = "fewest_context_views")]
+    pub min_context_views: usize,
     /// Number of target views per scene that renderings are compared with in a training step.
     pub target_views: usize,
     /// Range [shortest, longest] of the number of frames of a video from which the views of a training step are drawn, at most the
@@ -84,9 +86,11 @@ pub struct DataConfig {
     /// Number of loader threads; 0 for one per core.
     pub threads: usize,
     /// Number of scenes to prefetch.
-    pub ahead: usize,
+    #[serde(alias = "ahead")]
+    pub prefetch: usize,
     /// Size limit of the photo cache in 10⁶ bytes. Decoded photos are kept only if all of them together fit.
-    pub photo_megabytes: u64,
+    #[serde(alias = "photo_megabytes")]
+    pub photo_cache_mb: u64,
 }
 
 impl Default for DataConfig {
@@ -94,9 +98,9 @@ impl Default for DataConfig {
         DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
-            extents: vec![1.],
+            scene_scales: vec![1.],
             context_views: 24,
-            fewest_context_views: 0,
+            min_context_views: 0,
             target_views: 12,
             window: [40, 220],
             sampling: Sampling::Uniform,
@@ -108,8 +112,8 @@ impl Default for DataConfig {
             validation_scenes: 8,
             max_bad_share: 0.25,
             threads: 0,
-            ahead: 32,
-            photo_megabytes: 1000,
+            prefetch: 32,
+            photo_cache_mb: 1000,
         }
     }
 }
@@ -128,9 +132,9 @@ impl DataConfig {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
         let views = (self.image_size, self.context_views, self.target_views, self.window);
         // Omitting the default value keeps the string of runs that began before `extents` existed.
-        let settings = match self.extents == [1.] {
+        let settings = match self.scene_scales == [1.] {
             true => serde_json::to_string(&(scenes, views)),
-            false => serde_json::to_string(&(scenes, views, &self.extents)),
+            false => serde_json::to_string(&(scenes, views, &self.scene_scales)),
         };
         settings.expect("numbers and strings")
     }
@@ -164,13 +168,15 @@ impl DataConfig {
                 return Err(Error::setting(field, views, expected));
             }
         }
-        if self.fewest_context_views > self.context_views {
+        if self.min_context_views > self.context_views {
             let expected = format!("0 to the {} of data.context_views", self.context_views);
-            return Err(Error::setting("data.fewest_context_views", self.fewest_context_views, expected));
+            return Err(Error::setting("data.min_context_views", self.min_context_views, expected));
         }
-        if self.extents.is_empty() || !self.extents.iter().all(|extent| *extent > 0. && extent.is_finite()) {
+        if self.scene_scales.is_empty()
+            || !self.scene_scales.iter().all(|extent| *extent > 0. && extent.is_finite())
+        {
             let expected = "one or more numbers above 0";
-            return Err(Error::setting("data.extents", format!("{:?}", self.extents), expected));
+            return Err(Error::setting("data.scene_scales", format!("{:?}", self.scene_scales), expected));
         }
         let JitterConfig { brightness, contrast, saturation, hue } = self.jitter;
         for (field, value, largest) in [

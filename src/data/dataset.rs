@@ -4,7 +4,7 @@ use super::capture::Capture;
 use super::formats::{
     CaptureFolders, Chunk, INDEX_FILE, capture_folders, folder_name, is_capture, open_capture,
 };
-use super::made_up::MadeUp;
+use super::synthetic_dataset::SyntheticDataset;
 use crate::error::{Error, Result};
 use crate::io::{Inputs, read_text};
 use std::collections::BTreeMap;
@@ -55,7 +55,7 @@ enum Source {
     /// A capture of another format.
     Folder,
     /// The synthetic video of this index.
-    MadeUp(Arc<MadeUp>, usize),
+    SyntheticDataset(Arc<SyntheticDataset>, usize),
 }
 
 /// The captures of one split. They are located when the dataset is opened and read later.
@@ -89,10 +89,10 @@ impl Dataset {
     /// Fails if there is nothing of that kind at `root`, or if the index is not such an object. Chunks named by the index are not
     /// looked for until they are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
-        if let Some(videos) = MadeUp::named(root)? {
+        if let Some(videos) = SyntheticDataset::named(root)? {
             let made_by = Some(videos.made_by());
             let name = root.to_string_lossy().into_owned();
-            return Ok(Dataset { name, groups: made_up_groups(videos), warnings: vec![], made_by });
+            return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![], made_by });
         }
         let name = folder_name(root);
         let indexed =
@@ -145,7 +145,9 @@ impl SceneGroup {
         match &self.source {
             Source::Chunk => Ok(OpenGroup::Chunk(Chunk::read(&self.path)?)),
             Source::Folder => Ok(OpenGroup::Capture(Box::new(open_capture(&self.path)?))),
-            Source::MadeUp(videos, index) => Ok(OpenGroup::Capture(Box::new(videos.capture(*index)?))),
+            Source::SyntheticDataset(videos, index) => {
+                Ok(OpenGroup::Capture(Box::new(videos.capture(*index)?)))
+            }
         }
     }
 
@@ -166,7 +168,7 @@ impl SceneGroup {
                     capture.add_inputs(inputs);
                 }
             }
-            Source::MadeUp(..) => {}
+            Source::SyntheticDataset(..) => {}
         }
     }
 
@@ -216,11 +218,11 @@ fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
     Ok(chunks.into_iter().map(group).collect())
 }
 
-fn made_up_groups(videos: MadeUp) -> Vec<SceneGroup> {
+fn synthetic_groups(videos: SyntheticDataset) -> Vec<SceneGroup> {
     let videos = Arc::new(videos);
     let group = |(index, key)| SceneGroup {
-        path: PathBuf::from(MadeUp::PREFIX),
-        source: Source::MadeUp(videos.clone(), index),
+        path: PathBuf::from(SyntheticDataset::PREFIX),
+        source: Source::SyntheticDataset(videos.clone(), index),
         keys: vec![key],
     };
     videos.keys().into_iter().enumerate().map(group).collect()

@@ -7,10 +7,10 @@ mod dataset;
 mod formats;
 mod holdout;
 mod loading;
-mod made_up;
 mod pixels;
 mod polyphase;
 mod room;
+mod synthetic_dataset;
 
 pub(crate) use batch::cameras_at;
 pub use batch::{ViewBatch, view_batch};
@@ -23,10 +23,10 @@ pub use formats::{
 };
 pub use holdout::Holdout;
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};
-pub use made_up::{MadeUp, read_pictures};
 pub use pixels::{Planes, fit};
 pub use polyphase::polyphase;
 pub use room::write_room;
+pub use synthetic_dataset::{SyntheticDataset, read_pictures};
 
 // Exchanged between processes.
 pub(crate) use loading::News;

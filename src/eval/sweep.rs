@@ -102,7 +102,7 @@ impl Sweep<'_> {
         mut observe: impl FnMut(usize, usize) -> bool,
     ) -> Result<Evaluation> {
         let begun = self.group.is_first().then(|| self.begin()).transpose()?;
-        let (kept, missing) = self.group.from_first(begun)?;
+        let (kept, missing) = self.group.broadcast_object(begun)?;
         let share = self.run_share(self.share(&missing), kept.len(), judges, &mut observe)?;
         let (mut scenes, mut failures, mut stopped) = (kept, vec![], false);
         for share in self.group.gather(share)? {
@@ -113,7 +113,7 @@ impl Sweep<'_> {
         if stopped {
             let (done, total) = (scenes.len(), missing.len() + scenes.len());
             return Err(Error::Failed(format!(
-                "stopped after {done} of {total} scenes; {} holds their scores, and the same command goes on",
+                "stopped after {done} of {total} scenes; {} holds their scores, and the same command resumes",
                 self.out.display()
             )));
         }

@@ -43,9 +43,9 @@ pub use splat::{
 };
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};
-pub use weights_file::{LentWeights, WeightsFile, is_weights_name, read_weights};
+pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights};
 
-pub(crate) use torch_file::{Archive, Array, Id, Strangers, Value, Values, unpickle};
+pub(crate) use torch_file::{Archive, Array, Id, UnknownGlobals, Value, Values, unpickle};
 
 pub(crate) use append::AppendFile;
 pub(crate) use atomic::{lock_parent, recover_dirs, remove_dir, replace_dir, write_json};

@@ -81,9 +81,9 @@ pub struct WeightsFile {
 enum Bytes {
     Mapped(Mmap),
     /// Copy-on-write mapping: what is written there is private to the process.
-    Lent(MmapMut),
+    Private(MmapMut),
     /// Bytes embedded in the program.
-    Carried(&'static [u8]),
+    Embedded(&'static [u8]),
 }
 
 impl Bytes {
@@ -102,28 +102,29 @@ impl Bytes {
     fn get(&self) -> &[u8] {
         match self {
             Bytes::Mapped(map) => map,
-            Bytes::Lent(map) => map,
-            Bytes::Carried(bytes) => bytes,
+            Bytes::Private(map) => map,
+            Bytes::Embedded(bytes) => bytes,
         }
     }
 
-    fn lend(self, path: &Path) -> Result<Self> {
+    /// Makes a mapping copy-on-write.
+    fn make_private(self, path: &Path) -> Result<Self> {
         match self {
-            Bytes::Mapped(map) => Ok(Bytes::Lent(map.make_mut().map_err(Error::read(path))?)),
+            Bytes::Mapped(map) => Ok(Bytes::Private(map.make_mut().map_err(Error::read(path))?)),
             other => Ok(other),
         }
     }
 
     /// Advises the system that these pages aren't needed soon, so that pages of a mapped file don't stay in memory beside what was copied
     /// from them. A later access reads them from the file again.
-    fn let_go(&self, range: Range<usize>) {
+    fn release_pages(&self, range: Range<usize>) {
         let (start, length) = (range.start, range.len());
         // SAFETY: these are pages of a file, which are only read as numbers, for which every value is valid.
         let advised = unsafe {
             match self {
                 Bytes::Mapped(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
-                Bytes::Lent(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
-                Bytes::Carried(_) => Ok(()),
+                Bytes::Private(map) => map.unchecked_advise_range(UncheckedAdvice::DontNeed, start, length),
+                Bytes::Embedded(_) => Ok(()),
             }
         };
         // An error is ignored: this is only advice.
@@ -154,7 +155,7 @@ impl WeightsFile {
 
     /// Opens weights that are embedded in the program; errors call them `path`.
     pub(crate) fn carried(bytes: &'static [u8], path: &Path) -> Result<Self> {
-        Self::of(Bytes::Carried(bytes), path)
+        Self::of(Bytes::Embedded(bytes), path)
     }
 
     fn of(bytes: Bytes, path: &Path) -> Result<Self> {
@@ -255,16 +256,16 @@ impl WeightsFile {
     ///
     /// # Errors
     /// Returns the errors of [`WeightsFile::load_into`], and an error if a file can't be mapped.
-    pub fn lend_to(mut self, vs: &nn::VarStore) -> Result<LentWeights> {
+    pub fn load_mmap(mut self, vs: &nn::VarStore) -> Result<MappedWeights> {
         let path = &self.path;
-        self.parts = self.parts.into_iter().map(|bytes| bytes.lend(path)).collect::<Result<_>>()?;
-        let are_files = self.parts.iter().all(|bytes| matches!(bytes, Bytes::Lent(_)));
+        self.parts = self.parts.into_iter().map(|bytes| bytes.make_private(path)).collect::<Result<_>>()?;
+        let are_files = self.parts.iter().all(|bytes| matches!(bytes, Bytes::Private(_)));
         let takes = |variable: &Tensor, view: &Tensor| {
             variable.device() == Device::Cpu && variable.kind() == view.kind() && view.is_contiguous()
         };
         self.fill(vs, |variable, view| are_files && takes(variable, view))?;
         // The files stay mapped, because nothing limits how long the variables live.
-        Ok(LentWeights(Box::leak(self.parts.into_boxed_slice())))
+        Ok(MappedWeights(Box::leak(self.parts.into_boxed_slice())))
     }
 
     /// Fills the variables of `vs`. If `lies_in_file` returns `true` for a variable and the view of its weights in the file, the variable
@@ -296,7 +297,7 @@ impl WeightsFile {
                 }
                 _ => variable.f_copy_(&self.copy(place)?)?,
             }
-            self.parts[place.part].let_go(bytes.clone());
+            self.parts[place.part].release_pages(bytes.clone());
             Ok(())
         })
     }
@@ -309,15 +310,15 @@ impl WeightsFile {
     }
 }
 
-/// Mapped files that hold the data of variables ([`WeightsFile::lend_to`]), for the rest of the process.
+/// Mapped files that hold the data of variables ([`WeightsFile::load_mmap`]), for the rest of the process.
 #[derive(Debug, Clone, Copy)]
-pub struct LentWeights(&'static [Bytes]);
+pub struct MappedWeights(&'static [Bytes]);
 
-impl LentWeights {
+impl MappedWeights {
     /// Releases the memory of pages that were read, until they are read again, usually from the system's page cache. Values that were
     /// written to these variables are lost.
-    pub fn let_go(&self) {
-        self.0.iter().for_each(|bytes| bytes.let_go(0..bytes.get().len()));
+    pub fn release_pages(&self) {
+        self.0.iter().for_each(|bytes| bytes.release_pages(0..bytes.get().len()));
     }
 }
 

@@ -1,6 +1,6 @@
 //! Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
-use crate::render::handed_over;
+use crate::render::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
@@ -14,7 +14,7 @@ use tch::Tensor;
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
     let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { handed_over(|out| fit::depth_smoothness(depths, photos, factor, out)) };
+    let done = unsafe { take_outputs(|out| fit::depth_smoothness(depths, photos, factor, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }

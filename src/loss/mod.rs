@@ -28,7 +28,7 @@ pub(crate) use consistency::{Share, consistency, depth_pixels};
 
 use crate::data::Sample;
 use crate::model::Decoded;
-use crate::render::Pictures;
+use crate::render::RenderOutput;
 use tch::Tensor;
 
 /// Computes the loss terms of `decoded`, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
@@ -38,7 +38,7 @@ pub(crate) fn losses(
     perceptual: Option<&PerceptualLoss>,
     sample: &Sample,
     decoded: &Decoded,
-    pictures: &Pictures,
+    pictures: &RenderOutput,
     share: &Share,
 ) -> Losses<Tensor> {
     let truth = &sample.target.images;

@@ -5,7 +5,7 @@ use super::lpips::{Lpips, LpipsNetwork};
 use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
-use crate::model::{Precision, is_followed, part};
+use crate::model::{Precision, part, tracks_grad};
 use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
@@ -140,7 +140,7 @@ impl PerceptualLoss {
         let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
         let pictures = rendered.detach().reshape([&[repeats][..], &truth.size()].concat());
-        let gradient = is_followed(rendered).then(|| pictures.empty_like());
+        let gradient = tracks_grad(rendered).then(|| pictures.empty_like());
         let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
         for first in (0..count).step_by(at_once as usize) {
             let length = at_once.min(count - first);

@@ -1,7 +1,7 @@
 //! Photometric loss: absolute differences and structural similarity (SSIM, Wang et al. 2004), computed as by scikit-image's
 //! `structural_similarity` with Gaussian weights. (Spec 9.4.)
 
-use crate::render::handed_over;
+use crate::render::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
@@ -15,7 +15,7 @@ use tch::Tensor;
 pub fn photometric(picture: &Tensor, truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
     let (picture, truth) = (picture.as_ptr() as usize, truth.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { handed_over(|out| fit::photometric(picture, truth, absolute, similar, out)) };
+    let done = unsafe { take_outputs(|out| fit::photometric(picture, truth, absolute, similar, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }

@@ -1,6 +1,6 @@
 //! Attention (spec 4.2) by our own kernel where it is fastest, and by libtorch's kernels elsewhere.
 
-use super::parts::does;
+use super::parts::record_flops;
 use globalsplat_csrc::attention as ours;
 use globalsplat_csrc::processor::{Bf16, bf16_of_cpu};
 use tch::{Device, Kind, Tensor};
@@ -11,7 +11,7 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
     // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
-    does(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
+    record_flops(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
     out
 }
 

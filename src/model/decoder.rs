@@ -130,7 +130,7 @@ impl Decoder {
     }
 
     /// Returns the layers that compute in the configurable precision.
-    pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+    pub(super) fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
         std::iter::once(&self.sh)
     }
 

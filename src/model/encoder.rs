@@ -1,8 +1,8 @@
 //! The encoder: a fixed set of scene tokens attends to every view, in two streams (spec 4.1).
 
+use super::autograd::tracks_grad;
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
-use super::leaves::is_followed;
 use super::memory::Memory;
 use super::mixer::Mixer;
 use super::parts::part;
@@ -89,11 +89,11 @@ impl Encoder {
     }
 
     /// Returns the layers that compute in the configurable precision.
-    pub(super) fn products(&self) -> impl Iterator<Item = &nn::Linear> {
+    pub(super) fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
         let branch = self.appearance.iter();
         let rounds = self.geometry_rounds.iter().chain(branch.clone().flat_map(|branch| &branch.rounds));
         let mixers = branch.flat_map(|branch| &branch.mixers);
-        rounds.flat_map(StreamRound::products).chain(mixers.flat_map(Mixer::products))
+        rounds.flat_map(StreamRound::linear_layers).chain(mixers.flat_map(Mixer::linear_layers))
     }
 
     /// Calls [`StreamRound::fold_weights`] for every round of every stream.
@@ -104,8 +104,8 @@ impl Encoder {
     }
 
     /// Returns `true` if gradients will flow back to the encoder's weights from what is computed now.
-    pub(super) fn is_followed(&self) -> bool {
-        is_followed(&self.memory_registers)
+    pub(super) fn tracks_grad(&self) -> bool {
+        tracks_grad(&self.memory_registers)
     }
 
     /// Computes the memory that all rounds read: learned tokens, then image tokens, `tokens` [B, V·P, token width].

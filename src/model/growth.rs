@@ -4,7 +4,7 @@ use super::config::ModelConfig;
 use super::decoder::{OPACITY, PARAMETERS};
 use tch::{Kind, Tensor};
 
-/// Standard deviation of the noise between copies of a scene token, relative to that of all scene tokens.
+/// Standard deviation of the noise between latent_ratio of a scene token, relative to that of all scene tokens.
 const SPREAD: f64 = 0.2;
 
 /// Differences by which one model is larger than another.
@@ -13,9 +13,9 @@ pub(crate) struct Growth {
     /// Configuration of the smaller model.
     from: ModelConfig,
     /// Patch edge of the smaller model divided by that of the larger one.
-    finer: i64,
+    patch_size_ratio: i64,
     /// Number of scene tokens in the larger model for each one of the smaller model.
-    copies: i64,
+    latent_ratio: i64,
 }
 
 impl Growth {
@@ -23,8 +23,8 @@ impl Growth {
     pub fn between(from: &ModelConfig, to: &ModelConfig) -> Self {
         let times = |whole: i64, part: i64| if whole % part == 0 { whole / part } else { 1 };
         Growth {
-            finer: times(from.patch_size, to.patch_size),
-            copies: times(to.latents, from.latents),
+            patch_size_ratio: times(from.patch_size, to.patch_size),
+            latent_ratio: times(to.latents, from.latents),
             from: from.clone(),
         }
     }
@@ -32,8 +32,8 @@ impl Growth {
     /// Returns the configuration of the larger model.
     pub fn result(&self) -> ModelConfig {
         ModelConfig {
-            patch_size: self.from.patch_size / self.finer,
-            latents: self.from.latents * self.copies,
+            patch_size: self.from.patch_size / self.patch_size_ratio,
+            latents: self.from.latents * self.latent_ratio,
             ..self.from.clone()
         }
     }
@@ -42,13 +42,16 @@ impl Growth {
     pub fn of(&self, name: &str, weights: &Tensor) -> Tensor {
         match name {
             "ray_patch_embeds.1.weight" | "rgb_patch_embeds.1.weight" => {
-                for_smaller_patches(weights, self.from.patch_size, self.finer)
+                for_smaller_patches(weights, self.from.patch_size, self.patch_size_ratio)
             }
-            "scene_tokens" if self.copies > 1 => {
+            "scene_tokens" if self.latent_ratio > 1 => {
                 let (m, d) = weights.size2().expect("[M, d]");
-                more_tokens(weights, &Tensor::randn([self.copies * m, d], (weights.kind(), weights.device())))
+                repeat_scene_tokens(
+                    weights,
+                    &Tensor::randn([self.latent_ratio * m, d], (weights.kind(), weights.device())),
+                )
             }
-            "gaussian_decoder.geo_param_readout.bias" => shared_opacities(weights, self.copies),
+            "gaussian_decoder.geo_param_readout.bias" => shared_opacities(weights, self.latent_ratio),
             _ => weights.shallow_clone(),
         }
     }
@@ -63,16 +66,16 @@ pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> T
 }
 
 /// Repeats each of the scene tokens [M, d] n times, and adds a little of the normal noise [n·M, d] (spec 4.7). The result is [n·M, d].
-pub(crate) fn more_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
-    let copies = noise.size()[0] / tokens.size()[0];
-    tokens.repeat_interleave_self_int(copies, 0, None) + noise * (SPREAD * tokens.std(false))
+pub(crate) fn repeat_scene_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
+    let latent_ratio = noise.size()[0] / tokens.size()[0];
+    tokens.repeat_interleave_self_int(latent_ratio, 0, None) + noise * (SPREAD * tokens.std(false))
 }
 
-/// Shifts the opacity logits in the parameter head's bias, [10·K], so that `copies` overlapping Gaussians, of which each was half opaque,
+/// Shifts the opacity logits in the parameter head's bias, [10·K], so that `latent_ratio` overlapping Gaussians, of which each was half opaque,
 /// together cover half of what is behind them (spec 4.7).
-pub(crate) fn shared_opacities(bias: &Tensor, copies: i64) -> Tensor {
+pub(crate) fn shared_opacities(bias: &Tensor, latent_ratio: i64) -> Tensor {
     let shift = bias.zeros_like();
-    let shared = ((1. / copies as f64).exp2() - 1.).ln();
+    let shared = ((1. / latent_ratio as f64).exp2() - 1.).ln();
     let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(shared);
     bias + shift
 }
@@ -107,22 +110,26 @@ mod tests {
     fn copies_of_a_token_differ_a_little_and_cover_as_much_together() {
         tch::manual_seed(4);
         let of = |latents| ModelConfig { latents, ..Default::default() };
-        for copies in [1, 2, 3] {
-            let growth = Growth::between(&of(500), &of(500 * copies));
+        for latent_ratio in [1, 2, 3] {
+            let growth = Growth::between(&of(500), &of(500 * latent_ratio));
             let tokens = Tensor::randn([500, 16], (Kind::Float, Device::Cpu)) * 3.;
-            let apart = growth.of("scene_tokens", &tokens).view([500, copies, 16]) - tokens.unsqueeze(1);
+            let apart =
+                growth.of("scene_tokens", &tokens).view([500, latent_ratio, 16]) - tokens.unsqueeze(1);
             let apart = apart.square().mean(None::<Kind>).sqrt().double_value(&[]);
-            let expected = if copies == 1 { 0. } else { 3. * SPREAD };
-            assert!((apart - expected).abs() < 0.05 * expected + 1e-9, "{copies} copies: {apart}");
+            let expected = if latent_ratio == 1 { 0. } else { 3. * SPREAD };
+            assert!(
+                (apart - expected).abs() < 0.05 * expected + 1e-9,
+                "{latent_ratio} latent_ratio: {apart}"
+            );
 
             // Bias of two candidates that are half opaque.
             let bias = Tensor::zeros([2 * PARAMETERS], (Kind::Double, Device::Cpu));
             let grown = growth.of("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
             let left = grown.select(1, OPACITY).sigmoid().neg() + 1.;
-            let covered: Tensor = 1. - left.pow_tensor_scalar(copies);
+            let covered: Tensor = 1. - left.pow_tensor_scalar(latent_ratio);
             assert!(
                 covered.allclose(&covered.full_like(0.5), 1e-12, 0., false),
-                "{copies} copies: {covered:?}"
+                "{latent_ratio} latent_ratio: {covered:?}"
             );
             assert_eq!(grown.narrow(1, 0, OPACITY).abs().sum(None::<Kind>).double_value(&[]), 0.);
         }

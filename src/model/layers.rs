@@ -1,6 +1,6 @@
 //! Layers that streams and mixers are built from, with the initializations of spec 4.4.
 
-use super::parts::{does, part};
+use super::parts::{part, record_flops};
 use super::precision::Precision;
 use globalsplat_csrc::room::expect_room_for_code;
 use std::cell::Cell;
@@ -58,7 +58,7 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
     part("norms", || {
         let out = norm.forward(xs);
-        does(0, 0, &[xs, &out]);
+        record_flops(0, 0, &[xs, &out]);
         out
     })
 }
@@ -78,7 +78,7 @@ impl LayerScale {
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
         part("residual sums", || {
             let out = xs.addcmul(change, &self.gamma);
-            does(0, 0, &[xs, change, &out]);
+            record_flops(0, 0, &[xs, change, &out]);
             out
         })
     }
@@ -101,14 +101,14 @@ impl Mlp {
     }
 
     /// Returns both linear layers.
-    pub fn products(&self) -> [&nn::Linear; 2] {
+    pub fn linear_layers(&self) -> [&nn::Linear; 2] {
         [&self.expand, &self.contract]
     }
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
         part("MLPs", || {
             let hidden = gelu(precision.linear(&self.expand, xs));
-            does(0, 0, &[&hidden, &hidden]);
+            record_flops(0, 0, &[&hidden, &hidden]);
             precision.linear(&self.contract, &hidden)
         })
     }

@@ -1,8 +1,8 @@
 //! The memory that slots attend to: learned tokens and the image tokens of all views, normalized (spec 4.1), without their common part.
 
+use super::autograd::leaf;
 use super::layers::LAYER_NORM_EPS;
-use super::leaves::leaf;
-use super::parts::{does, part};
+use super::parts::{part, record_flops};
 use super::precision::Precision;
 use tch::{Kind, Tensor};
 
@@ -75,7 +75,7 @@ fn normalized(tokens: &Tensor) -> Tensor {
     part("norms", || {
         let out =
             tokens.layer_norm([tokens.size()[2]], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
-        does(0, 0, &[tokens, &out]);
+        record_flops(0, 0, &[tokens, &out]);
         out
     })
 }

@@ -29,8 +29,8 @@ impl Mixer {
     }
 
     /// Returns the layers that compute in the configurable precision.
-    pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
-        self.mlp.products().into_iter()
+    pub fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
+        self.mlp.linear_layers().into_iter()
     }
 
     /// Mixes the two streams, [B, S, d] each; the results have the same shape.

@@ -4,6 +4,7 @@
 //! format.
 
 mod attention;
+mod autograd;
 mod camera_code;
 mod config;
 mod decoder;
@@ -11,7 +12,6 @@ mod denormals;
 mod encoder;
 mod growth;
 mod layers;
-mod leaves;
 mod memory;
 mod merge;
 mod mixer;
@@ -36,8 +36,8 @@ pub(crate) use precision::convolve;
 pub use shapes::MODULES;
 
 // Used by training, which runs the model in parts and grows smaller models into larger ones.
+pub(crate) use autograd::{backward_from_grads, leaf, tracks_grad};
 pub(crate) use growth::Growth;
-pub(crate) use leaves::{is_followed, leaf, pull_back};
 pub(crate) use recompute::KeptRounds;
 
 // Used by the parity checks, which run every module by itself.
@@ -45,7 +45,7 @@ pub(crate) use attention::{attention, by_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
 pub(crate) use encoder::Encoder;
-pub(crate) use growth::{for_smaller_patches, more_tokens, shared_opacities};
+pub(crate) use growth::{for_smaller_patches, repeat_scene_tokens, shared_opacities};
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
@@ -89,12 +89,12 @@ impl GlobalSplat {
     ///
     /// # Errors
     /// Returns an error if the fields of `config` don't fit together.
-    pub fn to_be_filled(vs: &mut nn::VarStore, config: &ModelConfig, precision: Precision) -> Result<Self> {
+    pub fn uninitialized(vs: &mut nn::VarStore, config: &ModelConfig, precision: Precision) -> Result<Self> {
         // Creates every parameter in the kind of the products; the few others are converted to float32 below.
         vs.set_kind(precision.kind());
         let mut model = without_drawing(|| Self::new(&vs.root(), config))?;
         model.set_precision(precision);
-        let layers = model.encoder.products().chain(model.decoder.products());
+        let layers = model.encoder.linear_layers().chain(model.decoder.linear_layers());
         let kept: HashSet<_> = layers
             .flat_map(|layer| std::iter::once(&layer.ws).chain(&layer.bs))
             .map(Tensor::data_ptr)
@@ -131,11 +131,11 @@ impl GlobalSplat {
     /// Computes the encoder's memory from images and cameras. On a CPU without gradients it processes one view at a time, because the image
     /// tokens of many views are large. A GPU has enough memory for all views, and would spend the time on launching small kernels.
     pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Memory {
-        let is_followed = self.encoder.is_followed();
-        if is_followed || images.device() != Device::Cpu {
+        let tracks_grad = self.encoder.tracks_grad();
+        if tracks_grad || images.device() != Device::Cpu {
             let memory = self.memory_of(&self.tokens(images, c2w, intrinsics));
             // Converts once for all rounds. With gradients the memory stays in float32, in which they are accumulated.
-            return if is_followed { memory } else { memory.to_kind(self.precision().kind()) };
+            return if tracks_grad { memory } else { memory.to_kind(self.precision().kind()) };
         }
         let of_view = |view| {
             let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));

@@ -11,11 +11,11 @@ pub enum Event {
     /// End of the current span.
     Ends,
     /// Work done in the current span.
-    Does {
+    Flops {
         /// Number of floating-point operations of matrix products in the forward pass.
         flops: f64,
         /// Number of floating-point operations of matrix products in the backward pass; 0 if no gradient is needed.
-        owed: f64,
+        backward_flops: f64,
         /// Number of bytes of the input and output tensors.
         bytes: f64,
     },
@@ -60,13 +60,17 @@ pub(crate) fn part<T>(name: &'static str, work: impl FnOnce() -> T) -> T {
     result
 }
 
-/// Records work on `tensors`, the inputs and outputs: `flops` in the forward pass and `owed` in the backward pass. A no-op outside of
+/// Records work on `tensors`, the inputs and outputs: `flops` in the forward pass and `backward_flops` in the backward pass. A no-op outside of
 /// spans.
-pub(super) fn does(flops: i64, owed: i64, tensors: &[&Tensor]) {
+pub(super) fn record_flops(flops: i64, backward_flops: i64, tensors: &[&Tensor]) {
     LISTENER.with_borrow_mut(|listener| {
         if let Some(listener) = listener.as_mut().filter(|listener| listener.is_within) {
             let bytes: usize = tensors.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
-            (listener.tell)(Event::Does { flops: flops as f64, owed: owed as f64, bytes: bytes as f64 });
+            (listener.tell)(Event::Flops {
+                flops: flops as f64,
+                backward_flops: backward_flops as f64,
+                bytes: bytes as f64,
+            });
         }
     });
 }
@@ -82,15 +86,15 @@ mod tests {
         let said = Rc::new(RefCell::new(vec![]));
         let numbers = Tensor::zeros([3, 5], (Kind::BFloat16, Device::Cpu));
         let pass = || {
-            does(7, 0, &[&numbers]);
-            part("outer", || part("inner", || does(2, 3, &[&numbers, &numbers])));
+            record_flops(7, 0, &[&numbers]);
+            part("outer", || part("inner", || record_flops(2, 3, &[&numbers, &numbers])));
             part("next", || 4)
         };
         let to = said.clone();
         assert_eq!(told(move |event| to.borrow_mut().push(format!("{event:?}")), pass), 4);
         let expected = [
             "Begins(\"outer\")",
-            "Does { flops: 2.0, owed: 3.0, bytes: 60.0 }",
+            "Flops { flops: 2.0, backward_flops: 3.0, bytes: 60.0 }",
             "Ends",
             "Begins(\"next\")",
             "Ends",

@@ -1,6 +1,6 @@
 //! Precision of matrix products (spec 1.3).
 
-use super::parts::does;
+use super::parts::record_flops;
 use globalsplat_csrc::linear::linear;
 use globalsplat_csrc::processor::{Bf16, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
@@ -71,7 +71,7 @@ fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
         xs.device() == Device::Cpu && xs.numel() > 0 && matches!(xs.kind(), Kind::Float | Kind::BFloat16);
     let out = if is_ours { product_on_cpu(xs, weights, bias) } else { xs.linear(weights, bias) };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
-    does(flops, owed(flops, [xs, weights], &out), &[xs, weights, &out]);
+    record_flops(flops, backward_flops(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
 }
 
@@ -86,7 +86,7 @@ fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tenso
 
 /// Returns the backward operations of a product that takes `flops` operations forward: `flops` for each factor that needs a gradient, and 0
 /// if `out` doesn't.
-fn owed(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
+fn backward_flops(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
     match out.requires_grad() {
         true => flops * both.iter().filter(|t| t.requires_grad()).count() as i64,
         false => 0,
@@ -97,7 +97,7 @@ fn owed(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
 pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     let out = layer.forward(images).relu_();
     let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
-    does(flops, owed(flops, [images, &layer.ws], &out), &[images, &layer.ws, &out]);
+    record_flops(flops, backward_flops(flops, [images, &layer.ws], &out), &[images, &layer.ws, &out]);
     out
 }
 

@@ -1,7 +1,7 @@
 //! Activation checkpointing: an encoder pass that stores only the input of every round and recomputes the round in the backward pass.
 
+use super::autograd::{backward_from_grads, leaf};
 use super::encoder::{Encoded, Encoder, Slots};
-use super::leaves::{leaf, pull_back};
 use super::memory::Memory;
 use tch::{Tensor, no_grad};
 
@@ -43,10 +43,10 @@ impl KeptRounds<'_> {
         for round in (0..self.encoder.rounds()).rev() {
             let after = self.between.pop().expect("one more than rounds");
             let again = self.encoder.round(round, &self.between[round], &self.memory_leaf);
-            pull_back(&again.beside(&after));
+            backward_from_grads(&again.beside(&after));
         }
         let mut start = self.slots.beside(&self.between[0]);
         start.push((&self.memory.tokens, &self.memory_leaf.tokens));
-        pull_back(&start);
+        backward_from_grads(&start);
     }
 }

@@ -4,7 +4,7 @@ use super::attention::attention;
 use super::config::ModelConfig;
 use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear, normalize};
 use super::memory::Memory;
-use super::parts::{does, part};
+use super::parts::{part, record_flops};
 use super::precision::Precision;
 use tch::{Device, Tensor, nn};
 
@@ -73,9 +73,10 @@ impl StreamRound {
     }
 
     /// Returns the layers that compute in the configurable precision.
-    pub fn products(&self) -> impl Iterator<Item = &nn::Linear> {
-        let own = [&self.query, &self.key, &self.value, &self.output].into_iter().chain(self.mlp.products());
-        own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::products))
+    pub fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
+        let own =
+            [&self.query, &self.key, &self.value, &self.output].into_iter().chain(self.mlp.linear_layers());
+        own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::linear_layers))
     }
 
     /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d].
@@ -87,11 +88,11 @@ impl StreamRound {
 
         let normed = normalize(&self.slots_norm, &slots);
         let query = part("queries and outputs", || precision.linear(&self.query, &normed));
-        let seen = self.look(&query, memory, precision);
-        let seen = part("queries and outputs", || precision.linear(&self.output, &seen));
-        let slots = self.attention_scale.add(&slots, &seen);
-        let thought = self.mlp.forward(&normalize(&self.mlp_norm, &slots), precision);
-        let slots = self.mlp_scale.add(&slots, &thought);
+        let attn_out = self.cross_attention(&query, memory, precision);
+        let attn_out = part("queries and outputs", || precision.linear(&self.output, &attn_out));
+        let slots = self.attention_scale.add(&slots, &attn_out);
+        let mlp_out = self.mlp.forward(&normalize(&self.mlp_norm, &slots), precision);
+        let slots = self.mlp_scale.add(&slots, &mlp_out);
 
         let slots = Tensor::cat(&[slots, registers], 1);
         self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
@@ -103,12 +104,12 @@ impl StreamRound {
     /// The memory is γ ⊙ (y + c) + β, where y is what tokens differ by and c what they have in common (spec 4.2). Softmax is invariant to a
     /// constant added to all keys, and attention weights sum to 1. So keys are W_k (γ ⊙ y) and values W_v (γ ⊙ y), and the contribution of
     /// c, β and the values' bias is added after attention. The keys' own bias has no effect.
-    fn look(&self, query: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
+    fn cross_attention(&self, query: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
         let is_for_all =
             query.requires_grad() || query.device() != Device::Cpu || self.heads % HEAD_GROUPS != 0;
         let groups = if is_for_all { 1 } else { HEAD_GROUPS };
         let width = query.size()[2] / groups;
-        let seen: Vec<Tensor> = (0..groups)
+        let attn_out: Vec<Tensor> = (0..groups)
             .map(|group| {
                 let query = query.narrow(-1, group * width, width);
                 let read = part("keys and values", || match &self.folded {
@@ -121,15 +122,15 @@ impl StreamRound {
             .collect();
         let by_all = part("keys and values", || match &self.folded {
             Some(folded) => Precision::F32.linear(&folded.common_value, &memory.common),
-            None => self.read_by_all(memory),
+            None => self.value_offset(memory),
         });
-        let seen = match &seen[..] {
-            [seen] => seen.shallow_clone(),
+        let attn_out = match &attn_out[..] {
+            [attn_out] => attn_out.shallow_clone(),
             several => Tensor::cat(several, -1),
         };
         part("residual sums", || {
-            let out = &seen + &by_all;
-            does(0, 0, &[&seen, &out]);
+            let out = &attn_out + &by_all;
+            record_flops(0, 0, &[&attn_out, &out]);
             out
         })
     }
@@ -144,7 +145,7 @@ impl StreamRound {
     }
 
     /// Computes the common part of all values, W_v (γ ⊙ c + β) + b_v, [B, 1, d] in float32.
-    fn read_by_all(&self, memory: &Memory) -> Tensor {
+    fn value_offset(&self, memory: &Memory) -> Tensor {
         let [gamma, beta] = self.memory_affine();
         let exact = |t: &Tensor| t.to_kind(gamma.kind());
         let value = nn::Linear { ws: exact(&self.value.ws), bs: self.value.bs.as_ref().map(exact) };
@@ -153,7 +154,7 @@ impl StreamRound {
         of_values + self.key.bs.as_ref().map(exact).expect("a bias") * 0.
     }
 
-    /// Returns [`StreamRound::read_by_all`] as a linear layer of c: (W_v diag γ) c + (W_v β + b_v).
+    /// Returns [`StreamRound::value_offset`] as a linear layer of c: (W_v diag γ) c + (W_v β + b_v).
     fn common_value(&self) -> nn::Linear {
         let [gamma, beta] = self.memory_affine();
         let exact = |t: &Tensor| t.to_kind(gamma.kind());
@@ -194,8 +195,8 @@ impl SelfAttentionBlock {
         }
     }
 
-    fn products(&self) -> impl Iterator<Item = &nn::Linear> {
-        [&self.qkv, &self.project].into_iter().chain(self.mlp.products())
+    fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
+        [&self.qkv, &self.project].into_iter().chain(self.mlp.linear_layers())
     }
 
     /// Applies the block to `xs` [B, S, d]; the result has the same shape.
@@ -205,8 +206,8 @@ impl SelfAttentionBlock {
         let mixed = part("self-attention", || attention(&qkv[0], &qkv[1], &qkv[2], self.heads));
         let mixed = part("queries and outputs", || precision.linear(&self.project, &mixed));
         let xs = self.attention_scale.add(xs, &mixed);
-        let thought = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
-        self.mlp_scale.add(&xs, &thought)
+        let mlp_out = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
+        self.mlp_scale.add(&xs, &mlp_out)
     }
 }
 
@@ -232,9 +233,9 @@ mod tests {
         for (precision, most) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
             let (query, memory) = (query.to_kind(precision.kind()), memory.to_kind(precision.kind()));
             round.folded = None;
-            let expected = no_grad(|| round.look(&query, &memory, precision));
+            let expected = no_grad(|| round.cross_attention(&query, &memory, precision));
             no_grad(|| round.fold_weights(precision));
-            let found = no_grad(|| round.look(&query, &memory, precision));
+            let found = no_grad(|| round.cross_attention(&query, &memory, precision));
             let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
             assert!(error < most, "{precision}: {error:.1e}");
         }
@@ -255,17 +256,17 @@ mod tests {
         let query = uneven(0.9, &[2, 9, 32]) * 3.;
         let memory = Memory::new(&alike(300));
         let whole = Memory { tokens: &memory.tokens + &memory.common, common: memory.common.zeros_like() };
-        let seen = |memory: &Memory, precision: Precision| {
+        let attn_out = |memory: &Memory, precision: Precision| {
             let query = query.to_kind(precision.kind());
-            no_grad(|| round.look(&query, memory, precision))
+            no_grad(|| round.cross_attention(&query, memory, precision))
         };
-        let exact = seen(&memory, Precision::F32);
+        let exact = attn_out(&memory, Precision::F32);
         let size = (&exact - exact.mean_dim(1, true, None)).norm(); // norm of the differences among queries
         let error = |found: Tensor| ((found - &exact).norm() / &size).double_value(&[]);
-        let same = error(seen(&whole, Precision::F32));
+        let same = error(attn_out(&whole, Precision::F32));
         // Scores of tokens with their common part lose digits in float32, too.
         assert!(same < 1e-3, "nothing depends on what is called common, but {same:.1e}");
-        let [near, far] = [&memory, &whole].map(|memory| error(seen(memory, Precision::Bf16)));
+        let [near, far] = [&memory, &whole].map(|memory| error(attn_out(memory, Precision::Bf16)));
         assert!(near < 3e-2 && far > 20. * near, "{near:.1e}, and {far:.1e} of tokens as they are");
     }
 }

@@ -11,4 +11,4 @@ pub use optimizer::{Optimizer, ParameterGroup, Rule};
 // For benchmarks.
 pub use stopwatch::Stopwatch;
 
-pub(crate) use optimizer::forget_gradients;
+pub(crate) use optimizer::zero_grad;

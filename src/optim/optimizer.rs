@@ -3,7 +3,7 @@
 use super::address::{address, addresses};
 use super::muon::{self, Matrices};
 use crate::error::{Error, Result};
-use crate::render::handed_over;
+use crate::render::take_outputs;
 use globalsplat_csrc::fit::{AdamArguments, adam};
 use globalsplat_csrc::optim::{self as ffi, AdamWNumbers, fused_adamw, norm, scale};
 use std::collections::BTreeMap;
@@ -82,9 +82,9 @@ impl Parameter {
 }
 
 /// Resets the gradients of `leaves` to undefined.
-pub(crate) fn forget_gradients<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
+pub(crate) fn zero_grad<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
     // SAFETY: the tensors outlive the call.
-    unsafe { ffi::forget_gradients(&addresses(leaves)) }.expect("leaves");
+    unsafe { ffi::zero_grad(&addresses(leaves)) }.expect("leaves");
 }
 
 /// Settings that the parameters of a group share.
@@ -142,7 +142,7 @@ impl Optimizer {
     /// Makes this optimizer shard `part` of `parts`: it updates its share of the parameters and drops the moments of the others. Parameters
     /// are not split. They are assigned in descending order of their moments' size, each to the shard that has least so far (ZeRO stage 1,
     /// Rajbhandari et al. 2020, by tensors).
-    pub fn become_part(&mut self, part: usize, parts: usize) {
+    pub fn shard(&mut self, part: usize, parts: usize) {
         self.part = part;
         let mut order: Vec<usize> = (0..self.parameters.len()).collect();
         let size = |p: &Parameter| p.moments().map(|(_, moment)| moment.numel()).sum::<usize>();
@@ -165,9 +165,9 @@ impl Optimizer {
         self.parameters.iter().filter(move |p| p.part == part).map(|p| &p.value)
     }
 
-    /// Returns `true` if this optimizer updates every parameter.
-    pub fn is_whole(&self) -> bool {
-        self.parameters.iter().all(|p| p.part == self.part)
+    /// Returns `true` if other ranks update some of the parameters.
+    pub fn is_sharded(&self) -> bool {
+        self.parameters.iter().any(|p| p.part != self.part)
     }
 
     /// Returns the running means of the gradients and of their squares, which the caller may change in place.
@@ -189,14 +189,14 @@ impl Optimizer {
 
     /// Resets the gradients to undefined. The next backward pass stores its gradients instead of adding to earlier ones.
     pub fn zero_grad(&mut self) {
-        forget_gradients(self.parameters.iter().map(|p| &p.value));
+        zero_grad(self.parameters.iter().map(|p| &p.value));
     }
 
     /// Returns the norm of all gradients together, a scalar on their device.
     pub fn gradient_norm(&self) -> Tensor {
         let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
         // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor at `out`.
-        let done = unsafe { handed_over(|out| norm(&addresses(&gradients), out)) };
+        let done = unsafe { take_outputs(|out| norm(&addresses(&gradients), out)) };
         let [norm] = done.expect("gradients of one device");
         norm
     }

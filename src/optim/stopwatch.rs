@@ -1,6 +1,6 @@
 //! Measurement of the time that sections of some work take.
 
-use crate::device::Moment;
+use crate::device::DeviceEvent;
 use std::time::Duration;
 use tch::Device;
 
@@ -11,7 +11,7 @@ pub struct Stopwatch {
     sections: Vec<(&'static str, Duration)>,
     /// Starts and ends of sections that are not added up yet. A GPU's events are read only when the times are requested: reading them waits
     /// for the GPU.
-    parts: Vec<(&'static str, Moment, Moment)>,
+    parts: Vec<(&'static str, DeviceEvent, DeviceEvent)>,
 }
 
 impl Default for Stopwatch {
@@ -30,9 +30,9 @@ impl Stopwatch {
 
     /// Runs `work` and adds its time to `section`.
     pub fn time<T>(&mut self, section: &'static str, work: impl FnOnce() -> T) -> T {
-        let start = Moment::now(self.device);
+        let start = DeviceEvent::now(self.device);
         let result = work();
-        self.parts.push((section, start, Moment::now(self.device)));
+        self.parts.push((section, start, DeviceEvent::now(self.device)));
         if self.device == Device::Cpu {
             self.add_up();
         }

@@ -161,7 +161,7 @@ fn growth(request: &Request) -> Result<Answer> {
     let (patch, times) = (request.number("patch_size")?, request.number("times")?);
     outputs([
         ("patch_weights", model::for_smaller_patches(request.input("patch_weights")?, patch, times)),
-        ("scene_tokens", model::more_tokens(request.input("scene_tokens")?, request.input("noise")?)),
+        ("scene_tokens", model::repeat_scene_tokens(request.input("scene_tokens")?, request.input("noise")?)),
         ("bias", model::shared_opacities(request.input("bias")?, request.number("copies")?)),
     ])
 }

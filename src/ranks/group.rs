@@ -2,7 +2,7 @@
 
 use super::place::Place;
 use crate::error::{Error, Result};
-use crate::render::handed_over;
+use crate::render::take_outputs;
 use cxx::UniquePtr;
 use globalsplat_csrc::ranks as ffi;
 use serde::Serialize;
@@ -140,7 +140,7 @@ impl Group {
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn sum(&self, tensor: &Tensor) -> Result<()> {
+    pub fn all_reduce(&self, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
             Some(inner) => unsafe { inner.all_reduce(tensor.as_ptr() as usize) }.map_err(lost),
@@ -152,7 +152,7 @@ impl Group {
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn copy_from(&self, from: usize, tensor: &Tensor) -> Result<()> {
+    pub fn broadcast(&self, from: usize, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
             Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(lost),
@@ -187,7 +187,7 @@ impl Group {
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn from_first<T: Serialize + DeserializeOwned>(&self, said: Option<T>) -> Result<T> {
+    pub fn broadcast_object<T: Serialize + DeserializeOwned>(&self, said: Option<T>) -> Result<T> {
         // The value itself may be `None`, so every rank sends a list, which is empty on ranks that send no value.
         let said = self.gather(Vec::from_iter(said))?.into_iter().flatten().next();
         said.ok_or_else(|| Error::Failed("the first rank said nothing".into()))
@@ -199,7 +199,7 @@ impl Group {
         let tensor = tensor.to_device(self.device);
         // SAFETY: the tensor is alive, and on success the C++ side has stored a new tensor at `out`.
         let [all] =
-            unsafe { handed_over(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }.map_err(lost)?;
+            unsafe { take_outputs(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }.map_err(lost)?;
         Ok(all.to_device(Device::Cpu))
     }
 }

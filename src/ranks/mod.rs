@@ -72,13 +72,13 @@ pub(crate) mod tests {
             let found = together(ranks, |group| {
                 let number = group.rank() as f32 + 1.;
                 let sum = Tensor::full([2, 3], f64::from(number), (Kind::Float, Device::Cpu));
-                group.sum(&sum).expect("a sum");
+                group.all_reduce(&sum).expect("a sum");
                 let copy = Tensor::from_slice(&[number]);
-                group.copy_from(ranks - 1, &copy).expect("a copy");
+                group.broadcast(ranks - 1, &copy).expect("a copy");
                 // A list of a different length on each rank, a NaN, and a nested `None`, which JSON can't represent.
                 let said = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
                 let heard = group.gather(said).expect("words");
-                let first = group.from_first(group.is_first().then_some(None::<u64>)).expect("a word");
+                let first = group.broadcast_object(group.is_first().then_some(None::<u64>)).expect("a word");
                 (Vec::<f32>::try_from(sum.view(-1)).unwrap(), copy.double_value(&[0]), heard, first)
             });
             let expected = (1..=ranks).sum::<usize>() as f32;
@@ -118,11 +118,11 @@ pub(crate) mod tests {
             return;
         }
         let found = together(2, |group| match group.rank() {
-            0 => Some(group.sum(&Tensor::from_slice(&[1f32]))),
+            0 => Some(group.all_reduce(&Tensor::from_slice(&[1f32]))),
             _ => None,
         });
         let error = found[0].as_ref().unwrap().as_ref().unwrap_err();
-        assert!(error.to_string().starts_with("the processes have lost each other ("), "{error}");
+        assert!(error.to_string().starts_with("distributed communication failed ("), "{error}");
     }
 
     /// Buckets sum the gradients of leaves that are used once, in two backward passes of a step, or not at all.

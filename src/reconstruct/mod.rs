@@ -20,7 +20,7 @@ pub use spread::spread_over_path;
 use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
-use crate::io::{LentWeights, Splat};
+use crate::io::{MappedWeights, Splat};
 use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
@@ -43,13 +43,13 @@ pub struct Model<'a> {
     /// Conversion of photos to the views that the model sees.
     pub input: Input,
     /// Mapped files that hold the weights, if these weren't copied.
-    pub lent: Option<LentWeights>,
+    pub mapped: Option<MappedWeights>,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
-        let LoadedModel { model: network, config, stage, vs, lent, .. } = loaded;
-        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN, lent: *lent }
+        let LoadedModel { model: network, config, stage, vs, mapped, .. } = loaded;
+        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN, mapped: *mapped }
     }
 }
 
@@ -89,7 +89,7 @@ impl Reconstruction {
 }
 
 /// Runs the model over `photos`, which are converted to the views that it sees ([`Input`]). If its configuration has several
-/// `data.extents`, the model runs on the scene at each of these sizes and at small changes of the best placement, and the splat that
+/// `data.scene_scales`, the model runs on the scene at each of these sizes and at small changes of the best placement, and the splat that
 /// matches the photos best is kept. `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the
 /// normalization, as in the paper's protocol. Each photo takes part once, however many views it becomes.
 ///
@@ -117,7 +117,7 @@ pub fn reconstruct<'a>(
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.
 fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, Gaussians)> {
-    let Model { network, config, stage, device, lent, .. } = model;
+    let Model { network, config, stage, device, mapped, .. } = model;
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
     let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
@@ -131,12 +131,12 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, 
         let decoded = network.decode(&encoded, stage);
         (encoded, decoded)
     };
-    let (encoded, decoded) = tch::no_grad(|| match lent {
+    let (encoded, decoded) = tch::no_grad(|| match mapped {
         // A pass reads nearly every weight exactly once, so pages of weights can be released when the next part begins.
-        Some(lent) => told(
+        Some(mapped) => told(
             move |event| {
                 if let Event::Begins(_) = event {
-                    lent.let_go()
+                    mapped.release_pages()
                 }
             },
             pass,

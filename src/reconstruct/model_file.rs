@@ -3,7 +3,7 @@
 use super::published::{CHECKPOINT_PREFIX, assumed, configuration, is_ours, model_tensors};
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::io::{LentWeights, Weights, WeightsFile, write_checkpoint, write_weights};
+use crate::io::{MappedWeights, Weights, WeightsFile, write_checkpoint, write_weights};
 use crate::model::{GlobalSplat, Precision, Stage};
 use std::collections::HashMap;
 use std::path::Path;
@@ -39,7 +39,7 @@ pub struct LoadedModel {
     /// Weights of the network. Those of linear layers are in the precision of passes.
     pub vs: nn::VarStore,
     /// Mapped files that hold the weights that weren't copied. These weights must not be written to.
-    pub lent: Option<LentWeights>,
+    pub mapped: Option<MappedWeights>,
     /// Description of the assumed model, if the file has no configuration.
     pub assumed: Option<String>,
 }
@@ -192,9 +192,9 @@ impl ModelFile {
     ///
     /// # Errors
     /// Fails if the weights don't fit the configuration.
-    pub fn lend(self, device: Device, precision: Precision) -> Result<LoadedModel> {
+    pub fn load_mmap(self, device: Device, precision: Precision) -> Result<LoadedModel> {
         match device {
-            Device::Cpu => self.build(device, precision, |weights, vs| weights.lend_to(vs).map(Some)),
+            Device::Cpu => self.build(device, precision, |weights, vs| weights.load_mmap(vs).map(Some)),
             _ => self.load(device, precision),
         }
     }
@@ -203,7 +203,7 @@ impl ModelFile {
         self,
         device: Device,
         precision: Precision,
-        fill: impl FnOnce(WeightsFile, &nn::VarStore) -> Result<Option<LentWeights>>,
+        fill: impl FnOnce(WeightsFile, &nn::VarStore) -> Result<Option<MappedWeights>>,
     ) -> Result<LoadedModel> {
         // Checked before a model of the configured size is allocated.
         let numbers: i64 =
@@ -214,13 +214,13 @@ impl ModelFile {
             return Err(Error::input(self.weights.path(), "the number of weights", numbers, expected));
         }
         let mut vs = nn::VarStore::new(device);
-        let mut model = GlobalSplat::to_be_filled(&mut vs, &self.config.model, precision)?;
+        let mut model = GlobalSplat::uninitialized(&mut vs, &self.config.model, precision)?;
         let ModelFile { weights, config, stage, assumed, .. } = self;
-        let lent = fill(weights, &vs)?;
+        let mapped = fill(weights, &vs)?;
         if device != Device::Cpu {
             model.fold_weights();
         }
-        Ok(LoadedModel { model, config, stage, vs, lent, assumed })
+        Ok(LoadedModel { model, config, stage, vs, mapped, assumed })
     }
 }
 

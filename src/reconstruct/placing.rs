@@ -12,12 +12,12 @@ use std::time::Instant;
 use tch::Device;
 
 /// Changes of a placement that the search tries: forward shift of the cameras, and the logarithm of the factor that enlarges the scene.
-const NUDGES: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
+const SEARCH_OFFSETS: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
 
 /// Factors of the changes in each round.
 const ROUNDS: [f64; 2] = [1., 0.5];
 
-/// Runs the model over `views`, the views of each photo, at each of `data.extents` and at placements around the best of them. Returns the
+/// Runs the model over `views`, the views of each photo, at each of `data.scene_scales` and at placements around the best of them. Returns the
 /// result that matches `photos` best. `normalization` has the poses of the photos, followed by those of the targets.
 ///
 /// # Errors
@@ -28,7 +28,7 @@ pub(super) fn best_placed(
     views: &[Vec<View>],
     normalization: &Normalization,
 ) -> Result<Reconstruction> {
-    let extents = &model.config.data.extents;
+    let extents = &model.config.data.scene_scales;
     let several = extents.len() > 1;
     let start = Instant::now();
     let attempt = |placement: Placement| -> Result<Attempt> {
@@ -41,12 +41,12 @@ pub(super) fn best_placed(
     let mut attempts = extents.iter().map(|&extent| attempt(Placement { extent, forward: 0. }));
     let mut best = attempts.next().expect("a configuration that was checked has an extent")?;
     for tried in attempts {
-        best.give_way(tried?);
+        best.replace_if_better(tried?);
     }
     for share in ROUNDS.into_iter().filter(|_| several) {
-        for nudge in NUDGES {
+        for nudge in SEARCH_OFFSETS {
             for way in [share, -share] {
-                if best.give_way(attempt(best.placement.nudged(nudge.map(|by| way * by)))?) {
+                if best.replace_if_better(attempt(best.placement.nudged(nudge.map(|by| way * by)))?) {
                     break;
                 }
             }
@@ -72,7 +72,7 @@ struct Attempt {
 
 impl Attempt {
     /// Replaces this attempt by `other` if that is better, and returns `true` if it was. Any error is better than NaN.
-    fn give_way(&mut self, other: Attempt) -> bool {
+    fn replace_if_better(&mut self, other: Attempt) -> bool {
         let better = other.error < self.error || (self.error.is_nan() && !other.error.is_nan());
         if better {
             *self = other;

@@ -12,7 +12,7 @@ pub struct RefineConfig {
     pub views: usize,
     /// Fractions of the optimization at which images become twice as wide and high. Before the first of them, images have the smallest
     /// size.
-    pub sizes: Vec<f64>,
+    pub resolution_schedule: Vec<f64>,
     /// Final degree of the spherical harmonics.
     pub sh_degree: i64,
     /// Fraction of the optimization after which the degree of the spherical harmonics increases by one, repeatedly.
@@ -32,7 +32,7 @@ pub struct RefineConfig {
     /// Learning rate of the higher spherical harmonics, relative to that of the colours.
     pub harmonics: f64,
     /// Final factor of all other learning rates except that of the tokens, which is constant.
-    pub others_end: f64,
+    pub lr_final_factor: f64,
     /// Learning rate of the tokens.
     pub tokens: f64,
     /// Learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected.
@@ -40,17 +40,17 @@ pub struct RefineConfig {
     /// Learning rate of the logarithms of exposures, if exposures are corrected.
     pub exposures: f64,
     /// Weight of 1 − SSIM. The weight of absolute differences is one minus this.
-    pub similar: f64,
+    pub ssim_weight: f64,
     /// Weight of the mean opacity.
     pub opacity: f64,
     /// Weight of the mean scale in scene depths.
     pub scale: f64,
     /// Weight of the unevenness of depths, see [`crate::loss::depth_smoothness`].
-    pub smooth: f64,
+    pub depth_smoothness_weight: f64,
     /// Number of steps between relocations of dead Gaussians; 0 disables relocation.
     pub relocate_every: u64,
     /// Opacity at or below which a Gaussian is dead.
-    pub dead: f64,
+    pub prune_opacity: f64,
     /// Fraction of the optimization after which Gaussians are no longer relocated.
     pub relocate_until: f64,
 }
@@ -59,7 +59,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         RefineConfig {
             views: 2,
-            sizes: vec![0.03, 0.1],
+            resolution_schedule: vec![0.03, 0.1],
             sh_degree: 1,
             sh_every: 0.3,
             means: 2e-3,
@@ -69,19 +69,32 @@ impl Default for RefineConfig {
             opacity_logits: 3e-2,
             colours: 5e-3,
             harmonics: 0.1,
-            others_end: 0.2,
+            lr_final_factor: 0.2,
             tokens: 1e-2,
             poses: 5e-4,
             exposures: 5e-3,
-            similar: 0.4,
+            ssim_weight: 0.4,
             opacity: 1e-3,
             scale: 0.,
-            smooth: 0.7,
+            depth_smoothness_weight: 0.7,
             relocate_every: 100,
-            dead: 0.01,
+            prune_opacity: 0.01,
             relocate_until: 0.8,
         }
     }
+}
+
+/// Former names of keys, which are still accepted, and their current names.
+const RENAMED: [(&str, &str); 5] = [
+    ("dead", "prune_opacity"),
+    ("others_end", "lr_final_factor"),
+    ("similar", "ssim_weight"),
+    ("sizes", "resolution_schedule"),
+    ("smooth", "depth_smoothness_weight"),
+];
+
+fn current_name(key: String) -> String {
+    RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
 
 /// Maximum number of photo sizes besides the full size.
@@ -101,7 +114,7 @@ impl RefineConfig {
             if set.len() != 1 {
                 return Err(refused("expected KEY=VALUE"));
             }
-            table.extend(set);
+            table.extend(set.into_iter().map(|(key, value)| (current_name(key), value)));
             let config: RefineConfig =
                 table.clone().try_into().map_err(|e| refused(&e.message().replace('\n', " ")))?;
             config.check().map_err(|expected| refused(&format!("expected {expected}")))?;
@@ -125,21 +138,24 @@ impl RefineConfig {
             self.poses,
             self.exposures,
         ];
-        let weights = [self.opacity, self.scale, self.smooth];
+        let weights = [self.opacity, self.scale, self.depth_smoothness_weight];
         let is_size = |&part: &f64| 0. < part && part < 1.;
         // NaN is in no range, so it fails every rule.
         let rules = [
             (self.views >= 1, "1 or more"),
-            (self.sizes.len() <= MAX_SIZES, "8 sizes or fewer"),
-            (self.sizes.iter().all(is_size), "numbers above 0 and below 1"),
-            (self.sizes.is_sorted_by(|a, b| a < b), "numbers that increase"),
+            (self.resolution_schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
+            (self.resolution_schedule.iter().all(is_size), "numbers above 0 and below 1"),
+            (self.resolution_schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
             ((0..=3).contains(&self.sh_degree), "0 to 3"),
             (0. < self.sh_every && self.sh_every.is_finite(), "a finite number above 0"),
             (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
-            ([self.means_end, self.others_end].iter().all(|&end| 0. < end && end <= 1.), "above 0, up to 1"),
-            ((0. ..=1.).contains(&self.similar), "0 to 1"),
+            (
+                [self.means_end, self.lr_final_factor].iter().all(|&end| 0. < end && end <= 1.),
+                "above 0, up to 1",
+            ),
+            ((0. ..=1.).contains(&self.ssim_weight), "0 to 1"),
             (weights.iter().all(|weight| (0. ..=1000.).contains(weight)), "0 to 1000"),
-            ((0. ..1.).contains(&self.dead), "0 or more, below 1"),
+            ((0. ..1.).contains(&self.prune_opacity), "0 or more, below 1"),
             ((0. ..=1.).contains(&self.relocate_until), "0 to 1"),
         ];
         rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
@@ -147,12 +163,12 @@ impl RefineConfig {
 
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     fn from_splat() -> Self {
-        RefineConfig { sizes: vec![], opacity: 0., ..Default::default() }
+        RefineConfig { resolution_schedule: vec![], opacity: 0., ..Default::default() }
     }
 
     /// Returns the number of photo sizes.
     pub fn levels(&self) -> usize {
-        self.sizes.len() + 1
+        self.resolution_schedule.len() + 1
     }
 }
 
@@ -166,11 +182,11 @@ mod tests {
         for (assignment, expected) in [
             ("views=0", "expected 1 or more"),
             ("views=-1", "invalid"),
-            ("sizes=[0.1, 0.1]", "expected numbers that increase"),
-            ("sizes=[0.3, 0.1]", "expected numbers that increase"),
-            ("sizes=[0.1, nan]", "expected numbers above 0 and below 1"),
-            ("sizes=[1.0]", "expected numbers above 0 and below 1"),
-            ("sizes=[.01, .02, .03, .04, .05, .06, .07, .08, .09]", "expected"),
+            ("resolution_schedule=[0.1, 0.1]", "expected numbers that increase"),
+            ("resolution_schedule=[0.3, 0.1]", "expected numbers that increase"),
+            ("resolution_schedule=[0.1, nan]", "expected numbers above 0 and below 1"),
+            ("resolution_schedule=[1.0]", "expected numbers above 0 and below 1"),
+            ("resolution_schedule=[.01, .02, .03, .04, .05, .06, .07, .08, .09]", "expected"),
             ("sh_degree=4", "expected 0 to 3"),
             ("sh_degree=-1", "expected 0 to 3"),
             ("sh_every=0", "expected a finite number above 0"),
@@ -180,10 +196,10 @@ mod tests {
             ("means=1e30", "expected 0 to 10"),
             ("tokens=nan", "expected 0 to 10"),
             ("means_end=0", "expected above 0, up to 1"),
-            ("others_end=inf", "expected above 0, up to 1"),
-            ("similar=1.5", "expected 0 to 1"),
-            ("smooth=-1", "expected 0 to 1000"),
-            ("dead=1", "expected 0 or more, below 1"),
+            ("lr_final_factor=inf", "expected above 0, up to 1"),
+            ("ssim_weight=1.5", "expected 0 to 1"),
+            ("depth_smoothness_weight=-1", "expected 0 to 1000"),
+            ("prune_opacity=1", "expected 0 or more, below 1"),
             ("relocate_until=nan", "expected 0 to 1"),
             ("relocate_every=-1", "invalid"),
             ("views=", "expected KEY=VALUE"),
@@ -195,9 +211,19 @@ mod tests {
             assert!(message.starts_with(&format!("--set {assignment}: ")), "{message}");
             assert!(message.contains(expected), "{message}");
         }
-        assert_eq!(with("sizes=[]").unwrap().levels(), 1);
+        assert_eq!(with("resolution_schedule=[]").unwrap().levels(), 1);
         assert_eq!(with("relocate_every=0").unwrap().relocate_every, 0);
         assert_eq!(RefineConfig::default().check(), Ok(()));
         assert_eq!(RefineConfig::from_splat().check(), Ok(()));
+    }
+
+    #[test]
+    fn former_keys_are_accepted() {
+        let with = |key: &str, value: &str| RefineConfig::with(&[format!("{key}={value}")], false).unwrap();
+        for (former, current) in RENAMED {
+            let value = if former == "sizes" { "[0.5]" } else { "0.25" };
+            assert_eq!(with(former, value), with(current, value));
+            assert_ne!(with(former, value), RefineConfig::default(), "{former}");
+        }
     }
 }

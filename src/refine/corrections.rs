@@ -66,7 +66,7 @@ impl Corrections {
         let groups = [group("poses", &poses, config.poses), group("exposures", &exposures, config.exposures)];
         let (groups, rates) = groups.into_iter().flatten().unzip();
         let optimizer = Optimizer::new(groups);
-        Corrections { poses, exposures, optimizer, rates, rates_end: config.others_end, depth }
+        Corrections { poses, exposures, optimizer, rates, rates_end: config.lr_final_factor, depth }
     }
 
     /// Returns the corrected world-to-camera matrices of the photos `which`, [1, C, 4, 4], from their uncorrected poses in `views`;

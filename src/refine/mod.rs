@@ -5,7 +5,7 @@
 mod begin;
 mod config;
 mod corrections;
-mod leaves;
+mod gaussian_params;
 mod patches;
 mod photos;
 mod relocate;
@@ -27,7 +27,7 @@ use crate::error::{Error, Result};
 use crate::loss::{depth_smoothness, photometric};
 use crate::optim::Stopwatch;
 use crate::render::cpu::KernelThreads;
-use crate::render::{Cameras, DEFAULT_EPS2D, Pictures, render, render_views};
+use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render, render_views};
 use crate::scene::{Camera, Gaussians};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -115,7 +115,7 @@ pub(crate) fn refine_timed(
         if is_over {
             break;
         }
-        let level = config.sizes.iter().filter(|&&part| progress >= part).count();
+        let level = config.resolution_schedule.iter().filter(|&&part| progress >= part).count();
         let (which, batch) = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
         let gaussians = stopwatch.time("activation", || space.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
@@ -143,20 +143,21 @@ pub(crate) fn refine_timed(
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians.
 fn loss(
     gaussians: &Gaussians,
-    pictures: &Pictures,
+    pictures: &RenderOutput,
     photos: &Tensor,
     config: &RefineConfig,
     depth: f64,
 ) -> Tensor {
-    let mut loss = photometric(&pictures.rgb, photos, 1. - config.similar, -config.similar) + config.similar;
+    let mut loss =
+        photometric(&pictures.rgb, photos, 1. - config.ssim_weight, -config.ssim_weight) + config.ssim_weight;
     if config.opacity > 0. {
         loss += gaussians.opacities.mean(Kind::Float) * config.opacity;
     }
     if config.scale > 0. {
         loss += gaussians.scales.mean(Kind::Float) * (config.scale / depth);
     }
-    if config.smooth > 0. {
-        loss += depth_smoothness(&pictures.depth, photos, config.smooth);
+    if config.depth_smoothness_weight > 0. {
+        loss += depth_smoothness(&pictures.depth, photos, config.depth_smoothness_weight);
     }
     loss
 }
@@ -186,7 +187,7 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::made_up_scene;
+    use crate::bench::synthetic_scene;
     use crate::data::ViewBatch;
     use crate::scene::{ImageSize, RawGaussians};
     use globalsplat_csrc::ops::{WAITING, computing, ops_of, outermost_ops_of};
@@ -196,12 +197,13 @@ mod tests {
     /// the device only where memory for (splat, tile) pairs is allocated.
     #[test]
     fn a_step_moves_nothing_but_what_is_told() {
-        let (gaussians, cameras) = made_up_scene(40, 4, ImageSize { width: 32, height: 24 });
+        let (gaussians, cameras) = synthetic_scene(40, 4, ImageSize { width: 32, height: 24 });
         let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
         let intrinsics = cameras.intrinsics.shallow_clone();
         let views = ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c.shallow_clone(), intrinsics };
-        let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "smooth=0.1"].map(String::from);
+        let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "depth_smoothness_weight=0.1"]
+            .map(String::from);
         let config = RefineConfig::with(&settings, false).unwrap();
         let photos = Photos::of(views);
         let task_of = |steps| Task {

@@ -1,6 +1,6 @@
 //! Relocation of dead Gaussians to where more are needed (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-use super::leaves::Leaves;
+use super::gaussian_params::GaussianParams;
 use rand::Rng;
 use rand::distr::weighted::WeightedIndex;
 use rand::prelude::Distribution;
@@ -14,7 +14,7 @@ const LEAST_OPACITY: f64 = 0.005;
 /// Moves every Gaussian whose opacity is at most `dead` onto another one, drawn with probability proportional to its opacity. Changes the
 /// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Returns the indices of the
 /// changed Gaussians.
-pub fn relocate(leaves: &Leaves, dead: f64, random: &mut impl Rng) -> Vec<i64> {
+pub fn relocate(leaves: &GaussianParams, dead: f64, random: &mut impl Rng) -> Vec<i64> {
     let opacities = Vec::<f64>::try_from(leaves.opacity_logits.sigmoid().view([-1]).to_kind(Kind::Double))
         .expect("numbers");
     let (gone, alive): (Vec<usize>, Vec<usize>) = (0..opacities.len()).partition(|&i| opacities[i] <= dead);
@@ -104,7 +104,7 @@ mod tests {
             opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
             sh: Tensor::zeros([1, 10, 1, 3], options),
         };
-        let leaves = Leaves::of(&raw, 0);
+        let leaves = GaussianParams::of(&raw, 0);
         let mut changed = relocate(&leaves, 0.01, &mut ChaCha8Rng::seed_from_u64(1));
         let means: Vec<f64> = Vec::try_from(leaves.means.to_kind(Kind::Double).view([-1])).unwrap();
         for dead in 0..4 {

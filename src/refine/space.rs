@@ -1,7 +1,7 @@
 //! Parameter spaces of the optimization: the Gaussians themselves, or the tokens that a model decodes them from.
 
 use super::config::RefineConfig;
-use super::leaves::Leaves;
+use super::gaussian_params::GaussianParams;
 use super::relocate::relocate;
 use crate::model::{Encoded, GlobalSplat, Stage};
 use crate::optim::{Optimizer, ParameterGroup, Rule};
@@ -27,7 +27,7 @@ pub trait Space {
 /// Parameter space of individual Gaussians.
 #[derive(Debug)]
 pub struct GaussianSpace {
-    leaves: Leaves,
+    leaves: GaussianParams,
     optimizer: Optimizer,
     config: RefineConfig,
     depth: f64,
@@ -40,7 +40,7 @@ impl GaussianSpace {
     pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
-        let leaves = Leaves::of(raw, degrees[1]);
+        let leaves = GaussianParams::of(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named().map(alone).into()).with_epsilon(EPSILON);
         GaussianSpace { leaves, optimizer, config: config.clone(), depth, degrees }
     }
@@ -64,8 +64,8 @@ impl Space for GaussianSpace {
 
     fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) {
         let config = &self.config;
-        let (means, others) = (config.means_end.powf(progress), config.others_end.powf(progress));
-        // The order is that of `Leaves::named`.
+        let (means, others) = (config.means_end.powf(progress), config.lr_final_factor.powf(progress));
+        // The order is that of `GaussianParams::named`.
         self.optimizer.set_learning_rates(&[
             config.means * self.depth * means,
             config.log_scales * others,
@@ -77,7 +77,7 @@ impl Space for GaussianSpace {
         self.optimizer.step();
         let due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         if due && progress < config.relocate_until {
-            let changed = relocate(&self.leaves, config.dead, random);
+            let changed = relocate(&self.leaves, config.prune_opacity, random);
             let changed = Tensor::from_slice(&changed).to_device(self.leaves.means.device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);

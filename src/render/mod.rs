@@ -2,13 +2,13 @@
 
 pub mod cpu;
 pub mod cuda;
-mod handed_over;
 mod harmonics;
+mod take_outputs;
 mod transform;
 mod views;
 
-pub(crate) use handed_over::handed_over;
 pub use harmonics::{HarmonicLimits, fit_harmonics};
+pub(crate) use take_outputs::take_outputs;
 pub use transform::transform;
 pub use views::{Rendered, SplatRenderer, render_views};
 
@@ -54,7 +54,7 @@ impl Cameras {
 
 /// Rendered images of all cameras.
 #[derive(Debug)]
-pub struct Pictures {
+pub struct RenderOutput {
     /// Colour over a black background, [B, C, 3, H, W]; not clamped above.
     pub rgb: Tensor,
     /// Accumulated opacity in [0, 1], [B, C, H, W].
@@ -70,9 +70,9 @@ pub struct Pictures {
 /// # Errors
 /// Fails if shapes don't match, if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have, or if kernels can't be
 /// compiled for the GPU.
-pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Pictures> {
+pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<RenderOutput> {
     let [rgb, alpha, depth] = call(ffi::splat, gaussians, cameras, eps2d)?;
-    Ok(Pictures { rgb, alpha, depth })
+    Ok(RenderOutput { rgb, alpha, depth })
 }
 
 /// Projection of every Gaussian for every camera: the first step of the rasterizer on its own. Values are zero where a Gaussian isn't
@@ -105,7 +105,7 @@ type Op = unsafe fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cx
 
 fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
     // SAFETY: the tensors outlive the call, and on success the C++ side has written the addresses of new tensors.
-    Ok(unsafe { handed_over(|out| op(&arguments(gaussians, cameras, eps2d), out)) }?)
+    Ok(unsafe { take_outputs(|out| op(&arguments(gaussians, cameras, eps2d), out)) }?)
 }
 
 /// Returns the arguments of an op. They are valid as long as `gaussians` and `cameras` live.

@@ -276,13 +276,13 @@ mod tests {
         for pair in curve.steps.windows(2) {
             const SMALL: f64 = 1e-6;
             let [before, after] = pair else { unreachable!() };
-            let arriving = Velocity::between(&before.at(1. - SMALL), &before.at(1.), SMALL * before.h);
+            let incident_at = Velocity::between(&before.at(1. - SMALL), &before.at(1.), SMALL * before.h);
             let leaving = Velocity::between(&after.at(0.), &after.at(SMALL), SMALL * after.h);
             let off = |a: f64, b: f64| (a - b).abs() / (1. + b.abs());
-            for (a, b) in arriving.point.into_iter().zip(leaving.point) {
-                assert!(off(a, b) < 1e-4, "{arriving:?} {leaving:?}");
+            for (a, b) in incident_at.point.into_iter().zip(leaving.point) {
+                assert!(off(a, b) < 1e-4, "{incident_at:?} {leaving:?}");
             }
-            assert!(arriving.turn.distance(leaving.turn) < 1e-4 * (1. + leaving.turn.length()));
+            assert!(incident_at.turn.distance(leaving.turn) < 1e-4 * (1. + leaving.turn.length()));
         }
         // The speed is constant, except that chords are shorter than their arcs.
         let path = smooth_path(&cameras(), DISTANCE, 10_001).unwrap();

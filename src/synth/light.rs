@@ -17,7 +17,7 @@ pub(super) enum Lamp {
 }
 
 /// Light that arrives at a point.
-pub(super) struct Arriving {
+pub(super) struct IncidentLight {
     /// Unit direction towards the lamp.
     pub towards: Vec3,
     /// Distance to the point where the light left the lamp, in metres.
@@ -39,13 +39,13 @@ impl Lamp {
     }
 
     /// Returns the light that reaches `point` from the position on the lamp given by `at` in [0, 1)².
-    pub fn arriving(&self, point: Vec3, at: Vec2) -> Arriving {
+    pub fn incident_at(&self, point: Vec3, at: Vec2) -> IncidentLight {
         match *self {
             Lamp::Sun { towards, spread, colour } => {
                 let (right, up) = towards.any_orthonormal_pair();
                 let offset = spread * (at - 0.5);
                 let towards = (towards + offset.x * right + offset.y * up).normalize();
-                Arriving { towards, distance: f32::INFINITY, colour }
+                IncidentLight { towards, distance: f32::INFINITY, colour }
             }
             Lamp::Ball { at: centre, radius, colour } => {
                 let (right, up) = (centre - point).normalize_or(Vec3::Y).any_orthonormal_pair();
@@ -54,7 +54,7 @@ impl Lamp {
                 let distance = way.length().max(1e-3);
                 // Limit the irradiance to that at about a quarter of a metre, to avoid overexposure.
                 let colour = colour / (distance * distance).max(0.06);
-                Arriving { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), colour }
+                IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), colour }
             }
             Lamp::Panel { at: centre, right, up, facing, colour } => {
                 let offset = 2. * at - 1.;
@@ -62,7 +62,7 @@ impl Lamp {
                 let distance = way.length().max(1e-3);
                 let towards = way / distance;
                 let colour = colour * (-towards.dot(facing)).max(0.) / (distance * distance).max(0.25);
-                Arriving { towards, distance, colour }
+                IncidentLight { towards, distance, colour }
             }
         }
     }

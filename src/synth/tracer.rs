@@ -136,7 +136,7 @@ impl Tracer {
         if self.lamps.is_empty() {
             return (Vec3::ZERO, Vec3::ZERO);
         }
-        let light = self.lamps[choice.turn % self.lamps.len()].arriving(surface.point, choice.on_lamp);
+        let light = self.lamps[choice.turn % self.lamps.len()].incident_at(surface.point, choice.on_lamp);
         let facing = light.towards.dot(surface.normal);
         if facing <= 0. || light.towards.dot(surface.flat) <= 0. || light.colour.max_element() < 1e-4 {
             return (Vec3::ZERO, Vec3::ZERO);
@@ -204,7 +204,7 @@ impl Tracer {
         let gather = |(&inside, &normal): (&Vec3, &Vec3)| {
             let (right, up) = normal.any_orthonormal_pair();
             let start = inside + 5. * LIFT * normal;
-            let arriving = |(i, d): (usize, &Vec3)| {
+            let contribution = |(i, d): (usize, &Vec3)| {
                 let towards = d.x * right + d.y * up + d.z * normal;
                 let Some(hit) = self.tree.nearest(start, towards, f32::INFINITY) else {
                     return self.sky.around(towards);
@@ -216,7 +216,7 @@ impl Tracer {
                 let rest = 0.12 * self.sky.around(surface.normal);
                 surface.reflectance * (direct + surface.material.glow + rest)
             };
-            directions.iter().enumerate().map(arriving).sum::<Vec3>() / GATHERED as f32
+            directions.iter().enumerate().map(contribution).sum::<Vec3>() / GATHERED as f32
         };
         insides.par_iter().zip(&self.normals).map(gather).collect()
     }

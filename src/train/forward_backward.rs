@@ -8,10 +8,10 @@ use crate::config::Config;
 use crate::data::Sample;
 use crate::error::Result;
 use crate::loss::{PerceptualLoss, Share, depth_pixels, losses};
-use crate::model::{GlobalSplat, Stage, leaf, pull_back};
+use crate::model::{GlobalSplat, Stage, backward_from_grads, leaf};
 use crate::optim::Stopwatch;
 use crate::ranks::Group;
-use crate::render::{DEFAULT_EPS2D, Pictures, render};
+use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use tch::{Tensor, no_grad};
 
 /// Inputs that all slices of a step share.
@@ -45,9 +45,9 @@ impl ForwardBackward<'_> {
         let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));
         let decoded_leaves = decoded.map(leaf);
         let cameras = sample.target.cameras();
-        let Pictures { rgb, alpha, depth } =
+        let RenderOutput { rgb, alpha, depth } =
             watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
-        let pictures = Pictures { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+        let pictures = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
         let share = self.counted(sample, &pictures.alpha, share)?;
         let losses = watch.time("losses", || {
             losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, &share)
@@ -55,16 +55,20 @@ impl ForwardBackward<'_> {
 
         watch.time("losses backward", || losses.total.backward());
         watch.time("render backward", || {
-            pull_back(&[(&rgb, &pictures.rgb), (&alpha, &pictures.alpha), (&depth, &pictures.depth)]);
+            backward_from_grads(&[
+                (&rgb, &pictures.rgb),
+                (&alpha, &pictures.alpha),
+                (&depth, &pictures.depth),
+            ]);
         });
-        watch.time("decoder backward", || pull_back(&decoded.beside(&decoded_leaves)));
+        watch.time("decoder backward", || backward_from_grads(&decoded.beside(&decoded_leaves)));
         watch.time("encoder backward", || {
-            pull_back(&encoded.beside(&encoded_leaves));
+            backward_from_grads(&encoded.beside(&encoded_leaves));
             if let Some(kept) = kept {
                 kept.backward();
             }
         });
-        watch.time("tokens backward", || pull_back(&[(&tokens, &tokens_leaf)]));
+        watch.time("tokens backward", || backward_from_grads(&[(&tokens, &tokens_leaf)]));
         Ok(losses.packed())
     }
 
@@ -75,7 +79,7 @@ impl ForwardBackward<'_> {
         if pixels.is_none() && compares && self.group.ranks() > 1 {
             let alpha = alpha.detach().chunk(2, 0);
             let counted = depth_pixels([&alpha[0], &alpha[1]]);
-            self.group.sum(&counted)?;
+            self.group.all_reduce(&counted)?;
             pixels = Some(counted);
         }
         Ok(Share { depth_pixels: pixels, ..*share })

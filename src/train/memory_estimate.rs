@@ -41,7 +41,7 @@ impl MemoryEstimate {
     fn of_learned(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
         let (model, data) = (&config.model, &config.data);
-        let (batch, precision) = (config.train.batch, config.train.precision);
+        let (batch, precision) = (config.train.batch_size, config.train.precision);
         let scenes_at_once = match config.train.micro_batch {
             0 => batch,
             count => count.min(batch),
@@ -126,20 +126,20 @@ pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usiz
     config.train.micro_batch = 0;
     let learned = learned_numbers(&config.model)?;
     let mut refused = None;
-    while config.train.batch > 1 {
+    while config.train.batch_size > 1 {
         let estimate = MemoryEstimate::of_learned(&config, learned, device);
         if estimate.fits_into(bytes) {
             break;
         }
         refused = Some(estimate);
-        config.train.batch /= 2;
+        config.train.batch_size /= 2;
     }
-    Ok((config.train.batch, refused))
+    Ok((config.train.batch_size, refused))
 }
 
 /// Returns the number of trainable parameters of a model of `config`.
 fn learned_numbers(config: &ModelConfig) -> Result<f64> {
     let mut vs = nn::VarStore::new(Device::Cpu);
-    GlobalSplat::to_be_filled(&mut vs, config, Precision::F32)?;
+    GlobalSplat::uninitialized(&mut vs, config, Precision::F32)?;
     Ok(vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64)
 }

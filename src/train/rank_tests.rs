@@ -187,7 +187,7 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
             if sharded {
                 trainer = trainer.with_sharded_optimizer();
             }
-            trainer.follow_first().expect("the first rank");
+            trainer.broadcast_state().expect("the first rank");
             for _ in 0..3 {
                 let sample = Sample::of(&scenes(3)[rank..][..1], Device::Cpu);
                 trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
@@ -242,7 +242,7 @@ fn ranks_follow_the_first() {
             let _ = trainer.vs.variables()[NOT_TRAINED].shallow_clone().fill_(0.25);
         }
         let mut trainer = trainer.with_ranks(group);
-        trainer.follow_first().expect("the first rank");
+        trainer.broadcast_state().expect("the first rank");
         let moments: Vec<Tensor> = trainer.optimizer.moments().map(Tensor::copy).collect();
         let variables: BTreeMap<_, _> =
             trainer.vs.variables().into_iter().map(|(name, value)| (name, value.detach().copy())).collect();
@@ -269,7 +269,7 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
         let mut found = together(2, |group| {
             let config = training(TrainConfig::default());
             let trainer = if group.is_first() { far_from_the_start(&config) } else { second(config) };
-            trainer.with_ranks(group).follow_first().map_err(|e| e.to_string())
+            trainer.with_ranks(group).broadcast_state().map_err(|e| e.to_string())
         });
         found.remove(1).expect_err("the second rank goes on")
     };

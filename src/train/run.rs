@@ -77,10 +77,10 @@ pub fn run(
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
     let writes = trainer.group.is_first();
-    let begun = writes.then(|| Books::open(trainer, out, resume, &mut observe)).transpose()?;
-    trainer.follow_first()?;
+    let begun = writes.then(|| RunLogger::open(trainer, out, resume, &mut observe)).transpose()?;
+    trainer.broadcast_state()?;
     let held_out = validator.as_ref().map(|validator| validator.scenes());
-    let expected = trainer.group.from_first(writes.then_some(held_out))?;
+    let expected = trainer.group.broadcast_object(writes.then_some(held_out))?;
     if held_out != expected {
         let count = |scenes: Option<usize>| scenes.unwrap_or(0);
         let (found, expected) = (count(held_out), count(expected));
@@ -88,12 +88,12 @@ pub fn run(
             "this rank has {found} held-out scenes, expected {expected}, as the first one"
         )));
     }
-    let validated = begun.as_ref().map(|(books, _)| books.metrics.last_validation());
-    let validated = trainer.group.from_first(validated)?;
+    let validated = begun.as_ref().map(|(logger, _)| logger.metrics.last_validation());
+    let validated = trainer.group.broadcast_object(validated)?;
     let saved = begun.as_ref().map(|(_, saved)| saved.clone());
-    let saved = trainer.group.from_first(saved)?;
-    let books = begun.map(|(books, _)| books);
-    Run { trainer, out, validator, observe, books, validated, asked_to_stop: false }.train(saved)
+    let saved = trainer.group.broadcast_object(saved)?;
+    let logger = begun.map(|(logger, _)| logger);
+    Run { trainer, out, validator, observe, logger, validated, asked_to_stop: false }.train(saved)
 }
 
 /// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and the files beside them.
@@ -123,7 +123,7 @@ fn check_books(out: &Path) -> Result<()> {
 }
 
 /// Files that a run writes beside its checkpoints.
-struct Books {
+struct RunLogger {
     _lock: RunLock,
     metrics: Metrics,
     tensorboard: TensorBoard,
@@ -133,7 +133,7 @@ struct Books {
     settings: String,
 }
 
-impl Books {
+impl RunLogger {
     /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the run's own checkpoint of this state.
     fn open(
         trainer: &mut Trainer,
@@ -153,23 +153,23 @@ impl Books {
         };
         if !changes.is_empty() {
             let changes = changes.join(", ");
-            observe(Event::Notice(format!("the run goes on with another configuration: {changes}")));
+            observe(Event::Notice(format!("resuming with a changed configuration: {changes}")));
         }
-        patiently(observe, || {
+        retry_on_disk_full(observe, || {
             write_atomically(&config, |writer| {
                 writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
             })
         })?;
-        let metrics = patiently(observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
+        let metrics = retry_on_disk_full(observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
         let mut tensorboard =
-            patiently(observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
-        patiently(observe, || tensorboard.start(trainer.step))?;
+            retry_on_disk_full(observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
+        retry_on_disk_full(observe, || tensorboard.start(trainer.step))?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {
             observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
             None
         });
-        Ok((Books { _lock: lock, metrics, tensorboard, best, settings }, begun))
+        Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, begun))
     }
 
     fn log_step(
@@ -178,9 +178,9 @@ impl Books {
         report: &StepReport,
         samples_per_second: f64,
     ) -> Result<()> {
-        patiently(observe, || self.metrics.log_step(report, samples_per_second))?;
-        patiently(observe, || self.tensorboard.log_step(report, samples_per_second))?;
-        patiently(observe, || self.tensorboard.log_picture(report))
+        retry_on_disk_full(observe, || self.metrics.log_step(report, samples_per_second))?;
+        retry_on_disk_full(observe, || self.tensorboard.log_step(report, samples_per_second))?;
+        retry_on_disk_full(observe, || self.tensorboard.log_picture(report))
     }
 
     fn log_validation(
@@ -189,8 +189,8 @@ impl Books {
         step: u64,
         score: &Score,
     ) -> Result<()> {
-        patiently(observe, || self.tensorboard.log_validation(step, score))?;
-        patiently(observe, || self.metrics.log_validation(step, score))
+        retry_on_disk_full(observe, || self.tensorboard.log_validation(step, score))?;
+        retry_on_disk_full(observe, || self.metrics.log_validation(step, score))
     }
 }
 
@@ -201,7 +201,7 @@ struct Run<'a, 'v, O> {
     validator: Option<&'v mut dyn Validator>,
     observe: O,
     /// Log files, which only the first rank has.
-    books: Option<Books>,
+    logger: Option<RunLogger>,
     /// Step before the last validation that was logged.
     validated: Option<u64>,
     /// `true` if this rank was asked to stop. The other ranks learn of it with the next step.
@@ -211,7 +211,7 @@ struct Run<'a, 'v, O> {
 impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// Trains until all steps are done or the run is stopped. `saved` is the run's own checkpoint of the current state, if there is one.
     fn train(mut self, mut saved: Option<PathBuf>) -> Result<Outcome> {
-        let TrainConfig { steps, checkpoint_every, validate_every, max_skipped, .. } =
+        let TrainConfig { steps, checkpoint_every, validate_every, max_nonfinite_steps, .. } =
             self.trainer.config.train;
         let batch = self.trainer.batch() as f64;
         let (mut skipped, mut go_on) = (0, true);
@@ -242,14 +242,14 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             })?;
             let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
-            if let Some(books) = &mut self.books {
-                books.log_step(&mut self.observe, &report, samples_per_second)?;
+            if let Some(logger) = &mut self.logger {
+                logger.log_step(&mut self.observe, &report, samples_per_second)?;
             }
             go_on = self.tell(Event::Step { report: &report, samples_per_second }) && report.go_on;
             if report.skipped {
                 skipped += 1;
                 skipped_in_a_row += 1;
-                if skipped_in_a_row == max_skipped {
+                if skipped_in_a_row == max_nonfinite_steps {
                     return Err(self.not_finite(skipped_in_a_row, &report));
                 }
             } else {
@@ -266,7 +266,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         // Skipped steps changed nothing, so this is the state before them. They are repeated when the run is resumed.
         self.trainer.take_back(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
-        if self.books.is_some() {
+        if self.logger.is_some() {
             // Retry to remove checkpoints that an earlier save couldn't remove.
             drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
         }
@@ -293,8 +293,8 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.
     fn save(&mut self) -> Result<PathBuf> {
         let optimizer = self.trainer.optimizer_state()?;
-        match &self.books {
-            Some(_) => patiently(&mut self.observe, || self.trainer.save(self.out, &optimizer)),
+        match &self.logger {
+            Some(_) => retry_on_disk_full(&mut self.observe, || self.trainer.save(self.out, &optimizer)),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }
@@ -311,14 +311,14 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             observe(Event::Notice(format!("a held-out scene is left out: {why}")));
         }
         let step = self.trainer.step.saturating_sub(1);
-        if let Some(books) = &mut self.books {
-            if score.psnr > books.best.unwrap_or(f64::NEG_INFINITY) {
-                let found = || Validation { psnr: score.psnr, settings: books.settings.clone() };
-                patiently(observe, || keep_best(self.out, checkpoint, found()))?;
-                books.best = Some(score.psnr);
+        if let Some(logger) = &mut self.logger {
+            if score.psnr > logger.best.unwrap_or(f64::NEG_INFINITY) {
+                let found = || Validation { psnr: score.psnr, settings: logger.settings.clone() };
+                retry_on_disk_full(observe, || keep_best(self.out, checkpoint, found()))?;
+                logger.best = Some(score.psnr);
             }
             if self.validated != Some(step) {
-                books.log_validation(observe, step, &score)?;
+                logger.log_validation(observe, step, &score)?;
             }
         }
         self.validated = Some(step);
@@ -332,7 +332,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             Err(_) => "no checkpoint was saved before".into(),
         };
         Error::Failed(format!(
-            "training stops: loss or gradient of the last {steps} steps was not finite (train.max_skipped); step {} showed {}; \
+            "training stops: loss or gradient of the last {steps} steps was not finite (train.max_nonfinite_steps); step {} showed {}; \
              {before}",
             last.step,
             last.scenes.join(", ")
@@ -391,13 +391,18 @@ fn begin(
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Calls `write`, and repeats it as long as the disk is full and `observe` returns `true`.
-fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut() -> Result<T>) -> Result<T> {
+fn retry_on_disk_full<T>(
+    observe: &mut impl FnMut(Event) -> bool,
+    mut write: impl FnMut() -> Result<T>,
+) -> Result<T> {
     let mut waited = false;
     loop {
         match write() {
             Err(e) if e.is_disk_full() => {
                 if !waited {
-                    observe(Event::Notice(format!("training pauses: {e}; it goes on when there is room")));
+                    observe(Event::Notice(format!(
+                        "training paused: {e}; it resumes when there is disk space"
+                    )));
                     waited = true;
                 }
                 if !observe(Event::Waiting) {
@@ -407,7 +412,7 @@ fn patiently<T>(observe: &mut impl FnMut(Event) -> bool, mut write: impl FnMut()
             }
             result => {
                 if waited && result.is_ok() {
-                    observe(Event::Notice("there is room again: training goes on".into()));
+                    observe(Event::Notice("disk space is available again: training resumes".into()));
                 }
                 return result;
             }

@@ -8,7 +8,7 @@ use crate::data::Sample;
 use crate::error::Result;
 use crate::loss::Share;
 use crate::model::GlobalSplat;
-use crate::optim::{Stopwatch, forget_gradients};
+use crate::optim::{Stopwatch, zero_grad};
 use crate::ranks::Group;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
@@ -30,7 +30,7 @@ impl Twin {
     /// Returns an error if the model can't be built. This is not expected, because `model` was built with the same configuration.
     pub fn of(model: &GlobalSplat, vs: &nn::VarStore) -> Result<Self> {
         let mut own = nn::VarStore::new(vs.device());
-        let twin = GlobalSplat::to_be_filled(&mut own, model.config(), model.precision())?;
+        let twin = GlobalSplat::uninitialized(&mut own, model.config(), model.precision())?;
         let variables = vs.variables();
         let leaves = own.variables().into_iter().filter_map(|(name, mut leaf)| {
             let variable = variables[&name].shallow_clone();
@@ -48,7 +48,7 @@ impl Twin {
                 let _ = variable.grad().g_add_(&gradient);
             }
         }
-        forget_gradients(self.leaves.iter().map(|(_, leaf)| leaf));
+        zero_grad(self.leaves.iter().map(|(_, leaf)| leaf));
     }
 }
 

@@ -21,7 +21,7 @@ pub struct StepReport {
     pub skipped: bool,
     /// Names of the scenes of this rank, or of all ranks if the step was skipped.
     pub scenes: Vec<String>,
-    /// Preview of the first scene before the step, `[3, H, W]`, at the steps that `train.pictures_every` selects.
+    /// Preview of the first scene before the step, `[3, H, W]`, at the steps that `train.log_images_every` selects.
     pub picture: Option<Tensor>,
     /// `true` if no rank was asked to stop.
     pub go_on: bool,

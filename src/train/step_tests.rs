@@ -4,7 +4,7 @@ use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
-use crate::model::{ModelConfig, Precision, Stage, Streams, leaf, pull_back};
+use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
 use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
@@ -292,7 +292,7 @@ fn a_step_takes_few_kernels() {
     let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
     let (tokens, forward) = outermost_ops_of(|| network.tokens(images, c2w, intrinsics));
     let leaf_of_tokens = with_gradient(&tokens);
-    let (_, backward) = outermost_ops_of(|| pull_back(&[(&tokens, &leaf_of_tokens)]));
+    let (_, backward) = outermost_ops_of(|| backward_from_grads(&[(&tokens, &leaf_of_tokens)]));
     // Two layers, forward and for the gradients of their weights.
     let of_tokens = computing(&without_own_linear_layers([forward, backward].concat())) + 2 * 2;
 
@@ -307,7 +307,7 @@ fn a_step_takes_few_kernels() {
     let tokens = leaf(&tokens.to_kind(Kind::Double));
     let (decoded, forward) = outermost_ops_of(|| network.decode(&network.encode(&tokens), STAGE));
     let leaves = decoded.map(with_gradient);
-    let (_, backward) = outermost_ops_of(|| pull_back(&decoded.beside(&leaves)));
+    let (_, backward) = outermost_ops_of(|| backward_from_grads(&decoded.beside(&leaves)));
     let counts = [of_tokens, computing(&forward), computing(&backward), computing(&of_losses)];
     assert!((1000..=2100).contains(&counts.iter().sum::<usize>()), "{counts:?}");
 }

@@ -52,7 +52,7 @@ pub struct Trainer {
 }
 
 /// Values that ranks exchange in every step in addition to gradients. They are summed over all ranks.
-struct Word {
+struct StepSync {
     /// Number of ranks that were asked to stop.
     asked_to_stop: f64,
     /// Number of ranks that found bad data.
@@ -61,7 +61,7 @@ struct Word {
     gradients: [f64; 2],
 }
 
-impl Word {
+impl StepSync {
     const COUNT: usize = 4;
 
     fn packed(&self) -> [f64; Self::COUNT] {
@@ -69,7 +69,7 @@ impl Word {
     }
 
     fn unpacked([asked_to_stop, found_bad_data, sum, squares]: [f64; Self::COUNT]) -> Self {
-        Word { asked_to_stop, found_bad_data, gradients: [sum, squares] }
+        StepSync { asked_to_stop, found_bad_data, gradients: [sum, squares] }
     }
 }
 
@@ -108,7 +108,7 @@ impl Trainer {
         })
     }
 
-    /// Makes this trainer a rank of `group`. `train.batch` is the batch size of each rank. A step equals that of a single process with the
+    /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with the
     /// samples of all ranks.
     pub fn with_ranks(mut self, group: Group) -> Self {
         // Parameters notify only one set of buckets, so the old one is dropped first.
@@ -157,7 +157,7 @@ impl Trainer {
             return file.load_into(&self.vs);
         }
         let mut smaller = nn::VarStore::new(self.vs.device());
-        GlobalSplat::to_be_filled(&mut smaller, &theirs, Precision::F32)?;
+        GlobalSplat::uninitialized(&mut smaller, &theirs, Precision::F32)?;
         file.load_into(&smaller)?;
         let smaller = smaller.variables();
         no_grad(|| {
@@ -173,11 +173,11 @@ impl Trainer {
     /// # Errors
     /// Returns an error if loading or rendering fails, or if another rank is gone.
     pub fn step(&mut self, go_on: &mut dyn FnMut() -> bool) -> Result<StepReport> {
-        let (batch, device) = (self.config.train.batch, self.vs.device());
+        let (batch, device) = (self.config.train.batch_size, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
         self.samples += self.batch();
         let stage = stage_at(&self.config.curriculum, self.step);
-        let picture = (self.group.is_first() && is_due(self.config.train.pictures_every, self.step))
+        let picture = (self.group.is_first() && is_due(self.config.train.log_images_every, self.step))
             .then(|| preview(&self.model, &sample, stage))
             .transpose()?;
         Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default(), go_on)? })
@@ -189,7 +189,7 @@ impl Trainer {
     }
 
     fn part(&self) -> Part {
-        Part { batch: self.config.train.batch, number: self.group.rank(), parts: self.group.ranks() }
+        Part { batch: self.config.train.batch_size, number: self.group.rank(), parts: self.group.ranks() }
     }
 
     /// Computes the loss and gradient of `sample`, which isn't paired yet, and updates the weights. Records the time of each section of the
@@ -212,7 +212,7 @@ impl Trainer {
         };
         // The GPU is still busy with this step. The next samples are copied meanwhile.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
-            loader.send_ahead(self.config.train.batch, device);
+            loader.prefetch_to_device(self.config.train.batch_size, device);
         }
         let (losses, word, gradient_norm, skipped) = watch.time("optimizer", || {
             let (losses, word, gradient_norm) = read(&told, &self.optimizer.gradient_norm());
@@ -224,7 +224,7 @@ impl Trainer {
             }
             (losses, word, gradient_norm, skipped)
         });
-        if !skipped && !self.optimizer.is_whole() {
+        if !skipped && self.optimizer.is_sharded() {
             watch.time("parameters", || self.spread_parameters())?;
         }
         let [gradients, squares] = word.gradients;
@@ -255,11 +255,11 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the values of [`Word`] over all ranks,
+    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the values of [`StepSync`] over all ranks,
     /// packed.
     fn add_up(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()? as f64;
-        let word = Word {
+        let word = StepSync {
             asked_to_stop: f64::from(!go_on()),
             found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_news)),
             gradients: [gradients, gradients * gradients],
@@ -267,7 +267,7 @@ impl Trainer {
         // Filling a new tensor on a GPU doesn't wait for the GPU.
         let numbers = word.packed().map(|number| Tensor::full([1], number, (Kind::Double, losses.device())));
         let told = Tensor::cat(&std::iter::once(losses).chain(numbers).collect::<Vec<_>>(), 0);
-        self.group.sum(&told)?;
+        self.group.all_reduce(&told)?;
         Ok(told)
     }
 
@@ -279,7 +279,7 @@ impl Trainer {
                 continue;
             }
             let flat = Tensor::cat(&parameters.iter().map(|t| t.detach().view(-1)).collect::<Vec<_>>(), 0);
-            self.group.copy_from(part, &flat)?;
+            self.group.broadcast(part, &flat)?;
             if part != self.group.rank() {
                 let sizes: Vec<i64> = parameters.iter().map(|t| t.numel() as i64).collect();
                 for (parameter, value) in parameters.into_iter().zip(flat.split_with_sizes(sizes, 0)) {
@@ -296,7 +296,7 @@ impl Trainer {
     /// # Errors
     /// Returns an error if another rank is gone.
     pub(super) fn optimizer_state(&self) -> Result<BTreeMap<String, Tensor>> {
-        if self.optimizer.is_whole() {
+        if !self.optimizer.is_sharded() {
             return Ok(self.optimizer.state());
         }
         self.optimizer.state_by(|moment, shape, part| {
@@ -306,7 +306,7 @@ impl Trainer {
             } else {
                 Tensor::empty(shape, (Kind::Float, self.vs.device()))
             };
-            self.group.copy_from(part, &moment)?;
+            self.group.broadcast(part, &moment)?;
             Ok(if self.group.is_first() { moment.to_device(Device::Cpu) } else { Tensor::new() })
         })
     }
@@ -340,18 +340,18 @@ impl Trainer {
     ///
     /// # Errors
     /// Returns an error if this rank's configuration or scenes differ from the first rank's, or if another rank is gone.
-    pub(crate) fn follow_first(&mut self) -> Result<()> {
+    pub(crate) fn broadcast_state(&mut self) -> Result<()> {
         self.agree_with_first()?;
         let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
-        let (step, samples, updates) = self.group.from_first(position)?;
+        let (step, samples, updates) = self.group.broadcast_object(position)?;
         (self.step, self.samples) = (step, samples);
         self.optimizer.set_steps(updates);
         // Variables that aren't trained are copied, too.
         let variables: BTreeMap<String, Tensor> = self.vs.variables().into_iter().collect();
         let moments = self.optimizer.moments();
-        variables.values().chain(moments).try_for_each(|t| self.group.copy_from(0, t))?;
+        variables.values().chain(moments).try_for_each(|t| self.group.broadcast(0, t))?;
         if self.shards_optimizer {
-            self.optimizer.become_part(self.group.rank(), self.group.ranks());
+            self.optimizer.shard(self.group.rank(), self.group.ranks());
         }
         Ok(())
     }
@@ -359,7 +359,8 @@ impl Trainer {
     /// Checks that this rank has the configuration and scenes of the first one. The locations of the data may differ between machines.
     fn agree_with_first(&self) -> Result<()> {
         let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
-        let (config, scenes, shards) = self.group.from_first(self.group.is_first().then(|| own.clone()))?;
+        let (config, scenes, shards) =
+            self.group.broadcast_object(self.group.is_first().then(|| own.clone()))?;
         let mut changed = changed_keys(&config, &own.0);
         // A change has the form `key first → own`.
         changed.retain(|change| {
@@ -429,7 +430,7 @@ impl Trainer {
                 watch.time("depth pixels", || part.depth_pixels(&slice))
             });
             let pixels = Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>);
-            group.sum(&pixels)?;
+            group.all_reduce(&pixels)?;
             depth_pixels = Some(pixels);
         }
         watch.time("zero gradients", || self.optimizer.zero_grad());
@@ -521,16 +522,16 @@ impl Trainer {
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
-        Model { network, config, stage, device, input: Input::PLAIN, lent: None }
+        Model { network, config, stage, device, input: Input::PLAIN, mapped: None }
     }
 }
 
 /// Returns a step's packed losses, the exchanged values, and the gradient's norm (a scalar) as numbers. They are copied from a GPU
 /// together, because every copy waits for all of the GPU's work; this is the only copy of a step.
-fn read(told: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, Word, f64) {
+fn read(told: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, StepSync, f64) {
     let all = Tensor::cat(&[told, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
     let numbers = Vec::<f64>::try_from(all.to_device(Device::Cpu)).expect("float64");
     let (losses, others) = numbers.split_first_chunk().expect("all terms");
     let (word, norm) = others.split_first_chunk().expect("all words");
-    (Losses::unpacked(losses), Word::unpacked(*word), norm[0])
+    (Losses::unpacked(losses), StepSync::unpacked(*word), norm[0])
 }

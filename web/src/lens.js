@@ -1,10 +1,10 @@
-/** What a camera's pixels see, shown whole in the middle of a canvas of any shape. */
+/** A camera with pinhole intrinsics, whose whole image is fitted and centred in a canvas of any aspect ratio. */
 
 import { Matrix4, PerspectiveCamera } from "three";
 
 /**
- * Where the camera's picture is in a canvas of `width`×`height`: as large as it fits, centred.
- * `lens` has intrinsics (fx, fy, cx, cy) and the size (width, height) in pixels of the photo.
+ * Returns the rectangle of the camera's image in a canvas of `width`×`height`: as large as it fits, centred.
+ * `lens` has intrinsics (fx, fy, cx, cy) and the size (width, height) of the photo, in pixels.
  */
 export function frame(lens, width, height) {
   const scale = Math.min(width / lens.width, height / lens.height);
@@ -12,13 +12,13 @@ export function frame(lens, width, height) {
   return { scale, left: (width - size.width) / 2, top: (height - size.height) / 2, ...size };
 }
 
-/** A camera whose projection is a lens's and not a field of view's. */
+/** A camera whose projection matrix is computed from intrinsics instead of a field of view. */
 export class LensCamera extends PerspectiveCamera {
-  /** Near and far planes suit scenes of any size. */
+  /** Sets the intrinsics, the canvas size in pixels, and the near and far planes, and updates the projection matrix. */
   setLens(lens, width, height, near, far) {
     Object.assign(this, { lens, near, far });
     const { scale, left, top } = frame(lens, width, height);
-    // Pixel x = fx X/Z + cx in a camera that looks along z, with y down; OpenGL's looks along -z, with y up.
+    // Pixel x = fx X/Z + cx in a camera that looks along +z with y down; OpenGL's camera looks along -z with y up.
     const x = [(2 * scale * lens.fx) / width, 1 - (2 * (scale * lens.cx + left)) / width];
     const y = [(2 * scale * lens.fy) / height, (2 * (scale * lens.cy + top)) / height - 1];
     const z = [(far + near) / (near - far), (2 * far * near) / (near - far)];
@@ -28,13 +28,13 @@ export class LensCamera extends PerspectiveCamera {
     this.fov = (2 * Math.atan(1 / y[0]) * 180) / Math.PI;
   }
 
-  /** `setLens` alone decides. */
+  /** Does nothing: `setLens` alone sets the projection matrix. */
   updateProjectionMatrix() {}
 }
 
 const FLIP = new Matrix4().makeScale(1, -1, -1);
 
-/** The pose of an OpenGL camera from `c2w`, the 12 numbers of a camera-to-world matrix [3, 4] with y down and z forward. */
+/** Returns the pose of an OpenGL camera from `c2w`, the 12 elements of a camera-to-world matrix [3, 4] with y down and z forward. */
 export function pose(c2w) {
   return new Matrix4().set(...c2w, 0, 0, 0, 1).multiply(FLIP);
 }

@@ -1,4 +1,4 @@
-/** The page: buttons, keys and the strip of photos, and what they do to the stage. */
+/** The page's controls (buttons, keys and the strip of photos) and their effects on the stage. */
 
 import { scene, splat } from "./data.js";
 import { frame } from "./lens.js";
@@ -8,7 +8,7 @@ import { Walk } from "./walk.js";
 const at = (id) => document.getElementById(id);
 const canvas = at("canvas");
 
-/** Says what there is to see instead of a scene. */
+/** Shows an error message in place of the scene. */
 function give_up(words) {
   at("message").textContent = words;
   at("message").hidden = false;
@@ -63,7 +63,7 @@ class Page {
     this.last = index;
   }
 
-  /** The photo before or after the one that was last jumped to. */
+  /** Jumps `count` photos forward (or backward, if negative) from the photo that was last jumped to. */
   jumpBy(count) {
     const { length } = scene.cameras;
     this.jumpTo((this.last + count + length) % length);
@@ -101,13 +101,13 @@ class Page {
       Comma: () => this.jumpBy(-1), Period: () => this.jumpBy(1), Home: () => this.jumpTo(0), Slash: () => this.toggleHelp(),
     };
     addEventListener("keydown", (event) => {
-      // Keys that a control of the page has for itself stay with it.
+      // Leave a key to the focused control if that control handles it itself.
       const isTaken = event.target.matches("input, dialog *") || (event.code === "Space" && event.target.matches("button"));
       if (isTaken || event.ctrlKey || event.metaKey || event.altKey || !(event.code in keys)) return;
       event.preventDefault();
       keys[event.code]();
     });
-    // A slider's arrows don't walk.
+    // Arrow keys on a focused slider must not move the camera.
     for (const slider of document.querySelectorAll("input")) slider.addEventListener("keydown", (event) => event.stopPropagation());
   }
 
@@ -135,7 +135,7 @@ class Page {
     at("help").open ? at("help").close() : at("help").showModal();
   }
 
-  /** The photo over the picture, up to where the slider is. */
+  /** Overlays the photo on the rendered image, up to the slider's position. */
   compare() {
     const index = this.walk.at;
     const photo = index === null ? undefined : scene.cameras[index].photo;
@@ -148,7 +148,7 @@ class Page {
     at("compare").style.setProperty("--share", at("share").valueAsNumber);
   }
 
-  /** Controls show what is shown. */
+  /** Updates the controls to match the current view. */
   follow() {
     this.compare();
     const { at: here, isPlaying, along } = this.walk;

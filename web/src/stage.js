@@ -1,4 +1,4 @@
-/** The scene in WebGL: the splat, its Gaussians' centres, and the cameras that photographed it. */
+/** The WebGL scene: the splat, its Gaussians' centres, and the cameras that photographed it. */
 
 import { SparkRenderer, SplatMesh, dyno } from "@sparkjsdev/spark";
 import {
@@ -7,11 +7,11 @@ import {
 } from "three";
 import { LensCamera, pose } from "./lens.js";
 
-/** The share of Gaussians at either end of all depths that no colours are spent on. */
+/** Fraction of Gaussians at each end of the depth range that is clamped in the depth view. */
 const OUTLIERS = 0.02;
 
 export class Stage {
-  /** `world` is turned so that the scene's up is y, which is what whoever walks turns around. */
+  /** Creates the renderer. `world` is rotated so that the scene's up direction is y, the axis that the controls turn around. */
   constructor(canvas, scene) {
     this.scene = scene;
     this.renderer = new WebGLRenderer({ canvas, antialias: false });
@@ -19,7 +19,7 @@ export class Stage {
     this.world.quaternion.setFromUnitVectors(new Vector3(...scene.up), new Vector3(0, 1, 0));
     this.world.updateMatrixWorld();
     this.camera = new LensCamera();
-    // The blur and the order of our own rasterizer: by depth, and as much blur as the model was trained with.
+    // Match our rasterizer: sorted by depth, with the blur that the model was trained with.
     this.spark = new SparkRenderer({
       renderer: this.renderer, preBlurAmount: scene.blur, blurAmount: 0, sortRadial: false, maxStdDev: 3.3, onDirty: () => this.touch(),
     });
@@ -31,14 +31,14 @@ export class Stage {
     this.touch();
   }
 
-  /** Something is to be drawn anew. */
+  /** Marks the scene as changed, so that the next frame redraws it. */
   touch() {
     this.isDirty = true;
   }
 
   async load(bytes) {
     this.splat = new SplatMesh({ fileBytes: bytes, fileType: "spz" });
-    // An SPZ's y points up and its z backward.
+    // In an SPZ file, y points up and z backward.
     this.splat.rotation.x = Math.PI;
     this.world.add(this.splat);
     await this.splat.initialized;
@@ -57,7 +57,7 @@ export class Stage {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
     geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
-    // Numbers in a splat are colours as they are shown.
+    // A splat's colours are display (sRGB) values already, so skip the shader's colour space conversion.
     const material = new PointsMaterial({ size: 2 * this.renderer.getPixelRatio(), sizeAttenuation: false, vertexColors: true });
     material.onBeforeCompile = (shader) => {
       shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
@@ -68,7 +68,10 @@ export class Stage {
     this.world.add(this.centres);
   }
 
-  /** Grey by the depth of a Gaussian's centre, near bright, evenly by 1/depth: the page's filter gives greys their colours. */
+  /**
+   * Prepares the depth view: each Gaussian is grey by its centre's depth, linear in 1/depth, near ones bright. The page's filter maps
+   * greys to colours.
+   */
   addDepth() {
     this.eye = dyno.dynoVec3(new Vector3());
     this.forward = dyno.dynoVec3(new Vector3());
@@ -89,7 +92,7 @@ export class Stage {
       const matrix = pose(camera.c2w);
       eye.setFromMatrixPosition(matrix);
       forward.setFromMatrixColumn(matrix, 2).negate();
-      // Enough of them to know the range by.
+      // A sample of the Gaussians is enough to estimate the range.
       const step = Math.max(1, Math.floor((places.count * this.scene.cameras.length) / 50_000));
       for (let index = 0; index < places.count; index += step) {
         const depth = place.fromBufferAttribute(places, index).applyMatrix4(turned).sub(eye).dot(forward);
@@ -126,7 +129,7 @@ export class Stage {
     this.world.add(this.frustums);
   }
 
-  /** `colour`, `depth` or `centres`. */
+  /** Sets what is shown: `colour`, `depth` or `centres`. */
   show(mode) {
     this.mode = mode;
     this.splat.visible = mode !== "centres";
@@ -136,20 +139,20 @@ export class Stage {
     this.touch();
   }
 
-  /** Draws what changed; whether anything did. */
+  /** Redraws the scene if it changed; returns `true` if it did. */
   draw() {
     if (!this.isDirty) return false;
     this.isDirty = false;
     this.camera.updateMatrixWorld();
     if (this.mode === "depth" && !this.camera.matrixWorld.equals(this.lookedFrom)) {
-      // Greys are for one place to look from, and made anew for the next; that makes the picture dirty again.
+      // The greys hold for one camera pose and are recomputed when it changes, which marks the scene as changed again.
       this.lookedFrom.copy(this.camera.matrixWorld);
       this.eye.value.setFromMatrixPosition(this.lookedFrom);
       this.forward.value.setFromMatrixColumn(this.lookedFrom, 2).negate();
       this.splat.updateVersion();
     }
     for (const frustum of this.frustums?.children ?? []) {
-      // A photo right before the eye would hide all else; greys of depth have no place for photos.
+      // Hide a photo right in front of the camera, as it would hide everything else, and all photos in the depth view.
       const isNear = frustum.getWorldPosition(this.place).distanceTo(this.camera.position) < 3 * this.scene.frustum;
       frustum.visible = !isNear && this.mode !== "depth";
     }

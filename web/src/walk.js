@@ -1,33 +1,33 @@
-/** Where who looks stands: walking, jumping to a photo's camera, and going along the path. */
+/** Camera navigation: free movement, jumps to a photo's camera, and playback along the camera path. */
 
 import { SparkControls } from "@sparkjsdev/spark";
 import { Quaternion, Vector3 } from "three";
 import { pose } from "./lens.js";
 
-/** Milliseconds that a jump takes, and a second's share of the path. */
+/** Duration of a jump in milliseconds, and speed of playback along the path in cameras per second. */
 const JUMP = 700;
 const CAMERAS_A_SECOND = 1.5;
-/** Less movement than this, in radians and shares of the scene, is none. */
+/** Movement below this threshold counts as none: in radians, or relative to the scene's size. */
 const STILL = 1e-5;
 
 export class Walk {
   constructor(stage, canvas) {
     this.stage = stage;
     this.controls = new SparkControls({ canvas });
-    // Steps as large as the scene.
+    // Speeds are proportional to the scene's size.
     const { scene } = stage;
     this.controls.fpsMovement.moveSpeed = 0.5 * scene.distance;
     this.controls.pointerControls.slideSpeed *= 0.5 * scene.distance;
     this.controls.pointerControls.scrollSpeed *= 0.3 * scene.distance;
-    // Home is the page's: it goes to the first photo, and doesn't turn.
+    // The page uses the Home key to jump to the first photo, so it must not turn the camera.
     const { Home, End, ...turning } = this.controls.fpsMovement.keycodeRotateMapping;
     this.controls.fpsMovement.keycodeRotateMapping = turning;
     this.poses = scene.path.map((c2w) => this.placeOf(c2w));
-    /** Which of the cameras this is the view of, if any. */
+    /** Index of the camera whose view is shown, or `null`. */
     this.at = null;
     this.jump = null;
     this.isPlaying = false;
-    /** How far along the path, from 0 to 1. */
+    /** Position along the path, from 0 to 1. */
     this.along = 0;
   }
 
@@ -38,7 +38,7 @@ export class Walk {
     return place;
   }
 
-  /** Goes to camera number `index`; at once where movement isn't wanted. */
+  /** Moves to camera `index`: at once if `smoothly` is false. */
   jumpTo(index, smoothly) {
     this.isPlaying = false;
     this.halt();
@@ -56,7 +56,7 @@ export class Walk {
     this.leave();
   }
 
-  /** What hands set in motion before doesn't go on, and isn't taken for hands again. */
+  /** Stops the controls' remaining motion, which would otherwise be taken for new user input. */
   halt() {
     const { scroll, rotateVelocity, moveVelocity } = this.controls.pointerControls;
     for (const motion of [scroll, rotateVelocity, moveVelocity]) motion.set(0, 0, 0);
@@ -74,7 +74,7 @@ export class Walk {
     this.stage.touch();
   }
 
-  /** Stands where the path is. */
+  /** Moves the camera to the current position on the path. */
   stand() {
     const place = this.along * (this.poses.length - 1);
     const before = Math.min(Math.floor(place), this.poses.length - 2);
@@ -87,7 +87,7 @@ export class Walk {
     this.stage.touch();
   }
 
-  /** Moves on, `seconds` after the last time. */
+  /** Advances a jump, playback or movement by `seconds`. */
   step(seconds) {
     if (this.jump) {
       const { from, to, index, begun, takes } = this.jump;
@@ -107,7 +107,7 @@ export class Walk {
       this.isPlaying = false;
       this.leave();
     } else {
-      // Nothing but what rounding does.
+      // The difference is rounding error only.
       position.copy(before[0]);
       quaternion.copy(before[1]);
     }

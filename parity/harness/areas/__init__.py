@@ -1,8 +1,8 @@
-"""The cases, a file for each area: what a case draws, and beneath it the twin that answers."""
+"""The cases, in one module per area: each case, followed by its reference function (twin)."""
 
 from ..registry import CASES, TWINS
 
-# In the order in which the table has them.
+# Imported in the order of the cases in the table.
 from . import tokens, encoder, decoder, growth, normalization, rasterizer  # noqa: F401
 from . import losses, perceptual, photos, training, model  # noqa: F401
 

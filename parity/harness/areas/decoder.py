@@ -1,4 +1,4 @@
-"""From latents to Gaussians: heads, the merging of candidates, rotations."""
+"""Cases of the decoder, from latents to Gaussians: heads, merging of candidates, rotations."""
 
 from itertools import product
 
@@ -12,9 +12,9 @@ from ..draw import normal, uniform, whole
 from ..names import reference_config, under
 from ..registry import Draw, by, case, twin
 
-# The constant of the decoder, which is no parameter: both sides have their own.
+# Constant offset of the decoder, which is not a parameter: program and reference each define it.
 MEAN_OFFSET = (0.0, 0.0, 1.5)
-# The reference's name: the program's.
+# Names of the reference, and those of the program.
 MERGED = {
     "position": "positions",
     "log_scale": "log_scales",
@@ -46,13 +46,13 @@ def gaussians(decoded):
 
 
 def stages_of(candidates):
-    """Every stage, before, in and after its transition."""
+    """Returns (stage, mix) for every stage, at the start of, in and after its transition."""
     return product(range(int(np.log2(candidates)) + 1), (0.0, 0.3, 1.0))
 
 
 @case
 def heads(rng):
-    """What the heads say of every candidate, before clamps, at each degree of the harmonics."""
+    """Outputs of the heads for every candidate, before clamps, for each degree of spherical harmonics."""
     for degree in range(4):
         config = draw.model_config(rng, sh_degree=degree)
         inputs = latents(rng, config, whole(rng, 1, 3))
@@ -77,7 +77,7 @@ def heads_twin(config, params, inputs):
 
 @case
 def merge(rng):
-    """All that the clamps let through, at every stage of the curriculum."""
+    """Merging of values from the whole range within the clamps, at every stage of the curriculum."""
     for candidates in (2, 16):
         for stage, mix in stages_of(candidates):
             shape = whole(rng, 1, 2), whole(rng, 3, 9), candidates
@@ -102,7 +102,7 @@ def merge_twin(config, params, inputs):
 
 @case
 def decoder(rng):
-    """The whole decoder at every stage of the curriculum."""
+    """The complete decoder at every stage of the curriculum."""
     for candidates in (2, 16):
         for stage, mix in stages_of(candidates):
             config = draw.model_config(rng, candidates=candidates)
@@ -124,7 +124,7 @@ def decoder_twin(config, params, inputs):
 
 
 def rotations(rng):
-    """Random ones, the identity, and half turns, whose quaternion has no real part."""
+    """Yields 6D rotations: random ones, the identity, and rotations by 180°, whose quaternion has no real part."""
     yield normal(rng, 3, 17, 6)
     yield normal(rng, 50, 6)
     yield normal(rng, 2, 2, 5, 6, scale=0.1) + np.float32([1, 0, 0, 0, 1, 0])
@@ -134,7 +134,7 @@ def rotations(rng):
 
 @case
 def rotation_matrix(rng):
-    """Of six numbers, the first two rows before they are made orthonormal."""
+    """Matrices of 6D rotations, which are the first two rows before orthonormalization."""
     for six in rotations(rng):
         yield Draw(by(*six.shape), {"rotations": six}, differentiate=("rotations",))
 
@@ -146,7 +146,7 @@ def rotation_matrix_twin(config, params, inputs):
 
 @case
 def quaternion(rng):
-    """Of the same six numbers."""
+    """Quaternions of the 6D rotations of `rotation_matrix`."""
     for six in rotations(rng):
         yield Draw(by(*six.shape), {"rotations": six}, differentiate=("rotations",))
 

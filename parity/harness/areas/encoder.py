@@ -1,4 +1,4 @@
-"""From the tokens of all views to the latents of the scene."""
+"""Cases of the encoder, from the tokens of all views to the scene's latents."""
 
 from dataclasses import replace
 
@@ -14,13 +14,15 @@ from ..names import reference_config, under
 from ..registry import Draw, by, case, twin
 from ..tolerance import Tolerance
 
-REGISTERS = 4  # the last slots of a stream
+REGISTERS = 4  # number of registers, which are the last slots of a stream
 
 
 @case
 def linear(rng):
-    """One row, and rows of scenes by themselves; weights' gradients are added up over 2048 rows at a time: one more, and twice as many.
-    With a bias and without."""
+    """Linear layers with and without bias, for one row, and for batches of rows.
+
+    The program sums weight gradients over 2048 rows at a time, so there are cases with 2049 and with 4096 rows.
+    """
     for rows, inputs, outputs, biased in [
         ((1,), 3, 1, True),
         ((2, 7), 5, 9, False),
@@ -37,7 +39,7 @@ def linear(rng):
 
 @case
 def linear_bf16(rng):
-    """Of bfloat16 numbers, which the reference takes as they are and computes with as exactly as ever."""
+    """Linear layers in bfloat16. The reference gets the same bfloat16 values and computes with its usual precision."""
     why = "what comes out has 8 bits, and so have gradients, and what they are made of: a lone number may be off by 1/256 a rounding"
     tolerance = Tolerance(4e-3, 8e-3, why=why)
     for drawn in linear(rng):
@@ -46,7 +48,7 @@ def linear_bf16(rng):
 
 
 def cut_to_bf16(inputs):
-    """The upper half of each number's bits stays."""
+    """Truncates float32 values to bfloat16 in place: clears the lower 16 bits."""
     for numbers in inputs.values():
         numbers.view(np.uint32)[...] &= 0xFFFF0000
 
@@ -58,7 +60,10 @@ def linear_twin(config, params, inputs):
 
 
 def attention_inputs(rng, batch, queries, keys, width, scale=1.0):
-    """Scores have about this deviation: inputs are normal, and a product's deviation is the root of its length."""
+    """Returns random q, k, v, for which the attention scores have a standard deviation of about `scale`.
+
+    Inputs are normal, and the deviation of a dot product is the square root of its length.
+    """
     shapes = {"q": (batch, queries, width), "k": (batch, keys, width), "v": (batch, keys, width)}
     inputs = {name: normal(rng, *shape) for name, shape in shapes.items()}
     inputs["q"] *= np.float32(scale)
@@ -73,9 +78,12 @@ def attention_draw(inputs, heads, what="", **more):
 
 @case
 def attention(rng):
-    """From one query and one key on. Queries are taken six at a time, keys a vector, a panel or a block of 256 or 384 at a time, and
-    widths a vector at a time; many of either are shared out: sizes lie around all of these. Widths of 4 and more that our kernel
-    takes, and others. Once queries, keys and values are thirds of the same rows, as self-attention has them."""
+    """Attention of sizes around the kernel's block sizes, from one query and one key on.
+
+    The kernel processes six queries at a time, keys by vectors, panels or blocks of 256 or 384, and widths by vectors,
+    and distributes many of either to threads. Widths of 4 and more are supported by the kernel or not. In the last
+    case, queries, keys and values are thirds of the same rows, as in self-attention.
+    """
     for batch, queries, keys, heads, width in [
         (1, 1, 1, 1, 8),
         (3, 1, 17, 2, 4),
@@ -99,8 +107,8 @@ def attention(rng):
 
 @case
 def attention_large(rng):
-    """Scores of ±80, of which exponentials overflow float32, and below zero, where they would vanish; and a key that is nearly all
-    that half of the queries see."""
+    """Extreme scores: about ±80, whose exponentials overflow float32; all below zero, where they would underflow; and
+    one key that gets nearly all attention of half of the queries."""
     why = "a score of 80 has 4e-6 of its last digit's rounding, which is relative in its exponential"
     tolerance = Tolerance(1e-4, 1e-3, why=why)
     yield attention_draw(attention_inputs(rng, 1, 60, 300, 64, scale=25.0), 2, tolerance=tolerance)
@@ -116,8 +124,11 @@ def attention_large(rng):
 
 @case
 def attention_bf16(rng):
-    """Of bfloat16 numbers, which the reference takes as they are and computes with as exactly as ever. Keys are taken 512 at a time,
-    queries 32, and columns in panels of 64; backward, both 128 at a time."""
+    """Attention in bfloat16. The reference gets the same bfloat16 values and computes with its usual precision.
+
+    The kernel processes 512 keys and 32 queries at a time, and columns in panels of 64; in the backward pass, 128 of
+    both.
+    """
     why = "what comes out has 8 bits, and so have the weights that values are multiplied by, and gradients of scores"
     tolerance = Tolerance(4e-3, 5e-3, why=why)
     for batch, queries, keys, heads, width in [
@@ -140,7 +151,7 @@ def attention_twin(config, params, inputs):
 
 @case
 def stream_round(rng):
-    """One round of one stream: slots read the memory, then each other."""
+    """One round of one stream: cross-attention of the slots to the memory, then self-attention."""
     for _ in range(3):
         config = draw.model_config(rng)
         batch, slots, memory = whole(rng, 1, 3), whole(rng, 6, 15), whole(rng, 5, 30)
@@ -164,7 +175,7 @@ def stream_round_twin(config, params, inputs):
 
 @case
 def self_attention_block(rng):
-    """From one slot on, which has only itself to read."""
+    """Self-attention blocks of at least one slot, which attends only to itself."""
     for _ in range(3):
         config = draw.model_config(rng)
         slots = normal(rng, whole(rng, 1, 3), whole(rng, 1, 15), config["width"])
@@ -180,7 +191,7 @@ def self_attention_block_twin(config, params, inputs):
 
 @case
 def mixer(rng):
-    """What the two streams tell each other after a round."""
+    """The exchange between the two streams after a round."""
     for _ in range(3):
         config = draw.model_config(rng)
         shape = whole(rng, 1, 3), whole(rng, 1, 15), config["width"]
@@ -198,7 +209,7 @@ def mixer_twin(config, params, inputs):
 
 @case
 def encoder(rng):
-    """All rounds, of two streams and of the ablation's single one."""
+    """The complete encoder, with two streams and with the ablation's single stream."""
     for streams in ("dual", "dual", "single"):
         config = draw.model_config(rng, streams=streams)
         shape = whole(rng, 1, 3), whole(rng, 4, 40), config["ray_width"] + config["rgb_width"]
@@ -210,6 +221,6 @@ def encoder(rng):
 
 @twin("encoder")
 def encoder_twin(config, params, inputs):
-    tokens = inputs["tokens"][:, None]  # as of one view: the encoder doesn't tell views apart
+    tokens = inputs["tokens"][:, None]  # as tokens of one view, because the encoder doesn't distinguish views
     geometry, appearance = reference.encoder.encode(reference_config(config), params, tokens)
     return {"geometry": geometry, "appearance": appearance}

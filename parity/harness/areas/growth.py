@@ -1,4 +1,4 @@
-"""From a smaller model's weights to a larger one's."""
+"""Cases of the conversion of a smaller model's weights to a larger one's."""
 
 import reference.growth
 
@@ -8,7 +8,7 @@ from ..registry import Draw, case, twin
 
 @case
 def growth(rng):
-    """Patches of a half, a third and a quarter of the edge, up to four scene tokens in the place of one, and as many of both as before."""
+    """Patches of 1/2, 1/3 and 1/4 of the edge, up to four scene tokens for one; one draw keeps both unchanged."""
     for patch, times, copies, channels in [(4, 2, 2, 3), (9, 3, 3, 6), (8, 4, 4, 3), (5, 1, 1, 3)]:
         width, latents, candidates = 7, 5, 4
         inputs = {

@@ -1,4 +1,4 @@
-"""The terms of the training objective that need no trained network."""
+"""Cases of the terms of the training objective that need no trained network."""
 
 import numpy as np
 import reference.loss.consistency
@@ -15,7 +15,7 @@ from ..registry import Draw, by, case, twin
 
 @case
 def mse(rng):
-    """Down to one pixel."""
+    """Mean squared error of batches and of a single pixel."""
     for shape in [(1, 1, 3, 1, 1), (2, 3, 3, 7, 12)]:
         images = {"rendered": uniform(rng, 0.0, 1.0, *shape), "truth": uniform(rng, 0.0, 1.0, *shape)}
         yield Draw(by(*shape), images, differentiate=("rendered",))
@@ -28,7 +28,7 @@ def mse_twin(config, params, inputs):
 
 @case
 def frustum(rng):
-    """Points around the cameras, none within 0.05 of a camera's plane, where pixel coordinates have no digits."""
+    """Points around the cameras, none within 0.05 of a camera's plane, where pixel coordinates lose all precision."""
     for batch, count, points, image in [(1, 1, 40, (16, 16)), (2, 3, 60, (24, 40)), (3, 4, 25, (31, 17))]:
         w2c = draw.inverse(draw.poses(rng, batch, count))
         means = rng.uniform(-4.0, 4.0, (batch, points, 3)) + np.array([0.0, 0.0, 2.0])
@@ -67,7 +67,7 @@ def sh_soft_cap_twin(config, params, inputs):
 
 @case
 def decoder_regularization(rng):
-    """Scales, coefficients and opacities on both sides of what is allowed."""
+    """Scales, coefficients and opacities on both sides of their thresholds."""
     for opacity in (True, False):
         shape = whole(rng, 1, 3), whole(rng, 2, 9), whole(rng, 1, 16)
         inputs = {
@@ -93,7 +93,7 @@ def decoder_regularization_twin(config, params, inputs):
 
 @case
 def consistency(rng):
-    """A fifth of the pixels below the opacity at which depth counts; once all of them."""
+    """Renders with a fifth of the pixels below the opacity at which depth counts; in one draw, all pixels."""
     for shape, empty, factors in [
         ((1, 1, 4, 4), 0.2, (1e-3, 1e-2)),
         ((2, 3, 7, 12), 0.2, (1.0, 0.5)),
@@ -129,8 +129,11 @@ def consistency_twin(config, params, inputs):
 
 @case
 def ssim(rng):
-    """Pictures that have half of their values in common: the mean of unrelated ones is nearly nothing, and has no
-    digits. C1 counts in dark pictures alone. An identical pair has no gradient, and is held beside another one."""
+    """Image pairs that share half of their signal, because the SSIM of unrelated images is nearly 0 and has no
+    precision.
+
+    C1 only matters in dark images. An identical pair has no gradient, so one is tested together with another pair.
+    """
 
     def half_alike(*shape):
         truth = uniform(rng, 0.0, 1.0, *shape)
@@ -155,8 +158,11 @@ def ssim_twin(config, params, inputs):
 
 @case
 def photometric(rng):
-    """Absolute differences and SSIM in one pass, by themselves and together. Rows are taken sixteen at a time, and columns a vector
-    at a time: sizes lie around both. A sum of both that nearly cancels has no digits."""
+    """L1 and SSIM in one pass, alone and combined.
+
+    The kernel processes sixteen rows and a vector of columns at a time; the sizes are around multiples of these. The
+    weights avoid sums that nearly cancel, which would have no precision.
+    """
     for shape, absolute, similar in [
         ((1, 3, 11, 40), 1.0, 0.0),
         ((2, 3, 26, 27), 0.8, 0.2),
@@ -179,8 +185,10 @@ def photometric_twin(config, params, inputs):
 
 @case
 def depth_smoothness(rng):
-    """Steps in depth, some where the photo has one, and pixels that show nothing. Rows are taken sixteen at a time, and columns a
-    vector at a time: sizes lie around both."""
+    """Depth steps, some at edges of the photo, and pixels without depth.
+
+    The kernel processes sixteen rows and a vector of columns at a time; the sizes are around multiples of these.
+    """
     for shape, factor in [((1, 1, 1), 1.0), ((2, 17, 43), 0.7), ((1, 2, 33, 16), 3.0), ((1, 40, 1), 1.0)]:
         photo = uniform(rng, 0.0, 1.0, *shape[:-2], 3, *shape[-2:])
         depth = uniform(rng, 0.5, 8.0, *shape) * (uniform(rng, 0.0, 1.0, *shape) < 0.9)

@@ -1,4 +1,4 @@
-"""The whole model, from pictures to Gaussians."""
+"""Cases of the complete model, from images to Gaussians."""
 
 import reference.model
 
@@ -11,7 +11,7 @@ from .decoder import decoder_params, gaussians
 
 @case
 def model(rng):
-    """Small ones, those of the ablations among them; at the start of a transition, in it and after it."""
+    """Small models, including ablations; at the start of a transition, in it and after it."""
     for stage, mix, fixed in [
         (0, 1.0, {}),
         (2, 0.3, {"candidates": 8, "sh_degree": 3}),
@@ -28,7 +28,7 @@ def model(rng):
 
 @case
 def model_16k(rng):
-    """The published size: 84 million parameters."""
+    """A model of the published size, 84 million parameters."""
     inputs = {"images": uniform(rng, 0.0, 1.0, 1, 4, 3, 256, 256)} | draw.views(rng, 1, 4, 256, 256)
     yield Draw(
         f"{by(*inputs['images'].shape)}, stage 3, λ 1.0",

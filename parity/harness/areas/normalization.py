@@ -1,4 +1,4 @@
-"""The scene's own frame, from its cameras."""
+"""Cases of scene normalization from the cameras."""
 
 import reference.normalize
 
@@ -10,7 +10,11 @@ from ..tolerance import FLOAT64
 
 @case
 def scene_normalization(rng):
-    """One camera, and cameras all in one place, have no extent to divide by; cameras all around a thing no direction in the mean."""
+    """Random and degenerate cameras.
+
+    One camera, or several at one position, have no extent to divide by. Cameras around an object have no mean
+    direction.
+    """
     for count in (1, 2, 7, 36):
         c2w = draw.poses(rng, count, turn=0.4, move=whole(rng, 1, 20))
         yield Draw(f"{count} cameras", {"c2w": c2w}, tolerance=FLOAT64)

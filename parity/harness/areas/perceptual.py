@@ -1,4 +1,4 @@
-"""The losses that compare the features of trained networks."""
+"""Cases of the losses that compare the features of trained networks."""
 
 import numpy as np
 import reference.loss.lpips
@@ -11,7 +11,7 @@ from ..registry import Draw, by, case, twin
 from ..thresholds import MOST_TRIES
 from ..tolerance import Tolerance
 
-# The weights take no gradient in training; here they have one, which cuDNN computes of 5×5 kernels by an algorithm of its own.
+# The weights take no gradient in training, but have one here, for which cuDNN uses a special algorithm for 5×5 kernels.
 ON_GPU_TOLERANCE = Tolerance(
     1e-5,
     1e-3,
@@ -20,7 +20,10 @@ ON_GPU_TOLERANCE = Tolerance(
 
 
 def sure_pictures(rng, decisions, *shapes):
-    """Random pictures of these shapes, drawn until no call is close on a CPU. -> them, and the calls that are close on a GPU."""
+    """Draws random images of these shapes until no decision is a close call on a CPU.
+
+    Returns the images, and a function that returns the close calls on a GPU.
+    """
     for _ in range(MOST_TRIES):
         pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
         if closest(decisions(*pictures)) > ON_CPU:
@@ -29,7 +32,7 @@ def sure_pictures(rng, decisions, *shapes):
 
 
 def lpips_draws(rng, network, shapes, dead=()):
-    """Pictures are drawn again until no ReLU and no pooling is a close call. The layers in `dead` put out nothing."""
+    """Yields draws of images without close calls of ReLUs and poolings. Layers in `dead` have all-zero features."""
     params = draw.lpips_parameters(rng, network)
     for name in dead:
         params[f"{name}.bias"] -= np.float32(100.0)
@@ -53,13 +56,13 @@ def lpips_draws(rng, network, shapes, dead=()):
 
 @case
 def lpips_vgg(rng):
-    """The smallest height that its poolings leave anything of."""
+    """LPIPS with VGG on images of the smallest height that its poolings support."""
     yield from lpips_draws(rng, "lpips_vgg", [(2, 3, 16, 19)])
 
 
 @case
 def lpips_alex(rng):
-    """Its smallest picture, odd sides, and features that are all zero, whose length has no derivative."""
+    """LPIPS with AlexNet on the smallest images, on odd sizes, and with zero features, whose norm has no derivative."""
     yield from lpips_draws(rng, "lpips_alex", [(1, 3, 31, 31), (2, 3, 49, 36)])
     yield from lpips_draws(rng, "lpips_alex", [(1, 3, 47, 63)], dead=("conv5",))
 
@@ -72,7 +75,7 @@ def lpips_twin(config, params, inputs):
 
 @case
 def vgg19(rng):
-    """The smallest picture that its poolings leave anything of, and odd sides."""
+    """The VGG-19 loss on the smallest images that its poolings support, and on odd sizes."""
     params = draw.vgg19_parameters(rng)
     for shape in [(1, 3, 16, 16), (1, 3, 19, 17)]:
         (picture, truth), close_calls = sure_pictures(
@@ -89,8 +92,10 @@ def vgg19_twin(config, params, inputs):
 
 @case
 def perceptual(rng):
-    """Two renderings of the same targets, of which there are one and several. The network's weights are inputs that take no
-    gradient."""
+    """Two sets of renders of the same targets, with one target and with several.
+
+    The network's weights are inputs that take no gradient.
+    """
     params = draw.vgg19_parameters(rng)
     (rendered, truth), close_calls = sure_pictures(
         rng,

@@ -1,4 +1,4 @@
-"""What is done to photos before they are learned from."""
+"""Cases of the preprocessing and augmentation of photos."""
 
 import numpy as np
 import reference.jitter
@@ -17,7 +17,7 @@ RESAMPLE = Tolerance(
 
 @case
 def resample(rng):
-    """Smooth photos, and saturated ones, in which filters ring out of range."""
+    """Random photos, and saturated ones, in which the filter overshoots the range of values."""
     for shape, region, size in [
         ((45, 80), (0, 0, 80, 45), (32, 57)),
         ((45, 80), (20.3, 1.7, 40.2, 41.9), (31, 29)),
@@ -40,7 +40,7 @@ def resample_twin(config, params, inputs):
 
 @case
 def jitter(rng):
-    """Each adjustment by itself, and all of them in two orders; some pixels are grey, black or white."""
+    """Each adjustment alone, and all of them in two orders; some pixels are grey, black or white."""
     one = [{"brightness": 1.3}, {"contrast": 0.6}, {"saturation": 1.4}, {"hue": -0.1}, {"hue": 0.45}]
     several = [{"hue": 0.1}, {"contrast": 1.4}, {"brightness": 0.7}, {"saturation": 0.7}]
     for adjustments in [*([adjustment] for adjustment in one), several, several[::-1]]:

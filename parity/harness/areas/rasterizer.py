@@ -1,4 +1,4 @@
-"""Both steps from Gaussians to pictures, projection and rasterizer, in either precision."""
+"""Cases of projection and rasterizer, in float64 and float32."""
 
 import numpy as np
 import reference.splat
@@ -22,13 +22,16 @@ RASTERIZER_FLOAT32 = Tolerance(
     why="a gradient sums terms of both signs over all pixels of a Gaussian, and 1 - T has few digits where little is "
     "covered; 2.4e-4 is the largest over 8 seeds",
 )
-# Relative distance from a threshold within which rounding may decide.
+# Relative distances from a threshold within which rounding may decide.
 DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
 
 
 def splat_draws(rng, module, dtype, family, tolerance):
-    """Float64 scenes are drawn again until none of their pixels is doubtful. Float32 ones say which pixels are, and
-    these have no gradient."""
+    """Yields draws of a family of scenes.
+
+    Float64 scenes are drawn again until they have no doubtful pixels. Float32 scenes have a mask of doubtful pixels,
+    whose cotangents are 0.
+    """
     differentiate = ("means", "scales", "quaternions", "sh", "w2c")
     if module == "rasterizer":
         differentiate += ("opacities",)
@@ -47,7 +50,7 @@ def splat_draws(rng, module, dtype, family, tolerance):
 
 
 def of_every_camera(inputs, function):
-    """function(Gaussians of a scene, w2c, intrinsics) -> dict; the dicts' values stacked to [B, C, ...]."""
+    """Calls function(Gaussians of a scene, w2c, intrinsics) -> dict for every camera; stacks values to [B, C, ...]."""
     rows = []
     for b in range(inputs["w2c"].shape[0]):
         scene = [inputs[name][b] for name in ("means", "scales", "quaternions", "opacities", "sh")]
@@ -58,14 +61,14 @@ def of_every_camera(inputs, function):
 
 @case
 def projection(rng):
-    """Every scene: float64 has digits for thin Gaussians, too."""
+    """Projection of all scenes: float64 is precise enough for thin Gaussians, too."""
     family = scenes.RANDOM | scenes.ADVERSARIAL | scenes.THIN
     yield from splat_draws(rng, "projection", np.float64, family, FLOAT64)
 
 
 @case
 def projection_float32(rng):
-    """What float32 has digits for."""
+    """Projection of the scenes for which float32 is precise enough."""
     yield from splat_draws(rng, "projection", np.float32, scenes.RANDOM | scenes.ADVERSARIAL, FLOAT32)
 
 
@@ -95,7 +98,7 @@ def projection_twin(config, params, inputs):
 
 @case
 def rasterizer(rng):
-    """Ordinary scenes of several sizes; those that break rasterizers have a line of their own."""
+    """Ordinary scenes of several sizes; adversarial scenes are separate cases."""
     yield from splat_draws(rng, "rasterizer", np.float64, scenes.RANDOM, FLOAT64)
 
 

@@ -1,4 +1,4 @@
-"""From pictures and cameras to the tokens that the encoder reads."""
+"""Cases of the tokenizer, from images and cameras to the tokens that the encoder reads."""
 
 import reference.rays
 import reference.tokens
@@ -11,7 +11,7 @@ from ..registry import Draw, by, case, twin
 
 @case
 def patchify(rng):
-    """Any number of channels, which the program has last; down to patches of one pixel."""
+    """Patches of one pixel and more, for several numbers of channels, which are the last axis in the program."""
     for shape, patch in [((1, 1, 4, 4, 3), 2), ((2, 3, 6, 15, 6), 3), ((1, 2, 5, 3, 2), 1)]:
         label = f"{by(*shape)}, patch {patch}"
         yield Draw(label, {"xs": normal(rng, *shape)}, {"patch_size": patch}, differentiate=("xs",))
@@ -24,7 +24,7 @@ def patchify_twin(config, params, inputs):
 
 @case
 def rgb_tokens(rng):
-    """The half of a token that comes of colours."""
+    """The colour half of the tokens."""
     for _ in range(3):
         config = draw.model_config(rng)
         image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
@@ -41,7 +41,7 @@ def rgb_tokens_twin(config, params, inputs):
 
 @case
 def ray_tokens(rng):
-    """The half of a token that comes of cameras, with the camera code and without."""
+    """The ray half of the tokens, with and without the camera code."""
     for code in (True, True, False):
         config = draw.model_config(rng, camera_code=code)
         image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
@@ -62,7 +62,7 @@ def ray_tokens_twin(config, params, inputs):
 
 @case
 def rays(rng):
-    """Plücker coordinates of every pixel, down to an image of one."""
+    """Plücker coordinates of every pixel, for images of one pixel and more."""
     for batch, count, image in [(1, 1, (1, 1)), (2, 3, (7, 12)), (1, 4, (33, 17))]:
         yield Draw(by(batch, count, *image), draw.views(rng, batch, count, *image), {"image": image})
 
@@ -75,7 +75,7 @@ def rays_twin(config, params, inputs):
 
 @case
 def camera_code(rng):
-    """One code for each view. Intrinsics enter as shares of the image, so that its size counts."""
+    """Camera codes of views. Intrinsics are normalized by the image size, so several sizes are tested."""
     for batch, count, image in [(1, 1, (8, 8)), (2, 5, (24, 40)), (3, 2, (256, 256))]:
         config = draw.model_config(rng)
         params = draw.parameters(rng, config, "view_pe.")
@@ -91,7 +91,7 @@ def camera_code_twin(config, params, inputs):
 
 @case
 def tokens(rng):
-    """Both halves side by side, with the camera code and without."""
+    """Both halves of the tokens, with and without the camera code."""
     for code in (True, True, False):
         config = draw.model_config(rng, camera_code=code)
         image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))

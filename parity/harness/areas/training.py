@@ -1,4 +1,4 @@
-"""What depends on the step: subsets of the views, schedules, the optimizer."""
+"""Cases of values that depend on the training step: subsets of the views, schedules, optimizers."""
 
 from itertools import product
 
@@ -14,7 +14,7 @@ from ..tolerance import FLOAT64
 
 @case
 def subsets(rng):
-    """Odd and even numbers of views, down to two, on odd and even steps."""
+    """Odd and even numbers of views, from two on, at odd and even steps."""
     for views, step in product((2, 3, 7, 24), (0, 1)):
         yield Draw(f"{views} views, step {step}", config={"views": views, "step": step})
 
@@ -27,7 +27,7 @@ def subsets_twin(config, params, inputs):
 
 @case
 def learning_rate(rng):
-    """Either side of every bend, beyond the end, and steps between."""
+    """Steps on both sides of every change of the schedule, beyond its end, and random ones between."""
     for total, warmup, peak in [(220_000, 0.03, 5e-4), (1_000, 0.1, 2e-5), (500, 0.0, 1e-2)]:
         edges = [0, 1, int(warmup * total), int(warmup * total) + 1, total - 1, total, total + 10]
         steps = np.concatenate([edges, rng.integers(0, total, 50)]).astype(np.int64)
@@ -46,7 +46,7 @@ def learning_rate_twin(config, params, inputs):
 
 @case
 def stages(rng):
-    """Either side of every boundary, and through transitions."""
+    """Steps on both sides of every boundary, and random ones in and between transitions."""
     for final, full in [(0, False), (1, False), (3, False), (3, True)]:
         edges = [0, 9_999, 10_000, 10_001, 11_999, 12_000, 19_999, 20_000, 49_999, 50_000, 52_000, 220_000]
         steps = np.concatenate([edges, rng.integers(0, 60_000, 50)]).astype(np.int64)
@@ -73,7 +73,7 @@ def stages_twin(config, params, inputs):
 
 @case
 def adamw(rng):
-    """Several steps, so that both moments and their corrections matter, of parameters that decay and that don't."""
+    """One step, and several, so that both moments and their bias corrections matter, with and without weight decay."""
     for steps in (1, 12):
         params = {
             "layer.weight": normal(rng, 4, 7),
@@ -87,7 +87,7 @@ def adamw(rng):
 
 @twin("adamw")
 def adamw_twin(config, params, inputs):
-    # "token" stands for a learnable token of the model, which is told by its name.
+    # "token" stands for a learnable token of the model, which is recognized by its name.
     published = {"token": "scene_tokens", "slot_encoder.token": "slot_encoder.slot_regs"}
     after = {}
     for name, value in params.items():
@@ -104,7 +104,7 @@ def adamw_twin(config, params, inputs):
 
 @case
 def muon(rng):
-    """Matrices of the encoder, flat and upright, one of three layers in one, and what AdamW updates beside them."""
+    """Wide and tall matrices of the encoder, a fused QKV matrix, and parameters that AdamW updates."""
     for steps in (1, 6):
         params = {
             "slot_encoder.flat.weight": normal(rng, 5, 9),

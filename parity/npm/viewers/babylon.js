@@ -1,4 +1,4 @@
-// Babylon.js, as its page on Gaussian splatting says: for tests/viewers.rs, which tells what `show` does in spark.js.
+// Renders a splat with Babylon.js, as its documentation of Gaussian splatting shows, for tests/viewers.rs. spark.js documents `show`.
 
 import { TargetCamera } from "@babylonjs/core/Cameras/targetCamera.js";
 import { Engine } from "@babylonjs/core/Engines/engine.js";
@@ -14,12 +14,12 @@ window.show = async (bytes, ending, { c2w, angle, width, height }) => {
   document.body.append(canvas);
   const scene = new Scene(new Engine(canvas, false, { preserveDrawingBuffer: true }));
   scene.clearColor = new Color4(0, 0, 0, 1);
-  // Nothing is fetched from elsewhere.
+  // Nothing is fetched from the network.
   const options = { keepInRam: true, fflate, spzLibraryUrl: undefined };
   const { meshes } = await ImportMeshAsync(new File([bytes], `scene.${ending}`), scene, { pluginOptions: { splat: options } });
   const splat = meshes.find((mesh) => mesh.getClassName() === "GaussianSplattingMesh");
-  // From our axes to the file's, of which an SPZ's y points up and its z backward; the mesh takes them to its own, in which x, y
-  // and z are a left hand's.
+  // Convert from our axes to the file's (in an SPZ file, y points up and z backward). The mesh converts these to its own left-handed
+  // axes.
   const signs = ending === "spz" ? [1, -1, -1] : [1, 1, 1];
   splat.computeWorldMatrix(true);
   const world = splat.getWorldMatrix();
@@ -34,7 +34,7 @@ window.show = async (bytes, ending, { c2w, angle, width, height }) => {
     scene.render();
     await new Promise((resolve) => setTimeout(resolve, 100));
   }
-  // Of the file's means, taken back to our axes.
+  // Bounding box of the file's means, converted back to our axes.
   const means = splat.splatsData;
   const numbers = new Float32Array(means);
   const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];

@@ -1,1 +1,1 @@
-"""The terms of the training objective, one file each."""
+"""The terms of the training objective, one module each."""

@@ -1,4 +1,4 @@
-"""How uneven depths are where the photo is even."""
+"""Edge-aware depth smoothness loss: penalizes depth differences where the photo is smooth."""
 
 import torch
 
@@ -6,8 +6,11 @@ EDGE = 10.0
 
 
 def depth_smoothness(depth, photo):
-    """depth [..., H, W], 0 where nothing is seen, and photo [..., 3, H, W] -> the mean over all pairs of neighbours of
-    2 |a - b| / (a + b) exp(-10 |g - h|), 0 where a or b is."""
+    """Returns the loss of depth [..., H, W], 0 at pixels without depth, and photo [..., 3, H, W].
+
+    The loss is the mean over all pairs of adjacent pixels of 2 |a - b| / (a + b) exp(-10 |g - h|), where a and b are
+    their depths and g and h their grey levels; it is 0 for pairs with a = 0 or b = 0.
+    """
     grey = photo.mean(-3)
     total, pairs = depth.sum() * 0.0, 0
     for axis in (-1, -2):

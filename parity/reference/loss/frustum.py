@@ -8,7 +8,7 @@ SOFTNESS = 10.0
 
 
 def frustum(means, w2c, intrinsic, height, width, far):
-    """means [B, N, 3], w2c [B, V, 4, 4], intrinsic [B, V, 3, 3] in pixels, far [B] -> scalar.
+    """Returns the scalar loss of means [B, N, 3], w2c [B, V, 4, 4], intrinsic [B, V, 3, 3] in pixels, far [B].
 
     (u, v)    = (fx x + cx z, fy y + cy z) / max(z, 1e-6)
     violation = relu(-u) + relu(u - (W - 1)) + relu(-v) + relu(v - (H - 1)) + relu(near - z) + relu(z - far)
@@ -17,7 +17,7 @@ def frustum(means, w2c, intrinsic, height, width, far):
     camera = torch.einsum("bvrc,bnc->bvnr", w2c[..., :3, :3], means) + w2c[..., None, :3, 3]  # [B, V, N, 3]
     x, y, z = camera.unbind(-1)
     divisor = z.clamp(min=SMALLEST_DIVISOR)
-    # The divisor is held under all of K (x, y, z), principal point included: behind a camera cx z does not cancel.
+    # The clamped divisor divides all of K (x, y, z), principal point included: behind a camera cx z does not cancel.
     u = (intrinsic[..., 0, 0, None] * x + intrinsic[..., 0, 2, None] * z) / divisor
     v = (intrinsic[..., 1, 1, None] * y + intrinsic[..., 1, 2, None] * z) / divisor
 

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018): the distance of two pictures' features in a trained network."""
+"""LPIPS (Zhang et al. 2018): the distance between the features of two images in a trained network."""
 
 import torch
 
@@ -6,7 +6,7 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-10
 
-# Convolutions, a row between two max poolings: name, outputs, kernel, stride, padding.
+# Convolutions as (name, output channels, kernel size, stride, padding); a max pooling separates the rows.
 NETWORKS = {
     "lpips_vgg": [
         [("conv1_1", 64, 3, 1, 1), ("conv1_2", 64, 3, 1, 1)],
@@ -25,7 +25,7 @@ COMPARED = {
     "lpips_vgg": ("conv1_2", "conv2_2", "conv3_3", "conv4_3", "conv5_3"),
     "lpips_alex": ("conv1", "conv2", "conv3", "conv4", "conv5"),
 }
-POOLING = {"lpips_vgg": 2, "lpips_alex": 3}  # windows, 2 apart
+POOLING = {"lpips_vgg": 2, "lpips_alex": 3}  # window size; the stride is 2
 
 
 def pool(network, x):
@@ -33,7 +33,7 @@ def pool(network, x):
 
 
 def convolutions(network, params, pictures):
-    """[B, 3, H, W] in [0, 1] -> name -> what each convolution puts out, before its ReLU."""
+    """Returns the output of each convolution by name, before its ReLU, for images [B, 3, H, W] in [0, 1]."""
     shift, scale = (torch.tensor(c, dtype=pictures.dtype).reshape(3, 1, 1) for c in (SHIFT, SCALE))
     x = ((2.0 * pictures - 1.0) - shift) / scale
     found = {}
@@ -48,12 +48,13 @@ def convolutions(network, params, pictures):
 
 
 def unit(x):
-    """x / (|x| + eps) over the channels. At 0, where |x| has no derivative, the ReLU before lets none through."""
+    """Returns x / (|x| + eps) over the channels. |x| has no derivative at 0, but the ReLU before blocks gradients."""
     return x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
 
 
 def lpips(network, params, picture, truth):
-    """Two [B, 3, H, W] -> [B]: sum over layers, mean over pixels, sum over channels of w (a - b)^2."""
+    """Returns the distances [B] of images [B, 3, H, W]: sum over layers of mean over pixels of sum over channels of
+    w (a - b)^2."""
     ours, theirs = convolutions(network, params, picture), convolutions(network, params, truth)
     total = 0.0
     for i, name in enumerate(COMPARED[network]):

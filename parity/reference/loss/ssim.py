@@ -1,4 +1,4 @@
-"""SSIM (Wang et al. 2004): how alike two pictures are in brightness, contrast and structure, window by window."""
+"""SSIM (Wang et al. 2004): similarity of two images in brightness, contrast and structure, window by window."""
 
 import torch
 
@@ -9,7 +9,7 @@ C2 = 0.03**2
 
 
 def weights(like):
-    """[121]: a Gaussian over the window's pixels, of sum 1."""
+    """Returns a Gaussian over the window's pixels, [121], with sum 1."""
     offset = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     squared_distance = offset[:, None] ** 2 + offset[None, :] ** 2
     gaussian = torch.exp(-squared_distance / (2.0 * SIGMA**2)).flatten()
@@ -17,16 +17,17 @@ def weights(like):
 
 
 def windows(pictures):
-    """[B, C, H, W] -> [B, C, windows, 121], those that lie inside."""
+    """Extracts all windows that lie inside images [B, C, H, W]. Returns [B, C, windows, 121]."""
     return pictures.unfold(2, WINDOW, 1).unfold(3, WINDOW, 1).flatten(4).flatten(2, 3)
 
 
 def ssim(picture, truth):
-    """Two [B, C, H, W] in [0, 1], at least 11 pixels high and wide -> the mean over pictures, channels and windows of
+    """Returns the SSIM of two images [B, C, H, W] in [0, 1], at least 11 pixels high and wide: the mean of
 
     (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (var_x + var_y + C2))
 
-    with the window's weighted means, and its variances and covariance as of a sample of 121: times 121 / 120.
+    with the window's weighted means, and its variances and covariance as unbiased estimates from 121 samples: times
+    121 / 120. The mean is over images, channels and windows.
     """
     w = weights(picture)
     sample = WINDOW**2 / (WINDOW**2 - 1)

@@ -1,12 +1,12 @@
-"""The two subsets of the context views that the consistency loss compares."""
+"""Selection of the two subsets of the context views that the consistency loss compares."""
 
 
 def subsets(frames, step):
-    """frames: the frame number of each context view, in any order -> two lists of indices into it, of one length.
+    """Returns two lists of equal length of indices into `frames`, the frame numbers of the context views in any order.
 
-    Ordered by frame, the first and the last view go to both. Those between alternate: counted from 0 over the whole
-    order, odd positions go to a and even ones to b, the other way round on odd steps. The smaller list repeats its
-    last. With fewer than two views there is nothing to compare: None.
+    In order of frames, the first and the last view are in both subsets, and those between alternate: with positions
+    from 0 in the whole order, odd ones go to a and even ones to b, and vice versa on odd steps. The smaller list
+    repeats its last element. Returns None for fewer than two views.
     """
     if len(frames) < 2:
         return None

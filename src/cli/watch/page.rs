@@ -54,7 +54,7 @@ fn page(nonce: &str) -> Markup {
                     section.card.now aria-label="Now" { dl.tiles #tiles {} }
                     section aria-label="Curves" { div.plots #plots {} }
                     section #pictures hidden {
-                        h2 { "Pictures" }
+                        h2 { "Images" }
                         p { "Of a scene in training: a photo that the model sees, a target, what it makes of that, its depth and \
                              its opacity." }
                         div.shown {}

@@ -75,7 +75,7 @@ fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Respon
             answer
         }
         "/state" => match run.look().map_err(|e| e.to_string()).and_then(|state| {
-            serde_json::to_string(&state).map_err(|e| format!("the run can't be told in JSON: {e}"))
+            serde_json::to_string(&state).map_err(|e| format!("can't serialize the run's state as JSON: {e}"))
         }) {
             Ok(state) => send(StatusCode::OK, "application/json", state),
             Err(e) => {

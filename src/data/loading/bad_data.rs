@@ -73,7 +73,7 @@ pub(crate) struct News {
 
 /// Collects [`BadData`] from all threads.
 #[derive(Debug)]
-pub(super) struct Ledger {
+pub(super) struct BadDataLog {
     largest_share: f64,
     entries: Mutex<Entries>,
 }
@@ -84,7 +84,7 @@ struct Entries {
     seen: BTreeSet<Place>,
     /// Error of the most recent bad scene.
     last: Option<String>,
-    /// Bad scenes found by this process since the last [`Ledger::take_news`].
+    /// Bad scenes found by this process since the last [`BadDataLog::take_news`].
     news: Vec<News>,
 }
 
@@ -100,11 +100,11 @@ impl fmt::Display for Entries {
     }
 }
 
-impl Ledger {
-    /// Creates a ledger for `scenes` scenes, of which the share `largest_share` may be bad.
+impl BadDataLog {
+    /// Creates a bad_data_log for `scenes` scenes, of which the share `largest_share` may be bad.
     pub fn new(scenes: u64, largest_share: f64) -> Self {
         let counts = BadData { scenes, ..Default::default() };
-        Ledger { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
+        BadDataLog { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
     }
 
     /// Counts `places` as bad, once each.

@@ -1,11 +1,11 @@
 //! Loader threads that read, decode, resize and augment samples ahead of training. Sample i depends on the seed and i alone. Each
 //! of T threads produces every T-th sample, and samples are taken from the threads in turn.
 
-use super::bad_data::{BadData, Fault, Ledger, News};
+use super::bad_data::{BadData, BadDataLog, Fault, News};
 use super::open_groups::{OpenGroups, Opened};
 use super::order::{Order, Place};
 use super::part::Part;
-use super::sample::{ComingSample, Sample};
+use super::sample::{PendingSample, Sample};
 use super::sampler::{choose_views, context_views};
 use super::scene::{LoadTimes, LoadedScene};
 use super::scenes::SceneGroups;
@@ -53,7 +53,7 @@ struct Ahead {
     /// Index of its first sample.
     first: u64,
     /// Sample that is being copied, or the loading error to return when the batch is requested.
-    sample: Result<ComingSample>,
+    sample: Result<PendingSample>,
 }
 
 /// Decoded photos by scene and view.
@@ -66,7 +66,7 @@ struct Shared {
     seed: u64,
     order: Order,
     groups: OpenGroups,
-    ledger: Ledger,
+    bad_data_log: BadDataLog,
     /// Photo cache, if there is memory for all photos.
     photos: Option<Mutex<DecodedPhotos>>,
     stopped: AtomicBool,
@@ -100,12 +100,12 @@ impl Loader {
         }
         let fits = scenes
             .decoded_bytes()
-            .is_some_and(|bytes| bytes <= config.photo_megabytes.saturating_mul(1_000_000));
+            .is_some_and(|bytes| bytes <= config.photo_cache_mb.saturating_mul(1_000_000));
         let order = Order::new(sizes, seed);
         let shared = Arc::new(Shared {
             config: config.clone(),
             seed,
-            ledger: Ledger::new(order.scenes(), config.max_bad_share),
+            bad_data_log: BadDataLog::new(order.scenes(), config.max_bad_share),
             order,
             groups: OpenGroups::new(scenes),
             photos: fits.then(Default::default),
@@ -119,7 +119,7 @@ impl Loader {
         let mut loader =
             Loader { shared, receivers, threads: spawned, part, first, taken: 0, upload: None, ahead: None };
         // A thread holds one more sample while its queue is full.
-        let queue = config.ahead.div_ceil(threads).saturating_sub(1).max(1);
+        let queue = config.prefetch.div_ceil(threads).saturating_sub(1).max(1);
         for thread in 0..threads as u64 {
             let (sender, receiver) = sync_channel(queue);
             let shared = loader.shared.clone();
@@ -191,7 +191,7 @@ impl Loader {
     /// Fails like [`Loader::next_scene`].
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
         match self.ahead.take() {
-            Some(ahead) => Ok(ahead.sample?.arrive()),
+            Some(ahead) => Ok(ahead.sample?.wait()),
             None => {
                 let scenes = self.next_scenes(batch)?;
                 Ok(Sample::by(&scenes, self.upload.get_or_insert_with(|| Upload::to(device))))
@@ -201,13 +201,13 @@ impl Loader {
 
     /// Starts to copy the next `batch` samples to `device`, for the next [`Loader::next_batch`], which must get the same arguments.
     /// A GPU copies them while it computes. On the CPU nothing has to be copied.
-    pub fn send_ahead(&mut self, batch: usize, device: Device) {
+    pub fn prefetch_to_device(&mut self, batch: usize, device: Device) {
         if self.ahead.is_none() {
             let first = self.next();
             let scenes = self.next_scenes(batch);
             let upload = self.upload.get_or_insert_with(|| Upload::to(device));
             self.ahead =
-                Some(Ahead { first, sample: scenes.map(|scenes| ComingSample::begin(&scenes, upload)) });
+                Some(Ahead { first, sample: scenes.map(|scenes| PendingSample::begin(&scenes, upload)) });
         }
     }
 
@@ -217,17 +217,17 @@ impl Loader {
 
     /// Returns the scenes skipped so far, including those skipped while prefetching.
     pub fn bad_data(&self) -> BadData {
-        self.shared.ledger.counts()
+        self.shared.bad_data_log.counts()
     }
 
     /// Returns the bad scenes found since the last call, for the processes that load other parts of the same steps.
     pub(crate) fn take_news(&self) -> Vec<News> {
-        self.shared.ledger.take_news()
+        self.shared.bad_data_log.take_news()
     }
 
     /// Returns `true` if [`Loader::take_news`] would return anything.
     pub(crate) fn has_news(&self) -> bool {
-        self.shared.ledger.has_news()
+        self.shared.bad_data_log.has_news()
     }
 
     /// Counts scenes that other processes skipped.
@@ -235,7 +235,7 @@ impl Loader {
     /// # Errors
     /// Fails if there is more bad data, including theirs, than the configuration allows.
     pub(crate) fn hear(&self, news: Vec<News>) -> Result<()> {
-        news.into_iter().try_for_each(|news| self.shared.ledger.hear(news))
+        news.into_iter().try_for_each(|news| self.shared.bad_data_log.hear(news))
     }
 }
 
@@ -267,7 +267,7 @@ impl Shared {
                 Opened::Scenes(scenes) => scenes,
                 Opened::Broken(why) => {
                     let places = (0..self.order.size(group)).map(|scene| Place { group, scene });
-                    self.ledger.add(Fault::Group, places, why)?;
+                    self.bad_data_log.add(Fault::Group, places, why)?;
                     continue;
                 }
             };
@@ -286,11 +286,11 @@ impl Shared {
                 let place = Place { group, scene: turns[turn] };
                 match self.load_scene(place, scenes.get(place.scene), views, &mut random, tools) {
                     Ok(scene) => return Ok(scene),
-                    Err((fault, why)) => self.ledger.add(fault, std::iter::once(place), why)?,
+                    Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(place), why)?,
                 }
             }
         }
-        Err(self.ledger.exhausted())
+        Err(self.bad_data_log.exhausted())
     }
 
     fn load_scene(

@@ -3,7 +3,7 @@
 use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
 use crate::data::pixels::CHANNELS;
-use crate::device::{Upload, Uploading};
+use crate::device::{PendingCopy, Upload};
 use tch::{Device, Kind, Tensor};
 
 /// Largest value of a byte.
@@ -34,7 +34,7 @@ impl Sample {
     pub(crate) fn by(scenes: &[LoadedScene], upload: &Upload) -> Self {
         match upload.device() {
             Device::Cpu => Sample::on_host(scenes, floats),
-            _ => ComingSample::begin(scenes, upload).arrive(),
+            _ => PendingSample::begin(scenes, upload).wait(),
         }
     }
 
@@ -99,23 +99,23 @@ impl Sample {
 ///
 /// Images are copied as bytes and converted to floats on the device.
 #[derive(Debug)]
-pub(super) struct ComingSample {
+pub(super) struct PendingSample {
     names: Vec<String>,
-    tensors: Uploading<9>,
+    tensors: PendingCopy<9>,
 }
 
-impl ComingSample {
+impl PendingSample {
     /// Starts to copy the batch that [`Sample::of`] builds from `scenes`.
     pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Self {
         let Sample { names, context, target, far, .. } =
             Sample::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
         let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
-        ComingSample { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
+        PendingSample { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
     }
 
     /// Waits for the copies and returns the sample on the device.
-    pub fn arrive(self) -> Sample {
-        let [a, b, c, d, e, f, g, h, far] = self.tensors.arrive();
+    pub fn wait(self) -> Sample {
+        let [a, b, c, d, e, f, g, h, far] = self.tensors.wait();
         let in_floats = |bytes: Tensor| {
             let mut floats = bytes.to_kind(Kind::Float);
             let _in_place = floats.g_div_scalar_(f64::from(LEVELS));

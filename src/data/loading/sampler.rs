@@ -20,12 +20,12 @@ pub struct ChosenViews {
 
 /// Returns the number of context views of every scene in step `step`.
 pub fn context_views(config: &DataConfig, seed: u64, step: u64) -> usize {
-    if config.fewest_context_views == 0 {
+    if config.min_context_views == 0 {
         return config.context_views;
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed ^ COUNT_KEY);
     random.set_stream(step);
-    random.random_range(config.fewest_context_views..=config.context_views)
+    random.random_range(config.min_context_views..=config.context_views)
 }
 
 /// Chooses `context` context views and the target views from a random window of a video with camera centres `centres`. Returns
@@ -117,14 +117,14 @@ mod tests {
 
     #[test]
     fn steps_draw_how_many_views_are_seen() {
-        let config = DataConfig { context_views: 12, fewest_context_views: 4, ..Default::default() };
+        let config = DataConfig { context_views: 12, min_context_views: 4, ..Default::default() };
         let counts: Vec<usize> = (0..2000).map(|step| context_views(&config, 0, step)).collect();
         for count in 4..=12 {
             let share = counts.iter().filter(|&&drawn| drawn == count).count();
             assert!((160..=290).contains(&share), "{count}: {share}");
         }
         assert!(counts.iter().all(|count| (4..=12).contains(count)));
-        let always = DataConfig { fewest_context_views: 0, ..config };
+        let always = DataConfig { min_context_views: 0, ..config };
         assert!((0..20).all(|step| context_views(&always, 0, step) == 12));
     }
 

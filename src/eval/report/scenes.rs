@@ -130,7 +130,7 @@ fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
     let alt =
         format!("{}{view}, by {}: photo, render, error and depth side by side", scores.scene, entry.name);
     Ok(html! {
-        div.scroll.comparison-image tabindex="0" role="region" aria-label={ "Pictures of " (scores.scene) } {
+        div.scroll.comparison-image tabindex="0" role="region" aria-label={ "Images of " (scores.scene) } {
             figure {
                 div.parts aria-hidden="true" { @for part in PARTS { span { (part) } } }
                 img src=(source) width=(width) height=(height) alt=(alt) decoding="async";

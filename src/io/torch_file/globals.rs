@@ -81,7 +81,7 @@ pub(super) fn known(module: &str, name: &str) -> Option<Value<'static>> {
 }
 
 /// Returns `true` if a call of this function or class does nothing but assemble data.
-pub(super) fn makes_data(module: &str, name: &str) -> bool {
+pub(super) fn is_plain_constructor(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     let is_class = name.starts_with(|first: char| first.is_ascii_uppercase()) && !name.contains('.');
     HARMLESS.iter().any(|(m, names)| *m == module && names.contains(&name))

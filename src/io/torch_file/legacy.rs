@@ -2,7 +2,7 @@
 //! (`_use_new_zipfile_serialization=False`): four pickles, which are a magic number, a version, the system, and the contents; a pickle with
 //! the keys of the storages; and the storages in that order, each preceded by its number of elements in eight bytes.
 
-use super::pickle::{Strangers, unpickle};
+use super::pickle::{UnknownGlobals, unpickle};
 use super::value::Value;
 use super::{Storages, TorchFile};
 use std::collections::HashMap;
@@ -28,20 +28,20 @@ pub(super) fn is_one(bytes: &[u8]) -> bool {
 /// Returns a description of what is wrong with the file.
 pub(super) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
     let mut rest = bytes;
-    unpickle(&mut rest, Strangers::Refused)?;
-    let version = unpickle(&mut rest, Strangers::Refused)?;
+    unpickle(&mut rest, UnknownGlobals::Refused)?;
+    let version = unpickle(&mut rest, UnknownGlobals::Refused)?;
     if version.get(version.root) != &Value::Integer(VERSION) {
         return Err("of a version that nobody knows".into());
     }
-    let system = unpickle(&mut rest, Strangers::Refused)?;
+    let system = unpickle(&mut rest, UnknownGlobals::Refused)?;
     let Value::Dict(items) = system.get(system.root) else {
         return Err("without its system".into());
     };
     if system.entry(items, "little_endian") != Some(&Value::Truth(true)) {
         return Err("with numbers that are not little-endian".into());
     }
-    let values = unpickle(&mut rest, Strangers::Kept)?;
-    let keys = unpickle(&mut rest, Strangers::Refused)?;
+    let values = unpickle(&mut rest, UnknownGlobals::Kept)?;
+    let keys = unpickle(&mut rest, UnknownGlobals::Refused)?;
     let Value::List(ids) = keys.get(keys.root) else { return Err("without the keys of its storages".into()) };
 
     let dtypes: HashMap<&str, _> = values

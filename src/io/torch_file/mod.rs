@@ -11,7 +11,7 @@ mod write;
 
 pub(crate) use archive::Archive;
 pub(crate) use array::{Array, row_major};
-pub(crate) use pickle::{Strangers, unpickle};
+pub(crate) use pickle::{UnknownGlobals, unpickle};
 pub(crate) use value::{Id, Value, Values};
 pub use write::write_checkpoint;
 
@@ -47,7 +47,7 @@ impl<'a> TorchFile<'a> {
             return legacy::parse(bytes).map_err(refuse);
         }
         let Archive { pickle, storages } = Archive::open(file, bytes)?;
-        let values = unpickle(&mut &bytes[pickle], Strangers::Kept).map_err(refuse)?;
+        let values = unpickle(&mut &bytes[pickle], UnknownGlobals::Kept).map_err(refuse)?;
         Ok(TorchFile { values, storages })
     }
 }

@@ -5,12 +5,12 @@
 //! value that contains itself is harmless. Each value takes at least one byte of the program, so the size of the result is proportional to
 //! the length of the pickle, whatever it contains.
 
-use super::globals::{known, makes_data};
+use super::globals::{is_plain_constructor, known};
 use super::value::{Id, Rebuild, Value, Values};
 
 /// Treatment of values that aren't tensors, lists, dicts, strings or numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Strangers {
+pub(crate) enum UnknownGlobals {
     /// Error, for files that need no such values.
     Refused,
     /// Kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is known to
@@ -22,9 +22,12 @@ pub(crate) enum Strangers {
 ///
 /// # Errors
 /// Returns a description of what the pickle requests but may not, or of what is broken in it.
-pub(crate) fn unpickle<'a>(rest: &mut &'a [u8], strangers: Strangers) -> Result<Values<'a>, String> {
+pub(crate) fn unpickle<'a>(
+    rest: &mut &'a [u8],
+    unknown_globals: UnknownGlobals,
+) -> Result<Values<'a>, String> {
     let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
-    let mut machine = Machine { rest, strangers, values, stack, marks, memo };
+    let mut machine = Machine { rest, unknown_globals, values, stack, marks, memo };
     loop {
         if let Some(root) = machine.instruction()? {
             *rest = machine.rest;
@@ -35,7 +38,7 @@ pub(crate) fn unpickle<'a>(rest: &mut &'a [u8], strangers: Strangers) -> Result<
 
 struct Machine<'a> {
     rest: &'a [u8],
-    strangers: Strangers,
+    unknown_globals: UnknownGlobals,
     values: Vec<Value<'a>>,
     stack: Vec<Id>,
     /// Lengths of the stack at the marks.
@@ -139,12 +142,12 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Pushes the value of a global name: a known one, or with [`Strangers::Kept`] one that has just its name.
+    /// Pushes the value of a global name: a known one, or with [`UnknownGlobals::Kept`] one that has just its name.
     fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
-        let value = match (known(module, name), self.strangers) {
+        let value = match (known(module, name), self.unknown_globals) {
             (Some(value), _) => value,
-            (None, Strangers::Kept) => Value::Named { module, name },
-            (None, Strangers::Refused) => return Err(format!("a pickle that asks for {module}.{name}")),
+            (None, UnknownGlobals::Kept) => Value::Named { module, name },
+            (None, UnknownGlobals::Refused) => return Err(format!("a pickle that asks for {module}.{name}")),
         };
         self.push(value);
         Ok(())
@@ -163,7 +166,7 @@ impl<'a> Machine<'a> {
         let strange = || "a pickle with a persistent id that is no storage".to_string();
         let of = |id: &Id| &self.values[*id];
         let (fields, whole) = match self.tuple(id) {
-            [fields @ .., whole] if fields.len() == 5 && self.strangers == Strangers::Kept => {
+            [fields @ .., whole] if fields.len() == 5 && self.unknown_globals == UnknownGlobals::Kept => {
                 (fields, of(whole) == &Value::Constant)
             }
             fields => (fields, true),
@@ -210,7 +213,7 @@ impl<'a> Machine<'a> {
             (Value::Rebuild(_), _) => {
                 Err("a pickle with a tensor of other than storage, offset, size and stride".into())
             }
-            (&Value::Named { module, name }, _) => match makes_data(module, name) {
+            (&Value::Named { module, name }, _) => match is_plain_constructor(module, name) {
                 true => Ok(Value::Object(vec![])),
                 false => Err(format!("a pickle that calls {module}.{name}")),
             },

@@ -1,7 +1,7 @@
 //! Parser of a chunk's pickle. It locates scenes by byte ranges in the chunk's file.
 
 use super::CAMERA_NUMBERS;
-use crate::io::{Archive, Array, Id, Strangers, Value, Values, unpickle};
+use crate::io::{Archive, Array, Id, UnknownGlobals, Value, Values, unpickle};
 use std::ops::Range;
 use tch::{Kind, Tensor};
 
@@ -38,7 +38,7 @@ impl Scene {
 /// # Errors
 /// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
 pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
-    let values = unpickle(&mut &bytes[archive.pickle.clone()], Strangers::Refused)?;
+    let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refused)?;
     let most = VIEWS + bytes.len() / BYTES_OF_VIEW;
     scenes_of(&values, archive, most).map_err(|why| format!("unusable ({why})"))
 }

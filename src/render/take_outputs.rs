@@ -10,7 +10,7 @@ use tch::Tensor;
 ///
 /// # Errors
 /// Returns the exception of `op`.
-pub(crate) unsafe fn handed_over<const N: usize>(
+pub(crate) unsafe fn take_outputs<const N: usize>(
     op: impl FnOnce(&mut [usize]) -> Result<(), cxx::Exception>,
 ) -> Result<[Tensor; N], cxx::Exception> {
     let mut out = [0usize; N];

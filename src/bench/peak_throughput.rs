@@ -5,19 +5,19 @@ use crate::optim::Stopwatch;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
 /// Two square matrices, multiplied in the same way as in the model's linear layers.
-pub(super) struct Yardstick {
+pub(super) struct PeakThroughput {
     matrix: Tensor,
     layer: nn::Linear,
     precision: Precision,
 }
 
-impl Yardstick {
+impl PeakThroughput {
     /// Creates random matrices in `precision` on `device`, with sides of 2048 on the CPU and 8192 on a GPU.
     pub fn new(precision: Precision, device: Device) -> Self {
         let side = if device == Device::Cpu { 2048 } else { 8192 };
         let matrix = Tensor::randn([side, side], (Kind::Float, device)).to_kind(precision.kind());
         let layer = nn::Linear { ws: matrix.shallow_clone(), bs: None };
-        Yardstick { matrix, layer, precision }
+        PeakThroughput { matrix, layer, precision }
     }
 
     /// Returns the time of one product, in milliseconds.

@@ -17,7 +17,7 @@ const EXPECTED: &str =
 
 /// Synthetic videos of one seed, each generated on request.
 #[derive(Debug, Clone)]
-pub struct MadeUp {
+pub struct SyntheticDataset {
     /// Name as the user wrote it.
     name: String,
     seed: u64,
@@ -29,7 +29,7 @@ pub struct MadeUp {
     pictures_checksum: Option<u32>,
 }
 
-impl MadeUp {
+impl SyntheticDataset {
     /// Prefix of the name of synthetic videos.
     pub(super) const PREFIX: &str = "synth:";
 
@@ -43,16 +43,16 @@ impl MadeUp {
     pub const SIZE: RangeInclusive<u64> = 16..=8192;
 
     /// Creates `scenes` videos of `seed`, starting at index `first`.
-    pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> MadeUp {
+    pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> SyntheticDataset {
         let name = format!("{}seed={seed},first={first},scenes={scenes}", Self::PREFIX);
-        MadeUp { name, seed, first, scenes, settings, pictures_checksum: None }
+        SyntheticDataset { name, seed, first, scenes, settings, pictures_checksum: None }
     }
 
     /// Parses `path` as the name of synthetic videos. Returns `None` if it is an ordinary path.
     ///
     /// # Errors
     /// Fails if the name has the prefix of synthetic videos, but a field is missing, repeated, unknown or out of range.
-    pub fn named(path: &Path) -> Result<Option<MadeUp>> {
+    pub fn named(path: &Path) -> Result<Option<SyntheticDataset>> {
         let Some(fields) = path.to_str().and_then(|name| name.strip_prefix(Self::PREFIX)) else {
             return Ok(None);
         };
@@ -95,7 +95,7 @@ impl MadeUp {
         let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
         let settings = VideoSettings { frames, size, pictures };
         let name = path.to_string_lossy().into_owned();
-        Ok(Some(MadeUp { name, seed, first, scenes, settings, pictures_checksum }))
+        Ok(Some(SyntheticDataset { name, seed, first, scenes, settings, pictures_checksum }))
     }
 
     /// Returns what the videos depend on besides their name.

@@ -5,7 +5,7 @@ use tch::{Kind, Tensor};
 
 /// Gaussians of one scene before activation. Colours are separate from the higher spherical harmonics, which have a smaller learning rate.
 #[derive(Debug)]
-pub struct Leaves {
+pub struct GaussianParams {
     /// Means, [1, N, 3].
     pub means: Tensor,
     /// Logarithms of scales, [1, N, 3].
@@ -20,7 +20,7 @@ pub struct Leaves {
     pub harmonics: Tensor,
 }
 
-impl Leaves {
+impl GaussianParams {
     /// Copies `raw` to new parameters, with spherical harmonics up to `degree`, which is at least that of `raw`.
     pub fn of(raw: &RawGaussians, degree: i64) -> Self {
         let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
@@ -29,7 +29,7 @@ impl Leaves {
         let higher = Tensor::zeros([1, size[1], bases - 1, 3], (Kind::Float, raw.sh.device()));
         let known = size[2] - 1;
         higher.narrow(2, 0, known).copy_(&raw.sh.narrow(2, 1, known));
-        Leaves {
+        GaussianParams {
             means: leaf(raw.means.shallow_clone()),
             log_scales: leaf(raw.log_scales.shallow_clone()),
             quaternions: leaf(raw.quaternions.shallow_clone()),

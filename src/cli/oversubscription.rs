@@ -21,9 +21,9 @@ const QUIET: f64 = 0.1;
 
 /// Starts the guard, which runs until the returned value is dropped. If the CPU time of other processes can't be measured,
 /// threads wait as usual.
-pub fn heed() -> Option<Background> {
+pub fn start_guard() -> Option<Background> {
     // Without the guard's thread, the program runs as if no other process used the cores.
-    Background::start("neighbours", |until: Receiver<()>| {
+    Background::start("oversub", |until: Receiver<()>| {
         let mut crowds = Vec::new();
         let mut before = Times::now();
         while until.recv_timeout(INTERVAL) == Err(RecvTimeoutError::Timeout) {
@@ -186,9 +186,9 @@ mod tests {
 
     #[test]
     fn nobody_watches_once_the_program_ends() {
-        let heeding = heed();
-        assert!(becomes("neighbours", 1), "{}", called("neighbours"));
-        drop(heeding);
-        assert!(becomes("neighbours", 0), "{}", called("neighbours"));
+        let guard = start_guard();
+        assert!(becomes("oversub", 1), "{}", called("oversub"));
+        drop(guard);
+        assert!(becomes("oversub", 0), "{}", called("oversub"));
     }
 }
