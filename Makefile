@@ -47,6 +47,11 @@ gpu-bundle: build
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
 
+# The checks for the edit loop: formatting, lints, and the library's unit tests.
+.PHONY: quick
+quick: check-format check-lints
+	$(CARGO) test --release --locked --lib
+
 CHECKS := check-format check-lints check-library check-docs check-tests
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity

@@ -110,7 +110,8 @@ struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
 template <class Function, class... Numbers>
 void run(const Tensor& first, const Tensor& second, rust::Slice<size_t> out, Numbers... numbers) {
   const auto type = first.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
-  const at::Device device = type == at::kFloat && first.is_cuda() ? first.device() : at::Device(at::kCPU);
+  const bool is_on_gpu = type == at::kFloat && first.is_cuda() && cuda::emulation() == nullptr;
+  const at::Device device = is_on_gpu ? first.device() : at::Device(at::kCPU);
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   const bool differentiable = at::GradMode::is_enabled() && first.requires_grad();
   const Tensor value = Function::apply(there(first), there(second.detach()), numbers..., differentiable);

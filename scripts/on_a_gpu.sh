@@ -163,6 +163,14 @@ for precision in bf16 f32; do
 done
 bench train_tiny 60 train --config configs/tiny.toml --batch 2 --steps "$steps" --device "$device" ${model[@]+"${model[@]}"}
 bench refine 60 refine --steps "$steps" --device "$device" ${refine[@]+"${refine[@]}"}
+scene="$work/scene/000000.torch"
+part refine_scene 20 "$globalsplat" synth --out "$work/scene" --scenes 1 --frames 12 --size 64
+part refine_photos 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --correct-poses --correct-exposures \
+    --out "$work/photos.ply"
+part refine_splat 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --splat "$work/photos.ply" \
+    --holdout every:4 --sheet "$work/views.png" --out "$work/splat.ply"
+part refine_weights 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --from weights --gaussians 20000 \
+    --correct-exposures --out "$work/weights.ply"
 bench raster_million 60 raster "${large[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v ncu >"$work/found"; then
     part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 20 --launch-count 20 --section SpeedOfLight \

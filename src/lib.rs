@@ -3,10 +3,10 @@
 //! ```no_run
 //! use globalsplat::data::{Holdout, open_capture};
 //! use globalsplat::io::write_splat;
-//! use globalsplat::reconstruct::{load_context, reconstruct, shipped_model};
+//! use globalsplat::reconstruct::{load_context, reconstruct, bundled_model};
 //!
 //! # fn main() -> globalsplat::Result<()> {
-//! let model = shipped_model(tch::Device::Cpu)?;
+//! let model = bundled_model(tch::Device::Cpu)?;
 //! let capture = open_capture("captures/room".as_ref())?;
 //! // Twelve photos, spread along the camera path and resized to the model's image size.
 //! let views = load_context(&capture, Holdout::None, Some(12), model.config.data.image_size)?;

@@ -35,6 +35,8 @@ fn help(command: &[String]) -> String {
     let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
         .args(command)
         .arg("--help")
+        // The width to which help is wrapped.
+        .env_remove("COLUMNS")
         .output()
         .expect("a program that starts");
     String::from_utf8(output.stdout).expect("text")

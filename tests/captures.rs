@@ -36,8 +36,9 @@ fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
 /// Scores the published splat of the capture in `folder` at all of its cameras.
 fn published_scores(folder: &Path, capture: &Capture, perceptual: &Perceptual) -> CaptureScores {
     let scene = EvalScene::all_views(capture, None);
-    let mut made =
-        Method::Splat(folder.join("reference.ply")).synthesize(scene, tch::Device::Cpu).expect("a picture");
+    let mut made = Method::Splat(folder.join("reference.ply"))
+        .render_targets(scene, tch::Device::Cpu)
+        .expect("a picture");
     judge(&mut made, perceptual, |_, _, _| Ok(())).expect("scores")
 }
 

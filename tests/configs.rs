@@ -6,7 +6,7 @@ use globalsplat::data::write_room;
 use globalsplat::io::read_weights;
 use globalsplat::loss::Term;
 use globalsplat::model::{GlobalSplat, Streams};
-use globalsplat::reconstruct::{SHIPPED_MODEL, shipped_model};
+use globalsplat::reconstruct::{BUNDLED_MODEL, bundled_model};
 use globalsplat::train::{MemoryEstimate, Trainer};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -49,7 +49,7 @@ fn steps_fit_into_the_memory_of_a_large_gpu() {
 
 #[test]
 fn the_weights_that_come_with_the_program_are_those_of_tiny() {
-    let shipped = shipped_model(Device::Cpu).expect("a model");
+    let shipped = bundled_model(Device::Cpu).expect("a model");
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
@@ -63,7 +63,7 @@ fn the_weights_that_come_with_the_program_are_those_of_tiny() {
     let files = std::fs::read_dir(&folder).expect("models/").map(|entry| entry.expect("an entry").path());
     let weights: Vec<PathBuf> =
         files.filter(|file| file.extension().is_some_and(|e| e == "safetensors")).collect();
-    assert!(weights.contains(&folder.with_file_name(SHIPPED_MODEL)));
+    assert!(weights.contains(&folder.with_file_name(BUNDLED_MODEL)));
     let sizes: Vec<u64> = weights.iter().map(|file| file.metadata().expect("a file").len()).collect();
     assert!(
         sizes.iter().all(|&size| size <= 16_000_000) && sizes.iter().sum::<u64>() <= 48_000_000,

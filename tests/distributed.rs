@@ -550,7 +550,7 @@ fn ranks_that_are_asked_to_stop_save_first() {
     assert_ne!(ended.code, Some(0));
     let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
     let done = metrics(&run).0.len();
-    let saved = format!("stopped; {}/checkpoints/step-{done:08} holds all of it", arg(&run));
+    let saved = format!("stopped; {}/checkpoints/step-{done:08} is complete", arg(&run));
     assert!(sentence.starts_with(&saved) && sentence.ends_with("the same command resumes"), "{sentence}");
     assert!(done < 100 && checkpoints(&run) == [done as u64]);
     succeed_together(2, &text(&arguments));

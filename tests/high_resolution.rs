@@ -5,7 +5,7 @@ mod common;
 use common::program::{arg, command, rooms, tiny_weights};
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::eval::read_evaluation;
-use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, load_model, reconstruct};
+use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, load_model, reconstruct};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::Device;
@@ -224,7 +224,7 @@ fn settings_share_one_normalized_world() {
         (made.world_from_normalized.translation, made.target_poses)
     };
     let plain = world(Input::PLAIN);
-    for views_as in [ViewsAs::Polyphase, ViewsAs::Whole, ViewsAs::Repeated] {
+    for views_as in [HighResMode::Polyphase, HighResMode::Whole, HighResMode::Repeated] {
         assert_eq!(world(Input::at(64, views_as, size).unwrap()), plain, "{views_as}");
     }
 }

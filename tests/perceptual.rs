@@ -53,14 +53,14 @@ fn made_up(random: &mut Random) -> Tensor {
     (blocks.into_iter().reduce(|sum, block| sum + block).expect("four") / 4.).unsqueeze(0)
 }
 
-/// Asserts that loss and gradient in bf16 are near those in float32, for images at several distances from `truth`: the smaller
+/// Asserts that loss and gradient in bf16 are near those in float32, for images at several distances from `ground_truth`: the smaller
 /// the difference, the larger the relative rounding error.
-fn assert_near(networks: &[PerceptualLoss; 2], truth: &Tensor, name: &str, random: &mut Random) {
+fn assert_near(networks: &[PerceptualLoss; 2], ground_truth: &Tensor, name: &str, random: &mut Random) {
     for noise in NOISES {
-        let noise = random.symmetric(&truth.size()).to_kind(Kind::Float) * noise;
+        let noise = random.symmetric(&ground_truth.size()).to_kind(Kind::Float) * noise;
         let [exact, rounded] = networks.each_ref().map(|network| {
-            let picture = (truth + &noise).clamp(0., 1.).set_requires_grad(true);
-            let loss = network.loss(&picture, truth);
+            let picture = (ground_truth + &noise).clamp(0., 1.).set_requires_grad(true);
+            let loss = network.loss(&picture, ground_truth);
             loss.backward();
             (loss.double_value(&[]), picture.grad().flatten(0, -1).to_kind(Kind::Double))
         });
@@ -89,8 +89,8 @@ fn vgg19_in_bf16_is_float32_s() {
     }
     Tensor::write_safetensors(&weights, &file).expect("weights");
     let networks = both(PerceptualKind::Vgg19, &file);
-    let truth = made_up(&mut random);
-    assert_near(&networks, &truth, "vgg19", &mut random);
+    let ground_truth = made_up(&mut random);
+    assert_near(&networks, &ground_truth, "vgg19", &mut random);
 }
 
 #[test]
@@ -99,18 +99,18 @@ fn lpips_in_bf16_is_float32_s() {
         return;
     }
     let mut random = Random::new(8);
-    let mut truths = vec![("made up", made_up(&mut random))];
+    let mut ground_truths = vec![("made up", made_up(&mut random))];
     if let Some(captures) = common::captures() {
         let capture = open_capture(&captures[0]).expect("a capture");
         let views = load_context(&capture, Holdout::None, Some(2), [SIDE, SIDE].into()).expect("views");
-        truths.push(("a photo", views[0].image.to_kind(Kind::Float).unsqueeze(0).unsqueeze(0)));
+        ground_truths.push(("a photo", views[0].image.to_kind(Kind::Float).unsqueeze(0).unsqueeze(0)));
     }
     for (kind, network) in
         [(PerceptualKind::LpipsVgg, LpipsNetwork::Vgg16), (PerceptualKind::LpipsAlex, LpipsNetwork::AlexNet)]
     {
         let networks = both(kind, &find_pretrained(network.file_name()).expect("weights"));
-        for (what, truth) in &truths {
-            assert_near(&networks, truth, &format!("{}, {what}", network.metric()), &mut random);
+        for (what, ground_truth) in &ground_truths {
+            assert_near(&networks, ground_truth, &format!("{}, {what}", network.metric()), &mut random);
         }
     }
 }

@@ -5,7 +5,7 @@ mod common;
 use common::program::{arg, refuse, succeed, tiny_config};
 use globalsplat::data::{Holdout, View, open_capture, write_room};
 use globalsplat::loss::{mse, psnr_of_mse};
-use globalsplat::reconstruct::{LoadedModel, Reconstruction, load_context, reconstruct, shipped_model};
+use globalsplat::reconstruct::{LoadedModel, Reconstruction, bundled_model, load_context, reconstruct};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Placement, Similarity};
 use serde_json::Value;
@@ -38,7 +38,7 @@ fn psnr(made: &Reconstruction, photos: &[View]) -> f64 {
 #[test]
 fn the_splat_that_shows_the_photos_best_is_kept() {
     let folder = tempfile::tempdir().unwrap();
-    let mut model = shipped_model(Device::Cpu).unwrap();
+    let mut model = bundled_model(Device::Cpu).unwrap();
     let photos = photos_of(folder.path(), &model);
     let extents = [0.2, 0.5, 1., 2., 5.];
     let alone = extents.map(|extent| {
@@ -68,7 +68,7 @@ fn the_splat_that_shows_the_photos_best_is_kept() {
 fn reconstruct_tells_where_the_scene_was_shown() {
     let folder = tempfile::tempdir().unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("room.ply"));
-    let model = shipped_model(Device::Cpu).unwrap();
+    let model = bundled_model(Device::Cpu).unwrap();
     let photos = photos_of(&room, &model);
     let arguments = ["reconstruct", "--scene", arg(&room), "--out", arg(&out)];
     let told: Value = serde_json::from_str(&succeed(&[&arguments[..], &["--json"]].concat())).unwrap();

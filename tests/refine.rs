@@ -253,9 +253,9 @@ fn units_and_origin_change_nothing() {
 #[test]
 fn a_splat_becomes_better_or_stays() {
     let (folder, room) = room();
-    let (truth, dull, out) =
+    let (ground_truth, dull, out) =
         (room.join("truth.ply"), folder.path().join("dull.ply"), folder.path().join("a.ply"));
-    let mut splat = read_splat(&truth).unwrap();
+    let mut splat = read_splat(&ground_truth).unwrap();
     splat.gaussians.sh = &splat.gaussians.sh * 0.5;
     write_splat(&dull, &splat).unwrap();
     let refined = |from: &Path| {
@@ -271,7 +271,7 @@ fn a_splat_becomes_better_or_stays() {
     assert_eq!(done["held_out"], Value::Null);
     assert_eq!(read_splat(&out).unwrap().gaussians.count(), splat.gaussians.count());
     // Its photos are its own renders: no splat is better.
-    let done = refined(&truth);
+    let done = refined(&ground_truth);
     assert_eq!(done["shown"]["before"], done["shown"]["after"]);
     assert!(number(&done, "/shown/after/psnr") > 55.);
 }
@@ -332,9 +332,9 @@ fn points_are_begun_with() {
     for format in [Format::ColmapText, Format::ColmapBinary] {
         let (_folder, room) = room();
         assert!(points_of(&open_capture(&room).unwrap()).unwrap().is_empty());
-        let truth = read_splat(&room.join("truth.ply")).unwrap().gaussians;
+        let ground_truth = read_splat(&room.join("truth.ply")).unwrap().gaussians;
         let means: Vec<f64> =
-            Vec::try_from(truth.means.to_kind(Kind::Double).contiguous().view([-1])).unwrap();
+            Vec::try_from(ground_truth.means.to_kind(Kind::Double).contiguous().view([-1])).unwrap();
         rewrite(&room, format);
         let capture = open_capture(&room).unwrap();
         assert!(points_of(&capture).unwrap().is_empty());
@@ -381,8 +381,9 @@ fn what_photos_hide_is_found_out() {
     .save(&photo)
     .unwrap();
     let refined = |more: &[&str]| {
-        let truth = room.join("truth.ply");
-        let base = ["refine", "--splat", arg(&truth), "--scene", arg(&room), "--out", arg(&out), "--json"];
+        let ground_truth = room.join("truth.ply");
+        let base =
+            ["refine", "--splat", arg(&ground_truth), "--scene", arg(&room), "--out", arg(&out), "--json"];
         let steps = ["--steps", "300", "--set", "means=1e-4", "--set", "poses=2e-3"];
         told(&[&base[..], &steps, more].concat())
     };

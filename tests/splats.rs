@@ -587,10 +587,10 @@ fn numbers_that_do_not_fit() {
 #[test]
 fn convert_tells_what_is_lost() {
     let (folder, room) = room();
-    let truth = room.join("truth.ply");
+    let ground_truth = room.join("truth.ply");
     let convert = |to: &str, more: &[&str]| -> Value {
         let to = folder.path().join(to);
-        let told = succeed(&[&["convert", arg(&truth), arg(&to), "--json"], more].concat());
+        let told = succeed(&[&["convert", arg(&ground_truth), arg(&to), "--json"], more].concat());
         serde_json::from_str(&told).unwrap()
     };
     let same = convert("a.ply", &[]);
@@ -606,10 +606,11 @@ fn convert_tells_what_is_lost() {
         assert_eq!(told["to"]["sh_degree"].to_string(), degree);
         assert_eq!(told["views"], 8);
     }
-    let told = succeed(&["convert", arg(&truth), arg(&folder.path().join("c.splat"))]);
+    let told = succeed(&["convert", arg(&ground_truth), arg(&folder.path().join("c.splat"))]);
     assert!(told.contains("Gaussians, SH degree 0, ") && told.contains("dB between renders"), "{told}");
     let out = folder.path().join("d.ply");
-    let higher = common::program::globalsplat(&["convert", arg(&truth), arg(&out), "--sh-degree", "4"]);
+    let higher =
+        common::program::globalsplat(&["convert", arg(&ground_truth), arg(&out), "--sh-degree", "4"]);
     assert_eq!(higher.status.code(), Some(2));
 }
 

@@ -78,7 +78,7 @@ fn least_psnr(a: &Path, b: &Path) -> f64 {
 #[test]
 fn a_splat_looks_the_same_in_any_unit_and_place() {
     let (folder, room) = room();
-    let truth = room.join("truth.ply");
+    let ground_truth = room.join("truth.ply");
     let of = |name: &str| folder.path().join(name);
     // Renders from the capture's cameras, along a smooth path through them and on orbits, with the scores and the loss of
     // `convert`.
@@ -99,8 +99,8 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
         let loss = told(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
         (pictures, scores["psnr"].as_f64().unwrap(), loss["psnr"].as_f64().unwrap())
     };
-    let (plain, plain_psnr, plain_loss) = looked_at(&truth, &room, "plain");
-    let read = read_splat(&truth).unwrap();
+    let (plain, plain_psnr, plain_loss) = looked_at(&ground_truth, &room, "plain");
+    let read = read_splat(&ground_truth).unwrap();
     for place in PLACES {
         let to = to_place(place);
         let (scene, splat) = (of("scene"), of("a.ply"));
@@ -121,7 +121,7 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
 #[test]
 fn powers_of_two_change_no_bit() {
     let (folder, room) = room();
-    let truth = read_splat(&room.join("truth.ply")).unwrap();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
     let made = |scene: &Path, name: &str| {
         // This format stores linear scales.
@@ -142,7 +142,7 @@ fn powers_of_two_change_no_bit() {
     };
     let (plain, pictures) = made(&room, "plain");
     let cameras = open_capture(&room).unwrap().cameras();
-    let seen = truth.renderer().render(&cameras).unwrap();
+    let seen = ground_truth.renderer().render(&cameras).unwrap();
     for exponent in [-20, -3, 5, 20] {
         let factor = f64::from(exponent).exp2();
         let scene = of(&format!("scene{exponent}"));
@@ -154,7 +154,7 @@ fn powers_of_two_change_no_bit() {
         assert!(gaussians.quaternions.equal(&plain.quaternions) && gaussians.sh.equal(&plain.sh));
         assert!(pictures == same, "2^{exponent}");
         let cameras = open_capture(&scene).unwrap().cameras();
-        let scaled = moved_splat(&truth, &to).renderer().render(&cameras).unwrap();
+        let scaled = moved_splat(&ground_truth, &to).renderer().render(&cameras).unwrap();
         for (a, b) in seen.iter().zip(&scaled) {
             assert!(a.rgb.equal(&b.rgb) && a.alpha.equal(&b.alpha), "2^{exponent}");
             assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");
@@ -170,7 +170,7 @@ fn a_page_is_the_same_in_any_unit_and_place() {
         return;
     }
     let (folder, room) = room();
-    let truth = read_splat(&room.join("truth.ply")).unwrap();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
     let contents = |splat: &Path, scene: &Path| -> Value {
         let page = of("page.html");
@@ -184,7 +184,7 @@ fn a_page_is_the_same_in_any_unit_and_place() {
         let to = to_place(place);
         let (scene, splat) = (of("scene"), of("a.ply"));
         write_moved(&room, &scene, &to);
-        write_local_splat(&splat, &moved_splat(&truth, &to)).unwrap();
+        write_local_splat(&splat, &moved_splat(&ground_truth, &to)).unwrap();
         let other = contents(&splat, &scene);
         for (path, least) in [("/distance", 1e-4), ("/frustum", 1e-4)] {
             let number = |value: &Value| value.pointer(path).unwrap().as_f64().unwrap();
@@ -203,13 +203,13 @@ fn a_page_is_the_same_in_any_unit_and_place() {
 #[test]
 fn a_local_origin_keeps_the_detail() {
     let (folder, room) = room();
-    let truth = read_splat(&room.join("truth.ply")).unwrap();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
     let to = to_place(PLACES[4]);
     let offset = to.translation;
     let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
     write_moved(&room, &scene, &to);
-    write_local_splat(&local, &moved_splat(&truth, &to)).unwrap();
+    write_local_splat(&local, &moved_splat(&ground_truth, &to)).unwrap();
     let psnr = |splat: &Path| {
         told(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
     };

@@ -159,4 +159,7 @@ def settled(answer, expected, calls, turned):
                 best, chosen = other, chosen ^ {call}
         if chosen == before:
             break
+    # A program that decides most of them otherwise doesn't round otherwise: it has another threshold.
+    if len(chosen) > max(2, len(calls) // 2):
+        return expected, 0
     return best, len(chosen)

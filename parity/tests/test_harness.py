@@ -22,7 +22,7 @@ from harness.compare import compare, judge  # noqa: E402
 from harness.disturb import undetected  # noqa: E402
 from harness.document import document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
-from harness.hold import hold, questions  # noqa: E402
+from harness.hold import generator, hold, questions  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
 from harness.thresholds import doubtful_pixels  # noqa: E402
 from harness.tolerance import FLOAT32, FLOAT64, Tolerance  # noqa: E402
@@ -259,6 +259,12 @@ def test_close_calls_may_go_either_way_and_nothing_else(case, seed):
     name = max(otherwise, key=lambda name: otherwise[name].size)
     wrong = answer | {name: answer[name] * np.float32(1.001)}
     assert not passes(wrong, question.settled(wrong)[0])
+
+
+@pytest.mark.parametrize("case", ["perceptual", "lpips_alex"])
+def test_close_calls_can_be_asked_for_once_all_draws_are_made(case):
+    draws = list(CASES[case](generator(0, case)))
+    assert sum(len(drawn.close_calls()) for drawn in draws) > 0
 
 
 def test_every_module_has_a_case():

@@ -1,6 +1,6 @@
 //! Benchmark of attention on the CPU: this crate's kernel, libtorch's, and a matrix product for comparison.
 
-use super::Spread;
+use super::TimingStats;
 use super::peak_throughput::PeakThroughput;
 use crate::model::{Precision, attention, by_libtorch};
 use crate::optim::Stopwatch;
@@ -31,7 +31,7 @@ pub struct AttentionRow {
     /// Implementation: `ours`, `libtorch`, or `libtorch, heads apart` (with each head copied into a contiguous tensor).
     pub by: &'static str,
     /// Time of a call.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
     /// Throughput of the fastest call in GFLOP/s. Backward passes include the operations that recompute the scores.
     pub gflops: f64,
     /// Throughput as a fraction of that of the matrix product.
@@ -89,12 +89,12 @@ pub fn bench_attention(
             }
         }
     }
-    let gflops = |operations: f64, spread: &Spread| 1e-6 * operations / spread.least;
-    let product_gflops = yardstick.gflops(Spread::of(product).least);
+    let gflops = |operations: f64, spread: &TimingStats| 1e-6 * operations / spread.least;
+    let product_gflops = yardstick.gflops(TimingStats::of(product).least);
     // Two products forward, five backward.
     let one = 2. * queries as f64 * keys as f64 * width as f64;
     let row = |pass, by, products: f64, milliseconds| {
-        let milliseconds = Spread::of(milliseconds);
+        let milliseconds = TimingStats::of(milliseconds);
         let gflops = gflops(products * one, &milliseconds);
         AttentionRow { pass, by, milliseconds, gflops, share: gflops / product_gflops }
     };

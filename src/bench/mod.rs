@@ -26,7 +26,7 @@ use std::borrow::Cow;
 
 /// Distribution of several measurements of the same operation, in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize)]
-pub struct Spread {
+pub struct TimingStats {
     /// Median of the measurements.
     pub median: f64,
     /// Minimum of the measurements.
@@ -41,7 +41,7 @@ pub struct Section {
     /// Name of the section.
     pub name: Cow<'static, str>,
     /// Time per view or per step.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
 }
 
 /// Times in milliseconds of each run of an operation, in total and by section.
@@ -68,22 +68,22 @@ impl Measured {
     }
 
     /// Returns the distributions of the total time and of each section. Requires at least one run.
-    fn told(mut self) -> (Spread, Vec<Section>) {
-        (Spread::of(std::mem::take(&mut self.whole)), self.sections())
+    fn told(mut self) -> (TimingStats, Vec<Section>) {
+        (TimingStats::of(std::mem::take(&mut self.whole)), self.sections())
     }
 
     /// Returns the distribution of each section, in the order in which the sections were first added.
     fn sections(self) -> Vec<Section> {
-        let section = |(name, all)| Section { name, milliseconds: Spread::of(all) };
+        let section = |(name, all)| Section { name, milliseconds: TimingStats::of(all) };
         self.sections.into_iter().map(section).collect()
     }
 }
 
-impl Spread {
+impl TimingStats {
     /// Computes the distribution of at least one measurement.
     fn of(mut milliseconds: Vec<f64>) -> Self {
         milliseconds.sort_by(f64::total_cmp);
         let at = |share: f64| milliseconds[((milliseconds.len() - 1) as f64 * share).round() as usize];
-        Spread { median: at(0.5), least: at(0.), upper_quartile: at(0.75) }
+        TimingStats { median: at(0.5), least: at(0.), upper_quartile: at(0.75) }
     }
 }

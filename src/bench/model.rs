@@ -1,6 +1,6 @@
 //! Benchmark of the forward pass: the time of its parts, and its memory use.
 
-use super::Spread;
+use super::TimingStats;
 use super::parts::{Part, Parts};
 use super::peak_throughput::PeakThroughput;
 use super::train::synthetic_scene;
@@ -32,7 +32,7 @@ pub struct ModelReport {
     /// Number of measured passes.
     pub repeats: usize,
     /// Time from photos to Gaussians, both on the device.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
     /// Parts of the pass, in the order of execution.
     pub parts: Vec<Part>,
     /// Throughput of a product of large matrices in the same precision, in GFLOP/s.
@@ -81,7 +81,7 @@ pub fn bench_model(
         let told = parts.watch(device, forward);
         passes.push(untold.unwrap_or(told));
     }
-    let peak_gflops = yardstick.gflops(Spread::of(products).least);
+    let peak_gflops = yardstick.gflops(TimingStats::of(products).least);
     Ok(ModelReport {
         views: config.data.context_views,
         size: config.data.image_size.into(),
@@ -89,7 +89,7 @@ pub fn bench_model(
         precision,
         threads: tch::get_num_threads(),
         repeats,
-        milliseconds: Spread::of(passes),
+        milliseconds: TimingStats::of(passes),
         parts: parts.told(peak_gflops),
         peak_gflops,
         peak_bytes: peak_memory_bytes_on(device),

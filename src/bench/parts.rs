@@ -1,6 +1,6 @@
 //! Parts of a model's pass: the time, the floating-point operations and the memory traffic of each.
 
-use super::Spread;
+use super::TimingStats;
 use crate::device::DeviceEvent;
 use crate::model::{Event, told};
 use serde::Serialize;
@@ -14,7 +14,7 @@ pub struct Part {
     /// Name of the part.
     pub name: &'static str,
     /// Time of the part per pass.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
     /// Floating-point operations of the part's matrix products, in GFLOP.
     pub gflop: f64,
     /// Floating-point operations of the backward pass of these products, in GFLOP; 0 if gradients aren't recorded.
@@ -99,7 +99,7 @@ impl Parts {
     /// Returns the statistics. `peak_gflops` is the throughput of a product of large matrices, which [`Part::share_of_peak`] refers to.
     pub fn told(self, peak_gflops: f64) -> Vec<Part> {
         let part = |sum: Sum| {
-            let milliseconds = Spread::of(sum.milliseconds);
+            let milliseconds = TimingStats::of(sum.milliseconds);
             let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
             let [gflop, backward_gflop, gigabytes] =
                 [sum.flops, sum.backward_flops, sum.bytes].map(|of| 1e-9 * of);

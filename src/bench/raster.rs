@@ -1,6 +1,6 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
-use super::{Measured, Section, Spread};
+use super::{Measured, Section, TimingStats};
 use crate::error::Result;
 use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 use crate::optim::Stopwatch;
@@ -32,9 +32,9 @@ pub struct RasterReport {
     /// Height of an image, in pixels.
     pub height: i64,
     /// Time of a call without gradients.
-    pub forward: Spread,
+    pub forward: TimingStats,
     /// Time of a call that records gradients and of its backward pass.
-    pub forward_backward: Spread,
+    pub forward_backward: TimingStats,
     /// Stages on the CPU, or kernels on a GPU, in the order of execution. All launches of a kernel are added up.
     pub stages: Vec<Section>,
     /// Comparison of a GPU's results with the CPU's.
@@ -158,8 +158,8 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         views,
         width: cameras.width,
         height: cameras.height,
-        forward: Spread::of(forward),
-        forward_backward: Spread::of(forward_backward),
+        forward: TimingStats::of(forward),
+        forward_backward: TimingStats::of(forward_backward),
         stages,
         against_cpu,
         pairs,
@@ -227,7 +227,7 @@ fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Ve
 fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section> {
     let stage = |name: &'static str, seconds: fn(&StageTimes) -> f64| Section {
         name: name.into(),
-        milliseconds: Spread::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
+        milliseconds: TimingStats::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
     };
     vec![
         stage("project", |t| t.project),

@@ -1,6 +1,6 @@
 //! Benchmark of a refinement step: the time of its parts, and the share of rendering.
 
-use super::{Spread, synthetic_scene};
+use super::{TimingStats, synthetic_scene};
 use crate::data::ViewBatch;
 use crate::error::Result;
 use crate::optim::Stopwatch;
@@ -31,7 +31,7 @@ pub struct RefineReport {
     /// Number of measured steps.
     pub steps: u64,
     /// Time of a whole step.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
     /// Mean time of each part of a step in milliseconds, in the order of execution.
     pub sections: Vec<(&'static str, f64)>,
     /// Share of the time that isn't rendering, forward or backward. `None` on a GPU: only the CPU rasterizer reports the time of its
@@ -92,7 +92,7 @@ pub fn bench_refine(
         size: size.into(),
         threads: tch::get_num_threads(),
         steps,
-        milliseconds: Spread::of(whole),
+        milliseconds: TimingStats::of(whole),
         sections,
         other_share: (device == Device::Cpu).then_some(1. - rendering / all),
     })

@@ -2,7 +2,7 @@
 
 use super::parts::{Part, Parts};
 use super::peak_throughput::PeakThroughput;
-use super::{Measured, Section, Spread};
+use super::{Measured, Section, TimingStats};
 use crate::config::Config;
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
 use crate::device::Upload;
@@ -49,7 +49,7 @@ pub struct TrainReport {
     /// Number of measured steps.
     pub steps: usize,
     /// Time of a whole step.
-    pub milliseconds: Spread,
+    pub milliseconds: TimingStats,
     /// Sections of a step, in the order of execution.
     pub sections: Vec<Section>,
     /// Parts of all forward passes, including the rounds that are recomputed by checkpointing, with the operations of their backward
@@ -74,9 +74,9 @@ pub struct Together {
     /// Scenes per second of all ranks together.
     pub scenes_per_second: f64,
     /// Time of a step without communication, with all ranks running at the same time.
-    pub apart_milliseconds: Spread,
+    pub apart_milliseconds: TimingStats,
     /// Time of summing the gradients over all ranks when nothing overlaps with it.
-    pub communication_milliseconds: Spread,
+    pub communication_milliseconds: TimingStats,
     /// Share of this communication that overlaps with the backward pass, in the step with the shortest wait. Other steps include waiting
     /// for slower ranks.
     pub hidden: f64,
@@ -122,7 +122,7 @@ pub fn bench_train(
     tch::set_num_threads(threads / slices_at_once as i32);
     let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
     tch::set_num_threads(threads);
-    let peak_gflops = yardstick.gflops(Spread::of(products).least);
+    let peak_gflops = yardstick.gflops(TimingStats::of(products).least);
     let (milliseconds, sections) = measured.told();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {

@@ -6,7 +6,7 @@ use super::{device, memory, open_capture, parse_size, print_json, progress, warn
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    RasterReport, Spread, bench_loader, bench_raster, bench_synth, synthetic_scene, synthetic_videos,
+    RasterReport, TimingStats, bench_loader, bench_raster, bench_synth, synthetic_scene, synthetic_videos,
 };
 use globalsplat::data::{DataConfig, TrainingScenes, view_batch};
 use globalsplat::error::Error;
@@ -258,7 +258,7 @@ fn print_report(r: &RasterReport) {
         r.gaussians, r.views, r.width, r.height, r.device, r.threads, r.simd
     );
     println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "min", "p75");
-    let row = |name: &str, s: &Spread| {
+    let row = |name: &str, s: &TimingStats| {
         println!("{name:<18} {:>8.3} {:>8.3} {:>8.3}", s.median, s.least, s.upper_quartile);
     };
     row("forward", &r.forward);

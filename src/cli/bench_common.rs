@@ -1,7 +1,7 @@
 //! Code that the subcommands of `bench` share: reading the measured configuration, and printing tables.
 
 use anyhow::Result;
-use globalsplat::bench::{Part, Section, Spread};
+use globalsplat::bench::{Part, Section, TimingStats};
 use globalsplat::config::Config;
 use std::path::Path;
 
@@ -14,9 +14,9 @@ pub fn read_config(file: Option<&Path>, set: &[String]) -> Result<Config> {
 }
 
 /// Prints one line per section, with its share of the whole, and one for the whole.
-pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &Spread)) {
+pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &TimingStats)) {
     println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "min", "p75", "share");
-    let row = |name: &str, s: &Spread| {
+    let row = |name: &str, s: &TimingStats| {
         let share = 1e2 * s.median / whole.median;
         println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
     };
@@ -25,7 +25,7 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
 }
 
 /// Prints a table of the parts of a forward pass, with their shares of `whole`.
-pub fn print_parts(title: &str, parts: &[Part], whole: &Spread) {
+pub fn print_parts(title: &str, parts: &[Part], whole: &TimingStats) {
     println!(
         "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
         "median", "least", "share", "GFLOP", "GB", "of the peak"
@@ -41,7 +41,7 @@ pub fn print_parts(title: &str, parts: &[Part], whole: &Spread) {
 }
 
 /// Prints the line of one part: its median and minimum time in milliseconds, its share of `whole`, and `rest`.
-pub fn print_part(name: &str, s: &Spread, whole: &Spread, rest: &str) {
+pub fn print_part(name: &str, s: &TimingStats, whole: &TimingStats, rest: &str) {
     let share = 1e2 * s.median / whole.median;
     println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
 }

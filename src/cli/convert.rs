@@ -4,7 +4,7 @@ use clap::Args;
 use glam::DVec3;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{
-    Inputs, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
+    InputFiles, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
 };
 use globalsplat::render::HarmonicLimits;
 use globalsplat::scene::{Camera, ImageSize, LocalFrame};
@@ -63,8 +63,8 @@ impl Convert {
         check_writable_splat(&self.to)?;
         splat_out::check_origin(&self.to, self.local_origin)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
-        let mut inputs = Inputs::default();
-        capture.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        let mut inputs = InputFiles::default();
+        capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
         inputs.check_file(&self.to)?;
         let original = read_splat_without_invalid(&self.from)?;
         warn(&original.warnings);

@@ -8,7 +8,7 @@ use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::model::{Precision, are_denormals_flushed};
 use globalsplat::ranks::Backends;
-use globalsplat::reconstruct::SHIPPED_MODEL;
+use globalsplat::reconstruct::BUNDLED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
 use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
 use globalsplat::train::MemoryEstimate;
@@ -81,7 +81,7 @@ impl Doctor {
                     "architectures": nvrtc.architectures,
                 })),
                 "kernels": cache,
-                "model": SHIPPED_MODEL,
+                "model": BUNDLED_MODEL,
                 "weights": found,
                 "ffmpeg": or_error(&ffmpeg, |version| json!(version)),
                 "viewer": view::has_viewer(),
@@ -153,7 +153,7 @@ impl Doctor {
             }
         }
         line("kernels", &cache.as_deref().unwrap_or("kept nowhere: neither XDG_CACHE_HOME nor HOME is set"));
-        line("model", &format!("{SHIPPED_MODEL}, inside the program (reconstruct --weights takes another)"));
+        line("model", &format!("{BUNDLED_MODEL}, inside the program (reconstruct --weights takes another)"));
         for (metric, path) in weights {
             let found = match path {
                 Some(path) => path.display().to_string(),

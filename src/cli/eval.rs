@@ -7,13 +7,13 @@ use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    Baselines, CaptureScores, ContactSheet, EvalScene, Evaluation, EvaluationIndex, Method, Perceptual,
-    PhotoSource, REPORT, Sweep, TABLE, evaluation_files, judge, machine, peak_memory_bytes, write_csv,
-    write_evaluation, write_report,
+    Baselines, CaptureScores, ContactSheet, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex,
+    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, peak_memory_bytes,
+    write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{Inputs, WeightsFile, check_writable_dir, check_writable_png, checksum};
+use globalsplat::io::{InputFiles, WeightsFile, check_writable_dir, check_writable_png, checksum};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{Input, LoadedModel, Model, ViewsAs, context_views};
+use globalsplat::reconstruct::{HighResMode, Input, LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::ops::RangeInclusive;
@@ -79,7 +79,7 @@ pub struct Eval {
     /// Conversion of a photo of N times the height: N² views that share its pixels (polyphase), one larger view (whole), or N²
     /// copies of one view of the downscaled photo (repeated)
     #[arg(long, value_name = "HOW", requires = "views_at", default_value_t)]
-    views_as: ViewsAs,
+    views_as: HighResMode,
     /// Height of the scored images in pixels, in the shape of the model's images, or square; by default the size of the model's
     /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
     #[arg(long, value_name = "PIXELS")]
@@ -121,7 +121,7 @@ impl Eval {
         let capture = open_capture(scene)?;
         if let Some(sheet) = &self.sheet {
             let mut inputs = self.inputs(std::iter::once(self.method(None)));
-            capture.add_inputs(&mut inputs);
+            capture.add_input_files(&mut inputs);
             inputs.check_file(sheet)?;
         }
         let loaded = self.load_model(device)?;
@@ -130,14 +130,14 @@ impl Eval {
         if self.chooses_size() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let mut made = self.method(model).synthesize(scene, device)?;
+        let mut made = self.method(model).render_targets(scene, device)?;
         warn(&made.warnings);
         let peak_memory = peak_memory_bytes(); // of the method, without the networks of the metrics
         let perceptual = Perceptual::find(device)?;
         let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(made.scene.target.len()));
-        let scores = judge(&mut made, &perceptual, |truth, picture, _| {
+        let scores = judge(&mut made, &perceptual, |ground_truth, picture, _| {
             let row = sheet.as_mut().zip(picture.rendered.as_ref());
-            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&truth.image, rendered))
+            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image, rendered))
         })?;
         let scene = &made.scene;
         // For a model, also score the trivial baselines that use only the input photos.
@@ -193,10 +193,10 @@ impl Eval {
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
         let size = self.picture_size(Some(model))?;
         let photos = match size == model.input.photo_size(model.config.data.image_size) {
-            true => PhotoSource::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
+            true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
             false => {
                 let shown = context_views(capture, self.holdout(model)?, self.views);
-                PhotoSource::of(capture, &shown, Some(size))
+                LazyPhotos::of(capture, &shown, Some(size))
             }
         };
         Ok(Baselines::of(&scene.name, &photos, &scene.target)?)
@@ -251,11 +251,11 @@ impl Eval {
     }
 
     /// Returns the input files of the evaluation; for a dataset, `methods` has one method per scene.
-    fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> Inputs {
-        let mut inputs = Inputs::default();
+    fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> InputFiles {
+        let mut inputs = InputFiles::default();
         match &self.weights {
             Some(weights) => inputs.add_weights(weights),
-            None => methods.for_each(|method| method.add_inputs(&mut inputs)),
+            None => methods.for_each(|method| method.add_input_files(&mut inputs)),
         }
         inputs
     }
@@ -270,7 +270,7 @@ impl Eval {
         let method = self.method(None);
         let scenes = || evaluations.clone().flat_map(|(index, _)| index.scenes.keys());
         let mut inputs = self.inputs(scenes().map(|key| method.of_scene(key)));
-        dataset.add_inputs(out, &mut inputs);
+        dataset.add_input_files(out, &mut inputs);
         evaluations.clone().for_each(|(index, _)| inputs.add(&index.file));
         inputs.check_folder(out)?;
         inputs.check_file(&out.join(REPORT))?;
@@ -321,7 +321,7 @@ impl Eval {
         }
         let dataset = Dataset::open(data, Split::Test)?;
         warn_of_many(dataset.warnings().iter());
-        let dataset_name = |index| Sweep::dataset_name(self.dataset.as_deref(), data, index);
+        let dataset_name = |index| DatasetEvaluation::dataset_name(self.dataset.as_deref(), data, index);
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
         self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
@@ -344,7 +344,7 @@ impl Eval {
                 }
                 _ => precision.into(),
             };
-            let sweep = Sweep {
+            let sweep = DatasetEvaluation {
                 method: self.method(model),
                 name: self.name.clone().unwrap_or(stem + &setting),
                 fingerprint: fingerprint.clone() + &setting,

@@ -2,7 +2,7 @@ use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::config::Config;
-use globalsplat::io::Inputs;
+use globalsplat::io::InputFiles;
 use globalsplat::model::GlobalSplat;
 use globalsplat::reconstruct::load_model;
 use globalsplat::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
@@ -36,7 +36,7 @@ pub struct Export {
 
 impl Export {
     pub fn run(self) -> Result<()> {
-        let mut inputs = Inputs::default();
+        let mut inputs = InputFiles::default();
         self.run.iter().for_each(|run| add_run_inputs(run, &mut inputs));
         self.config.iter().for_each(|config| inputs.add(config));
         self.out.check(self.format, &inputs)?;

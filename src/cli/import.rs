@@ -1,7 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::io::Inputs;
+use globalsplat::io::InputFiles;
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
@@ -31,7 +31,7 @@ pub struct Import {
 
 impl Import {
     pub fn run(self) -> Result<()> {
-        let mut inputs = Inputs::default();
+        let mut inputs = InputFiles::default();
         inputs.add_weights(&self.from);
         self.out.check(Format::Safetensors, &inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;

@@ -3,7 +3,7 @@
 use super::ranks;
 use globalsplat::config::Config;
 use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{Input, LoadedModel, ModelFile, SHIPPED_MODEL, ViewsAs};
+use globalsplat::reconstruct::{BUNDLED_MODEL, HighResMode, Input, LoadedModel, ModelFile};
 use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
 use std::path::Path;
@@ -52,7 +52,7 @@ pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) ->
 
 /// Returns the name of the weights in errors and reports.
 pub fn name(weights: Option<&Path>) -> &Path {
-    weights.unwrap_or(Path::new(SHIPPED_MODEL))
+    weights.unwrap_or(Path::new(BUNDLED_MODEL))
 }
 
 /// Warning for photos that are smaller than the size they are resized to.
@@ -65,11 +65,11 @@ pub fn shown_as(input: Input, trained: ImageSize) -> String {
         (pixels(input.photo_size(trained)), pixels(trained), input.views_of_photo());
     match input.views_as() {
         _ if input.is_plain() => format!("the {trained} that the model sees"),
-        ViewsAs::Polyphase => format!("{photo}, {views} views of the {trained} that the model sees"),
-        ViewsAs::Whole => {
+        HighResMode::Polyphase => format!("{photo}, {views} views of the {trained} that the model sees"),
+        HighResMode::Whole => {
             format!("{photo}, a view of more than the {trained} that the model was trained with")
         }
-        ViewsAs::Repeated => format!("the {trained} that the model sees, {views} times the same view"),
+        HighResMode::Repeated => format!("the {trained} that the model sees, {views} times the same view"),
     }
 }
 

@@ -3,7 +3,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{ChunkWriter, FoundCaptures, Holdout, find_captures};
 use globalsplat::error::Error;
-use globalsplat::io::{Inputs, check_writable_dir};
+use globalsplat::io::{InputFiles, check_writable_dir};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -51,8 +51,8 @@ impl Pack {
         }
         warn_of_many(lines.iter());
         check_writable_dir(&self.out)?;
-        let mut inputs = Inputs::default();
-        captures.iter().for_each(|capture| capture.add_inputs(&mut inputs));
+        let mut inputs = InputFiles::default();
+        captures.iter().for_each(|capture| capture.add_input_files(&mut inputs));
         inputs.check_folder(&self.out)?;
         let mut writer = ChunkWriter::new(&self.out, self.chunk_size as usize * 1_000_000)?;
         let bar = progress::bar(captures.len() as u64, "scenes");

@@ -12,7 +12,7 @@ static WATCH: OnceLock<Watch> = OnceLock::new();
 /// Joins the group of processes started together with this one, to work on the device called `name`: `cuda` means a GPU of its
 /// own for each process.
 pub fn join(name: &str) -> Result<(Group, Device)> {
-    let Some(place) = Place::of_process()? else { return Ok((Group::alone(), device::parse(name)?)) };
+    let Some(place) = Place::from_env()? else { return Ok((Group::alone(), device::parse(name)?)) };
     let watch = Watch::begin(&place, |why| {
         why.iter().for_each(|why| eprintln!("globalsplat: {why}"));
         // Work that waits for a hung rank is abandoned.
@@ -22,17 +22,17 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
     let watch = WATCH.get_or_init(|| watch);
     // The processes of a machine share its cores, as torchrun divides libtorch's threads.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let threads = (cores / place.local_ranks).max(1);
+    let threads = (cores / place.local_world_size).max(1);
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build_global()
         .expect("nothing has used threads yet");
     let device = match name {
         "cuda" => device::parse(&format!("cuda:{}", place.local_rank))?,
-        one if one.starts_with("cuda:") && place.local_ranks > 1 => {
+        one if one.starts_with("cuda:") && place.local_world_size > 1 => {
             let why = format!(
                 "{} processes of this machine can't share a GPU, expected --device cuda",
-                place.local_ranks
+                place.local_world_size
             );
             return Err(Error::Request(format!("--device {one}: {why}")));
         }
@@ -43,13 +43,13 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
 
 /// Returns `true` in the process that prints messages on behalf of all.
 pub fn is_first() -> bool {
-    !matches!(Place::of_process(), Ok(Some(Place { rank: 1.., .. })))
+    !matches!(Place::from_env(), Ok(Some(Place { rank: 1.., .. })))
 }
 
 /// Returns an error if torchrun started several processes for a command that can't be distributed.
 pub fn refuse() -> Result<()> {
     let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
-    let Ok(Some(Place { rank, ranks, .. })) = Place::of_process() else { return Ok(()) };
+    let Ok(Some(Place { rank, ranks, .. })) = Place::from_env() else { return Ok(()) };
     match (by_torchrun, rank) {
         (false, _) => Ok(()),
         (true, 0) => Err(Error::Request(format!(

@@ -6,9 +6,9 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{Inputs, check_writable_splat};
+use globalsplat::io::{InputFiles, check_writable_splat};
 use globalsplat::optim::Stopwatch;
-use globalsplat::reconstruct::{Input, Model, ViewsAs, load_context, reconstruct};
+use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, reconstruct};
 use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
@@ -103,13 +103,13 @@ impl Reconstruct {
         let mut watch = Stopwatch::default();
         let loaded = watch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = watch.time("photos", || open_capture(&self.scene))?;
-        let mut inputs = Inputs::default();
-        capture.add_inputs(&mut inputs);
+        let mut inputs = InputFiles::default();
+        capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {
-            Some(height) => Input::at(height, ViewsAs::Polyphase, data.image_size)?,
+            Some(height) => Input::at(height, HighResMode::Polyphase, data.image_size)?,
             None => Input::PLAIN,
         };
         let count = self.views.unwrap_or(data.context_views);

@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use globalsplat::data::{Capture, Holdout, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, process_age, score_views};
-use globalsplat::io::{Inputs, Splat, check_writable_png, check_writable_splat, read_splat};
+use globalsplat::io::{InputFiles, Splat, check_writable_png, check_writable_splat, read_splat};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
 use globalsplat::refine::{
@@ -205,7 +205,7 @@ impl Refine {
         let begun = Instant::now();
         let before = scorer.score(&initial, &scored)?;
         session.reserve(begun.elapsed() + self.time_after(&session, &initial)?);
-        if let Some(line) = session.is_late() {
+        if let Some(line) = session.late_start_warning() {
             bar.bar.suspend(|| eprintln!("{line}"));
         }
         let result = session.run()?;
@@ -345,8 +345,8 @@ impl Refine {
 
     /// Returns an error if an output would replace an input, except the initial splat.
     fn check_outputs(&self, capture: &Capture) -> Result<()> {
-        let mut inputs = Inputs::default();
-        capture.add_inputs(&mut inputs);
+        let mut inputs = InputFiles::default();
+        capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_file(&self.out)?;
         self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add_splat(splat));

@@ -2,7 +2,7 @@ use super::print_json;
 use anyhow::Result;
 use clap::Args;
 use globalsplat::eval::{evaluation_files, read_evaluation, write_report};
-use globalsplat::io::{Inputs, check_writable_file};
+use globalsplat::io::{InputFiles, check_writable_file};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -26,7 +26,7 @@ pub struct Report {
 impl Report {
     pub fn run(self) -> Result<()> {
         check_writable_file(&self.out)?;
-        let (mut evaluations, mut inputs) = (vec![], Inputs::default());
+        let (mut evaluations, mut inputs) = (vec![], InputFiles::default());
         for folder in self.folders {
             let evaluation = read_evaluation(&folder)?;
             let scenes = evaluation.scenes.iter().map(|scene| &scene.scores.scene);

@@ -5,7 +5,8 @@ use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    Inputs, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy, write_png,
+    InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy,
+    write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
@@ -82,7 +83,7 @@ impl Synth {
     fn write_videos(&self) -> Result<()> {
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
         check_writable_dir(&self.out)?;
-        let mut inputs = Inputs::default();
+        let mut inputs = InputFiles::default();
         let on_walls = self.pictures.iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
         on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
         inputs.check_folder(&self.out)?;

@@ -5,7 +5,7 @@ use globalsplat::config::Config;
 use globalsplat::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::{Inputs, check_writable_dir};
+use globalsplat::io::{InputFiles, check_writable_dir};
 use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
 use serde_json::json;
@@ -135,10 +135,10 @@ impl Train {
     /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is
     /// rewritten unchanged.
     fn check_outputs(&self, config: &Config, scenes: &TrainingScenes) -> Result<()> {
-        let mut inputs = Inputs::default();
-        scenes.add_inputs(&self.out, &mut inputs);
+        let mut inputs = InputFiles::default();
+        scenes.add_input_files(&self.out, &mut inputs);
         for path in config.data.validation_paths()? {
-            Dataset::open(&path, Split::Test)?.add_inputs(&self.out, &mut inputs);
+            Dataset::open(&path, Split::Test)?.add_input_files(&self.out, &mut inputs);
         }
         self.from.iter().for_each(|path| inputs.add_weights(path));
         inputs.check_folder(&self.out)?;

@@ -5,7 +5,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::Error;
 use globalsplat::config::Config;
-use globalsplat::io::{Inputs, check_writable_file, shard_index, write_sharded};
+use globalsplat::io::{InputFiles, check_writable_file, shard_index, write_sharded};
 use globalsplat::model::Stage;
 use globalsplat::reconstruct::{ModelDtype, model_weights, save_checkpoint};
 use serde_json::{Value, json};
@@ -47,7 +47,7 @@ pub enum Format {
 
 impl WeightsOut {
     /// Returns an error, before the work, if the output couldn't be written, or would replace one of `inputs`.
-    pub fn check(&self, format: Format, inputs: &Inputs) -> Result<()> {
+    pub fn check(&self, format: Format, inputs: &InputFiles) -> Result<()> {
         if format == Format::Torch && self.max_shard_size.is_some() {
             let why = "--max-shard-size: a checkpoint for torch is one file, expected --format safetensors";
             return Err(Error::Request(why.into()).into());

@@ -3,7 +3,7 @@
 use super::holdout::Holdout;
 use super::pixels::{Distortion, Lens, Planes, fit, looked_at, undistort};
 use crate::error::{Error, Result};
-use crate::io::{self, Inputs};
+use crate::io::{self, InputFiles};
 use crate::scene::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::synth::Video;
 use glam::DMat4;
@@ -324,7 +324,7 @@ impl Capture {
     }
 
     /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
-    pub fn add_inputs(&self, inputs: &mut Inputs) {
+    pub fn add_input_files(&self, inputs: &mut InputFiles) {
         let described = described_in(&self.file);
         inputs.add(&described);
         // A COLMAP model consists of several files.

@@ -6,7 +6,7 @@ use super::formats::{
 };
 use super::synthetic_dataset::SyntheticDataset;
 use crate::error::{Error, Result};
-use crate::io::{Inputs, read_text};
+use crate::io::{InputFiles, read_text};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -126,8 +126,8 @@ impl Dataset {
     }
 
     /// Adds to `inputs` the files of the dataset that writing below the folder `output` could overwrite.
-    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
-        self.groups.iter().for_each(|group| group.add_inputs(output, inputs));
+    pub fn add_input_files(&self, output: &Path, inputs: &mut InputFiles) {
+        self.groups.iter().for_each(|group| group.add_input_files(output, inputs));
     }
 
     /// Returns the number of scenes.
@@ -153,7 +153,7 @@ impl SceneGroup {
 
     /// Adds to `inputs` the files of the group that writing below the folder `output` could overwrite. Adds none of a capture that
     /// can't be opened; opening it elsewhere reports the error.
-    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
+    pub fn add_input_files(&self, output: &Path, inputs: &mut InputFiles) {
         let resolved = |path: &Path| path.canonicalize().unwrap_or(path.to_owned());
         match &self.source {
             Source::Chunk => {
@@ -165,7 +165,7 @@ impl SceneGroup {
                 if (folder.starts_with(&output) || output.starts_with(&folder))
                     && let Ok(capture) = open_capture(&self.path)
                 {
-                    capture.add_inputs(inputs);
+                    capture.add_input_files(inputs);
                 }
             }
             Source::SyntheticDataset(..) => {}

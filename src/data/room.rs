@@ -13,7 +13,7 @@ const TRUTH: &str = "truth.ply";
 /// All entries of a room's folder.
 const FILES: [&str; 3] = ["cameras.json", TRUTH, PHOTOS];
 
-/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `truth.ply`. An existing room is replaced.
+/// Writes one capture at `path`: `cameras.json`, `images/`, and the room itself as `ground_truth.ply`. An existing room is replaced.
 ///
 /// # Errors
 /// Fails if anything other than a room exists at `path`, or if a file can't be written.

@@ -1,7 +1,7 @@
 //! Comparison image of one view: ground truth, render, error and depth side by side.
 
 use crate::io::{colourize_depth, shrink, shrink_factor, subsample, tile_horizontally};
-use crate::render::Rendered;
+use crate::render::RenderedView;
 use tch::{Kind, Tensor};
 
 /// Mean error over the channels from which on the brightest colour is used.
@@ -11,14 +11,18 @@ const FULL_ERROR: f64 = 0.25;
 const MOST_PIXELS: i64 = 1 << 24;
 
 /// Returns the comparison image, `[3, H, W']` in [0, 1]. Large images are shrunk. The depth is left out if `rendered` is `None`.
-pub(super) fn comparison_image(truth: &Tensor, picture: &Tensor, rendered: Option<&Rendered>) -> Tensor {
+pub(super) fn comparison_image(
+    ground_truth: &Tensor,
+    picture: &Tensor,
+    rendered: Option<&RenderedView>,
+) -> Tensor {
     let size = picture.size();
     let factor = shrink_factor(4 * size[1] * size[2], MOST_PIXELS);
-    let (truth, picture) = (shrink(truth, factor), shrink(&picture.clamp(0., 1.), factor));
-    let error = (&picture - &truth).abs().mean_dim([0i64].as_slice(), false, Kind::Float) / FULL_ERROR;
+    let (ground_truth, picture) = (shrink(ground_truth, factor), shrink(&picture.clamp(0., 1.), factor));
+    let error = (&picture - &ground_truth).abs().mean_dim([0i64].as_slice(), false, Kind::Float) / FULL_ERROR;
     // Colour map: black, red, yellow, white.
     let heat = Tensor::stack(&[&error * 3., &error * 3. - 1., &error * 3. - 2.], 0).clamp(0., 1.);
-    let mut pictures = vec![truth, picture, heat];
+    let mut pictures = vec![ground_truth, picture, heat];
     if let Some(rendered) = rendered {
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
         pictures.push(colourize_depth(&depth, &alpha));

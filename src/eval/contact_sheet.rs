@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::io::{Mosaic, colourize_depth, enlarge, shrink, subsample};
-use crate::render::Rendered;
+use crate::render::RenderedView;
 use std::path::Path;
 use tch::Tensor;
 
@@ -19,15 +19,16 @@ impl ContactSheet {
         ContactSheet(Mosaic::column(views))
     }
 
-    /// Adds the row of a view: the photo `truth` `[3, H, W]`, and what was rendered from its camera.
+    /// Adds the row of a view: the photo `ground_truth` `[3, H, W]`, and what was rendered from its camera.
     ///
     /// # Errors
     /// Fails if the images differ in size.
-    pub fn add(&mut self, truth: &Tensor, rendered: &Rendered) -> Result<()> {
-        let factor = self.0.factor(3, truth);
+    pub fn add(&mut self, ground_truth: &Tensor, rendered: &RenderedView) -> Result<()> {
+        let factor = self.0.factor(3, ground_truth);
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
-        let [truth, rgb] = [truth, &rendered.rgb.clamp(0., 1.)].map(|picture| shrink(picture, factor));
-        let pictures = [truth, rgb, colourize_depth(&depth, &alpha)];
+        let [ground_truth, rgb] =
+            [ground_truth, &rendered.rgb.clamp(0., 1.)].map(|picture| shrink(picture, factor));
+        let pictures = [ground_truth, rgb, colourize_depth(&depth, &alpha)];
         self.0.add_shrunk(&pictures.map(|picture| enlarge(&picture, HEIGHT)))
     }
 

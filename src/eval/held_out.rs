@@ -1,6 +1,6 @@
 //! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
-use super::photo_source::PhotoSource;
+use super::photo_source::LazyPhotos;
 use super::scene::split_views;
 use super::scores::{CaptureScores, nearest_context_baseline, score};
 use crate::data::{
@@ -192,7 +192,7 @@ fn judge_views(
     let rendered = render_views(&gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
     let pictures: Vec<Tensor> = rendered.into_iter().map(|rendered| rendered.rgb).collect();
     let ours = score(name, &pictures, &target, Some(reconstruction.gaussians.count()))?;
-    let [context, target] = [context, target].map(PhotoSource::Loaded);
+    let [context, target] = [context, target].map(LazyPhotos::Loaded);
     Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
 

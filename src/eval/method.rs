@@ -7,11 +7,11 @@ use super::scores::{CaptureScores, ViewScore, score_view};
 use crate::data::View;
 use crate::error::{Error, Result};
 use crate::io::{
-    Inputs, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
+    InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
     tensor_from_rgb,
 };
 use crate::reconstruct::{Input, Model, reconstruct};
-use crate::render::{Rendered, SplatRenderer};
+use crate::render::{RenderedView, SplatRenderer};
 use crate::scene::{Camera, ImageSize, LocalFrame};
 use glam::{DMat4, DVec3};
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ pub enum Method<'a> {
 
 /// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`judge`] needs them.
 #[derive(Debug)]
-pub struct Synthesis {
+pub struct MethodOutput {
     /// Scene with its context and target views.
     pub scene: EvalScene,
     source: PictureSource,
@@ -61,7 +61,7 @@ pub struct Picture {
     /// Colours, `[3, H, W]`.
     pub rgb: Tensor,
     /// Render with depth, if the image was rendered from a splat here.
-    pub rendered: Option<Rendered>,
+    pub rendered: Option<RenderedView>,
 }
 
 /// Peak memory of a model, in bytes.
@@ -89,7 +89,7 @@ impl Method<'_> {
     ///
     /// # Errors
     /// Fails if the reconstruction fails, or if the splat, the first photo or the first image can't be read.
-    pub fn synthesize(&self, scene: EvalScene, device: Device) -> Result<Synthesis> {
+    pub fn render_targets(&self, scene: EvalScene, device: Device) -> Result<MethodOutput> {
         let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
                 let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
@@ -107,7 +107,7 @@ impl Method<'_> {
             }
             Method::Renders(folder) => (PictureSource::Folder(folder.clone()), None, None),
         };
-        Ok(Synthesis {
+        Ok(MethodOutput {
             first: Some(source.picture(&scene, 0)?),
             scene,
             source,
@@ -119,7 +119,7 @@ impl Method<'_> {
     }
 
     /// Adds the files of a splat or of images to `inputs`.
-    pub fn add_inputs(&self, inputs: &mut Inputs) {
+    pub fn add_input_files(&self, inputs: &mut InputFiles) {
         match self {
             Method::Model(_) => {}
             Method::Splat(file) => inputs.add_splat(file),
@@ -180,10 +180,10 @@ impl Method<'_> {
 impl PictureSource {
     /// Produces the image of target view `i` of `scene`, and loads its photo.
     fn picture(&self, scene: &EvalScene, i: usize) -> Result<(View, Picture)> {
-        let truth = scene.target.load(i)?;
+        let ground_truth = scene.target.load(i)?;
         let picture = match self {
             PictureSource::Splat(renderer, poses) => {
-                let camera = Camera { c2w: poses[i], ..truth.camera };
+                let camera = Camera { c2w: poses[i], ..ground_truth.camera };
                 let rendered = renderer.render(&[camera])?.remove(0);
                 Picture { rgb: rendered.rgb.shallow_clone(), rendered: Some(rendered) }
             }
@@ -192,7 +192,7 @@ impl PictureSource {
                 Picture { rgb: tensor_from_rgb(&read_image(&file)?), rendered: None }
             }
         };
-        Ok((truth, picture))
+        Ok((ground_truth, picture))
     }
 }
 
@@ -201,35 +201,35 @@ impl PictureSource {
 /// # Errors
 /// Fails if a photo or an image can't be read, if an image differs in size from its view, or if `see` fails.
 pub fn judge(
-    made: &mut Synthesis,
+    made: &mut MethodOutput,
     perceptual: &Perceptual,
     mut see: impl FnMut(&View, &Picture, &ViewScore) -> Result<()>,
 ) -> Result<CaptureScores> {
-    let Synthesis { scene, source, first, gaussians, .. } = made;
+    let MethodOutput { scene, source, first, gaussians, .. } = made;
     let mut scores = vec![];
     for i in 0..scene.target.len() {
-        let (truth, picture) = first.take().map_or_else(|| source.picture(scene, i), Ok)?;
-        let score = perceptual.add_to(score_view(&picture.rgb, &truth)?, &picture.rgb, &truth);
-        see(&truth, &picture, &score)?;
+        let (ground_truth, picture) = first.take().map_or_else(|| source.picture(scene, i), Ok)?;
+        let score = perceptual.add_to(score_view(&picture.rgb, &ground_truth)?, &picture.rgb, &ground_truth);
+        see(&ground_truth, &picture, &score)?;
         scores.push(score);
     }
     Ok(CaptureScores::of(&scene.name, scores, *gaussians))
 }
 
-/// Scores images of the views `truth`, including LPIPS.
+/// Scores images of the views `ground_truth`, including LPIPS.
 ///
 /// # Errors
 /// Fails if an image differs in size from its view.
-pub fn judge_pictures(
+pub fn score_with_lpips(
     scene: &str,
     pictures: &[Tensor],
-    truth: &[View],
+    ground_truth: &[View],
     gaussians: Option<i64>,
     perceptual: &Perceptual,
 ) -> Result<CaptureScores> {
     let score =
         |(picture, view): (&Tensor, &View)| Ok(perceptual.add_to(score_view(picture, view)?, picture, view));
-    let scores = pictures.iter().zip(truth).map(score).collect::<Result<_>>()?;
+    let scores = pictures.iter().zip(ground_truth).map(score).collect::<Result<_>>()?;
     Ok(CaptureScores::of(scene, scores, gaussians))
 }
 

@@ -24,27 +24,30 @@ fn bands(rows: i64, width: i64) -> impl Iterator<Item = (i64, i64)> {
 }
 
 /// Returns the sum of squared differences of two images `[3, H, W]`, with values clamped to [0, 1].
-pub(super) fn squared_error(picture: &Tensor, truth: &Tensor) -> f64 {
+pub(super) fn squared_error(picture: &Tensor, ground_truth: &Tensor) -> f64 {
     let size = picture.size();
     let error = |(first, count)| {
-        (band(picture, first, count) - band(truth, first, count)).square().sum(Kind::Double).double_value(&[])
+        (band(picture, first, count) - band(ground_truth, first, count))
+            .square()
+            .sum(Kind::Double)
+            .double_value(&[])
     };
     bands(size[1], size[2]).map(error).sum()
 }
 
 /// Returns the peak signal-to-noise ratio in dB of two images of the same shape, `[3, H, W]`.
-pub fn psnr(picture: &Tensor, truth: &Tensor) -> f64 {
-    psnr_of_mse(squared_error(picture, truth) / picture.numel() as f64)
+pub fn psnr(picture: &Tensor, ground_truth: &Tensor) -> f64 {
+    psnr_of_mse(squared_error(picture, ground_truth) / picture.numel() as f64)
 }
 
 /// Returns the structural similarity of two images `[3, H, W]`. H and W are at least 11.
-pub fn ssim(picture: &Tensor, truth: &Tensor) -> f64 {
+pub fn ssim(picture: &Tensor, ground_truth: &Tensor) -> f64 {
     let size = picture.size();
     // Number of rows of windows that lie inside the image.
     let rows = size[1] - SSIM_OVERLAP;
     let weighted = |(first, count)| {
         let band = |picture| band(picture, first, count + SSIM_OVERLAP);
-        loss::ssim(&band(picture), &band(truth)).double_value(&[]) * count as f64
+        loss::ssim(&band(picture), &band(ground_truth)).double_value(&[]) * count as f64
     };
     bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64
 }

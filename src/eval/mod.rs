@@ -33,10 +33,10 @@ pub use journal::evaluation_files;
 pub use machine::machine;
 pub(crate) use memory::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 pub use memory::{peak_memory_bytes, total_memory_bytes};
-pub use method::{Method, Picture, Synthesis, judge, judge_pictures};
+pub use method::{Method, MethodOutput, Picture, judge, score_with_lpips};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
-pub use photo_source::PhotoSource;
+pub use photo_source::LazyPhotos;
 pub use published::{
     Published, PublishedAblation, PublishedCompactness, PublishedEfficiency, PublishedMethod,
     PublishedScores, published,
@@ -46,4 +46,4 @@ pub use scene::EvalScene;
 pub use score_views::score_views;
 pub use scores::{Baselines, CaptureScores, ViewScore, score};
 pub use scores_file::{REPORT, TABLE, comparison_path, read_evaluation, write_csv, write_evaluation};
-pub use sweep::Sweep;
+pub use sweep::DatasetEvaluation;

@@ -27,12 +27,12 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `truth`. A distance is
+    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`. A distance is
     /// `None` if its network is missing or the view is too small for it.
-    pub(super) fn add_to(&self, score: ViewScore, picture: &Tensor, truth: &View) -> ViewScore {
+    pub(super) fn add_to(&self, score: ViewScore, picture: &Tensor, ground_truth: &View) -> ViewScore {
         ViewScore {
-            lpips_vgg: distance(self.vgg.as_ref(), picture, &truth.image),
-            lpips_alex: distance(self.alex.as_ref(), picture, &truth.image),
+            lpips_vgg: distance(self.vgg.as_ref(), picture, &ground_truth.image),
+            lpips_alex: distance(self.alex.as_ref(), picture, &ground_truth.image),
             ..score
         }
     }
@@ -72,7 +72,7 @@ impl Perceptual {
     }
 }
 
-fn distance(lpips: Option<&Lpips>, picture: &Tensor, truth: &Tensor) -> Option<f64> {
+fn distance(lpips: Option<&Lpips>, picture: &Tensor, ground_truth: &Tensor) -> Option<f64> {
     let lpips = lpips?;
     let size = picture.size();
     let smallest = lpips.network().smallest_side();
@@ -80,5 +80,5 @@ fn distance(lpips: Option<&Lpips>, picture: &Tensor, truth: &Tensor) -> Option<f
         return None;
     }
     let prepare = |picture: &Tensor| picture.to_device(lpips.device()).clamp(0., 1.);
-    Some(tch::no_grad(|| lpips.distance(&prepare(picture), &prepare(truth))).double_value(&[]))
+    Some(tch::no_grad(|| lpips.distance(&prepare(picture), &prepare(ground_truth))).double_value(&[]))
 }

@@ -7,7 +7,7 @@ use glam::DMat4;
 
 /// Photos of a capture. They are decoded on access, so that large photos don't fill the memory all at once.
 #[derive(Debug)]
-pub enum PhotoSource {
+pub enum LazyPhotos {
     /// Photos in memory.
     Loaded(Vec<View>),
     /// Photos in their files.
@@ -23,19 +23,19 @@ pub enum PhotoSource {
     },
 }
 
-impl PhotoSource {
+impl LazyPhotos {
     /// Creates a source of the photos `indices` of `capture`, under their names in the capture, fitted to `size`.
     pub fn of(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Self {
         let all: Vec<&str> = capture.names().collect();
         let names = indices.iter().map(|&index| all[index].to_string()).collect();
-        PhotoSource::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }
+        LazyPhotos::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }
     }
 
     /// Returns the number of photos.
     pub fn len(&self) -> usize {
         match self {
-            PhotoSource::Loaded(views) => views.len(),
-            PhotoSource::OnDisk { indices, .. } => indices.len(),
+            LazyPhotos::Loaded(views) => views.len(),
+            LazyPhotos::OnDisk { indices, .. } => indices.len(),
         }
     }
 
@@ -47,8 +47,8 @@ impl PhotoSource {
     /// Returns the poses of the photos, camera-to-world, without loading pixels.
     pub fn poses(&self) -> Vec<DMat4> {
         match self {
-            PhotoSource::Loaded(views) => views.iter().map(|view| view.camera.c2w).collect(),
-            PhotoSource::OnDisk { capture, indices, .. } => {
+            LazyPhotos::Loaded(views) => views.iter().map(|view| view.camera.c2w).collect(),
+            LazyPhotos::OnDisk { capture, indices, .. } => {
                 let cameras = capture.cameras();
                 indices.iter().map(|&index| cameras[index].c2w).collect()
             }
@@ -61,8 +61,8 @@ impl PhotoSource {
     /// Fails if the photo can't be read.
     pub fn load(&self, i: usize) -> Result<View> {
         match self {
-            PhotoSource::Loaded(views) => Ok(views[i].shallow_clone()),
-            PhotoSource::OnDisk { capture, indices, names, size } => {
+            LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
+            LazyPhotos::OnDisk { capture, indices, names, size } => {
                 let view = capture.load(&indices[i..=i], *size)?.remove(0);
                 Ok(View { name: names[i].clone(), ..view })
             }

@@ -1,7 +1,7 @@
 //! Scenes for evaluation: context photos, which a method may see, and target photos, which it has to match.
 
 use super::index::{EvaluationIndex, SceneFrames};
-use super::photo_source::PhotoSource;
+use super::photo_source::LazyPhotos;
 use crate::data::{Capture, Holdout, SceneGroup, View};
 use crate::error::{Error, Result};
 use crate::reconstruct::load_context;
@@ -16,7 +16,7 @@ pub struct EvalScene {
     /// Context photos, which the model sees; empty if no model is evaluated.
     pub context: Vec<View>,
     /// Target photos, loaded one by one.
-    pub target: PhotoSource,
+    pub target: LazyPhotos,
     /// File names of the target images, without their extensions.
     pub picture_names: Vec<String>,
     /// Positions of the context and target photos in the capture; `None` without an index.
@@ -35,7 +35,7 @@ impl EvalScene {
         EvalScene {
             name: capture.name.clone(),
             context: vec![],
-            target: PhotoSource::of(capture, &views, size),
+            target: LazyPhotos::of(capture, &views, size),
             picture_names: views.into_iter().map(|view| names[view].clone()).collect(),
             frames: None,
             checksum: 0,
@@ -60,7 +60,7 @@ impl EvalScene {
         Ok(EvalScene {
             name: capture.name.clone(),
             context: load_context(capture, holdout, views, photo_size)?,
-            target: PhotoSource::of(capture, &held_out, Some(picture_size)),
+            target: LazyPhotos::of(capture, &held_out, Some(picture_size)),
             picture_names: held_out.iter().map(|&view| all[view].clone()).collect(),
             frames: None,
             checksum: 0,
@@ -80,7 +80,7 @@ impl EvalScene {
             None => vec![],
         };
         let picture_names = frames.picture_names();
-        let target = PhotoSource::OnDisk {
+        let target = LazyPhotos::OnDisk {
             capture: capture.clone(),
             indices: frames.target.clone(),
             names: picture_names.clone(),

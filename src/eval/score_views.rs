@@ -1,6 +1,6 @@
 //! Scores of a splat on views, computed one view at a time.
 
-use super::method::judge_pictures;
+use super::method::score_with_lpips;
 use super::perceptual::Perceptual;
 use super::scores::{CaptureScores, score};
 use crate::data::View;
@@ -26,10 +26,10 @@ pub fn score_views(
             break;
         }
         let pictures = [render_views(gaussians, &[view.camera])?.remove(0).rgb];
-        let truth = [view.shallow_clone()];
+        let ground_truth = [view.shallow_clone()];
         let scores = match perceptual {
-            Some(perceptual) => judge_pictures(scene, &pictures, &truth, None, perceptual),
-            None => score(scene, &pictures, &truth, None),
+            Some(perceptual) => score_with_lpips(scene, &pictures, &ground_truth, None, perceptual),
+            None => score(scene, &pictures, &ground_truth, None),
         };
         done.extend(scores?.views);
     }

@@ -1,7 +1,7 @@
 //! Scores of rendered images against photos, view by view.
 
 use super::metrics::{SSIM_WINDOW, psnr, ssim};
-use super::photo_source::PhotoSource;
+use super::photo_source::LazyPhotos;
 use crate::data::View;
 use crate::error::{Error, Result};
 use glam::DVec3;
@@ -54,10 +54,10 @@ pub struct CaptureScores {
 pub fn score(
     scene: &str,
     pictures: &[Tensor],
-    truth: &[View],
+    ground_truth: &[View],
     gaussians: Option<i64>,
 ) -> Result<CaptureScores> {
-    let scores = pictures.iter().zip(truth).map(|(picture, view)| score_view(picture, view));
+    let scores = pictures.iter().zip(ground_truth).map(|(picture, view)| score_view(picture, view));
     Ok(CaptureScores::of(scene, scores.collect::<Result<_>>()?, gaussians))
 }
 
@@ -115,7 +115,7 @@ impl Baselines {
     ///
     /// # Errors
     /// Fails if photos differ in size or can't be read.
-    pub fn of(scene: &str, context: &PhotoSource, target: &PhotoSource) -> Result<Self> {
+    pub fn of(scene: &str, context: &LazyPhotos, target: &LazyPhotos) -> Result<Self> {
         let mut sum = context.load(0)?.image.copy();
         for i in 1..context.len() {
             sum += context.load(i)?.image;
@@ -135,10 +135,10 @@ impl Baselines {
 /// Scores, for every target view, the context photo whose camera centre is nearest.
 pub(super) fn nearest_context_baseline(
     scene: &str,
-    context: &PhotoSource,
-    target: &PhotoSource,
+    context: &LazyPhotos,
+    target: &LazyPhotos,
 ) -> Result<CaptureScores> {
-    let centres = |photos: &PhotoSource| -> Vec<DVec3> {
+    let centres = |photos: &LazyPhotos| -> Vec<DVec3> {
         photos.poses().iter().map(|pose| pose.w_axis.truncate()).collect()
     };
     let shown = centres(context);
@@ -167,7 +167,7 @@ mod tests {
             image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)),
             camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
         };
-        let photos = PhotoSource::Loaded;
+        let photos = LazyPhotos::Loaded;
         let (context, target) = (photos(vec![view(0., 0.2), view(1., 0.6)]), photos(vec![view(0.7, 0.7)]));
         let baselines = Baselines::of("", &context, &target).unwrap();
         assert!((baselines.nearest_photo.psnr - 20.).abs() < 1e-4, "0.1 apart");

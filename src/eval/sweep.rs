@@ -5,7 +5,7 @@ use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 use super::index::EvaluationIndex;
 use super::journal::{Identity, Journal};
-use super::method::{Method, Synthesis, judge};
+use super::method::{Method, MethodOutput, judge};
 use super::perceptual::Perceptual;
 use super::published::known_dataset;
 use super::scene::SceneLoader;
@@ -24,7 +24,7 @@ use tch::{Device, Tensor};
 
 /// Evaluation of a method over a dataset.
 #[derive(Debug)]
-pub struct Sweep<'a> {
+pub struct DatasetEvaluation<'a> {
     /// Method under evaluation. For splats and images, this is the folder that holds those of every scene.
     pub method: Method<'a>,
     /// Name of the method in the report.
@@ -35,7 +35,7 @@ pub struct Sweep<'a> {
     pub dataset: &'a Dataset,
     /// Folder of the dataset.
     pub root: &'a Path,
-    /// Name of the dataset in the report, from [`Sweep::dataset_name`].
+    /// Name of the dataset in the report, from [`DatasetEvaluation::dataset_name`].
     pub dataset_name: String,
     /// Index of the scenes' context and target frames.
     pub index: &'a EvaluationIndex,
@@ -63,7 +63,7 @@ struct Share {
 /// Number of loaded scenes that may wait while another one is evaluated.
 const LOADED_AHEAD: usize = 1;
 
-impl Sweep<'_> {
+impl DatasetEvaluation<'_> {
     /// Returns the name of the dataset at `root` for the report. This is `said` if given; else the known dataset that is a word of the
     /// folder's name; else the known dataset that is a word of the index's name; else the name of the folder.
     ///
@@ -199,7 +199,7 @@ impl Sweep<'_> {
             scope.spawn(move || loader.send(own, &sender));
             while go_on && let Ok((key, loaded)) = receiver.recv() {
                 let method = self.method.of_scene(&key);
-                let made = loaded.and_then(|scene| method.synthesize(scene, self.device));
+                let made = loaded.and_then(|scene| method.render_targets(scene, self.device));
                 let first = made.is_ok().then(|| judges.take()).flatten();
                 let warm_up = first.is_some();
                 if let Some(judges) = first {
@@ -291,16 +291,16 @@ impl Sweep<'_> {
     }
 
     /// Scores the scene, and writes the comparison image of its worst view.
-    fn judge(&self, mut made: Synthesis, perceptual: &Perceptual) -> Result<SceneScores> {
+    fn judge(&self, mut made: MethodOutput, perceptual: &Perceptual) -> Result<SceneScores> {
         let mut worst: Option<(f64, Tensor)> = None;
-        let scores = judge(&mut made, perceptual, |truth, picture, score| {
+        let scores = judge(&mut made, perceptual, |ground_truth, picture, score| {
             if worst.as_ref().is_none_or(|(psnr, _)| score.psnr.total_cmp(psnr).is_lt()) {
-                let image = comparison_image(&truth.image, &picture.rgb, picture.rendered.as_ref());
+                let image = comparison_image(&ground_truth.image, &picture.rgb, picture.rendered.as_ref());
                 worst = Some((score.psnr, image));
             }
             Ok(())
         })?;
-        let Synthesis { scene, splat_bytes, forward_seconds, warnings, .. } = made;
+        let MethodOutput { scene, splat_bytes, forward_seconds, warnings, .. } = made;
         let (_, image) = worst.expect("a target view");
         write_jpeg(&comparison_path(self.out, &scene.name), &image)?;
         let frames = scene.frames.expect("an indexed scene");
@@ -343,7 +343,7 @@ mod tests {
 
     fn name(root: &str, index: &str) -> Result<String> {
         let index = EvaluationIndex { file: index.into(), scenes: BTreeMap::new() };
-        Sweep::dataset_name(None, Path::new(root), &index)
+        DatasetEvaluation::dataset_name(None, Path::new(root), &index)
     }
 
     #[test]

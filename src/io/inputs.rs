@@ -10,7 +10,7 @@ use std::path::Path;
 /// Files that a command reads. They are identified by the file itself, not by its name: an output is refused whatever path or link it uses
 /// to name one of them.
 #[derive(Debug, Clone, Default)]
-pub struct Inputs {
+pub struct InputFiles {
     files: BTreeMap<FileId, Kind>,
     /// Folders that contain photos.
     photo_folders: BTreeSet<FileId>,
@@ -28,7 +28,7 @@ type FileId = (u64, u64);
 #[cfg(not(unix))]
 type FileId = std::path::PathBuf;
 
-impl Inputs {
+impl InputFiles {
     /// Adds `file`, if it exists.
     pub fn add(&mut self, file: &Path) {
         self.files.extend(file_id(file).map(|id| (id, Kind::Other)));
@@ -63,7 +63,7 @@ impl Inputs {
     }
 
     /// Adds all files and folders of `others`.
-    pub fn extend(&mut self, others: Inputs) {
+    pub fn extend(&mut self, others: InputFiles) {
         self.files.extend(others.files);
         self.photo_folders.extend(others.photo_folders);
     }
@@ -122,7 +122,7 @@ mod tests {
         let splat = folder.path().join("room.ply");
         let origin = origin_file(&splat);
         [&splat, &origin].iter().for_each(|file| fs::write(file, "").expect("a file"));
-        let mut inputs = Inputs::default();
+        let mut inputs = InputFiles::default();
         inputs.add_splat(&splat);
         assert!(inputs.check_file(&splat).is_err() && inputs.check_file(&origin).is_err());
         assert!(inputs.check_file(&folder.path().join("other.ply")).is_ok());

@@ -32,7 +32,7 @@ pub use images::{
     Photo, check_writable_png, decode_photo, encode_photo, is_png_name, read_image, rgb_from_tensor,
     tensor_from_rgb, tile_horizontally, tile_vertically, tiled_size, write_png,
 };
-pub use inputs::Inputs;
+pub use inputs::InputFiles;
 pub use mosaic::Mosaic;
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};

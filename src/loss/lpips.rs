@@ -258,18 +258,18 @@ impl Lpips {
     ///
     /// # Panics
     /// Panics if the images have another shape or a smaller size.
-    pub fn distance(&self, picture: &Tensor, truth: &Tensor) -> Tensor {
+    pub fn distance(&self, picture: &Tensor, ground_truth: &Tensor) -> Tensor {
         let size = picture.size();
         let [.., height, width] = size[..] else { panic!("a picture has shape {size:?}") };
         let distance = match height * width <= MOST_PIXELS {
-            true => self.compare(self.features(picture), self.features(truth)),
-            false => self.distance_in_tiles(picture, truth, TILE),
+            true => self.compare(self.features(picture), self.features(ground_truth)),
+            false => self.distance_in_tiles(picture, ground_truth, TILE),
         };
         distance.view(&size[..size.len() - 3])
     }
 
     /// Computes [`Lpips::distance`] of B images, `[B]`, in tiles with sides of about `length` pixels.
-    fn distance_in_tiles(&self, picture: &Tensor, truth: &Tensor, length: i64) -> Tensor {
+    fn distance_in_tiles(&self, picture: &Tensor, ground_truth: &Tensor, length: i64) -> Tensor {
         let [.., height, width] = picture.size()[..] else { panic!("a picture has two sides") };
         let columns = Tile::cover(width, length);
         let tiles =
@@ -282,8 +282,8 @@ impl Lpips {
                 let dims = pictures.dim() as i64;
                 column.cut(&row.cut(pictures, dims - 2), dims - 1)
             };
-            let (picture, truth) = (cut(picture), cut(truth));
-            let differences = self.differences(self.features(&picture), self.features(&truth));
+            let (picture, ground_truth) = (cut(picture), cut(ground_truth));
+            let differences = self.differences(self.features(&picture), self.features(&ground_truth));
             for ((difference, stride), sum) in differences.zip(&strides).zip(&mut sums) {
                 let own = column.keep(&row.keep(&difference, 2, *stride), 3, *stride);
                 let count = own.size()[2] * own.size()[3];

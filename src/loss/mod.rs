@@ -41,12 +41,12 @@ pub(crate) fn losses(
     pictures: &RenderOutput,
     share: &Share,
 ) -> Losses<Tensor> {
-    let truth = &sample.target.images;
-    let mse = mse(&pictures.rgb, truth) * share.scenes;
+    let ground_truth = &sample.target.images;
+    let mse = mse(&pictures.rgb, ground_truth) * share.scenes;
     let perceptual = match perceptual {
         Some(network) => {
             // Both halves of a paired sample have the same targets.
-            let halves = truth.chunk(if sample.paired { 2 } else { 1 }, 0);
+            let halves = ground_truth.chunk(if sample.paired { 2 } else { 1 }, 0);
             network.loss(&pictures.rgb, &halves[0]) * share.scenes
         }
         None => mse.zeros_like(),

@@ -3,8 +3,8 @@
 use tch::{Kind, Tensor};
 
 /// Computes the mean squared error over all elements; a scalar.
-pub fn mse(rendered: &Tensor, truth: &Tensor) -> Tensor {
-    (rendered - truth).square().mean(None::<Kind>)
+pub fn mse(rendered: &Tensor, ground_truth: &Tensor) -> Tensor {
+    (rendered - ground_truth).square().mean(None::<Kind>)
 }
 
 /// Minimum error in [`psnr_of_mse`], so that equal images have a finite PSNR: 100 dB.

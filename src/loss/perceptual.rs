@@ -125,32 +125,33 @@ impl PerceptualLoss {
         }
     }
 
-    /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `truth` [B, C, 3, H, W] along the batch. The
+    /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `ground_truth` [B, C, 3, H, W] along the batch. The
     /// features of the ground truth are computed once and used R times. If a gradient is needed, it is computed in the forward pass, one
     /// image at a time on a CPU and a few at a time on a GPU: the activations of all images would take nearly as much memory as the rest of
     /// a training step. The number of images that go together depends on their size alone, because the last bits of sums depend on it.
-    pub fn loss(&self, rendered: &Tensor, truth: &Tensor) -> Tensor {
-        let pixels = truth.size()[3..].iter().product();
+    pub fn loss(&self, rendered: &Tensor, ground_truth: &Tensor) -> Tensor {
+        let pixels = ground_truth.size()[3..].iter().product();
         let at_once = Self::at_once(pixels, rendered.device());
-        self.loss_by_chunks(rendered, truth, at_once)
+        self.loss_by_chunks(rendered, ground_truth, at_once)
     }
 
     /// Computes [`PerceptualLoss::loss`] with `at_once` images at a time.
-    fn loss_by_chunks(&self, rendered: &Tensor, truth: &Tensor, at_once: i64) -> Tensor {
-        let truth = truth.flatten(0, 1); // [B·C, 3, H, W]
-        let (count, repeats) = (truth.size()[0], rendered.size()[0] * rendered.size()[1] / truth.size()[0]);
-        let pictures = rendered.detach().reshape([&[repeats][..], &truth.size()].concat());
+    fn loss_by_chunks(&self, rendered: &Tensor, ground_truth: &Tensor, at_once: i64) -> Tensor {
+        let ground_truth = ground_truth.flatten(0, 1); // [B·C, 3, H, W]
+        let (count, repeats) =
+            (ground_truth.size()[0], rendered.size()[0] * rendered.size()[1] / ground_truth.size()[0]);
+        let pictures = rendered.detach().reshape([&[repeats][..], &ground_truth.size()].concat());
         let gradient = tracks_grad(rendered).then(|| pictures.empty_like());
         let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
         for first in (0..count).step_by(at_once as usize) {
             let length = at_once.min(count - first);
             let share = length as f64 / (count * repeats) as f64;
-            let truth = truth.narrow(0, first, length);
-            let truth = part("L_perc", || tch::no_grad(|| self.features(&truth)));
+            let ground_truth = ground_truth.narrow(0, first, length);
+            let ground_truth = part("L_perc", || tch::no_grad(|| self.features(&ground_truth)));
             for turn in 0..repeats {
                 let place = |of: &Tensor| of.select(0, turn).narrow(0, first, length);
                 let picture = place(&pictures).detach().set_requires_grad(gradient.is_some());
-                let loss = part("L_perc", || self.compare(&self.features(&picture), &truth)) * share;
+                let loss = part("L_perc", || self.compare(&self.features(&picture), &ground_truth)) * share;
                 if let Some(gradient) = &gradient {
                     loss.backward();
                     place(gradient).copy_(&picture.grad());
@@ -176,12 +177,12 @@ impl PerceptualLoss {
     }
 
     /// Computes the mean loss over the images with these features.
-    fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
+    fn compare(&self, picture: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
         let each = |features: &[Tensor]| features.iter().map(Tensor::shallow_clone).collect::<Vec<_>>();
         match self {
-            PerceptualLoss::Vgg19(network) => network.compare(picture, truth),
+            PerceptualLoss::Vgg19(network) => network.compare(picture, ground_truth),
             PerceptualLoss::Lpips(lpips) => {
-                lpips.compare(each(picture).into_iter(), each(truth).into_iter()).mean(None::<Kind>)
+                lpips.compare(each(picture).into_iter(), each(ground_truth).into_iter()).mean(None::<Kind>)
             }
         }
     }
@@ -203,10 +204,10 @@ mod tests {
         let loss = PerceptualLoss::Lpips(network);
         // Two renderings of five images.
         let pictures = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
-        let (rendered, truth) = (pictures(2), pictures(1));
+        let (rendered, ground_truth) = (pictures(2), pictures(1));
         let of_chunks = |at_once: i64| {
             let rendered = rendered.detach().set_requires_grad(true);
-            let loss = loss.loss_by_chunks(&rendered, &truth, at_once);
+            let loss = loss.loss_by_chunks(&rendered, &ground_truth, at_once);
             loss.backward();
             (loss.double_value(&[]), rendered.grad())
         };

@@ -12,10 +12,10 @@ use tch::Tensor;
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller.
-pub fn photometric(picture: &Tensor, truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
-    let (picture, truth) = (picture.as_ptr() as usize, truth.as_ptr() as usize);
+pub fn photometric(picture: &Tensor, ground_truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
+    let (picture, ground_truth) = (picture.as_ptr() as usize, ground_truth.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { take_outputs(|out| fit::photometric(picture, truth, absolute, similar, out)) };
+    let done = unsafe { take_outputs(|out| fit::photometric(picture, ground_truth, absolute, similar, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }
@@ -24,6 +24,6 @@ pub fn photometric(picture: &Tensor, truth: &Tensor, absolute: f64, similar: f64
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller than 11×11.
-pub fn ssim(picture: &Tensor, truth: &Tensor) -> Tensor {
-    photometric(picture, truth, 0., 1.)
+pub fn ssim(picture: &Tensor, ground_truth: &Tensor) -> Tensor {
+    photometric(picture, ground_truth, 0., 1.)
 }

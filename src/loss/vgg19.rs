@@ -112,9 +112,9 @@ impl Vgg19 {
     }
 
     /// Computes the loss from two lists of features: Σ of their mean absolute differences, each divided by its own divisor, over 255.
-    pub fn compare(&self, picture: &[Tensor], truth: &[Tensor]) -> Tensor {
+    pub fn compare(&self, picture: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
         let divisors = std::iter::once(1.).chain(LAYERS.iter().filter_map(|(.., divisor)| *divisor));
-        let differences = picture.iter().zip(truth).zip(divisors);
+        let differences = picture.iter().zip(ground_truth).zip(divisors);
         let float = |features: &Tensor| features.to_kind(Kind::Float);
         let differences =
             differences.map(|((a, b), divisor)| (float(a) - float(b)).abs().mean(None::<Kind>) / divisor);

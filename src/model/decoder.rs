@@ -1,7 +1,7 @@
 //! The decoder: linear heads, and the activations that turn their outputs into Gaussians (spec 5.1, 5.2 and 5.5).
 
 use super::config::ModelConfig;
-use super::encoder::Encoded;
+use super::encoder::EncodedTokens;
 use super::layers::linear;
 use super::merge::{Candidates, Stage};
 use super::precision::Precision;
@@ -135,7 +135,7 @@ impl Decoder {
     }
 
     /// Applies only the linear heads.
-    pub(crate) fn heads(&self, encoded: &Encoded) -> Heads {
+    pub(crate) fn heads(&self, encoded: &EncodedTokens) -> Heads {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
         let of_geometry = |head| Precision::F32.linear(head, &encoded.geometry);
@@ -152,7 +152,7 @@ impl Decoder {
     }
 
     /// Applies the heads and builds the Gaussians of `stage`.
-    pub fn forward(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+    pub fn forward(&self, encoded: &EncodedTokens, stage: Stage) -> Decoded {
         let Heads { positions, log_scales, rotations, opacity_logits, gate, sh } = self.heads(encoded);
         // A transition doubles the number of Gaussians, so it starts with half the opacity.
         let opacity_logits = opacity_logits + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
@@ -197,7 +197,7 @@ mod tests {
         let config = ModelConfig { width: 32, latents: 8, candidates: 4, ..Default::default() };
         let mut decoder = Decoder::new(&vs.root(), &config);
         let tokens = || Tensor::linspace(-1., 1., 8 * 32, (Kind::Float, Device::Cpu)).sin().view([1, 8, 32]);
-        let encoded = Encoded { geometry: tokens(), appearance: tokens() };
+        let encoded = EncodedTokens { geometry: tokens(), appearance: tokens() };
         let exact = decoder.heads(&encoded);
         decoder.precision = Precision::Bf16;
         let rounded = decoder.heads(&encoded);

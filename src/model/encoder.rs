@@ -17,21 +17,21 @@ const MEMORY_REGISTERS: i64 = 4;
 
 /// Scene tokens that have attended to every view, [B, M, d] each. With a single stream both fields are the same tensor.
 #[derive(Debug)]
-pub struct Encoded {
+pub struct EncodedTokens {
     /// Tokens from which positions, scales, rotations, opacities and the gate are decoded.
     pub geometry: Tensor,
     /// Tokens from which colours are decoded.
     pub appearance: Tensor,
 }
 
-impl Encoded {
+impl EncodedTokens {
     /// Applies `f` to both tensors.
     pub(crate) fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
-        Encoded { geometry: f(&self.geometry), appearance: f(&self.appearance) }
+        EncodedTokens { geometry: f(&self.geometry), appearance: f(&self.appearance) }
     }
 
     /// Pairs both tensors with the corresponding ones of `other`.
-    pub(crate) fn beside<'a>(&'a self, other: &'a Encoded) -> [(&'a Tensor, &'a Tensor); 2] {
+    pub(crate) fn beside<'a>(&'a self, other: &'a EncodedTokens) -> [(&'a Tensor, &'a Tensor); 2] {
         [(&self.geometry, &other.geometry), (&self.appearance, &other.appearance)]
     }
 }
@@ -120,7 +120,7 @@ impl Encoder {
     }
 
     /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`].
-    pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory) -> Encoded {
+    pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory) -> EncodedTokens {
         let mut slots = self.start(scene_tokens, memory.common.size()[0]);
         for round in 0..self.rounds() {
             slots = self.round(round, &slots, memory);
@@ -153,9 +153,9 @@ impl Encoder {
     }
 
     /// Returns the scene tokens among the slots.
-    pub(super) fn decoded(&self, slots: &Slots) -> Encoded {
+    pub(super) fn decoded(&self, slots: &Slots) -> EncodedTokens {
         let decoded = |slots: &Tensor| slots.narrow(1, AUXILIARIES, self.latents);
-        Encoded {
+        EncodedTokens {
             geometry: decoded(&slots.geometry),
             appearance: decoded(slots.appearance.as_ref().unwrap_or(&slots.geometry)),
         }

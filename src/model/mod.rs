@@ -26,7 +26,7 @@ mod tokens;
 pub use config::{ModelConfig, Streams};
 pub use decoder::{Decoded, RawOutputs};
 pub use denormals::{are_denormals_flushed, flush_denormals};
-pub use encoder::Encoded;
+pub use encoder::EncodedTokens;
 pub use memory::Memory;
 pub use merge::Stage;
 pub(crate) use parts::part;
@@ -119,7 +119,7 @@ impl GlobalSplat {
     }
 
     /// Encodes image tokens into scene tokens that have attended to every view: the second part of [`GlobalSplat::forward`].
-    pub fn encode(&self, tokens: &Tensor) -> Encoded {
+    pub fn encode(&self, tokens: &Tensor) -> EncodedTokens {
         self.encode_memory(&self.memory_of(tokens))
     }
 
@@ -145,17 +145,17 @@ impl GlobalSplat {
     }
 
     /// Encodes the memory into scene tokens: [`GlobalSplat::encode`] without the computation of the memory.
-    pub fn encode_memory(&self, memory: &Memory) -> Encoded {
+    pub fn encode_memory(&self, memory: &Memory) -> EncodedTokens {
         self.encoder.forward(&self.scene_tokens, memory)
     }
 
     /// Runs [`GlobalSplat::encode`] with activation checkpointing: the backward pass recomputes every round.
-    pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (Encoded, KeptRounds<'_>) {
+    pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (EncodedTokens, KeptRounds<'_>) {
         self.encoder.forward_keeping_rounds(&self.scene_tokens, self.memory_of(tokens))
     }
 
     /// Decodes scene tokens into the Gaussians of `stage`: the last part of [`GlobalSplat::forward`].
-    pub fn decode(&self, encoded: &Encoded, stage: Stage) -> Decoded {
+    pub fn decode(&self, encoded: &EncodedTokens, stage: Stage) -> Decoded {
         part("heads", || self.decoder.forward(encoded, stage))
     }
 

@@ -1,7 +1,7 @@
 //! Activation checkpointing: an encoder pass that stores only the input of every round and recomputes the round in the backward pass.
 
 use super::autograd::{backward_from_grads, leaf};
-use super::encoder::{Encoded, Encoder, Slots};
+use super::encoder::{EncodedTokens, Encoder, Slots};
 use super::memory::Memory;
 use tch::{Tensor, no_grad};
 
@@ -24,7 +24,7 @@ impl Encoder {
         &self,
         scene_tokens: &Tensor,
         memory: Memory,
-    ) -> (Encoded, KeptRounds<'_>) {
+    ) -> (EncodedTokens, KeptRounds<'_>) {
         let slots = self.start(scene_tokens, memory.common.size()[0]);
         let memory_leaf = memory.leaf();
         let mut between = vec![slots.map(leaf)];

@@ -6,7 +6,7 @@ use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
-use crate::model::{self, Encoded, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
+use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians};
@@ -241,8 +241,8 @@ fn encoder(request: &Request) -> Result<Answer> {
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
 
-fn encoded(request: &Request) -> Result<Encoded> {
-    Ok(Encoded {
+fn encoded(request: &Request) -> Result<EncodedTokens> {
+    Ok(EncodedTokens {
         geometry: request.input("geometry")?.shallow_clone(),
         appearance: request.input("appearance")?.shallow_clone(),
     })

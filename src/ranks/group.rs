@@ -21,7 +21,7 @@ pub struct Group {
     inner: Option<UniquePtr<ffi::Group>>,
     rank: usize,
     ranks: usize,
-    local_ranks: usize,
+    local_world_size: usize,
     /// Device that collectives run on.
     device: Device,
 }
@@ -56,7 +56,7 @@ impl Backends {
 impl Group {
     /// Returns the group of a process that runs alone.
     pub fn alone() -> Self {
-        Group { inner: None, rank: 0, ranks: 1, local_ranks: 1, device: Device::Cpu }
+        Group { inner: None, rank: 0, ranks: 1, local_world_size: 1, device: Device::Cpu }
     }
 
     /// Joins the group of all ranks at `store`, for collectives on `device`: by Gloo on CPUs, by NCCL on GPUs.
@@ -101,7 +101,13 @@ impl Group {
             let why = e.what().lines().next().unwrap_or_default().to_string();
             Error::Failed(format!("rank {rank} of {ranks} can't meet the others: {why}"))
         })?);
-        Ok(Group { inner, rank: place.rank, ranks: place.ranks, local_ranks: place.local_ranks, device })
+        Ok(Group {
+            inner,
+            rank: place.rank,
+            ranks: place.ranks,
+            local_world_size: place.local_world_size,
+            device,
+        })
     }
 
     /// Returns the number of this rank, from 0.
@@ -115,8 +121,8 @@ impl Group {
     }
 
     /// Returns the number of ranks on this machine.
-    pub fn local_ranks(&self) -> usize {
-        self.local_ranks
+    pub fn local_world_size(&self) -> usize {
+        self.local_world_size
     }
 
     /// Returns `true` if this is the first rank, which writes files and prints messages.

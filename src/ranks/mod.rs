@@ -38,7 +38,7 @@ pub(crate) mod tests {
                         rank,
                         ranks,
                         local_rank: rank,
-                        local_ranks: ranks,
+                        local_world_size: ranks,
                         restarts: 0,
                         host: "127.0.0.1".into(),
                         port: 0,

@@ -14,7 +14,7 @@ pub struct Place {
     /// Number of this process among those on this machine, from 0.
     pub local_rank: usize,
     /// Number of processes on this machine.
-    pub local_ranks: usize,
+    pub local_world_size: usize,
     /// Number of times that all processes have been restarted.
     pub restarts: u64,
     /// Host of the store through which the processes connect.
@@ -30,7 +30,7 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if a variable is missing or has a value that `torchrun` doesn't set.
-    pub fn of_process() -> Result<Option<Self>> {
+    pub fn from_env() -> Result<Option<Self>> {
         Place::told_by(|name| env::var(name).ok())
     }
 
@@ -55,7 +55,7 @@ impl Place {
             rank,
             ranks,
             local_rank: variable.number("LOCAL_RANK", Some(0))?,
-            local_ranks: variable.number("LOCAL_WORLD_SIZE", Some(1))?.max(1),
+            local_world_size: variable.number("LOCAL_WORLD_SIZE", Some(1))?.max(1),
             restarts: variable.number("TORCHELASTIC_RESTART_COUNT", Some(0))?,
             host: variable.text("MASTER_ADDR")?,
             port: variable.number("MASTER_PORT", None)?,
@@ -117,7 +117,7 @@ mod tests {
             rank: 5,
             ranks: 8,
             local_rank: 1,
-            local_ranks: 4,
+            local_world_size: 4,
             restarts: 2,
             host,
             port: 29500,
@@ -126,7 +126,7 @@ mod tests {
         assert_eq!(found, expected);
         // Other launchers set at least these variables.
         let others = place(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap().unwrap();
-        assert_eq!((others.local_rank, others.local_ranks, others.store_is_kept), (0, 1, false));
+        assert_eq!((others.local_rank, others.local_world_size, others.store_is_kept), (0, 1, false));
     }
 
     #[test]

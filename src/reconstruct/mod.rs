@@ -9,10 +9,10 @@ mod published;
 mod spread;
 
 pub use context::{context_views, load_context};
-pub use input::{Input, ViewsAs};
+pub use input::{HighResMode, Input};
 pub use model_file::{
-    CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, SHIPPED_MODEL, STAGE_KEY, load_model, model_weights,
-    save_checkpoint, save_model, shipped_model,
+    BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, STAGE_KEY, bundled_model, load_model,
+    model_weights, save_checkpoint, save_model,
 };
 
 pub use spread::spread_over_path;
@@ -21,7 +21,7 @@ use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
-use crate::model::{Encoded, Event, GlobalSplat, Stage, told};
+use crate::model::{EncodedTokens, Event, GlobalSplat, Stage, told};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
@@ -57,7 +57,7 @@ impl<'a> From<&'a LoadedModel> for Model<'a> {
 #[derive(Debug)]
 pub struct Reconstruction {
     /// Tokens that the Gaussians were decoded from.
-    pub tokens: Encoded,
+    pub tokens: EncodedTokens,
     /// Gaussians of one scene, in the normalized world.
     pub gaussians: Gaussians,
     /// Placement of the cameras in the normalized world.
@@ -116,7 +116,7 @@ pub fn reconstruct<'a>(
 }
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.
-fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(Encoded, Gaussians)> {
+fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(EncodedTokens, Gaussians)> {
     let Model { network, config, stage, device, mapped, .. } = model;
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));

@@ -93,14 +93,14 @@ pub fn save_checkpoint(path: &Path, weights: Weights) -> Result<()> {
 
 /// Path of the weights that are embedded in this program: the model of `configs/tiny.toml`, trained on synthetic scenes only. Its model
 /// card is `models/README.md`.
-pub const SHIPPED_MODEL: &str = "models/tiny.safetensors";
+pub const BUNDLED_MODEL: &str = "models/tiny.safetensors";
 const SHIPPED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
 
-/// Loads the model that is embedded in this program, [`SHIPPED_MODEL`], in float32.
+/// Loads the model that is embedded in this program, [`BUNDLED_MODEL`], in float32.
 ///
 /// # Errors
 /// Fails if the device reports an error.
-pub fn shipped_model(device: Device) -> Result<LoadedModel> {
+pub fn bundled_model(device: Device) -> Result<LoadedModel> {
     ModelFile::shipped()?.load(device, Precision::F32)
 }
 
@@ -135,12 +135,12 @@ impl ModelFile {
         Self::of(WeightsFile::open(path)?, overrides)
     }
 
-    /// Opens the weights that are embedded in this program, [`SHIPPED_MODEL`].
+    /// Opens the weights that are embedded in this program, [`BUNDLED_MODEL`].
     ///
     /// # Errors
     /// Fails only if the embedded weights are damaged.
     pub fn shipped() -> Result<Self> {
-        Self::of(WeightsFile::carried(SHIPPED_BYTES, Path::new(SHIPPED_MODEL))?, &[])
+        Self::of(WeightsFile::carried(SHIPPED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
     }
 
     /// Reads the configuration and the stage of an open weights file. `overrides` change its configuration, as in [`Config::read`].

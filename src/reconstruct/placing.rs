@@ -4,8 +4,8 @@ use super::{Model, Reconstruction, pass};
 use crate::data::{View, cameras_at};
 use crate::error::Result;
 use crate::loss::mse;
-use crate::model::Encoded;
-use crate::render::{Rendered, render_views};
+use crate::model::EncodedTokens;
+use crate::render::{RenderedView, render_views};
 use crate::scene::{Gaussians, Normalization, Placement};
 use glam::DMat4;
 use std::time::Instant;
@@ -66,7 +66,7 @@ struct Attempt {
     /// Mean squared error of the rendered images against the photos; 0 if there is no other attempt.
     error: f64,
     placement: Placement,
-    tokens: Encoded,
+    tokens: EncodedTokens,
     gaussians: Gaussians,
 }
 
@@ -84,7 +84,7 @@ impl Attempt {
 /// Returns the mean squared error of `gaussians`, rendered from the photos' `poses`, against the photos.
 fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
     let rendered = render_views(gaussians, &cameras_at(photos, poses))?;
-    let error = |(made, photo): (&Rendered, &View)| {
+    let error = |(made, photo): (&RenderedView, &View)| {
         mse(&made.rgb, &photo.image.to_device(made.rgb.device())).double_value(&[])
     };
     let errors = rendered.iter().zip(photos).map(error);

@@ -1,6 +1,6 @@
 //! Initial Gaussians from photos, or from photos and points.
 
-use super::sweep::{Swept, sweep};
+use super::sweep::{DepthMap, sweep};
 use super::view_selection::projection;
 use crate::data::{Point, View};
 use crate::scene::{RawGaussians, SH_C0};
@@ -45,17 +45,17 @@ pub fn gaussians_from_photos(
         return None;
     }
     let Some(known) = known else { return Some(anew(&swept, points, count, seed).to_device(device)) };
-    let kept = known.select(&supported(known, &swept));
+    let kept = known.select(&supported(known, &swept)).to_device(device);
     let left = count.saturating_sub(kept.means.size()[1] as usize);
     Some(kept.and(&anew(&swept, points, left, seed).to_device(device)))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
 /// least one photo must see it unoccluded or not be sure of the depth there.
-fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
+fn supported(raw: &RawGaussians, swept: &[DepthMap]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
-    let map = |of: &Swept| {
+    let map = |of: &DepthMap| {
         let depth = Vec::<f32>::try_from(of.depth.contiguous().view([-1])).expect("numbers");
         let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
         (projection(&of.camera), of.camera.width as usize, depth, sure)
@@ -77,7 +77,7 @@ fn supported(raw: &RawGaussians, swept: &[Swept]) -> Vec<i64> {
     (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
 }
 
-fn anew(swept: &[Swept], points: &[Point], count: usize, seed: u64) -> RawGaussians {
+fn anew(swept: &[DepthMap], points: &[Point], count: usize, seed: u64) -> RawGaussians {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let pixels: f64 = swept.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
     let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
@@ -93,15 +93,15 @@ fn anew(swept: &[Swept], points: &[Point], count: usize, seed: u64) -> RawGaussi
 }
 
 /// Creates a Gaussian at a point, with the size that it would have if the nearest camera had seen it.
-fn at_point(point: &Point, swept: &[Swept], spacing: f64) -> Ball {
+fn at_point(point: &Point, swept: &[DepthMap], spacing: f64) -> Ball {
     let size =
-        |of: &Swept| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
+        |of: &DepthMap| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
     let least = swept.iter().map(size).fold(f64::INFINITY, f64::min);
     Ball { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
 }
 
 /// Appends `count` Gaussians at random pixels of `of` to `balls`.
-fn in_picture(of: &Swept, count: usize, spacing: f64, random: &mut impl Rng, balls: &mut Vec<Ball>) {
+fn in_picture(of: &DepthMap, count: usize, spacing: f64, random: &mut impl Rng, balls: &mut Vec<Ball>) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
     let numbers = |t: &Tensor| Vec::<f32>::try_from(t.contiguous().view([-1])).expect("numbers");
     let (depth, image, k) = (numbers(&of.depth), numbers(&of.image), of.camera.intrinsics);
@@ -148,7 +148,7 @@ mod tests {
             height: 16,
         };
         let options = (Kind::Float, Device::Cpu);
-        let wall = |x: f64, sure_columns: i64| Swept {
+        let wall = |x: f64, sure_columns: i64| DepthMap {
             camera: camera(x),
             image: Tensor::zeros([3, 16, 16], options),
             depth: Tensor::full([16, 16], 4., options),

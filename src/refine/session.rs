@@ -225,7 +225,7 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Returns a warning if reading the photos and the start left little or no time for the optimization.
-    pub fn is_late(&self) -> Option<String> {
+    pub fn late_start_warning(&self) -> Option<String> {
         let Budget::Time(time) = self.options.budget else { return None };
         let gone = self.clock.elapsed();
         (gone + self.reserve + MIN_TIME.min(time) > time).then(|| {
@@ -272,7 +272,7 @@ impl<'a> RefineSession<'a> {
         };
         let gaussians = match &start {
             Start::Gaussians(raw) => raw.activate(),
-            Start::Model(_, reconstruction) => reconstruction.in_world(),
+            Start::Model(_, reconstruction) => reconstruction.in_world().to_device(self.options.device),
         };
         let depth = scene_depth(&gaussians, &self.photos)?;
         self.leave_out_near_duplicates(depth);

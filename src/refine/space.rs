@@ -3,7 +3,7 @@
 use super::config::RefineConfig;
 use super::gaussian_params::GaussianParams;
 use super::relocate::relocate;
-use crate::model::{Encoded, GlobalSplat, Stage};
+use crate::model::{EncodedTokens, GlobalSplat, Stage};
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
@@ -91,14 +91,19 @@ impl Space for GaussianSpace {
 pub struct TokenSpace<'a> {
     network: &'a GlobalSplat,
     stage: Stage,
-    tokens: Encoded,
+    tokens: EncodedTokens,
     optimizer: Optimizer,
     learning_rate: f64,
 }
 
 impl<'a> TokenSpace<'a> {
     /// Creates a space with the initial `tokens`, from which `network` decodes the Gaussians of `stage`.
-    pub fn new(network: &'a GlobalSplat, stage: Stage, tokens: &Encoded, config: &RefineConfig) -> Self {
+    pub fn new(
+        network: &'a GlobalSplat,
+        stage: Stage,
+        tokens: &EncodedTokens,
+        config: &RefineConfig,
+    ) -> Self {
         let tokens = tokens.map(|t| t.detach().copy().set_requires_grad(true));
         let groups = [("geometry", &tokens.geometry), ("appearance", &tokens.appearance)].map(alone);
         let optimizer = Optimizer::new(groups.into()).with_epsilon(EPSILON);

@@ -52,7 +52,7 @@ const ROOM: f64 = 1.3;
 
 /// Downscaled photo with a depth for every pixel.
 #[derive(Debug)]
-pub struct Swept {
+pub struct DepthMap {
     /// Camera at the size of the downscaled photo.
     pub camera: Camera,
     /// Downscaled photo, [3, h, w].
@@ -81,11 +81,11 @@ pub fn sweep(
     points: &[Point],
     device: Device,
     mut go_on: impl FnMut(usize) -> bool,
-) -> Vec<Swept> {
+) -> Vec<DepthMap> {
     let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE, device)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
     let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE, device)).collect();
-    let (mut depths, mut swept): (Vec<f64>, Vec<(usize, Swept)>) = (vec![], vec![]);
+    let (mut depths, mut swept): (Vec<f64>, Vec<(usize, DepthMap)>) = (vec![], vec![]);
     for index in farthest_first(&cameras, MOST) {
         if !go_on(swept.len()) {
             break;
@@ -94,7 +94,7 @@ pub fn sweep(
         depths.extend(median);
         let depth = median.unwrap_or_else(|| typical_depth(&depths, extent(&cameras)));
         let is_new =
-            |(other, _): &(usize, Swept)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
+            |(other, _): &(usize, DepthMap)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
         if swept.iter().all(is_new) {
             let others = neighbours(index, &cameras, depth);
             let others: Vec<&Small> = others.into_iter().map(|other| &small[other]).collect();
@@ -105,7 +105,7 @@ pub fn sweep(
     swept.into_iter().map(|(_, swept)| swept).collect()
 }
 
-fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) -> Swept {
+fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) -> DepthMap {
     let nearest = match (nearest, others.first()) {
         (Some(nearest), _) => nearest,
         (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
@@ -113,7 +113,7 @@ fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) 
         (None, None) => 2. / depth,
     };
     let (inverse, likeness) = most_alike(this, others, nearest, PLANES);
-    Swept {
+    DepthMap {
         camera: this.camera,
         image: this.image.shallow_clone(),
         depth: filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal(),

@@ -10,7 +10,7 @@ mod views;
 pub use harmonics::{HarmonicLimits, fit_harmonics};
 pub(crate) use take_outputs::take_outputs;
 pub use transform::transform;
-pub use views::{Rendered, SplatRenderer, render_views};
+pub use views::{RenderedView, SplatRenderer, render_views};
 
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, pose_to_rows};

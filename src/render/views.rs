@@ -8,7 +8,7 @@ use tch::{Device, Tensor};
 
 /// Rendered image of one camera.
 #[derive(Debug)]
-pub struct Rendered {
+pub struct RenderedView {
     /// Colour, [3, H, W].
     pub rgb: Tensor,
     /// Accumulated opacity, [H, W].
@@ -22,13 +22,13 @@ pub struct Rendered {
 ///
 /// # Errors
 /// Fails like [`render`].
-pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Rendered>> {
+pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<RenderedView>> {
     cameras
         .iter()
         .map(|camera| {
             let pictures = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
             let first = |t: Tensor| t.select(0, 0).select(0, 0);
-            Ok(Rendered {
+            Ok(RenderedView {
                 rgb: first(pictures.rgb),
                 alpha: first(pictures.alpha),
                 depth: first(pictures.depth),
@@ -44,11 +44,11 @@ pub struct SplatRenderer {
     frame: LocalFrame,
 }
 
-impl Rendered {
+impl RenderedView {
     /// Returns the rendered image in host memory.
     pub fn to_host(&self) -> Self {
         let to_host = |t: &Tensor| t.to_device(Device::Cpu);
-        Rendered { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
+        RenderedView { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
     }
 }
 
@@ -73,11 +73,11 @@ impl SplatRenderer {
     ///
     /// # Errors
     /// Fails like [`render`].
-    pub fn render(&self, cameras: &[Camera]) -> Result<Vec<Rendered>> {
+    pub fn render(&self, cameras: &[Camera]) -> Result<Vec<RenderedView>> {
         let rendered = render_views(&self.gaussians, &self.frame.cameras_to_local(cameras))?;
-        let finish = |view: Rendered| {
+        let finish = |view: RenderedView| {
             let view = view.to_host();
-            Rendered { depth: view.depth * self.frame.scale, ..view }
+            RenderedView { depth: view.depth * self.frame.scale, ..view }
         };
         Ok(rendered.into_iter().map(finish).collect())
     }

@@ -8,7 +8,8 @@
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    Inputs, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically, write_weights,
+    InputFiles, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically,
+    write_weights,
 };
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
@@ -110,7 +111,7 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
 }
 
 /// Adds the files of the run's checkpoints to `inputs`.
-pub(super) fn add_checkpoints(run: &Path, inputs: &mut Inputs) {
+pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
     [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
 }
 

@@ -19,8 +19,8 @@ pub(super) fn preview(model: &GlobalSplat, sample: &Sample, stage: Stage) -> Res
         render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
     })?;
     let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
-    let (photo, truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
+    let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
     let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
     let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
-    Ok(tile_horizontally(&[photo, truth, rgb.clamp(0., 1.), colourize_depth(&depth, &alpha), grey]))
+    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colourize_depth(&depth, &alpha), grey]))
 }

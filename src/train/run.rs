@@ -13,7 +13,7 @@ use super::trainer::Trainer;
 use super::validator::{Score, Validator};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
-use crate::io::{Inputs, write_atomically};
+use crate::io::{InputFiles, write_atomically};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -97,7 +97,7 @@ pub fn run(
 }
 
 /// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and the files beside them.
-pub fn add_run_inputs(run: &Path, inputs: &mut Inputs) {
+pub fn add_run_inputs(run: &Path, inputs: &mut InputFiles) {
     add_checkpoints(run, inputs);
     event_files(run).iter().for_each(|file| inputs.add(file));
     [CONFIG_FILE, METRICS_FILE].iter().for_each(|file| inputs.add(&run.join(file)));

@@ -17,13 +17,13 @@ use tch::{Kind, Tensor, nn, no_grad};
 /// Copy of the model that shares its weights in memory and has gradients of its own. So the gradients of a step are summed in the order of
 /// its scenes, whichever is done first, and the sums are bit-identical every time.
 #[derive(Debug)]
-pub(super) struct Twin {
+pub(super) struct ModelReplica {
     model: GlobalSplat,
     /// Trained variables of the model, each with the copy's variable for it.
     leaves: Vec<(Tensor, Tensor)>,
 }
 
-impl Twin {
+impl ModelReplica {
     /// Creates a copy of `model`, whose variables are those of `vs`.
     ///
     /// # Errors
@@ -37,7 +37,7 @@ impl Twin {
             no_grad(|| leaf.set_data(&variable.detach()));
             variable.requires_grad().then_some((variable, leaf))
         });
-        Ok(Twin { leaves: leaves.collect(), model: twin })
+        Ok(ModelReplica { leaves: leaves.collect(), model: twin })
     }
 
     /// Adds the gradients of the copy to those of the model's own variables, and clears them.
@@ -59,9 +59,9 @@ impl Twin {
 ///
 /// # Errors
 /// Returns an error if rendering fails.
-pub(super) fn gradients_side_by_side(
+pub(super) fn gradients_in_parallel(
     part: &ForwardBackward,
-    twins: &mut [Twin],
+    replicas: &mut [ModelReplica],
     slices: Vec<(Sample, Share)>,
     watch: &mut Stopwatch,
 ) -> Result<Tensor> {
@@ -72,7 +72,7 @@ pub(super) fn gradients_side_by_side(
     let (sample, share) = slices.next().expect("a slice");
     let losses: Vec<Result<Tensor>> = thread::scope(|scope| {
         let others: Vec<_> = slices
-            .zip(twins.iter_mut())
+            .zip(replicas.iter_mut())
             .map(|((sample, share), twin)| {
                 scope.spawn(move || {
                     tch::set_num_threads(each);
@@ -91,6 +91,6 @@ pub(super) fn gradients_side_by_side(
     tch::set_num_threads(threads);
     let count = losses.len();
     let losses: Vec<Tensor> = losses.into_iter().collect::<Result<_>>()?;
-    watch.time("adding up", || twins[..count - 1].iter().for_each(Twin::hand_over));
+    watch.time("adding up", || replicas[..count - 1].iter().for_each(ModelReplica::hand_over));
     Ok(Tensor::stack(&losses, 0).sum_dim_intlist(0i64, false, None::<Kind>))
 }

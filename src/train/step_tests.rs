@@ -198,7 +198,7 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
                 step();
                 // This time, there are gradients to clear.
                 let losses = step();
-                assert_eq!(trainer.twins.len() + 1, threads as usize);
+                assert_eq!(trainer.replicas.len() + 1, threads as usize);
                 // Three threads can't share four scenes more evenly than two can.
                 assert_eq!(trainer.slices_at_once(4), [1, 2, 2][threads as usize - 1]);
                 losses

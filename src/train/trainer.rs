@@ -6,7 +6,7 @@ use super::is_due;
 use super::parameter_groups::{in_backward_order, parameter_groups};
 use super::preview::preview;
 use super::schedule::learning_rate;
-use super::side_by_side::{Twin, gradients_side_by_side};
+use super::side_by_side::{ModelReplica, gradients_in_parallel};
 use super::step_report::StepReport;
 use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
@@ -32,7 +32,7 @@ pub struct Trainer {
     pub(super) vs: nn::VarStore,
     pub(super) model: GlobalSplat,
     /// Copies of the model for additional threads, created when they are first needed.
-    pub(super) twins: Vec<Twin>,
+    pub(super) replicas: Vec<ModelReplica>,
     pub(super) optimizer: Optimizer,
     pub(super) perceptual: Option<PerceptualLoss>,
     /// File that has the initial weights, if they aren't drawn at random.
@@ -94,7 +94,7 @@ impl Trainer {
             config,
             vs,
             model,
-            twins: vec![],
+            replicas: vec![],
             optimizer,
             perceptual,
             weights: None,
@@ -261,7 +261,7 @@ impl Trainer {
         let gradients = self.buckets.finish()? as f64;
         let word = StepSync {
             asked_to_stop: f64::from(!go_on()),
-            found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_news)),
+            found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_bad_scene_reports)),
             gradients: [gradients, gradients * gradients],
         };
         // Filling a new tensor on a GPU doesn't wait for the GPU.
@@ -315,7 +315,7 @@ impl Trainer {
     fn tell_bad_data(&self) -> Result<()> {
         let Some(loader) = &self.loader else { return Ok(()) };
         if self.group.ranks() > 1 {
-            let news: Vec<Vec<News>> = self.group.gather(loader.take_news())?;
+            let news: Vec<Vec<News>> = self.group.gather(loader.take_bad_scene_reports())?;
             let others = news.into_iter().enumerate().filter(|(rank, _)| *rank != self.group.rank());
             others.map(|(_, news)| news).try_for_each(|news| loader.hear(news))?;
         }
@@ -396,8 +396,8 @@ impl Trainer {
         let halves = pair.then(|| subsets(sample.context_views(), self.step));
         let scenes = sample.scenes();
         let at_once = self.slices_at_once(scenes);
-        while self.twins.len() + 1 < at_once {
-            self.twins.push(Twin::of(&self.model, &self.vs)?);
+        while self.replicas.len() + 1 < at_once {
+            self.replicas.push(ModelReplica::of(&self.model, &self.vs)?);
         }
         let perceptual = self.perceptual.as_ref();
         let group = &self.group;
@@ -421,7 +421,7 @@ impl Trainer {
         if at_once > 1 {
             watch.time("zero gradients", || self.optimizer.zero_grad());
             let slices = watch.time("data", || firsts.map(|first| (slice(first), share(first))).collect());
-            return gradients_side_by_side(&part, &mut self.twins, slices, watch);
+            return gradients_in_parallel(&part, &mut self.replicas, slices, watch);
         }
         let mut depth_pixels = None;
         if pair && self.config.loss.consistency_depth > 0. && count < scenes {
@@ -470,7 +470,7 @@ impl Trainer {
                 let mut config = self.config.data.clone();
                 if config.threads == 0 {
                     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-                    config.threads = (cores / self.group.local_ranks()).max(1);
+                    config.threads = (cores / self.group.local_world_size()).max(1);
                 }
                 let (seed, scenes) = (self.config.train.seed, self.scenes.clone());
                 Loader::start(&config, seed, scenes, self.part(), first)?

@@ -86,7 +86,7 @@ pub fn rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
     succeed(&[&["synth", "--gaussians", "--out", arg(folder)][..], &numbers].concat());
 }
 
-/// Returns a capture of nine 40×40 photos of a procedural room, with `truth.ply` beside them; every caller gets its own copy.
+/// Returns a capture of nine 40×40 photos of a procedural room, with `ground_truth.ply` beside them; every caller gets its own copy.
 pub fn room() -> (TempDir, PathBuf) {
     static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
     let original = ORIGINAL.get_or_init(|| {

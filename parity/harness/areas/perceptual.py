@@ -96,23 +96,23 @@ def perceptual(rng):
 
     The network's weights are inputs that take no gradient.
     """
-    params = draw.vgg19_parameters(rng)
+    of_vgg = draw.vgg19_parameters(rng)
     (rendered, truth), close_calls = sure_pictures(
         rng,
-        lambda rendered, truth: decisions_of_vgg19(params, [(half, truth) for half in np.split(rendered, 2)]),
+        lambda rendered, truth: decisions_of_vgg19(of_vgg, [(half, truth) for half in np.split(rendered, 2)]),
         (2, 2, 3, 16, 16),
         (1, 2, 3, 16, 16),
     )
-    inputs = {"rendered": rendered, "truth": truth, **params}
+    inputs = {"rendered": rendered, "truth": truth, **of_vgg}
     yield Draw("vgg19", inputs, {"kind": "vgg19"}, differentiate=("rendered",), close_calls=close_calls)
-    params = draw.lpips_parameters(rng, "lpips_alex")
+    of_alex = draw.lpips_parameters(rng, "lpips_alex")
 
     def decisions_of_alex(rendered, truth):
         both = [pictures for half in np.split(rendered, 2) for pictures in (half, truth)]
-        return decisions_of_lpips("lpips_alex", params, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
+        return decisions_of_lpips("lpips_alex", of_alex, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
 
     (rendered, truth), close_calls = sure_pictures(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
-    inputs = {"rendered": rendered, "truth": truth, **params}
+    inputs = {"rendered": rendered, "truth": truth, **of_alex}
     yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",), close_calls=close_calls)
 
 

@@ -8,10 +8,10 @@ use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, Inputs, Splat, read_splat, tiled_size};
+use globalsplat::io::{DepthScale, InputFiles, Splat, read_splat, tiled_size};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
-use globalsplat::render::{Rendered, SplatRenderer};
+use globalsplat::render::{RenderedView, SplatRenderer};
 use globalsplat::scene::{Camera, ImageSize};
 use output::Output;
 use serde_json::json;
@@ -170,11 +170,11 @@ impl Render {
     }
 
     /// Returns the input files, which no output may replace.
-    fn inputs(&self, capture: Option<&Capture>) -> Inputs {
-        let mut inputs = Inputs::default();
+    fn inputs(&self, capture: Option<&Capture>) -> InputFiles {
+        let mut inputs = InputFiles::default();
         self.weights.iter().for_each(|path| inputs.add_weights(path));
         self.splat.iter().for_each(|splat| inputs.add_splat(splat));
-        capture.inspect(|capture| capture.add_inputs(&mut inputs));
+        capture.inspect(|capture| capture.add_input_files(&mut inputs));
         inputs
     }
 
@@ -185,7 +185,7 @@ impl Render {
     }
 
     /// Returns colour and the other requested images, [3, H, W] each, in the order of the suffixes.
-    fn parts(&self, rendered: &Rendered, scale: Option<DepthScale>) -> Vec<Tensor> {
+    fn parts(&self, rendered: &RenderedView, scale: Option<DepthScale>) -> Vec<Tensor> {
         let mut parts = vec![rendered.rgb.clamp(0., 1.)];
         if let Some(scale) = scale {
             parts.push(scale.colourize(&rendered.depth, &rendered.alpha));

@@ -3,7 +3,7 @@
 use super::super::say_shrunk;
 use globalsplat::error::{Error, Result};
 use globalsplat::io::{
-    Film, Inputs, Mosaic, check_regular, check_writable_dir, check_writable_file, is_png_name,
+    Film, InputFiles, Mosaic, check_regular, check_writable_dir, check_writable_file, is_png_name,
     tile_horizontally, write_png,
 };
 use globalsplat::scene::ImageSize;
@@ -52,7 +52,7 @@ impl<'a> Output<'a> {
         path: &'a Path,
         (names, suffixes): (&[String], &[&str]),
         (size, frames_per_second): (ImageSize, u32),
-        inputs: &Inputs,
+        inputs: &InputFiles,
     ) -> Result<Self> {
         let kind = kind(path);
         if kind != Kind::Folder {

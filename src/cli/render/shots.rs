@@ -4,7 +4,7 @@ use super::super::cameras::{median_depth, orbit_around_splat};
 use crate::cli::warn;
 use anyhow::Result;
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
-use globalsplat::io::{Inputs, Splat};
+use globalsplat::io::{InputFiles, Splat};
 use globalsplat::render::SplatRenderer;
 use globalsplat::scene::{Camera, ImageSize, orbit_around_cameras, smooth_path};
 use std::path::Path;
@@ -22,7 +22,7 @@ pub struct Shots {
     pub cameras: Vec<Camera>,
     pub frames_per_second: u32,
     /// Files that a path was read from.
-    pub inputs: Inputs,
+    pub inputs: InputFiles,
 }
 
 impl Shots {
@@ -83,7 +83,7 @@ impl Shots {
     fn numbered(cameras: Vec<Camera>) -> Self {
         let digits = (cameras.len().max(2) - 1).to_string().len().max(3);
         let names = (0..cameras.len()).map(|i| format!("{i:0digits$}")).collect();
-        Shots { names, cameras, frames_per_second: FRAMES_PER_SECOND, inputs: Inputs::default() }
+        Shots { names, cameras, frames_per_second: FRAMES_PER_SECOND, inputs: InputFiles::default() }
     }
 }
 

@@ -8,7 +8,7 @@ use super::transforms_json::{from_opengl, shown};
 use super::{cameras_json, is_capture, open_for, transforms_json};
 use crate::data::capture::{Purpose, check_cameras};
 use crate::error::{Error, Result};
-use crate::io::{Inputs, read_text};
+use crate::io::{InputFiles, read_text};
 use crate::scene::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
 use serde_json::Value;
 use std::path::Path;
@@ -23,7 +23,7 @@ pub struct CameraPath {
     /// Warnings as returned by [`Capture::warnings`](crate::data::Capture::warnings).
     pub warnings: Vec<String>,
     /// Files that the cameras were read from, and the existing photos of the capture.
-    pub inputs: Inputs,
+    pub inputs: InputFiles,
 }
 
 /// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) finds, or of a JSON file of any name.
@@ -51,8 +51,8 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
         _ => open_for(path, purpose)?,
     };
     let warnings = capture.warnings().to_vec();
-    let mut inputs = Inputs::default();
-    capture.add_inputs(&mut inputs);
+    let mut inputs = InputFiles::default();
+    capture.add_input_files(&mut inputs);
     Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None, warnings, inputs })
 }
 
@@ -106,7 +106,7 @@ fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
         }
         (None, None) => None,
     };
-    let mut inputs = Inputs::default();
+    let mut inputs = InputFiles::default();
     inputs.add(file);
     let frames_per_second = rate.map(|rate| rate.round() as u32);
     Ok(CameraPath { cameras, frames_per_second, warnings: vec![], inputs })

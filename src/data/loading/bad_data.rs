@@ -84,7 +84,7 @@ struct Entries {
     seen: BTreeSet<Place>,
     /// Error of the most recent bad scene.
     last: Option<String>,
-    /// Bad scenes found by this process since the last [`BadDataLog::take_news`].
+    /// Bad scenes found by this process since the last [`BadDataLog::take_bad_scene_reports`].
     news: Vec<News>,
 }
 
@@ -101,7 +101,7 @@ impl fmt::Display for Entries {
 }
 
 impl BadDataLog {
-    /// Creates a bad_data_log for `scenes` scenes, of which the share `largest_share` may be bad.
+    /// Creates a log for `scenes` scenes, of which the share `largest_share` may be bad.
     pub fn new(scenes: u64, largest_share: f64) -> Self {
         let counts = BadData { scenes, ..Default::default() };
         BadDataLog { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
@@ -159,11 +159,11 @@ impl BadDataLog {
         Ok(())
     }
 
-    pub fn has_news(&self) -> bool {
+    pub fn has_bad_scene_reports(&self) -> bool {
         !self.entries.lock().expect("no thread panics here").news.is_empty()
     }
 
-    pub fn take_news(&self) -> Vec<News> {
+    pub fn take_bad_scene_reports(&self) -> Vec<News> {
         std::mem::take(&mut self.entries.lock().expect("no thread panics here").news)
     }
 

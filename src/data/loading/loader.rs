@@ -221,13 +221,13 @@ impl Loader {
     }
 
     /// Returns the bad scenes found since the last call, for the processes that load other parts of the same steps.
-    pub(crate) fn take_news(&self) -> Vec<News> {
-        self.shared.bad_data_log.take_news()
+    pub(crate) fn take_bad_scene_reports(&self) -> Vec<News> {
+        self.shared.bad_data_log.take_bad_scene_reports()
     }
 
-    /// Returns `true` if [`Loader::take_news`] would return anything.
-    pub(crate) fn has_news(&self) -> bool {
-        self.shared.bad_data_log.has_news()
+    /// Returns `true` if [`Loader::take_bad_scene_reports`] would return anything.
+    pub(crate) fn has_bad_scene_reports(&self) -> bool {
+        self.shared.bad_data_log.has_bad_scene_reports()
     }
 
     /// Counts scenes that other processes skipped.

@@ -3,7 +3,7 @@
 use crate::data::capture::Capture;
 use crate::data::dataset::{Dataset, SceneGroup, Split};
 use crate::error::Result;
-use crate::io::Inputs;
+use crate::io::InputFiles;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -80,9 +80,9 @@ impl TrainingScenes {
 
     /// Adds the files of the captures to `inputs`, and of the other groups the files that writing below the folder `output` could
     /// overwrite.
-    pub fn add_inputs(&self, output: &Path, inputs: &mut Inputs) {
-        self.captures.iter().for_each(|capture| capture.add_inputs(inputs));
-        self.others.iter().for_each(|group| group.add_inputs(output, inputs));
+    pub fn add_input_files(&self, output: &Path, inputs: &mut InputFiles) {
+        self.captures.iter().for_each(|capture| capture.add_input_files(inputs));
+        self.others.iter().for_each(|group| group.add_input_files(output, inputs));
     }
 
     /// Returns the open captures.
