@@ -44,14 +44,28 @@ pub(super) fn write_weights_partially(
     };
     let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
     sort_header(&mut bytes).map_err(|e| failed(&e))?;
-    write_partially(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+    let (header, tensors) = bytes.split_at(8 + header_length(&bytes));
+    let padding = header.len().next_multiple_of(ALIGNMENT) - header.len();
+    let length = (header.len() - 8 + padding) as u64;
+    write_partially(path, |writer| {
+        let parts = [&length.to_le_bytes(), &header[8..], &[b' '; ALIGNMENT][..padding], tensors];
+        parts.into_iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
+    })
+}
+
+/// Alignment of the tensors' bytes in a file. Kernels of libtorch round differently where a mapped file's values aren't aligned to 16 bytes.
+const ALIGNMENT: usize = 64;
+
+/// Returns the length of the header, which follows the eight bytes that hold it.
+fn header_length(bytes: &[u8]) -> usize {
+    u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes")) as usize
 }
 
 /// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give
 /// equal bytes.
 fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
-    let (length, rest) = bytes.split_at_mut(8);
-    let length = u64::from_le_bytes(length.try_into().expect("eight bytes")) as usize;
+    let length = header_length(bytes);
+    let rest = &mut bytes[8..];
     let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
     let sorted = serde_json::to_vec(&header)?;
     // The header keeps its length, which includes padding with spaces.
@@ -134,4 +148,24 @@ pub(super) fn fit(
         return Err(Error::input(file, format!("tensor {name}"), found, format!("{expected}{others}")));
     }
     tch::no_grad(|| variables.into_iter().try_for_each(|(name, mut variable)| copy(&name, &mut variable)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tensors_are_aligned_whatever_the_metadata() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let file = folder.path().join("a.safetensors");
+        let tensors = BTreeMap::from([("a".to_string(), Tensor::arange(5, (Kind::Float, Device::Cpu)))]);
+        for length in 0..70 {
+            let metadata = HashMap::from([("text".to_string(), "x".repeat(length))]);
+            write_weights(&file, &tensors, metadata).expect("a file");
+            let bytes = std::fs::read(&file).expect("a file");
+            assert_eq!((8 + header_length(&bytes)) % ALIGNMENT, 0, "{length}");
+            let read = safetensors::SafeTensors::deserialize(&bytes).expect("safetensors");
+            assert_eq!(read.tensor("a").expect("a tensor").data()[4..8], 1f32.to_le_bytes());
+        }
+    }
 }
