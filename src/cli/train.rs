@@ -7,12 +7,14 @@ use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
 use globalsplat::io::{InputFiles, check_writable_dir};
 use globalsplat::loss::{Term, psnr_of_mse};
-use globalsplat::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
+use globalsplat::train::{
+    CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
+};
 use serde_json::json;
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Train a model on captures, or on chunks of RealEstate10K and the like.
@@ -108,7 +110,8 @@ impl Train {
         }
 
         let start = Instant::now();
-        let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
+        let stop = stop_flag()?;
+        let outcome = self.train(&config, &mut trainer, &mut held_out, &resume, &stop)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
         trainer.group().leave()?;
@@ -129,7 +132,7 @@ impl Train {
             };
             anyhow::bail!("stopped; {checkpoint} is complete; {command} resumes");
         }
-        self.report(&outcome, seconds, held_out.scores(), &bad_data)
+        self.report(&outcome, seconds, held_out.scores(), &bad_data, &stop)
     }
 
     /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is
@@ -152,8 +155,8 @@ impl Train {
         trainer: &mut Trainer,
         held_out: &mut HeldOut,
         resume: &Resume,
+        stop: &AtomicBool,
     ) -> Result<Outcome> {
-        let stop = stop_flag()?;
         let is_first = trainer.group().is_first();
         let bar = progress::of_first(is_first, config.train.steps, "steps");
         let mut smooth_mse = None;
@@ -206,12 +209,20 @@ impl Train {
         seconds: f64,
         validation: &[HeldOutScores],
         bad_data: &BadData,
+        stop: &AtomicBool,
     ) -> Result<()> {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
         let curves = self.out.join(CURVES_FILE);
-        write_curves(&curves, &self.out, (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr)))?;
+        let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr));
+        let mut observe = |event: Event| {
+            if let Event::Notice(text) = event {
+                eprintln!("{text}");
+            }
+            !stop.load(Ordering::Relaxed)
+        };
+        retry_on_disk_full(&mut observe, || write_curves(&curves, &self.out, nearest))?;
         if self.json {
             let mut object = json!({
                 "checkpoint": outcome.checkpoint.to_string_lossy(),

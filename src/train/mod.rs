@@ -25,7 +25,7 @@ mod watch;
 pub use checkpoint::{Kept, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use memory_estimate::{MemoryEstimate, batch_within};
 pub use metrics::{Curves, METRICS_FILE};
-pub use run::{CONFIG_FILE, Event, Outcome, Resume, add_run_inputs, run};
+pub use run::{CONFIG_FILE, Event, Outcome, Resume, add_run_inputs, retry_on_disk_full, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};

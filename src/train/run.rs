@@ -391,7 +391,10 @@ fn begin(
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Calls `write`, and repeats it as long as the disk is full and `observe` returns `true`.
-fn retry_on_disk_full<T>(
+///
+/// # Errors
+/// Returns the errors of `write`.
+pub fn retry_on_disk_full<T>(
     observe: &mut impl FnMut(Event) -> bool,
     mut write: impl FnMut() -> Result<T>,
 ) -> Result<T> {
