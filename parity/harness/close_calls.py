@@ -42,7 +42,7 @@ class Turned(TorchFunctionMode):
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         result = function(*args, **(kwargs or {}))
-        if function is torch.conv2d or function is torch.nn.functional.conv2d:
+        if function is torch.conv2d:
             self.convolution += 1
             here = [call for call in self.calls if call.convolution == self.convolution]
             if here:
@@ -150,13 +150,14 @@ def settled(answer, expected, calls, turned):
         apart = (norm(np.asarray(answer[name], np.float64) - other[name]) / lengths[name] for name in gradients)
         return sum(share**2 for share in apart)
 
-    best, chosen = expected, frozenset()
+    best, chosen, least = expected, frozenset(), distance(expected)
     for _ in range(SWEEPS):
         before = chosen
         for call in calls:
             other = expected | turned(chosen ^ {call})
-            if distance(other) < distance(best):
-                best, chosen = other, chosen ^ {call}
+            apart = distance(other)
+            if apart < least:
+                best, chosen, least = other, chosen ^ {call}, apart
         if chosen == before:
             break
     # A program that decides most of them otherwise doesn't round otherwise: it has another threshold.

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 
 /// Former names of keys, which are still accepted, and their current names.
-pub(crate) const RENAMED: [(&str, &str); 7] = [
+const RENAMED: [(&str, &str); 7] = [
     ("data.ahead", "data.prefetch"),
     ("data.extents", "data.scene_scales"),
     ("data.fewest_context_views", "data.min_context_views"),

@@ -17,6 +17,14 @@ pub struct RenderedView {
     pub depth: Tensor,
 }
 
+impl RenderedView {
+    /// Returns the rendered image in host memory.
+    pub fn to_host(&self) -> Self {
+        let to_host = |t: &Tensor| t.to_device(Device::Cpu);
+        RenderedView { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
+    }
+}
+
 /// Renders Gaussians from each camera; cameras may differ in size. Gaussians and cameras are in the unit of the near plane of spec 6.2.
 /// [`SplatRenderer`] renders from cameras of any world.
 ///
@@ -42,14 +50,6 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
 pub struct SplatRenderer {
     gaussians: Gaussians,
     frame: LocalFrame,
-}
-
-impl RenderedView {
-    /// Returns the rendered image in host memory.
-    pub fn to_host(&self) -> Self {
-        let to_host = |t: &Tensor| t.to_device(Device::Cpu);
-        RenderedView { rgb: to_host(&self.rgb), alpha: to_host(&self.alpha), depth: to_host(&self.depth) }
-    }
 }
 
 impl SplatRenderer {
