@@ -61,7 +61,7 @@ struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
 
   static Tensor forward(AutogradContext* ctx, Tensor picture, Tensor photo, double absolute, double similar, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(picture) : Tensor();
-    if (const auto device = cuda::device_of(picture)) {
+    if (const auto device = cuda::kernel_device(picture)) {
       const cuda::Parts parts =
           cuda::photometric(*device, job_of<float>(picture, photo), absolute, similar, data_or_null<float>(gradient));
       return with_gradient(ctx, sum_of(parts, picture), gradient);
@@ -88,7 +88,7 @@ struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
 
   static Tensor forward(AutogradContext* ctx, Tensor depths, Tensor photos, double factor, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(depths) : Tensor();
-    if (const auto device = cuda::device_of(depths)) {
+    if (const auto device = cuda::kernel_device(depths)) {
       const cuda::Parts parts =
           cuda::depth_smoothness(*device, job_of<float>(depths, photos), factor, data_or_null<float>(gradient));
       return with_gradient(ctx, sum_of(parts, depths), gradient);

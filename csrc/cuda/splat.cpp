@@ -55,23 +55,21 @@ struct KeptFrame : Kept {
   Frame frame;
 };
 
-template <class On>
 globalsplat::RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
-  const On device(in.gaussians.means);
+  const auto device = kernel_device(in.gaussians.means);
   const auto options = in.gaussians.means.options();
   const Tensor rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   const globalsplat::RenderOutput out{rgb, alpha, at::empty_like(alpha)};
-  kept = std::make_unique<KeptFrame>(device, arguments_of(in), places_of<float>(out));
+  kept = std::make_unique<KeptFrame>(*device, arguments_of(in), places_of<float>(out));
   return out;
 }
 
-template <class On>
 Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& drawn, const globalsplat::RenderOutput& gradients,
                          const Kept& kept, bool of_cameras) {
-  const On device(in.gaussians.means);
+  const auto device = kernel_device(in.gaussians.means);
   const Gradients out = empty_gradients(in, of_cameras);
-  static_cast<const KeptFrame&>(kept).frame.backward(device, arguments_of(in), places_of<const float>(drawn),
+  static_cast<const KeptFrame&>(kept).frame.backward(*device, arguments_of(in), places_of<const float>(drawn),
                                                      places_of<const float>(gradients), places_of(out.gaussians),
                                                      place_of_cameras(out));
   return out;
@@ -85,10 +83,9 @@ constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // i
 constexpr double kTwoLn2 = 2 / raster::kLog2E;
 
 // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
-template <class On>
 Projected project(const Inputs& in) {
-  const On device(in.gaussians.means);
-  const Seen seen(device, arguments_of(in));
+  const auto device = kernel_device(in.gaussians.means);
+  const Seen seen(*device, arguments_of(in));
   const std::vector<Tensor> s = numbers_of(seen, in);
   const Tensor &a = s[kA], &b = s[kB], &c = s[kC], visible = s[kZ] > 0;
   const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
@@ -99,10 +96,9 @@ Projected project(const Inputs& in) {
 
 // Creates one record per visible Gaussian, with the sums over pixels that are converted to exactly these gradients: ∂L/∂(u, v) = 2 ln
 // 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two entries.
-template <class On>
 Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
-  const On device(in.gaussians.means);
-  const Seen seen(device, arguments_of(in));
+  const auto device = kernel_device(in.gaussians.means);
+  const Seen seen(*device, arguments_of(in));
   const std::vector<Tensor> s = numbers_of(seen, in);
   const Tensor &a = s[kA], &b = s[kB], &c = s[kC];
   const std::vector<Tensor> d_mean = gradients.mean2d.unbind(-1), d_conic = gradients.conic.unbind(-1);
@@ -116,22 +112,19 @@ Gradients project_backward(const Inputs& in, const Projected& gradients, bool of
   const Tensor records = all.flatten(0, 2).index_select(0, visible.nonzero().squeeze(1)).contiguous();
   const Tensor first = at::cat({at::zeros({1}, visible.options().dtype(at::kInt)), visible.cumsum(0, at::kInt)});
   const Gradients out = empty_gradients(in, of_cameras);
-  seen.backward(device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
+  seen.backward(*device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
                 reinterpret_cast<const uint32_t*>(data<int32_t>(first)), places_of(out.gaussians), place_of_cameras(out));
   return out;
 }
 
-template <class On>
-constexpr Backend backend_on(at::DeviceType device) {
-  return {device, splat<On>, splat_backward<On>, project<On>, project_backward<On>};
-}
+constexpr Backend backend_on(at::DeviceType device) { return {device, splat, splat_backward, project, project_backward}; }
 
 }  // namespace
 
-const Backend backend = backend_on<Gpu>(at::kCUDA);
+const Backend backend = backend_on(at::kCUDA);
 
 const Backend* emulated_backend() {
-  static const Backend emulated = backend_on<Emulated>(at::kCPU);
+  static const Backend emulated = backend_on(at::kCPU);
   return emulation() != nullptr ? &emulated : nullptr;
 }
 

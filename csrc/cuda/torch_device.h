@@ -53,15 +53,10 @@ class Gpu : public Device {
 // Returns the variable that enables emulation, a number that seeds the order of blocks and threads; null if it isn't set.
 inline const char* emulation() { return std::getenv("GLOBALSPLAT_CUDA_ON_CPU"); }
 
-class Emulated : public emulated::Emulator {
- public:
-  explicit Emulated(const at::Tensor&) : Emulator(std::strtoull(emulation(), nullptr, 10)) {}
-};
-
 // Returns the device whose kernels process a tensor; null if the CPU's kernels do, which also process float64, used to verify gradients.
-inline std::unique_ptr<Device> device_of(const at::Tensor& t) {
+inline std::unique_ptr<Device> kernel_device(const at::Tensor& t) {
   if (t.scalar_type() != at::kFloat) return nullptr;
-  if (emulation() != nullptr) return std::make_unique<Emulated>(t);
+  if (const char* seed = emulation()) return std::make_unique<emulated::Emulator>(std::strtoull(seed, nullptr, 10));
   return t.is_cuda() ? std::make_unique<Gpu>(t) : nullptr;
 }
 
