@@ -26,10 +26,10 @@ fn main() -> Result<()> {
     let (photo, out, steps) = match arguments.as_slice() {
         [_, photo, out] => (photo, out, 500),
         [_, photo, out, steps] => {
-            let expected = || Error::Request(format!("STEPS is {steps}, expected a whole number"));
+            let expected = || Error::request(format!("STEPS is {steps}, expected a whole number"));
             (photo, out, steps.parse().map_err(|_| expected())?)
         }
-        _ => return Err(Error::Request("expected PHOTO OUT.png [STEPS]".into())),
+        _ => return Err(Error::request("expected PHOTO OUT.png [STEPS]")),
     };
     let (photo, camera) = load(Path::new(photo))?;
     let cameras = Cameras::single(&camera);

@@ -12,7 +12,7 @@ use tch::Device;
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().collect();
     let [_, weights, scene, out] = arguments.as_slice() else {
-        return Err(Error::Request("expected WEIGHTS SCENE OUT.ply".into()));
+        return Err(Error::request("expected WEIGHTS SCENE OUT.ply"));
     };
     let model = load_model(Path::new(weights), Device::Cpu)?;
     let capture = open_capture(Path::new(scene))?;

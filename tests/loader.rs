@@ -59,9 +59,9 @@ impl SceneGroups for Groups {
 
     fn open(&self, group: usize) -> Result<Vec<Result<Capture>>> {
         if self.0[group].is_empty() {
-            return Err(Error::Failed(format!("group {group} is broken")));
+            return Err(Error::failed(format!("group {group} is broken")));
         }
-        let broken = || Error::Failed("a camera is NaN".into());
+        let broken = || Error::failed("a camera is NaN");
         Ok(self.0[group].iter().map(|capture| capture.clone().ok_or_else(broken)).collect())
     }
 

@@ -99,12 +99,10 @@ impl Raster {
             tch::set_num_threads(i32::from(threads).max(1));
         }
         if self.repeats == 0 {
-            return Err(Error::Request("--repeats is 0, expected 1 or more".into()).into());
+            return Err(Error::request("--repeats is 0, expected 1 or more").into());
         }
         if self.gaussians == 0 || self.cameras == 0 {
-            return Err(
-                Error::Request("--gaussians and --cameras are expected to be 1 or more".into()).into()
-            );
+            return Err(Error::request("--gaussians and --cameras are expected to be 1 or more").into());
         }
         // Before tensors are created, so that a missing device is reported immediately.
         let device = device::parse(&self.device)?;

@@ -45,7 +45,7 @@ impl Attention {
         }
         if !self.width.is_multiple_of(self.heads) {
             let (width, heads) = (self.width, self.heads);
-            return Err(Error::Request(format!(
+            return Err(Error::request(format!(
                 "--width is {width}, expected a multiple of the {heads} heads"
             ))
             .into());

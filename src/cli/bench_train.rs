@@ -70,7 +70,7 @@ impl Train {
         let is_first = group.is_first();
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
-            return Err(Error::Request(format!("--set {set}: expected --batch N")).into());
+            return Err(Error::request(format!("--set {set}: expected --batch N")).into());
         }
         memory::keep_for(&config.train);
         let report = match self.batch {
@@ -79,7 +79,7 @@ impl Train {
                 bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?
             }
             Batch::Auto if group.ranks() > 1 => {
-                return Err(Error::Request("--batch auto: expected a number under torchrun".into()).into());
+                return Err(Error::request("--batch auto: expected a number under torchrun").into());
             }
             Batch::Auto => self.bench_what_fits(config, device)?,
         };

@@ -6,7 +6,7 @@ use tch::{Cuda, Device};
 
 /// Parses a device and checks that it is available.
 pub fn parse(name: &str) -> Result<Device> {
-    let refused = |why: &str| Error::Request(format!("--device {name}: {why}"));
+    let refused = |why: &str| Error::request(format!("--device {name}: {why}"));
     let index = match name.split_once(':') {
         None if name == "cpu" => return Ok(Device::Cpu),
         None if name == "cuda" => 0,

@@ -277,10 +277,10 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
 
 /// Prints a table of the resources of kernels, a row for each kernel and a column for each architecture.
 fn kernels(as_json: bool) -> globalsplat::Result<()> {
-    let nvrtc = Nvrtc::find().map_err(Error::Request)?;
+    let nvrtc = Nvrtc::find().map_err(Error::request)?;
     let mut of_all: Vec<(i32, Vec<KernelUse>)> = vec![];
     for &architecture in &nvrtc.architectures {
-        let compiled = nvrtc.compile(architecture, Form::Cubin).map_err(Error::Request)?;
+        let compiled = nvrtc.compile(architecture, Form::Cubin).map_err(Error::request)?;
         let mut kernels = usage(&compiled.log);
         kernels.sort_by(|a, b| a.name.cmp(&b.name));
         of_all.push((architecture, kernels));

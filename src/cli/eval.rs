@@ -11,7 +11,9 @@ use globalsplat::eval::{
     LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, peak_memory_bytes,
     write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{InputFiles, WeightsFile, check_writable_dir, check_writable_png, checksum};
+use globalsplat::io::{
+    InputFiles, WeightsFile, check_writable_dir, check_writable_png, checksum, weights_files,
+};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{HighResMode, Input, LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
@@ -204,7 +206,7 @@ impl Eval {
 
     fn holdout(&self, model: Model) -> Result<Holdout> {
         match &self.holdout {
-            Some(text) => Ok(text.parse::<Holdout>().map_err(Error::Request)?),
+            Some(text) => Ok(text.parse::<Holdout>().map_err(Error::request)?),
             None => Ok(model.config.data.holdout),
         }
     }
@@ -225,7 +227,7 @@ impl Eval {
             let why = format!(
                 "--pictures-at is {height}, expected pictures with sides of {least} to {most} pixels"
             );
-            return Err(Error::Request(why).into());
+            return Err(Error::request(why).into());
         }
         Ok(ImageSize { height, width })
     }
@@ -254,7 +256,7 @@ impl Eval {
     fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> InputFiles {
         let mut inputs = InputFiles::default();
         match &self.weights {
-            Some(weights) => inputs.add_weights(weights),
+            Some(weights) => inputs.add_all(weights_files(weights)),
             None => methods.for_each(|method| method.add_input_files(&mut inputs)),
         }
         inputs
@@ -430,7 +432,7 @@ impl Eval {
         match failures.len() {
             0 => Ok(()),
             count => {
-                Err(Error::Failed(format!("{count} scenes could not be scored, the means are of the others"))
+                Err(Error::failed(format!("{count} scenes could not be scored, the means are of the others"))
                     .into())
             }
         }
@@ -450,7 +452,7 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
         several => several.iter().map(stem).collect(),
     };
     match folders.iter().enumerate().find(|(i, folder)| folders[..*i].contains(folder)) {
-        Some((_, twice)) => Err(Error::Request(format!(
+        Some((_, twice)) => Err(Error::request(format!(
             "--index: two of them would go to {}, expected other names",
             twice.display()
         ))

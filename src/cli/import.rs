@@ -1,7 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::io::InputFiles;
+use globalsplat::io::{InputFiles, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
@@ -32,7 +32,7 @@ pub struct Import {
 impl Import {
     pub fn run(self) -> Result<()> {
         let mut inputs = InputFiles::default();
-        inputs.add_weights(&self.from);
+        inputs.add_all(weights_files(&self.from));
         self.out.check(Format::Safetensors, &inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;

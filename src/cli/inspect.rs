@@ -31,7 +31,7 @@ impl Inspect {
             _ if is_splat_name(&self.path) => splat(&self.path)?,
             _ if is_weights_name(&self.path) => weights(&self.path)?,
             _ if !self.path.exists() => {
-                return Err(Error::Request(format!("{}: no such file or folder", self.path.display())).into());
+                return Err(Error::request(format!("{}: no such file or folder", self.path.display())).into());
             }
             Some("torch") => chunk(&self.path)?,
             Some("json") => capture(&self.path)?,

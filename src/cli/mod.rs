@@ -145,7 +145,7 @@ pub fn main() -> ExitCode {
         Ok(Ok(())) => DONE,
         Ok(Err(error)) => {
             let error_of_ours = error.downcast_ref::<Error>();
-            tell(&error.to_string(), matches!(error_of_ours, Some(Error::Ranks(_))));
+            tell(&error.to_string(), error_of_ours.is_some_and(Error::is_distributed));
             if error_of_ours.is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
         }
         Err(panic) => {
@@ -178,7 +178,7 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     match sides {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
-        _ => Err(Error::Request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
+        _ => Err(Error::request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
     }
 }
 
@@ -193,7 +193,7 @@ fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
 /// Returns an error if --views is smaller than the number of photos that a reconstruction needs.
 fn check_views(views: Option<usize>) -> Result<(), Error> {
     match views {
-        Some(views @ ..2) => Err(Error::Request(format!("--views is {views}, expected 2 or more"))),
+        Some(views @ ..2) => Err(Error::request(format!("--views is {views}, expected 2 or more"))),
         _ => Ok(()),
     }
 }

@@ -15,7 +15,7 @@ pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
         return Ok(None);
     }
     let precision = asked.parse().map_err(|_| {
-        Error::Request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
+        Error::request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
     })?;
     Ok(Some(precision))
 }

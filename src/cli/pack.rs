@@ -33,7 +33,7 @@ impl Pack {
         let (mut captures, mut lines) = (vec![], vec![]);
         for scene in &self.scenes {
             if !scene.exists() && !scene.to_string_lossy().contains('#') {
-                return Err(Error::Request(format!("{}: no such capture", scene.display())).into());
+                return Err(Error::request(format!("{}: no such capture", scene.display())).into());
             }
             let found: FoundCaptures = find_captures(scene)?;
             lines.extend(found.warnings);

@@ -34,7 +34,7 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
                 "{} processes of this machine can't share a GPU, expected --device cuda",
                 place.local_world_size
             );
-            return Err(Error::Request(format!("--device {one}: {why}")));
+            return Err(Error::request(format!("--device {one}: {why}")));
         }
         name => device::parse(name)?,
     };
@@ -52,7 +52,7 @@ pub fn refuse() -> Result<()> {
     let Ok(Some(Place { rank, ranks, .. })) = Place::from_env() else { return Ok(()) };
     match (by_torchrun, rank) {
         (false, _) => Ok(()),
-        (true, 0) => Err(Error::Request(format!(
+        (true, 0) => Err(Error::request(format!(
             "this is work for one process, and torchrun started {ranks}: expected train, eval --data or bench train"
         ))),
         // The first process reports the error.

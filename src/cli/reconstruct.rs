@@ -6,7 +6,7 @@ use clap::Args;
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
 use globalsplat::eval::{peak_memory_bytes, process_age};
-use globalsplat::io::{InputFiles, check_writable_splat};
+use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
 use globalsplat::optim::Stopwatch;
 use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, reconstruct};
 use globalsplat::scene::{ImageSize, LocalFrame};
@@ -95,7 +95,7 @@ impl Reconstruct {
             return self.refined(seconds).run();
         }
         let device = device::parse(&self.device)?;
-        let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
+        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
         let asked = model::asked_precision(&self.precision)?;
@@ -105,7 +105,7 @@ impl Reconstruct {
         let capture = watch.time("photos", || open_capture(&self.scene))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
-        self.weights.iter().for_each(|path| inputs.add_weights(path));
+        self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {

@@ -8,7 +8,9 @@ use clap::{Args, ValueEnum};
 use globalsplat::data::{Capture, Holdout, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, process_age, score_views};
-use globalsplat::io::{InputFiles, Splat, check_writable_png, check_writable_splat, read_splat};
+use globalsplat::io::{
+    InputFiles, Splat, check_writable_png, check_writable_splat, read_splat, splat_files, weights_files,
+};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
 use globalsplat::refine::{
@@ -141,7 +143,7 @@ impl From {
         let needs_model = asked.weights.is_some() || asked.space != SpaceName::Gaussians;
         if asked.from == Some(From::Nothing) && needs_model {
             let why = "--from nothing has neither weights nor tokens; --from weights has";
-            return Err(Error::Request(why.into()).into());
+            return Err(Error::request(why).into());
         }
         Ok(needs_model || asked.from == Some(From::Weights))
     }
@@ -153,12 +155,12 @@ impl Refine {
         let clock = clock.checked_sub(process_age().unwrap_or_default()).unwrap_or(clock);
         memory::keep();
         check_views(self.views)?;
-        let holdout = self.holdout.parse::<Holdout>().map_err(Error::Request)?;
+        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
         let options = self.options()?;
         let needs_model = From::needs_model(&self)?;
         if self.space == SpaceName::Tokens && (self.correct_poses || self.correct_exposures) {
             let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
-            return Err(Error::Request(why.into()).into());
+            return Err(Error::request(why).into());
         }
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
@@ -250,11 +252,11 @@ impl Refine {
         {
             let (width, height) = (size.width, size.height);
             let why = format!("--size {width}x{height}: expected {MIN_SIDE} pixels or more along each side");
-            return Err(Error::Request(why).into());
+            return Err(Error::request(why).into());
         }
         if !(self.seconds > 0. && self.seconds <= MAX_SECONDS) {
             let why = format!("--seconds is {}, expected more than 0, up to a year", self.seconds);
-            return Err(Error::Request(why).into());
+            return Err(Error::request(why).into());
         }
         Ok(RefineOptions {
             config: RefineConfig::with(&self.set, self.splat.is_some())?,
@@ -347,9 +349,9 @@ impl Refine {
     fn check_outputs(&self, capture: &Capture) -> Result<()> {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
-        self.weights.iter().for_each(|path| inputs.add_weights(path));
+        self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
         inputs.check_file(&self.out)?;
-        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add_splat(splat));
+        self.splat.iter().chain([&self.out]).for_each(|splat| inputs.add_all(splat_files(splat)));
         Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 }

@@ -50,7 +50,7 @@ impl WeightsOut {
     pub fn check(&self, format: Format, inputs: &InputFiles) -> Result<()> {
         if format == Format::Torch && self.max_shard_size.is_some() {
             let why = "--max-shard-size: a checkpoint for torch is one file, expected --format safetensors";
-            return Err(Error::Request(why.into()).into());
+            return Err(Error::request(why).into());
         }
         check_writable_file(&self.out)?;
         inputs.check_file(&self.out)?;

@@ -63,11 +63,11 @@ impl Config {
             override_key(&mut table, assignment)?;
             let config: std::result::Result<Config, _> = table.clone().try_into();
             config.map_err(|e: toml::de::Error| {
-                Error::Request(format!("--set {assignment}: {}", e.message().replace('\n', " ")))
+                Error::request(format!("--set {assignment}: {}", e.message().replace('\n', " ")))
             })?;
         }
         let config: Config = table.try_into().map_err(described)?;
-        config.check().map_err(|e| Error::Request(format!("{}: {e}", origin.display())))?;
+        config.check().map_err(|e| Error::request(format!("{}: {e}", origin.display())))?;
         Ok(config)
     }
 

@@ -12,7 +12,7 @@ use crate::scene::Camera;
 pub fn polyphase(photo: &View, phase: u32) -> Result<Vec<View>> {
     let Camera { intrinsics, c2w, width, height } = photo.camera;
     if [height, width].iter().any(|side| side.checked_rem(phase) != Some(0)) {
-        return Err(Error::Request(format!(
+        return Err(Error::request(format!(
             "the image {} has {width}×{height} pixels, expected sides that {phase} divides",
             photo.name
         )));

@@ -206,7 +206,7 @@ impl Validator for HeldOut {
         let (mut scores, mut unusable) = (vec![], vec![]);
         for found in trainer.group().gather(self.judge_share(trainer, go_on))? {
             if let Some(why) = found.failed {
-                return Err(Error::Failed(why));
+                return Err(Error::failed(why));
             }
             if found.stopped {
                 return Ok(None);
@@ -223,7 +223,7 @@ impl Validator for HeldOut {
         let left_out: Vec<String> = unusable.into_iter().map(|(_, why)| why).collect();
         if scores.is_empty() {
             let why = left_out.first().map(|why| format!(": {why}")).unwrap_or_default();
-            return Err(Error::Failed(format!("no held-out scene can be used{why}")));
+            return Err(Error::failed(format!("no held-out scene can be used{why}")));
         }
         let mean =
             |value: fn(&HeldOutScores) -> f64| scores.iter().map(value).sum::<f64>() / scores.len() as f64;

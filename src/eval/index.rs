@@ -74,7 +74,7 @@ impl EvaluationIndex {
     /// # Errors
     /// Fails if the file can't be written.
     pub fn write(&self) -> Result<()> {
-        write_json(&self.file, &self.scenes)
+        Ok(write_json(&self.file, &self.scenes)?)
     }
 
     /// Returns the name of the index file.

@@ -101,7 +101,7 @@ impl Journal {
     /// # Errors
     /// Fails if the file can't be written.
     pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
-        write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })
+        Ok(write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })?)
     }
 
     fn file(&self, key: &str) -> PathBuf {

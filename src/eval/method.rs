@@ -8,7 +8,7 @@ use crate::data::View;
 use crate::error::{Error, Result};
 use crate::io::{
     InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
-    tensor_from_rgb,
+    splat_files, tensor_from_rgb,
 };
 use crate::reconstruct::{Input, Model, reconstruct};
 use crate::render::{RenderedView, SplatRenderer};
@@ -122,7 +122,7 @@ impl Method<'_> {
     pub fn add_input_files(&self, inputs: &mut InputFiles) {
         match self {
             Method::Model(_) => {}
-            Method::Splat(file) => inputs.add_splat(file),
+            Method::Splat(file) => inputs.add_all(splat_files(file)),
             Method::Renders(folder) => {
                 let pictures = std::fs::read_dir(folder).into_iter().flatten().flatten();
                 pictures.for_each(|picture| inputs.add_photo(&picture.path()));
@@ -167,11 +167,11 @@ impl Method<'_> {
             Method::Model(_) => Ok(None),
             Method::Splat(file) => {
                 let origin = Some(origin_file(file)).filter(|origin| origin.exists());
-                checksum([file].into_iter().chain(&origin)).map(Some)
+                Ok(checksum([file].into_iter().chain(&origin)).map(Some)?)
             }
             Method::Renders(folder) => {
                 let files = names.iter().map(|name| find_picture(folder, name));
-                checksum(files.collect::<Result<Vec<_>>>()?).map(Some)
+                Ok(checksum(files.collect::<Result<Vec<_>>>()?).map(Some)?)
             }
         }
     }

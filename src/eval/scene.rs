@@ -135,7 +135,7 @@ impl SceneLoader<'_> {
                     Ok(open) => {
                         open.capture(&key).and_then(|capture| EvalScene::indexed(&key, &capture, self))
                     }
-                    Err(e) => Err(Error::Failed(e.clone())),
+                    Err(e) => Err(Error::failed(e.clone())),
                 };
                 if sender.send((key, scene)).is_err() {
                     return;

@@ -69,11 +69,11 @@ pub(super) fn score_view(picture: &Tensor, view: &View) -> Result<ViewScore> {
     let (found, expected) = (picture.size(), view.image.size());
     if found != expected {
         let why = format!("the picture for {} has shape {found:?}, expected {expected:?}", view.name);
-        return Err(Error::Request(why));
+        return Err(Error::request(why));
     }
     if found[1].min(found[2]) < SSIM_WINDOW {
         let (height, width) = (found[1], found[2]);
-        return Err(Error::Request(format!(
+        return Err(Error::request(format!(
             "the picture for {} is {width}×{height} pixels, expected sides of {SSIM_WINDOW} or more, as SSIM needs",
             view.name
         )));

@@ -28,7 +28,7 @@ pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
 /// # Errors
 /// Fails if the file can't be written.
 pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
-    write_json(&folder.join(SCORES), evaluation)
+    Ok(write_json(&folder.join(SCORES), evaluation)?)
 }
 
 /// Reads `folder/scores.json`.

@@ -112,7 +112,7 @@ impl DatasetEvaluation<'_> {
         }
         if stopped {
             let (done, total) = (scenes.len(), missing.len() + scenes.len());
-            return Err(Error::Failed(format!(
+            return Err(Error::failed(format!(
                 "stopped after {done} of {total} scenes; {} holds their scores, and the same command resumes",
                 self.out.display()
             )));
@@ -129,7 +129,7 @@ impl DatasetEvaluation<'_> {
         failures.sort_by_key(|failure| missing.iter().position(|key| *key == failure.scene));
         if let (Some(failure), true) = (failures.first(), scenes.is_empty()) {
             let count = failures.len();
-            return Err(Error::Failed(format!(
+            return Err(Error::failed(format!(
                 "none of {count} scenes could be scored; {}: {}",
                 failure.scene, failure.error
             )));
@@ -222,7 +222,7 @@ impl DatasetEvaluation<'_> {
                         share.scenes.push(scene);
                     }
                     // If this file can't be written, the next scene's can't either.
-                    Err(e @ Error::Write { .. }) => return Err(e),
+                    Err(e) if e.is_failed_write() => return Err(e),
                     Err(e) => share.failures.push(Failure { scene: key, error: e.to_string() }),
                 }
                 go_on = observe(kept + share.scenes.len() + share.failures.len(), total);

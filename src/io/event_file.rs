@@ -9,9 +9,9 @@
 //! message Image   { int32 height = 1; int32 width = 2; int32 colorspace = 3; bytes encoded_image_string = 4; }
 //! ```
 
-use super::append::AppendFile;
 use super::images::{encode_photo, rgb_from_tensor};
 use crate::error::Result;
+use globalsplat_files::AppendFile;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tch::Tensor;
@@ -46,7 +46,7 @@ impl EventFile {
     pub fn start(&mut self, step: u64) -> Result<()> {
         let version = record(&Message::event(0).bytes(3, VERSION.as_bytes()));
         let session = record(&Message::event(step).message(7, &Message::default().varint(1, START)));
-        self.file.append(&[version, session].concat())
+        Ok(self.file.append(&[version, session].concat())?)
     }
 
     /// Writes the scalars of one step, by tag.
@@ -57,7 +57,7 @@ impl EventFile {
         let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
             summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
         });
-        self.file.append(&record(&Message::event(step).message(5, &summary)))
+        Ok(self.file.append(&record(&Message::event(step).message(5, &summary)))?)
     }
 
     /// Writes an image [3, H, W] in [0, 1].
@@ -73,7 +73,7 @@ impl EventFile {
             .bytes(4, &encode_photo(&pixels, false)?);
         let value = Message::default().bytes(1, tag.as_bytes()).message(4, &image);
         let summary = Message::default().message(1, &value);
-        self.file.append(&record(&Message::event(step).message(5, &summary)))
+        Ok(self.file.append(&record(&Message::event(step).message(5, &summary)))?)
     }
 }
 

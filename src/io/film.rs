@@ -1,9 +1,9 @@
 //! Videos, written frame by frame: GIF by our own code, MP4 by the ffmpeg on the PATH. No partial file stays behind.
 
-use super::atomic::PartialFile;
 use super::images::rgb_from_tensor;
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
+use globalsplat_files::PartialFile;
 use image::RgbImage;
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Read, Write};
@@ -98,13 +98,13 @@ impl Film {
     pub fn finish(self) -> Result<()> {
         let Film { path, frames, encoder, partial, .. } = self;
         if frames == 0 {
-            return Err(Error::Request(format!("{}: a film needs a frame", path.display())));
+            return Err(Error::request(format!("{}: a film needs a frame", path.display())));
         }
         match encoder {
             Encoder::Gif(gif) => gif.finish(&path)?,
             Encoder::Mp4(mp4) => mp4.finish(&path)?,
         }
-        partial.keep()
+        Ok(partial.keep()?)
     }
 }
 
@@ -158,7 +158,7 @@ impl Gif {
 fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
     move |e| match e {
         gif::EncodingError::Io(e) => Error::write(path)(e),
-        e => Error::Failed(format!("{}: the film can't be encoded: {e}", path.display())),
+        e => Error::failed(format!("{}: the film can't be encoded: {e}", path.display())),
     }
 }
 
@@ -197,7 +197,7 @@ impl Mp4 {
     fn check(path: &Path) -> Result<()> {
         find_ffmpeg().map(drop).map_err(|why| {
             let path = path.display();
-            Error::Request(format!(
+            Error::request(format!(
                 "{path}: {why}, expected for an .mp4; a .gif, or a folder for PNGs, needs nothing"
             ))
         })
@@ -250,7 +250,7 @@ impl Mp4 {
         #[cfg(unix)]
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         let mut ffmpeg =
-            command.spawn().map_err(|e| Error::Failed(format!("ffmpeg can't be started: {e}")))?;
+            command.spawn().map_err(|e| Error::failed(format!("ffmpeg can't be started: {e}")))?;
         let input = ffmpeg.stdin.take();
         let mut errors = ffmpeg.stderr.take().expect("a pipe was asked for");
         let said = std::thread::spawn(move || {
@@ -266,7 +266,7 @@ impl Mp4 {
             Ok(()) => Ok(()),
             // The message of ffmpeg is more helpful than the broken pipe.
             Err(_) => {
-                self.end(path).and(Err(Error::Failed(format!("{}: ffmpeg ended early", path.display()))))
+                self.end(path).and(Err(Error::failed(format!("{}: ffmpeg ended early", path.display()))))
             }
         }
     }
@@ -283,9 +283,9 @@ impl Mp4 {
         match status.success() {
             true => Ok(()),
             false if said.is_empty() => {
-                Err(Error::Failed(format!("{}: ffmpeg failed ({status})", path.display())))
+                Err(Error::failed(format!("{}: ffmpeg failed ({status})", path.display())))
             }
-            false => Err(Error::Failed(format!("{}: ffmpeg failed: {said}", path.display()))),
+            false => Err(Error::failed(format!("{}: ffmpeg failed: {said}", path.display()))),
         }
     }
 }

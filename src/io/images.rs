@@ -76,7 +76,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
         true => pixels.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY)),
         false => pixels.write_to(&mut bytes, ImageFormat::Png),
     };
-    encoded.map_err(|e| Error::Failed(format!("an image can't be encoded: {e}")))?;
+    encoded.map_err(|e| Error::failed(format!("an image can't be encoded: {e}")))?;
     Ok(bytes.into_inner())
 }
 
@@ -192,7 +192,7 @@ pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
         (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
     let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
-        .ok_or_else(|| Error::Failed("a picture has another size than its pixels".into()))
+        .ok_or_else(|| Error::failed("a picture has another size than its pixels"))
 }
 
 /// Returns `true` if `path` has the extension of a PNG.
@@ -208,7 +208,7 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
     if !is_png_name(path) {
         return Err(Error::input(path, "the picture's ending", "another", ".png"));
     }
-    check_writable_file(path)
+    Ok(check_writable_file(path)?)
 }
 
 /// Writes a tensor [3, H, W] or [H, W] (grey) with values in [0, 1] as a PNG.

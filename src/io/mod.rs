@@ -1,61 +1,55 @@
 //! File formats: splats, weights (safetensors), images, videos, arrays (NPY) and TensorBoard event files. Writes never leave a partial
 //! file.
 
-mod append;
-mod atomic;
-mod checksum;
 mod depth_colours;
-mod environment;
 mod event_file;
 mod event_reader;
 mod film;
 mod images;
-mod inputs;
 mod jpeg;
-mod keyed_path;
 mod mosaic;
 mod npy;
 mod pretrained;
 mod shards;
 mod splat;
 mod state_dict;
-mod text;
 mod torch_file;
 mod weights;
 mod weights_file;
 
-pub use atomic::{check_regular, check_writable_dir, check_writable_file, write_atomically};
-pub use checksum::checksum;
+pub use globalsplat_files::{
+    InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, write_atomically,
+};
+
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
 pub use film::{Film, find_ffmpeg};
 pub use images::{
     Photo, check_writable_png, decode_photo, encode_photo, is_png_name, read_image, rgb_from_tensor,
     tensor_from_rgb, tile_horizontally, tile_vertically, tiled_size, write_png,
 };
-pub use inputs::InputFiles;
 pub use mosaic::Mosaic;
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::{shard_index, write_sharded};
 pub use splat::{
     Splat, check_writable_origin, check_writable_splat, find_splat, fit_splat, is_splat_name, origin_file,
-    read_splat, read_splat_without_invalid, write_local_splat, write_splat,
+    read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
 };
 pub use torch_file::write_checkpoint;
 pub use weights::{Weights, write_weights};
-pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights};
+pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
 
 pub(crate) use torch_file::{Archive, Array, Id, UnknownGlobals, Value, Values, unpickle};
 
-pub(crate) use append::AppendFile;
-pub(crate) use atomic::{lock_parent, recover_dirs, remove_dir, replace_dir, write_json};
-pub(crate) use environment::expand_path;
+pub(crate) use globalsplat_files::{
+    AppendFile, expand_path, files_and_keys, lock_parent, read_text, recover_dirs, remove_dir, replace_dir,
+    write_json,
+};
+
 pub(crate) use event_file::EventFile;
 pub(crate) use event_reader::{EventReader, read_picture};
 pub(crate) use images::{
     PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, subsample, write_jpeg,
 };
-pub(crate) use keyed_path::files_and_keys;
 pub(crate) use mosaic::shrink_factor;
 pub(crate) use pretrained::pretrained_folders;
-pub(crate) use text::read_text;

@@ -1,11 +1,11 @@
 //! Weights that are too large for one file: several files, and an index of which tensor is in which file, in the format of Hugging Face's
 //! libraries.
 
-use super::atomic::PartialFile;
 use super::weights::{Weights, write_weights, write_weights_partially};
 use super::weights_file::{INDEX_ENDING, ShardIndex};
 use super::write_json;
 use crate::error::{Error, Result};
+use globalsplat_files::PartialFile;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::Tensor;

@@ -1,7 +1,7 @@
 //! Weights in safetensors files, whose metadata hold the configuration that rebuilds their model.
 
-use super::atomic::{PartialFile, write_partially};
 use crate::error::{Error, Result};
+use globalsplat_files::{PartialFile, write_partially};
 use safetensors::{Dtype, tensor::TensorView};
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -25,7 +25,7 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    write_weights_partially(path, tensors, metadata)?.keep()
+    Ok(write_weights_partially(path, tensors, metadata)?.keep()?)
 }
 
 /// Writes a file like [`write_weights`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
@@ -40,7 +40,7 @@ pub(super) fn write_weights_partially(
     let stored = Stored::all(tensors)?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
     let failed = |e: &dyn std::fmt::Display| {
-        Error::Failed(format!("{}: weights can't be serialized: {e}", path.display()))
+        Error::failed(format!("{}: weights can't be serialized: {e}", path.display()))
     };
     let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
     sort_header(&mut bytes).map_err(|e| failed(&e))?;
@@ -99,10 +99,10 @@ impl Stored {
             Kind::Float => Dtype::F32,
             Kind::BFloat16 => Dtype::BF16,
             Kind::Int64 => Dtype::I64,
-            other => return Err(Error::Failed(format!("tensors of kind {other:?} are not stored"))),
+            other => return Err(Error::failed(format!("tensors of kind {other:?} are not stored"))),
         };
         TensorView::new(dtype, self.shape.clone(), &self.bytes)
-            .map_err(|e| Error::Failed(format!("weights can't be serialized: {e}")))
+            .map_err(|e| Error::failed(format!("weights can't be serialized: {e}")))
     }
 }
 

@@ -2,10 +2,10 @@
 //! needed, once, and directly into its destination.
 
 use super::state_dict::{Contents, state_dict};
-use super::text::read_text;
 use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
+use globalsplat_files::read_text;
 use memmap2::{Mmap, MmapMut, MmapOptions, UncheckedAdvice};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};

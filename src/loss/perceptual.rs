@@ -43,7 +43,7 @@ impl PerceptualLoss {
         };
         if !file.is_file() {
             let found = format!("{}, which is not there", file.display());
-            return Err(Error::Request(format!(
+            return Err(Error::request(format!(
                 "loss.perceptual_weights is {found}, expected {expected} ({how})"
             )));
         }
@@ -55,7 +55,7 @@ impl PerceptualLoss {
         };
         let smallest = loss.smallest_side();
         if i64::from(size.height.min(size.width)) < smallest {
-            return Err(Error::Request(format!(
+            return Err(Error::request(format!(
                 "data.image_size is [{}, {}], expected {smallest} or more for loss.perceptual",
                 size.height, size.width
             )));
@@ -108,7 +108,7 @@ impl PerceptualLoss {
     /// Returns an error if a variable isn't set and has no default.
     pub fn weights_file(config: &LossConfig) -> Result<PathBuf> {
         if !config.perceptual_weights.is_empty() {
-            return expand_path(&config.perceptual_weights);
+            return Ok(expand_path(&config.perceptual_weights)?);
         }
         let name = match config.perceptual {
             PerceptualKind::LpipsVgg => LpipsNetwork::Vgg16.file_name(),

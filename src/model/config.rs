@@ -104,7 +104,7 @@ impl ModelConfig {
         }
         let expect = |holds: bool, field: &str, value: i64, expected: String| match holds {
             true => Ok(()),
-            false => Err(Error::Request(format!("model.{field} is {value}, expected {expected}"))),
+            false => Err(Error::request(format!("model.{field} is {value}, expected {expected}"))),
         };
         expect(
             self.width % self.heads == 0,
@@ -135,7 +135,7 @@ impl ModelConfig {
         for (name, size) in [("height", height), ("width", width)] {
             if size <= 0 || size % self.patch_size != 0 {
                 let p = self.patch_size;
-                return Err(Error::Request(format!(
+                return Err(Error::request(format!(
                     "the image {name} is {size}, expected a multiple of the patch size {p}"
                 )));
             }

@@ -71,19 +71,19 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "adamw" => steps_of(OptimizerKind::AdamW, request),
         "muon" => steps_of(OptimizerKind::Muon, request),
         "model" => whole_model(request),
-        other => Err(Error::Request(format!("there is no parity case {other}"))),
+        other => Err(Error::request(format!("there is no parity case {other}"))),
     }
 }
 
 impl Request {
     fn input(&self, name: &str) -> Result<&Tensor> {
-        self.inputs.get(name).ok_or_else(|| Error::Request(format!("{}: no input {name}", self.case)))
+        self.inputs.get(name).ok_or_else(|| Error::request(format!("{}: no input {name}", self.case)))
     }
 
     /// Returns the value of `key` in the case's configuration, such as a number or a list.
     fn number<T: DeserializeOwned>(&self, key: &str) -> Result<T> {
         serde_json::from_value(self.config[key].clone())
-            .map_err(|e| Error::Request(format!("{}: config.{key}: {e}", self.case)))
+            .map_err(|e| Error::request(format!("{}: config.{key}: {e}", self.case)))
     }
 
     fn model_config(&self) -> Result<ModelConfig> {
@@ -93,7 +93,7 @@ impl Request {
         let given = self.config.as_object().cloned().unwrap_or_default();
         let ours = given.into_iter().filter(|(key, _)| known.contains_key(key)).collect();
         serde_json::from_value(serde_json::Value::Object(ours))
-            .map_err(|e| Error::Request(format!("{}: config: {e}", self.case)))
+            .map_err(|e| Error::request(format!("{}: config: {e}", self.case)))
     }
 
     fn stage(&self) -> Result<Stage> {
@@ -396,7 +396,7 @@ fn subsets(request: &Request) -> Result<Answer> {
 fn lpips(request: &Request) -> Result<Answer> {
     let name: String = request.number("network")?;
     let network = loss::LpipsNetwork::ALL.into_iter().find(|network| network.metric() == name);
-    let network = network.ok_or_else(|| Error::Request(format!("{}: no network {name}", request.case)))?;
+    let network = network.ok_or_else(|| Error::request(format!("{}: no network {name}", request.case)))?;
     let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
     with_params([("distance", lpips.distance(request.input("picture")?, request.input("truth")?))], params)
 }

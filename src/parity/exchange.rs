@@ -50,7 +50,7 @@ pub fn write_npz(path: &Path, arrays: &Arrays) -> Result<()> {
             Kind::Double => write_array::<f64>(&mut writer, name, tensor, path)?,
             Kind::Int64 => write_array::<i64>(&mut writer, name, tensor, path)?,
             Kind::Uint8 => write_array::<u8>(&mut writer, name, tensor, path)?,
-            other => return Err(Error::Failed(format!("{name} has kind {other:?}, which isn't exchanged"))),
+            other => return Err(Error::failed(format!("{name} has kind {other:?}, which isn't exchanged"))),
         }
     }
     Ok(())

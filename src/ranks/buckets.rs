@@ -1,7 +1,7 @@
 //! Gradient buckets, which are summed over all ranks while the backward pass is still running.
 
-use super::group::Group;
-use crate::error::{Error, Result};
+use super::group::{Group, lost};
+use crate::error::Result;
 use cxx::UniquePtr;
 use globalsplat_csrc::ranks as ffi;
 use std::fmt;
@@ -57,6 +57,6 @@ impl Buckets {
     /// Returns an error if another rank is gone.
     pub fn finish(&self) -> Result<usize> {
         let Some(inner) = &self.inner else { return Ok(0) };
-        inner.finish().map_err(|e| Error::Ranks(e.what().lines().next().unwrap_or_default().to_string()))
+        inner.finish().map_err(lost)
     }
 }

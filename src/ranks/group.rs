@@ -33,8 +33,8 @@ impl fmt::Debug for Group {
 }
 
 /// Returns the error for a failed collective. The cause is almost always that another rank is gone.
-fn lost(why: cxx::Exception) -> Error {
-    Error::Ranks(why.what().lines().next().unwrap_or_default().to_string())
+pub(super) fn lost(why: cxx::Exception) -> Error {
+    Error::Distributed { message: why.what().lines().next().unwrap_or_default().to_string() }
 }
 
 /// Backends that this build has for communication between ranks.
@@ -75,7 +75,7 @@ impl Group {
         seconds: i64,
     ) -> Result<Self> {
         let without = |what: &str, install: &str| {
-            Error::Request(format!(
+            Error::request(format!(
                 "this program was built without {what}, which {} processes need: {install}, then `touch csrc/build.rs` and build \
                  again",
                 place.ranks
@@ -99,7 +99,7 @@ impl Group {
         };
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
-            Error::Failed(format!("rank {rank} of {ranks} can't meet the others: {why}"))
+            Error::failed(format!("rank {rank} of {ranks} can't meet the others: {why}"))
         })?);
         Ok(Group {
             inner,
@@ -184,7 +184,7 @@ impl Group {
         let said = lengths.iter().enumerate().map(|(rank, &length)| {
             let bytes = &all[rank * longest..][..length as usize];
             rmp_serde::from_slice(bytes)
-                .map_err(|e| Error::Failed(format!("rank {rank} isn't understood: {e}")))
+                .map_err(|e| Error::failed(format!("rank {rank} isn't understood: {e}")))
         });
         said.collect()
     }
@@ -196,7 +196,7 @@ impl Group {
     pub fn broadcast_object<T: Serialize + DeserializeOwned>(&self, said: Option<T>) -> Result<T> {
         // The value itself may be `None`, so every rank sends a list, which is empty on ranks that send no value.
         let said = self.gather(Vec::from_iter(said))?.into_iter().flatten().next();
-        said.ok_or_else(|| Error::Failed("the first rank said nothing".into()))
+        said.ok_or_else(|| Error::failed("the first rank said nothing"))
     }
 
     /// Returns the tensors of all ranks, stacked along a new first dimension, on the CPU.

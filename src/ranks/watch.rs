@@ -61,7 +61,7 @@ impl Watch {
         let store = store.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
             let Place { rank, ranks, host, port, .. } = place;
-            Error::Failed(format!("rank {rank} of {ranks} can't reach the others at {host}:{port}: {why}"))
+            Error::failed(format!("rank {rank} of {ranks} can't reach the others at {host}:{port}: {why}"))
         })?;
         let (sender, receiver) = channel();
         let listening = Mutex::new(Some(sender));
@@ -99,7 +99,7 @@ impl Watch {
             [("listen", Box::new(listen) as Box<dyn FnOnce() + Send>), ("check", Box::new(check))]
         {
             let thread = std::thread::Builder::new().name(name.into()).spawn(work);
-            thread.map_err(|e| Error::Failed(format!("a thread can't be started: {e}")))?;
+            thread.map_err(|e| Error::failed(format!("a thread can't be started: {e}")))?;
         }
         Ok(Watch { store, place: place.clone(), listening })
     }

@@ -29,7 +29,7 @@ impl FromStr for HighResMode {
     fn from_str(text: &str) -> Result<Self> {
         let all = [HighResMode::Polyphase, HighResMode::Whole, HighResMode::Repeated];
         let named = all.into_iter().find(|views_as| views_as.to_string() == text);
-        named.ok_or_else(|| Error::Request("expected polyphase, whole or repeated".into()))
+        named.ok_or_else(|| Error::request("expected polyphase, whole or repeated"))
     }
 }
 
@@ -64,7 +64,7 @@ impl Input {
         let longest = u64::from(phase) * u64::from(side.max(trained.width));
         if phase == 0 || phase * side != height || longest > MOST.into() {
             let [twice, thrice] = [2, 3].map(|times| u64::from(side) * times);
-            return Err(Error::Request(format!(
+            return Err(Error::request(format!(
                 "--views-at is {height}, expected a multiple of the {side} pixels that the model sees, with sides of {MOST} at \
                  most: {side}, {twice}, {thrice}, …"
             )));

@@ -103,7 +103,7 @@ pub fn reconstruct<'a>(
 ) -> Result<Reconstruction> {
     let model = model.into();
     if photos.len() < 2 {
-        return Err(Error::Request(format!(
+        return Err(Error::request(format!(
             "a reconstruction needs two views or more, found {}",
             photos.len()
         )));

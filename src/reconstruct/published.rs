@@ -69,7 +69,7 @@ pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
         halves.into_iter().find(|heads| model.width % heads == 0).expect("one divides all")
     });
     let mut config = Config { model, ..Default::default() };
-    config.model.check().map_err(|e| Error::Request(format!("{}: {e}", file.path().display())))?;
+    config.model.check().map_err(|e| Error::request(format!("{}: {e}", file.path().display())))?;
 
     let ModelConfig { latents, candidates, .. } = config.model;
     let known = VARIANTS.iter().find(|&&(_, m, k, _)| (m, k) == (latents, candidates));

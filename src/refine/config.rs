@@ -109,7 +109,7 @@ impl RefineConfig {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
         let mut table = toml::Table::try_from(&defaults).expect("plain numbers");
         for assignment in overrides {
-            let refused = |why: &str| Error::Request(format!("--set {assignment}: {why}"));
+            let refused = |why: &str| Error::request(format!("--set {assignment}: {why}"));
             let set: toml::Table = assignment.parse().map_err(|_| refused("expected KEY=VALUE"))?;
             if set.len() != 1 {
                 return Err(refused("expected KEY=VALUE"));

@@ -179,7 +179,7 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
     }
     let depths = Tensor::cat(&seen, 0);
     if depths.numel() == 0 {
-        return Err(Error::Request("the cameras see nothing of the splat: are both of one world?".into()));
+        return Err(Error::request("the cameras see nothing of the splat: are both of one world?"));
     }
     Ok(depths.median().double_value(&[]))
 }

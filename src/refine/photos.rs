@@ -50,7 +50,7 @@ pub fn load_photos(
     let mut views = vec![];
     for some in indices.chunks(READ_AT_ONCE) {
         if !go_on(views.len()) {
-            return Err(Error::Failed("stopped before all photos were read: nothing is written".into()));
+            return Err(Error::failed("stopped before all photos were read: nothing is written"));
         }
         // Photos of one size are loaded together, as they share the lens undistortion.
         for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {

@@ -261,7 +261,7 @@ impl<'a> RefineSession<'a> {
             Initial::Photos => {
                 if self.photos.len() < 2 {
                     let why = "one photo tells no depth: two or more are expected, or a splat to begin with";
-                    return Err(Error::Request(why.into()));
+                    return Err(Error::request(why));
                 }
                 if self.are_in_one_place() {
                     let line = "the photos were all taken from one place, and tell no depth: all that they show is put at one distance";
@@ -502,7 +502,7 @@ impl<'a> RefineSession<'a> {
 
 /// Returns the error of a session that is ended before there is a result.
 fn stopped() -> Error {
-    Error::Failed("stopped before there was a splat: nothing is written".into())
+    Error::failed("stopped before there was a splat: nothing is written")
 }
 
 /// Returns the first few names, and the number of the others.

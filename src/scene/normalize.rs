@@ -83,7 +83,7 @@ impl Normalization {
 /// Fails if there are no cameras.
 pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     if c2w.is_empty() {
-        return Err(Error::Request("a scene without cameras can't be normalized".into()));
+        return Err(Error::request("a scene without cameras can't be normalized"));
     }
     let mean =
         |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;

@@ -44,7 +44,7 @@ type Point = [f64; 7];
 /// # Errors
 /// Fails if there are no cameras.
 pub fn smooth_path(cameras: &[Camera], distance: f64, frames: usize) -> Result<Vec<Camera>> {
-    let first = cameras.first().ok_or_else(|| Error::Request("a path needs a camera".into()))?;
+    let first = cameras.first().ok_or_else(|| Error::request("a path needs a camera"))?;
     let size = ImageSize { width: first.width, height: first.height };
     let views: Vec<View> = cameras.iter().map(|camera| View::of(&camera.with_size(size), distance)).collect();
     let curve = Curve::through(views, distance);

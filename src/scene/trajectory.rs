@@ -24,7 +24,7 @@ pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) ->
     let [right, down, forward] =
         [to_world.rotation.x_axis, to_world.rotation.y_axis, to_world.rotation.z_axis];
     let target = to_world.translation + forward * distance;
-    let reference = cameras.first().ok_or_else(|| Error::Request("an orbit needs a camera".into()))?;
+    let reference = cameras.first().ok_or_else(|| Error::request("an orbit needs a camera"))?;
     let camera = |frame: usize| {
         let angle = TAU * frame as f64 / frames as f64;
         let eye = to_world.translation + right * (x * angle.cos()) + down * (y * angle.sin());

@@ -155,7 +155,7 @@ pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
 /// Returns an error if files can't be read, renamed or removed.
 pub(super) fn recover(run: &Path) -> Result<()> {
     recover_dirs(run, &FILES)?;
-    recover_dirs(&run.join(FOLDER), &FILES)
+    Ok(recover_dirs(&run.join(FOLDER), &FILES)?)
 }
 
 /// Returns the validation PSNR of the run's best checkpoint in dB, or `None` if there is no best checkpoint.

@@ -119,7 +119,7 @@ impl Metrics {
     }
 
     fn append(&mut self, line: &Value) -> Result<()> {
-        self.file.append(format!("{line}\n").as_bytes())
+        Ok(self.file.append(format!("{line}\n").as_bytes())?)
     }
 }
 

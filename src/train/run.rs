@@ -84,7 +84,7 @@ pub fn run(
     if held_out != expected {
         let count = |scenes: Option<usize>| scenes.unwrap_or(0);
         let (found, expected) = (count(held_out), count(expected));
-        return Err(Error::Failed(format!(
+        return Err(Error::failed(format!(
             "this rank has {found} held-out scenes, expected {expected}, as the first one"
         )));
     }
@@ -224,7 +224,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 go_on = match self.validate(&checkpoint) {
                     // A failed write or a lost rank isn't a problem of the held-out data.
-                    Err(e @ (Error::Write { .. } | Error::Ranks(_))) => return Err(e),
+                    Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
                     Err(e) => self.tell(Event::Notice(format!("a validation is left out: {e}"))),
                     go_on => go_on?,
                 };
@@ -272,7 +272,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         }
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
-                Err(e @ (Error::Write { .. } | Error::Ranks(_))) => return Err(e),
+                Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
                 Err(e) => {
                     self.tell(Event::Notice(format!("the last validation is left out: {e}")));
                 }
@@ -331,7 +331,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             Ok(checkpoint) => format!("{} is from before", checkpoint.display()),
             Err(_) => "no checkpoint was saved before".into(),
         };
-        Error::Failed(format!(
+        Error::failed(format!(
             "training stops: loss or gradient of the last {steps} steps was not finite (train.max_nonfinite_steps); step {} showed {}; \
              {before}",
             last.step,

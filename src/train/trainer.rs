@@ -229,8 +229,8 @@ impl Trainer {
         }
         let [gradients, squares] = word.gradients;
         if gradients * gradients != squares * self.group.ranks() as f64 {
-            return Err(Error::Failed(
-                "ranks have different parameters: were they started with the same program?".into(),
+            return Err(Error::failed(
+                "ranks have different parameters: were they started with the same program?",
             ));
         }
         if word.found_bad_data > 0. {
@@ -371,12 +371,12 @@ impl Trainer {
         }
         if !changed.is_empty() {
             let changed = changed.join(", ");
-            return Err(Error::Failed(format!("this rank's configuration isn't the first one's: {changed}")));
+            return Err(Error::failed(format!("this rank's configuration isn't the first one's: {changed}")));
         }
         if scenes != own.1 {
             let count = |sizes: &[usize]| sizes.iter().sum::<usize>();
             let (own, first) = (count(&own.1), count(&scenes));
-            return Err(Error::Failed(format!(
+            return Err(Error::failed(format!(
                 "this rank's training scenes aren't the first one's: {own} of {} groups, expected {first} of {}",
                 self.scenes.sizes().len(),
                 scenes.len()

@@ -8,7 +8,7 @@ use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, InputFiles, Splat, read_splat, tiled_size};
+use globalsplat::io::{DepthScale, InputFiles, Splat, read_splat, splat_files, tiled_size, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{RenderedView, SplatRenderer};
@@ -128,7 +128,7 @@ impl Render {
             output.add(&self.parts(&rendered, scale))?;
             if stop.load(Ordering::Relaxed) {
                 let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
-                return Err(Error::Failed(format!("{out}: stopped after {done} of {of} views")).into());
+                return Err(Error::failed(format!("{out}: stopped after {done} of {of} views")).into());
             }
             bar.inc(1);
         }
@@ -172,8 +172,8 @@ impl Render {
     /// Returns the input files, which no output may replace.
     fn inputs(&self, capture: Option<&Capture>) -> InputFiles {
         let mut inputs = InputFiles::default();
-        self.weights.iter().for_each(|path| inputs.add_weights(path));
-        self.splat.iter().for_each(|splat| inputs.add_splat(splat));
+        self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
+        self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));
         capture.inspect(|capture| capture.add_input_files(&mut inputs));
         inputs
     }

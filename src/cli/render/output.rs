@@ -30,17 +30,17 @@ impl<'a> Output<'a> {
     pub fn check(path: &Path, frames_per_second: Option<u32>) -> Result<()> {
         let kind = kind(path);
         if kind != Kind::Film && frames_per_second.is_some() {
-            return Err(Error::Request(format!(
+            return Err(Error::request(format!(
                 "--fps is for films: {} is none, expected a name that ends in .mp4 or .gif",
                 path.display()
             )));
         }
         match kind {
-            Kind::Folder => return check_writable_dir(path),
+            Kind::Folder => return Ok(check_writable_dir(path)?),
             Kind::Row => {}
             Kind::Film => Film::check(path, frames_per_second.unwrap_or(1))?,
         }
-        check_writable_file(path)
+        Ok(check_writable_file(path)?)
     }
 
     /// Creates the output for images called `names`, whose parts have `suffixes`, in frames of at most `size` with all parts

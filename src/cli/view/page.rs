@@ -31,8 +31,8 @@ pub fn has_viewer() -> bool {
 /// A program that was built without npm.
 pub fn check_has_viewer() -> Result<()> {
     if !has_viewer() {
-        return Err(Error::Request(
-            "this program was built without the viewer that pages need: install Node.js 20 or newer with npm, and run make build".into(),
+        return Err(Error::request(
+            "this program was built without the viewer that pages need: install Node.js 20 or newer with npm, and run make build",
         )
         .into());
     }

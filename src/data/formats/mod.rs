@@ -79,12 +79,12 @@ fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
         }
     }
     match refusals.len() {
-        0 if !path.exists() => Err(Error::Request(format!("{}: no such capture", path.display()))),
+        0 if !path.exists() => Err(Error::request(format!("{}: no such capture", path.display()))),
         0 => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
         1 => Err(refusals.remove(0)),
         _ => {
             let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
-            Err(Error::Request(format!("{}: none of its formats can be read: {reasons}", path.display())))
+            Err(Error::request(format!("{}: none of its formats can be read: {reasons}", path.display())))
         }
     }
 }

@@ -154,7 +154,7 @@ impl BadDataLog {
         *last = Some(why);
         if counts.total() as f64 > self.largest_share * counts.scenes as f64 {
             let share = self.largest_share;
-            return Err(Error::Failed(format!("{entries}; data.max_bad_share allows {share} of them")));
+            return Err(Error::failed(format!("{entries}; data.max_bad_share allows {share} of them")));
         }
         Ok(())
     }
@@ -170,7 +170,7 @@ impl BadDataLog {
     /// Returns the error for the case that no usable scene is left.
     pub fn exhausted(&self) -> Error {
         let entries = self.entries.lock().expect("no thread panics here");
-        Error::Failed(format!("no scene can be trained on: {entries}"))
+        Error::failed(format!("no scene can be trained on: {entries}"))
     }
 
     pub fn counts(&self) -> BadData {

@@ -96,7 +96,7 @@ impl Loader {
         let part = part.into();
         let sizes = scenes.sizes();
         if sizes.iter().all(|&size| size == 0) {
-            return Err(Error::Request("there are no scenes to train on".into()));
+            return Err(Error::request("there are no scenes to train on"));
         }
         let fits = scenes
             .decoded_bytes()
@@ -136,7 +136,7 @@ impl Loader {
                     let load = AssertUnwindSafe(|| shared.load(sample, step, &mut tools));
                     let scene = catch_unwind(load).unwrap_or_else(|panic| {
                         let why = panic_message(&*panic);
-                        Err(Error::Failed(format!("loading sample {sample} failed inside: {why}")))
+                        Err(Error::failed(format!("loading sample {sample} failed inside: {why}")))
                     });
                     if sender.send(scene).is_err() {
                         return;
@@ -145,7 +145,7 @@ impl Loader {
             };
             let spawned = std::thread::Builder::new().name(format!("loader-{thread}")).spawn(work);
             let spawned =
-                spawned.map_err(|e| Error::Failed(format!("a loading thread can't be started: {e}")))?;
+                spawned.map_err(|e| Error::failed(format!("a loading thread can't be started: {e}")))?;
             loader.receivers.push(receiver);
             loader.threads.push(spawned);
         }
@@ -179,7 +179,7 @@ impl Loader {
         // Thread t produced the t-th sample, whatever its index.
         let turn = self.receivers.len();
         let receiver = &self.receivers[0];
-        let scene = receiver.recv().map_err(|_| Error::Failed("a loading thread has ended".into()))??;
+        let scene = receiver.recv().map_err(|_| Error::failed("a loading thread has ended"))??;
         self.receivers.rotate_left(1 % turn);
         self.taken += 1;
         Ok(scene)

@@ -50,7 +50,7 @@ impl Augmentation {
         let width = room_x.min(room_y * aspect);
         let height = width / aspect;
         if width.min(height) < SMALLEST_PART {
-            return Err(Error::Failed(format!(
+            return Err(Error::failed(format!(
                 "the principal point ({:.1}, {:.1}) of a photo of {}×{} leaves less than {SMALLEST_PART} pixels around it",
                 k.cx, k.cy, camera.width, camera.height
             )));

@@ -30,7 +30,7 @@ const SORTING: &str = include_str!("sorting.js");
 /// Fails if there is no evaluation, if an existing image can't be read, or if the file can't be written.
 pub fn write_report(path: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
     if evaluations.is_empty() {
-        return Err(Error::Request("a report shows one evaluation or more, found none".into()));
+        return Err(Error::request("a report shows one evaluation or more, found none"));
     }
     let page = page(&entry::entries(evaluations))?.into_string();
     write_atomically(path, |writer| writer.write_all(page.as_bytes()).map_err(Error::write(path)))

@@ -4,9 +4,9 @@ use super::invalid::InvalidGaussians;
 use super::values::{Values, normalized};
 use super::{Contents, Splat, recognize};
 use crate::error::{Error, Result};
-use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
 use crate::scene::SH_C0;
+use globalsplat_files::write_atomically;
 use std::path::Path;
 
 /// Number of bytes of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
@@ -55,7 +55,7 @@ pub(super) fn limits() -> HarmonicLimits {
 pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let values = Values::of(path, splat)?;
     if values.count() == 0 {
-        return Err(Error::Failed(format!(
+        return Err(Error::failed(format!(
             "{}: a .splat holds one Gaussian at least, found 0",
             path.display()
         )));

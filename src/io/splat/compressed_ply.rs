@@ -9,9 +9,9 @@ use super::ply_header::{Header, Kind, Scalar};
 use super::values::{Values, normalized};
 use super::{Contents, Splat};
 use crate::error::{Error, Result};
-use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
 use crate::scene::SH_C0;
+use globalsplat_files::write_atomically;
 use std::f64::consts::SQRT_2;
 use std::path::Path;
 

@@ -13,13 +13,13 @@ mod rotations;
 mod spz;
 mod values;
 
-pub use origin::{check_writable_origin, origin_file};
+pub use origin::{check_writable_origin, origin_file, splat_files};
 
 use crate::error::{Error, Result};
-use crate::io::atomic::check_writable_file;
 use crate::render::{HarmonicLimits, SplatRenderer, fit_harmonics};
 use crate::scene::{Camera, Gaussians, LocalFrame};
 use glam::DVec3;
+use globalsplat_files::check_writable_file;
 use invalid::InvalidGaussians;
 use origin::{read_origin, write_with_origin};
 use rotations::with_rotation;
@@ -60,7 +60,7 @@ impl Splat {
                 let on_host = gaussians.map(|t| t.detach().to_device(Device::Cpu).to_kind(Kind::Float));
                 Ok(Splat::of_rotated(on_host, "the splat", vec![]))
             }
-            scenes => Err(Error::Request(format!("a splat holds one scene, found {scenes}"))),
+            scenes => Err(Error::request(format!("a splat holds one scene, found {scenes}"))),
         }
     }
 
@@ -205,7 +205,7 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// Returns an error for an unknown extension, or a request error that names the path.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
     format_of(path)?;
-    check_writable_file(path)
+    Ok(check_writable_file(path)?)
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
@@ -289,7 +289,7 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &
 /// Checks that all of `numbers`, which are to be written at `path`, are finite.
 fn all_finite(path: &Path, numbers: &Tensor) -> Result<()> {
     match numbers.isfinite().all().int64_value(&[]) {
-        0 => Err(Error::Failed(format!("{}: the splat has numbers that aren't finite", path.display()))),
+        0 => Err(Error::failed(format!("{}: the splat has numbers that aren't finite", path.display()))),
         _ => Ok(()),
     }
 }

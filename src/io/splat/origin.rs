@@ -1,8 +1,8 @@
 //! Origin of a splat's coordinates, in a file beside it (spec 10.18): `room.ply.origin.json` for `room.ply`.
 
 use crate::error::{Error, Result};
-use crate::io::atomic::{PartialFile, check_writable_file};
 use glam::DVec3;
+use globalsplat_files::{PartialFile, check_writable_file};
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::fs;
@@ -24,12 +24,17 @@ pub fn origin_file(path: &Path) -> PathBuf {
     name.into()
 }
 
+/// Returns the files that a splat at `path` may consist of: the splat itself, and its origin file.
+pub fn splat_files(path: &Path) -> [PathBuf; 2] {
+    [path.to_owned(), origin_file(path)]
+}
+
 /// Checks that the origin file of a splat at `path`, whose name is longer, could be written. Call it before the work starts.
 ///
 /// # Errors
 /// Returns a request error that names the file.
 pub fn check_writable_origin(path: &Path) -> Result<()> {
-    check_writable_file(&origin_file(path))
+    Ok(check_writable_file(&origin_file(path))?)
 }
 
 /// Returns the origin of the splat at `path`, or zero if it has no origin file.
@@ -67,5 +72,5 @@ pub(super) fn write_with_origin(
     let json = serde_json::to_vec_pretty(&Contents { origin: origin.to_array() }).expect("numbers");
     partial.file.write_all(&json).map_err(Error::write(&file))?;
     write()?;
-    partial.keep()
+    Ok(partial.keep()?)
 }

@@ -8,9 +8,9 @@ use super::ply_body::columns;
 use super::ply_header::{Header, Scalar};
 use super::{Contents, Splat, all_finite};
 use crate::error::{Error, Result};
-use crate::io::atomic::write_atomically;
 use crate::render::HarmonicLimits;
 use crate::scene::{MIN_SCALE, RawGaussians, SH_C0};
+use globalsplat_files::write_atomically;
 use std::path::Path;
 use tch::{Device, Kind, Tensor};
 

@@ -46,7 +46,7 @@ pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
         }
         add("version", VERSION)
     })();
-    let failed = |e: ZipError| Error::Failed(format!("{}: {e}", path.display()));
+    let failed = |e: ZipError| Error::failed(format!("{}: {e}", path.display()));
     written.map_err(failed)?;
     let bytes = zip.finish().map_err(failed)?.into_inner();
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
@@ -65,7 +65,7 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
             Kind::BFloat16 => "BFloat16Storage",
             Kind::Half => "HalfStorage",
             Kind::Int64 => "LongStorage",
-            other => return Err(Error::Failed(format!("tensors of kind {other:?} are not stored"))),
+            other => return Err(Error::failed(format!("tensors of kind {other:?} are not stored"))),
         };
         p.text(name);
         p.global("torch._utils", "_rebuild_tensor_v2");

@@ -100,7 +100,7 @@ impl Chunk {
             [scene] => self.capture_of(scene, purpose),
             scenes => {
                 let file = self.file.display();
-                Err(Error::Request(format!(
+                Err(Error::request(format!(
                     "{file}: it holds {} scenes, expected {file}#KEY with {}",
                     scenes.len(),
                     self.choice()

@@ -2,10 +2,10 @@
 
 use super::axes::Axes;
 use crate::error::{Error, Result};
-use crate::io::atomic::write_atomically;
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
+use globalsplat_files::write_atomically;
 use std::io::{Read, Write};
 use std::path::Path;
 

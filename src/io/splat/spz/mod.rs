@@ -129,7 +129,7 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let fits = |bits: &u32| f64::from(farthest) * f64::from(1u32 << bits) <= MAX_FIXED;
     let Some(fractional_bits) = (0..=MAX_FRACTIONAL_BITS).rev().find(fits) else {
         let limit = format!("at most {MAX_FIXED} in an SPZ");
-        return Err(Error::Failed(format!(
+        return Err(Error::failed(format!(
             "{}: a coordinate is {farthest}, expected {limit}",
             path.display()
         )));

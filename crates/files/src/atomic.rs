@@ -5,7 +5,7 @@
 //! write to the same path. Its process holds a lock on it. A temporary file without a lock was left by a process that was killed: the next
 //! process that writes to the same path removes it.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use serde::Serialize;
 use std::fs::{self, File, FileType, Metadata, OpenOptions};
 use std::io::{self, BufWriter, ErrorKind, Write};
@@ -24,15 +24,21 @@ const NAME_BYTES: usize = 48;
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a regular file is at `path` or the file can't be written.
-pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    write_partially(path, fill)?.keep()
+pub fn write_atomically<E: From<Error>>(
+    path: &Path,
+    fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
+) -> Result<(), E> {
+    Ok(write_partially(path, fill)?.keep()?)
 }
 
 /// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
 ///
 /// # Errors
 /// Returns the errors of [`write_atomically`].
-pub fn write_partially(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<PartialFile> {
+pub fn write_partially<E: From<Error>>(
+    path: &Path,
+    fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
+) -> Result<PartialFile, E> {
     let partial = PartialFile::create(path)?;
     let mut writer = BufWriter::new(&partial.file);
     fill(&mut writer)?;
@@ -54,7 +60,11 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a folder is at `path` or the folder can't be written.
-pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+pub fn replace_dir<E: From<Error>>(
+    path: &Path,
+    made: &[&str],
+    fill: impl FnOnce(&Path) -> Result<(), E>,
+) -> Result<(), E> {
     let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
     fs::create_dir_all(parent_of(&target)).map_err(Error::write(path))?;
     let make = |place: &Path| {
@@ -79,7 +89,7 @@ pub fn replace_dir(path: &Path, made: &[&str], fill: impl FnOnce(&Path) -> Resul
     let filled = fill(&temporary);
     sync_dir(&temporary);
     let _swapping = lock_parent(&target);
-    let result = filled.and_then(|()| swap());
+    let result = filled.and_then(|()| Ok(swap()?));
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
         if !target.exists() {
@@ -268,7 +278,7 @@ fn refused(e: Error) -> Error {
     match e {
         // Disk space may become available later.
         full if full.is_disk_full() => full,
-        Error::Write { .. } => Error::Request(e.to_string()),
+        Error::Write { .. } => Error::request(e.to_string()),
         other => other,
     }
 }

@@ -1,6 +1,6 @@
 //! Checksums of the contents of files.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;

@@ -1,8 +1,6 @@
 //! Files that a command reads, which its outputs must not replace.
 
-use super::splat::origin_file;
-use super::weights_file::weights_files;
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
@@ -34,15 +32,9 @@ impl InputFiles {
         self.files.extend(file_id(file).map(|id| (id, Kind::Other)));
     }
 
-    /// Adds the files that hold the weights at `path`: one file, or an index and the files that it names.
-    pub fn add_weights(&mut self, path: &Path) {
-        weights_files(path).iter().for_each(|file| self.add(file));
-    }
-
-    /// Adds the splat `file` and its origin file.
-    pub fn add_splat(&mut self, file: &Path) {
-        self.add(file);
-        self.add(&origin_file(file));
+    /// Adds those of `files` that exist.
+    pub fn add_all(&mut self, files: impl IntoIterator<Item = impl AsRef<Path>>) {
+        files.into_iter().for_each(|file| self.add(file.as_ref()));
     }
 
     /// Adds every file in `folder` and in its subfolders.
@@ -117,14 +109,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_splat_is_its_file_and_its_origins() {
+    fn files_are_recognized_by_any_path_and_links() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let splat = folder.path().join("room.ply");
-        let origin = origin_file(&splat);
-        [&splat, &origin].iter().for_each(|file| fs::write(file, "").expect("a file"));
+        let at = |name: &str| folder.path().join(name);
+        ["a.ply", "b.ply", "other.ply"].iter().for_each(|name| fs::write(at(name), "").expect("a file"));
         let mut inputs = InputFiles::default();
-        inputs.add_splat(&splat);
-        assert!(inputs.check_file(&splat).is_err() && inputs.check_file(&origin).is_err());
-        assert!(inputs.check_file(&folder.path().join("other.ply")).is_ok());
+        inputs.add_all([at("a.ply"), at("b.ply"), at("missing.ply")]);
+        let roundabout = folder.path().join(".").join("b.ply");
+        assert!([at("a.ply"), at("b.ply"), roundabout].iter().all(|file| inputs.check_file(file).is_err()));
+        assert!(["other.ply", "missing.ply"].iter().all(|name| inputs.check_file(&at(name)).is_ok()));
+        fs::hard_link(at("a.ply"), at("link.ply")).expect("a link");
+        assert!(inputs.check_file(&at("link.ply")).is_err());
     }
 }

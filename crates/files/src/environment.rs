@@ -1,6 +1,6 @@
 //! Expansion of environment variables in paths of a configuration.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
@@ -21,7 +21,7 @@ fn expand(text: &str) -> Result<OsString> {
     };
     let value = std::env::var_os(name).filter(|v| !v.is_empty()).or(default);
     let value = value.ok_or_else(|| {
-        Error::Request(format!(
+        Error::request(format!(
             "{text}: the environment variable {name} is not set, expected it or a path in its place"
         ))
     })?;

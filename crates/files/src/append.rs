@@ -1,7 +1,7 @@
 //! Files to which whole records are appended.
 
 use super::atomic::check_regular;
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};

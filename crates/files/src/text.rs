@@ -1,6 +1,6 @@
 //! Text files of other programs.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Reads a UTF-8 file without the byte order mark that Windows programs put at its start.

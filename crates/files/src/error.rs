@@ -1,0 +1,165 @@
+//! The error type of the crates that read and write files; every message is one sentence.
+
+use std::any::Any;
+use std::error::Error as StdError;
+use std::path::{Path, PathBuf};
+
+/// Result type of the crates that read and write files.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Error of reading, checking or writing files. [`Error::is_request`] distinguishes a wrong request from work that failed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// Invalid value in a file.
+    #[error("{}: {field} is {found}, expected {expected}", .file.display())]
+    Input {
+        /// Path of the file.
+        file: PathBuf,
+        /// Field of the file, in the words of its format.
+        field: String,
+        /// Value found there.
+        found: String,
+        /// Value or values that were expected.
+        expected: String,
+    },
+    /// Invalid setting.
+    #[error("{field} is {found}, expected {expected}")]
+    Setting {
+        /// Name of the setting.
+        field: String,
+        /// Its value.
+        found: String,
+        /// Value or values that were expected.
+        expected: String,
+    },
+    /// Invalid argument, or invalid combination of arguments, that isn't a single setting.
+    #[error("{message}")]
+    Request {
+        /// What is wrong, in one sentence.
+        message: String,
+    },
+    /// Failed read of a file or folder.
+    #[error("{} can't be read: {source}", .path.display())]
+    Read {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// Failed write of a file or folder.
+    #[error("{} can't be written: {source}", .path.display())]
+    Write {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// Failure of work after it had started.
+    #[error("{message}")]
+    Failed {
+        /// What failed and why, in one sentence.
+        message: String,
+        /// Error that caused the failure, if another library reported one. The message includes its text.
+        source: Option<Box<dyn StdError + Send + Sync>>,
+    },
+}
+
+impl Error {
+    /// Returns an [`Error::Input`]: in `file`, `field` is `found`, expected `expected`.
+    pub fn input(
+        file: impl AsRef<Path>,
+        field: impl Into<String>,
+        found: impl std::fmt::Display,
+        expected: impl Into<String>,
+    ) -> Self {
+        Error::Input {
+            file: file.as_ref().to_owned(),
+            field: field.into(),
+            found: found.to_string(),
+            expected: expected.into(),
+        }
+    }
+
+    /// Returns an [`Error::Setting`]: the setting `field` is `found`, expected `expected`.
+    pub fn setting(
+        field: impl std::fmt::Display,
+        found: impl std::fmt::Display,
+        expected: impl std::fmt::Display,
+    ) -> Self {
+        let (field, found, expected) = (field.to_string(), found.to_string(), expected.to_string());
+        Error::Setting { field, found, expected }
+    }
+
+    /// Returns an [`Error::Request`].
+    pub fn request(message: impl Into<String>) -> Self {
+        Error::Request { message: message.into() }
+    }
+
+    /// Returns an [`Error::Failed`] that no other error caused.
+    pub fn failed(message: impl Into<String>) -> Self {
+        Error::Failed { message: message.into(), source: None }
+    }
+
+    /// Returns a closure for `map_err` that wraps the error of another library in an [`Error::Failed`]: "`what`: its message".
+    pub fn failed_by<E: StdError + Send + Sync + 'static>(
+        what: impl std::fmt::Display,
+    ) -> impl FnOnce(E) -> Self {
+        move |source| Error::Failed { message: format!("{what}: {source}"), source: Some(Box::new(source)) }
+    }
+
+    /// Returns a closure for `map_err` that wraps an I/O error in [`Error::Read`].
+    pub fn read(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_owned();
+        move |source| Error::Read { path, source }
+    }
+
+    /// Returns a closure for `map_err` that wraps an I/O error in [`Error::Write`].
+    pub fn write(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_owned();
+        move |source| Error::Write { path, source }
+    }
+
+    /// Returns `true` if a write failed because the disk was full, which may be temporary.
+    pub fn is_disk_full(&self) -> bool {
+        use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+        matches!(self, Error::Write { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
+    }
+
+    /// Returns `true` if the request was wrong, `false` if the work failed. Programs of this project exit with code 2 and 1.
+    pub fn is_request(&self) -> bool {
+        match self {
+            Error::Input { .. } | Error::Setting { .. } | Error::Request { .. } => true,
+            // The file itself is fine if there was too little memory to map it.
+            Error::Read { source, .. } => source.kind() != std::io::ErrorKind::OutOfMemory,
+            Error::Write { .. } | Error::Failed { .. } => false,
+        }
+    }
+}
+
+/// Returns the message of a panic, cut to its first line because libtorch appends stack traces to its messages.
+pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("an unknown reason");
+    text.lines().next().unwrap_or(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_keep_their_sources() {
+        let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
+        let error = Error::failed_by("room.ply: the encoder failed")(denied());
+        assert_eq!(error.to_string(), format!("room.ply: the encoder failed: {}", denied()));
+        for error in [error, Error::read("room.ply")(denied()), Error::write("room.ply")(denied())] {
+            let source = error.source().and_then(|source| source.downcast_ref::<std::io::Error>());
+            assert_eq!(
+                source.map(std::io::Error::kind),
+                Some(std::io::ErrorKind::PermissionDenied),
+                "{error}"
+            );
+        }
+    }
+}
