@@ -2,6 +2,7 @@
 //! file.
 
 mod depth_colours;
+mod dtype;
 mod event_file;
 mod event_reader;
 mod film;
@@ -13,7 +14,6 @@ mod pretrained;
 mod shards;
 mod splat;
 mod state_dict;
-mod torch_file;
 mod weights;
 mod weights_file;
 
@@ -35,11 +35,8 @@ pub use splat::{
     Splat, check_writable_origin, check_writable_splat, find_splat, fit_splat, is_splat_name, origin_file,
     read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
 };
-pub use torch_file::write_checkpoint;
-pub use weights::{Weights, write_weights};
+pub use weights::{Weights, write_checkpoint, write_weights};
 pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
-
-pub(crate) use torch_file::{Archive, Array, Id, UnknownGlobals, Value, Values, unpickle};
 
 pub(crate) use globalsplat_files::{
     AppendFile, expand_path, files_and_keys, lock_parent, read_text, recover_dirs, remove_dir, replace_dir,

@@ -1,7 +1,7 @@
 //! Extraction of weights from a checkpoint of torch.save: a Lightning checkpoint, a plain state dict, or one under another customary key.
 
-use super::torch_file::{Array, TorchFile, Value};
 use crate::error::{Error, Result};
+use globalsplat_torch_file::{Array, TorchFile, Value};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
@@ -26,19 +26,18 @@ pub(super) fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
     };
     let root = match values.get(values.root) {
         Value::Dict(items) => items,
-        other => return refuse(other.name()),
+        other => return refuse(other.type_name()),
     };
-    let inner = PLACES.iter().find_map(|place| match values.entry(root, place) {
+    let inner = PLACES.iter().find_map(|place| match values.find(root, place) {
         Some(Value::Dict(items)) => Some(items),
         _ => None,
     });
     let mut arrays = BTreeMap::new();
-    for pair in inner.unwrap_or(root).chunks_exact(2) {
-        let (&Value::Text(name), tensor @ Value::Tensor { .. }) = (values.get(pair[0]), values.get(pair[1]))
-        else {
+    for &(key, value) in inner.unwrap_or(root) {
+        let (&Value::Str(name), tensor @ Value::Tensor { .. }) = (values.get(key), values.get(value)) else {
             continue;
         };
-        let array = Array::of(values, storages, tensor).map_err(|why| {
+        let array = Array::locate(values, storages, tensor).map_err(|why| {
             Error::input(path, format!("tensor {name}"), format!("broken: it {why}"), "a whole one")
         })?;
         arrays.insert(name.to_string(), array);
@@ -47,17 +46,17 @@ pub(super) fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
         return refuse("a dict without tensors");
     }
     let mut metadata = HashMap::new();
-    for pair in root.chunks_exact(2) {
-        if let (&Value::Text(key), &Value::Text(text)) = (values.get(pair[0]), values.get(pair[1])) {
+    for &(key, value) in root {
+        if let (&Value::Str(key), &Value::Str(text)) = (values.get(key), values.get(value)) {
             metadata.insert(key.to_string(), text.to_string());
         }
     }
     for setting in SETTINGS {
         let said = values.iter().filter_map(|value| match value {
-            Value::Dict(items) | Value::Object(items) => values.entry(items, setting),
+            Value::Dict(items) | Value::Object(items) => values.find(items, setting),
             _ => None,
         });
-        let said: BTreeSet<i64> = said.filter_map(Value::integer).collect();
+        let said: BTreeSet<i64> = said.filter_map(Value::as_int).collect();
         if let (Some(number), 1) = (said.first(), said.len()) {
             metadata.insert(setting.to_string(), number.to_string());
         }

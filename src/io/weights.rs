@@ -1,11 +1,14 @@
-//! Weights in safetensors files, whose metadata hold the configuration that rebuilds their model.
+//! Weights in safetensors files, whose metadata hold the configuration that rebuilds their model, and in checkpoints.
 
+use super::dtype::to_dtype;
 use crate::error::{Error, Result};
 use globalsplat_files::{PartialFile, write_partially};
-use safetensors::{Dtype, tensor::TensorView};
+use globalsplat_torch_file as torch_file;
+use globalsplat_torch_file::Dtype;
+use safetensors::tensor::TensorView;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
-use tch::{Device, Kind, Tensor, nn};
+use tch::{Device, Tensor, nn};
 
 /// Contents of a safetensors file.
 #[derive(Debug)]
@@ -53,6 +56,20 @@ pub(super) fn write_weights_partially(
     })
 }
 
+/// Writes a checkpoint in the format of torch.save atomically, with `weights` as its state dict and their metadata beside it. `torch.load`
+/// and Lightning read it without any of our code.
+///
+/// # Errors
+/// Returns an error if a tensor's type can't be stored, or if the file can't be written.
+pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
+    let stored = Stored::all(&weights.tensors)?;
+    let tensors: Vec<_> = stored
+        .iter()
+        .map(|(name, s)| torch_file::TensorView { name, dtype: s.dtype, shape: &s.shape, bytes: &s.bytes })
+        .collect();
+    Ok(torch_file::write_checkpoint(path, &tensors, &weights.metadata)?)
+}
+
 /// Alignment of the tensors' bytes in a file. Kernels of libtorch round differently where a mapped file's values aren't aligned to 16 bytes.
 const ALIGNMENT: usize = 64;
 
@@ -75,31 +92,32 @@ fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
 }
 
 /// A tensor's bytes in row-major order, with its type and shape.
-pub(super) struct Stored {
-    pub kind: Kind,
-    pub shape: Vec<usize>,
-    pub bytes: Vec<u8>,
+struct Stored {
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
 }
 
 impl Stored {
-    pub fn all(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<(&str, Self)>> {
+    fn all(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<(&str, Self)>> {
         tensors.iter().map(|(name, tensor)| Ok((name.as_str(), Stored::new(tensor)?))).collect()
     }
 
     fn new(tensor: &Tensor) -> Result<Self> {
         let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-        let mut bytes = vec![0; tensor.numel() * tensor.kind().elt_size_in_bytes()];
+        let dtype = to_dtype(tensor.kind())?;
+        let mut bytes = vec![0; tensor.numel() * dtype.size()];
         tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
         let shape = tensor.size().iter().map(|&s| s as usize).collect();
-        Ok(Stored { kind: tensor.kind(), shape, bytes })
+        Ok(Stored { dtype, shape, bytes })
     }
 
     fn view(&self) -> Result<TensorView<'_>> {
-        let dtype = match self.kind {
-            Kind::Float => Dtype::F32,
-            Kind::BFloat16 => Dtype::BF16,
-            Kind::Int64 => Dtype::I64,
-            other => return Err(Error::failed(format!("tensors of kind {other:?} are not stored"))),
+        let dtype = match self.dtype {
+            Dtype::F32 => safetensors::Dtype::F32,
+            Dtype::BF16 => safetensors::Dtype::BF16,
+            Dtype::I64 => safetensors::Dtype::I64,
+            other => return Err(Error::failed(format!("tensors of type {other} are not stored"))),
         };
         TensorView::new(dtype, self.shape.clone(), &self.bytes)
             .map_err(|e| Error::failed(format!("weights can't be serialized: {e}")))
@@ -153,6 +171,7 @@ pub(super) fn fit(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use tch::Kind;
 
     #[test]
     fn tensors_are_aligned_whatever_the_metadata() {

@@ -1,13 +1,14 @@
 //! Memory-mapped weights: one safetensors file, several with an index, or a checkpoint that torch.save wrote. A tensor is read when it is
 //! needed, once, and directly into its destination.
 
+use super::dtype::to_kind;
 use super::state_dict::{Contents, state_dict};
-use super::torch_file::{Array, TorchFile, row_major};
 use super::weights::{Weights, fit};
 use crate::error::{Error, Result};
 use globalsplat_files::read_text;
+use globalsplat_torch_file::{Array, Dtype, TorchFile, is_torch_file, row_major};
 use memmap2::{Mmap, MmapMut, MmapOptions, UncheckedAdvice};
-use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use safetensors::{SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs::File;
@@ -159,7 +160,7 @@ impl WeightsFile {
     }
 
     fn of(bytes: Bytes, path: &Path) -> Result<Self> {
-        let (arrays, metadata) = match TorchFile::is_one(bytes.get()) {
+        let (arrays, metadata) = match is_torch_file(bytes.get()) {
             true => state_dict(&TorchFile::parse(path, bytes.get())?, path)?,
             false => safetensors(bytes.get(), path)?,
         };
@@ -222,7 +223,7 @@ impl WeightsFile {
     pub fn shapes(&self) -> BTreeMap<String, (Kind, Vec<i64>)> {
         self.tensors
             .iter()
-            .map(|(name, s)| (name.clone(), (s.array.dtype, dimensions(&s.array.size))))
+            .map(|(name, s)| (name.clone(), (to_kind(s.array.dtype), dimensions(&s.array.shape))))
             .collect()
     }
 
@@ -271,23 +272,22 @@ impl WeightsFile {
     /// Fills the variables of `vs`. If `lies_in_file` returns `true` for a variable and the view of its weights in the file, the variable
     /// takes the view; the others get a copy.
     fn fill(&self, vs: &nn::VarStore, lies_in_file: impl Fn(&Tensor, &Tensor) -> bool) -> Result<()> {
-        let is_weight = |kind| matches!(kind, Kind::Float | Kind::Double | Kind::BFloat16 | Kind::Half);
-        if let Some((name, place)) = self.tensors.iter().find(|(_, place)| !is_weight(place.array.dtype)) {
-            let (field, found) = (format!("tensor {name}"), format!("{:?}", place.array.dtype));
-            return Err(Error::input(&self.path, field, found, "F32, BF16 or F16"));
+        if let Some((name, place)) = self.tensors.iter().find(|(_, place)| !place.array.dtype.is_float()) {
+            let field = format!("tensor {name}");
+            return Err(Error::input(&self.path, field, place.array.dtype, "F32, BF16 or F16"));
         }
         let shapes =
-            self.tensors.iter().map(|(name, s)| (name.as_str(), dimensions(&s.array.size))).collect();
+            self.tensors.iter().map(|(name, s)| (name.as_str(), dimensions(&s.array.shape))).collect();
         fit(vs, &shapes, &self.path, |name, variable| {
             let place = &self.tensors[name];
-            let Array { dtype, size, stride, bytes } = &place.array;
+            let Array { dtype, shape, strides, bytes } = &place.array;
             let part = &self.parts[place.part].get()[bytes.clone()];
-            match part.as_ptr().align_offset(dtype.elt_size_in_bytes()) {
+            match part.as_ptr().align_offset(dtype.size()) {
                 0 if !part.is_empty() => {
                     // SAFETY: the array lies inside the file, which stays mapped until the array is copied, or else forever.
                     let view = unsafe {
-                        let (size, stride) = (dimensions(size), dimensions(stride));
-                        Tensor::f_from_blob(part.as_ptr(), &size, &stride, *dtype, Device::Cpu)?
+                        let (size, stride) = (dimensions(shape), dimensions(strides));
+                        Tensor::f_from_blob(part.as_ptr(), &size, &stride, to_kind(*dtype), Device::Cpu)?
                     };
                     if lies_in_file(variable, &view) {
                         variable.set_data(&view);
@@ -304,9 +304,11 @@ impl WeightsFile {
 
     fn copy(&self, Place { part, array }: &Place) -> Result<Tensor> {
         let bytes = &self.parts[*part].get()[array.bytes.clone()];
-        let count = bytes.len() / array.dtype.elt_size_in_bytes();
-        let numbers = Tensor::f_from_data_size(bytes, &[count as i64], array.dtype)?;
-        Ok(numbers.f_as_strided(dimensions(&array.size), dimensions(&array.stride), None)?.f_contiguous()?)
+        let count = bytes.len() / array.dtype.size();
+        let numbers = Tensor::f_from_data_size(bytes, &[count as i64], to_kind(array.dtype))?;
+        Ok(numbers
+            .f_as_strided(dimensions(&array.shape), dimensions(&array.strides), None)?
+            .f_contiguous()?)
     }
 }
 
@@ -337,11 +339,11 @@ fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
     let mut arrays = BTreeMap::new();
     for (name, info) in header.tensors() {
         let dtype = match info.dtype {
-            Dtype::F32 => Kind::Float,
-            Dtype::F64 => Kind::Double,
-            Dtype::BF16 => Kind::BFloat16,
-            Dtype::F16 => Kind::Half,
-            Dtype::I64 => Kind::Int64,
+            safetensors::Dtype::F32 => Dtype::F32,
+            safetensors::Dtype::F64 => Dtype::F64,
+            safetensors::Dtype::BF16 => Dtype::BF16,
+            safetensors::Dtype::F16 => Dtype::F16,
+            safetensors::Dtype::I64 => Dtype::I64,
             other => {
                 let (field, found) = (format!("tensor {name}"), format!("{other:?}"));
                 return Err(Error::input(path, field, found, "F32, BF16 or F16"));
@@ -349,9 +351,9 @@ fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
         };
         let (from, to) = info.data_offsets;
         let start = LENGTH + header_length;
-        let size = info.shape.clone();
-        let stride = row_major(&size);
-        arrays.insert(name, Array { dtype, size, stride, bytes: start + from..start + to });
+        let shape = info.shape.clone();
+        let strides = row_major(&shape);
+        arrays.insert(name, Array { dtype, shape, strides, bytes: start + from..start + to });
     }
     Ok((arrays, header.metadata().clone().unwrap_or_default()))
 }

@@ -10,9 +10,10 @@ use super::Found;
 use crate::data::capture::{Capture, Changes, Frame, Photo, Purpose};
 use crate::data::pixels::Distortion;
 use crate::error::{Error, Result};
-use crate::io::{Archive, encoded_image_size, files_and_keys};
+use crate::io::{encoded_image_size, files_and_keys};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec4};
+use globalsplat_torch_file::Archive;
 use scenes::{Scene, scenes};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -59,7 +60,7 @@ impl Chunk {
     /// # Errors
     /// Fails like [`Chunk::read`], except for errors of reading the file.
     pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
-        let archive = Archive::open(file, &bytes)?;
+        let archive = Archive::parse(file, &bytes)?;
         let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
         let scenes =
             scenes(&bytes, &archive).map_err(|found| Error::input(file, "data.pkl", found, expected))?;

@@ -1,9 +1,8 @@
 //! Parser of a chunk's pickle. It locates scenes by byte ranges in the chunk's file.
 
 use super::CAMERA_NUMBERS;
-use crate::io::{Archive, Array, Id, UnknownGlobals, Value, Values, unpickle};
+use globalsplat_torch_file::{Archive, Array, Dtype, Id, UnknownGlobals, Value, Values, unpickle};
 use std::ops::Range;
-use tch::{Kind, Tensor};
 
 /// Number of views that is always allowed. A chunk may refer to one image repeatedly, in a byte or two each time.
 const VIEWS: usize = 100_000;
@@ -24,12 +23,7 @@ pub(super) struct Scene {
 impl Scene {
     /// Reads the camera values of every view from `file`.
     pub fn cameras(&self, file: &[u8]) -> Vec<f32> {
-        let Array { dtype, size, stride, bytes } = &self.cameras;
-        let counts = |counts: &[usize]| counts.iter().map(|&count| count as i64).collect::<Vec<_>>();
-        let stored = [(bytes.len() / dtype.elt_size_in_bytes()) as i64];
-        let stored = Tensor::from_data_size(&file[bytes.clone()], &stored, *dtype).to_kind(Kind::Float);
-        let cameras = stored.as_strided(counts(size), counts(stride), 0);
-        Vec::try_from(cameras.flatten(0, -1)).expect("float32 on the host")
+        self.cameras.to_f32(file).expect("floats inside the file, as the parser checked")
     }
 }
 
@@ -38,7 +32,7 @@ impl Scene {
 /// # Errors
 /// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
 pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
-    let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refused)?;
+    let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refuse)?;
     let most = VIEWS + bytes.len() / BYTES_OF_VIEW;
     scenes_of(&values, archive, most).map_err(|why| format!("unusable ({why})"))
 }
@@ -46,7 +40,7 @@ pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, Stri
 /// Parses the scenes, with `most` as the maximum number of views.
 fn scenes_of(values: &Values, archive: &Archive, most: usize) -> Result<Vec<Scene>, String> {
     let Value::List(list) = values.get(values.root) else {
-        return Err(format!("{}, expected a list of scenes", values.get(values.root).name()));
+        return Err(format!("{}, expected a list of scenes", values.get(values.root).type_name()));
     };
     let (mut scenes, mut views) = (vec![], 0);
     for (index, &scene) in list.iter().enumerate() {
@@ -61,10 +55,10 @@ fn scenes_of(values: &Values, archive: &Archive, most: usize) -> Result<Vec<Scen
 }
 
 /// Returns the keys and values of the scene.
-fn dict<'v>(values: &'v Values, index: usize, scene: Id) -> Result<&'v [Id], String> {
+fn dict<'v>(values: &'v Values, index: usize, scene: Id) -> Result<&'v [(Id, Id)], String> {
     match values.get(scene) {
         Value::Dict(items) => Ok(items),
-        other => Err(format!("scene {index} is {}, expected a dict", other.name())),
+        other => Err(format!("scene {index} is {}, expected a dict", other.type_name())),
     }
 }
 
@@ -72,7 +66,7 @@ fn dict<'v>(values: &'v Values, index: usize, scene: Id) -> Result<&'v [Id], Str
 struct Fields<'v, 'a> {
     values: &'v Values<'a>,
     archive: &'v Archive,
-    dict: &'v [Id],
+    dict: &'v [(Id, Id)],
     index: usize,
 }
 
@@ -82,28 +76,30 @@ impl<'v, 'a> Fields<'v, 'a> {
     }
 
     fn get(&self, field: &str) -> Result<&'v Value<'a>, String> {
-        self.values.entry(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
+        self.values.find(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
     }
 
     fn list(&self, field: &str) -> Result<&'v [Id], String> {
         match self.get(field)? {
             Value::List(items) => Ok(items),
-            other => Err(format!("{} is {}, expected a list of tensors", self.name(field), other.name())),
+            other => {
+                Err(format!("{} is {}, expected a list of tensors", self.name(field), other.type_name()))
+            }
         }
     }
 
     fn text(&self, field: &str) -> Result<&'a str, String> {
         match self.get(field)? {
-            Value::Text(text) => Ok(text),
-            other => Err(format!("{} is {}, expected a string", self.name(field), other.name())),
+            Value::Str(text) => Ok(text),
+            other => Err(format!("{} is {}, expected a string", self.name(field), other.type_name())),
         }
     }
 
     /// Returns `value`, which is in `field`, as an array of one or two dimensions.
     fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
-        let array = Array::of(self.values, &self.archive.storages, value)
+        let array = Array::locate(self.values, &self.archive.storages, value)
             .map_err(|why| format!("{} {why}", self.name(field)))?;
-        match array.size.len() <= 2 {
+        match array.shape.len() <= 2 {
             true => Ok(array),
             false => Err(format!("{} is no plain tensor", self.name(field))),
         }
@@ -113,25 +109,24 @@ impl<'v, 'a> Fields<'v, 'a> {
         let images = self.list("images")?;
         let views = images.len();
         let cameras = self.array("cameras", self.get("cameras")?)?;
-        let is_float = matches!(cameras.dtype, Kind::Half | Kind::BFloat16 | Kind::Float | Kind::Double);
-        if !is_float || cameras.size != [views, CAMERA_NUMBERS] {
-            let (found, field) = (format!("{:?} {:?}", cameras.dtype, cameras.size), self.name("cameras"));
+        if !cameras.dtype.is_float() || cameras.shape != [views, CAMERA_NUMBERS] {
+            let (found, field) = (format!("{} {:?}", cameras.dtype, cameras.shape), self.name("cameras"));
             return Err(format!(
-                "{field} is {found}, expected Float [{views}, {CAMERA_NUMBERS}] for as many images"
+                "{field} is {found}, expected F32 [{views}, {CAMERA_NUMBERS}] for as many images"
             ));
         }
-        let timestamps = self.values.entry(self.dict, "timestamps");
+        let timestamps = self.values.find(self.dict, "timestamps");
         let timestamps = timestamps.map(|value| self.array("timestamps", value)).transpose()?;
-        if let Some(Array { size, .. }) = timestamps.filter(|timestamps| timestamps.size != [views]) {
+        if let Some(Array { shape, .. }) = timestamps.filter(|timestamps| timestamps.shape != [views]) {
             let field = self.name("timestamps");
-            return Err(format!("{field} has shape {size:?}, expected [{views}] for as many images"));
+            return Err(format!("{field} has shape {shape:?}, expected [{views}] for as many images"));
         }
         let key = self.text("key")?;
         let image = |&id: &Id| match self.array("images", self.values.get(id))? {
             array if !array.is_contiguous() => Err(format!("{} is no plain tensor", self.name("images"))),
-            Array { dtype: Kind::Uint8, size, bytes, .. } if size.len() == 1 => Ok(bytes),
-            Array { dtype, size, .. } => {
-                let found = format!("{dtype:?} {size:?}");
+            Array { dtype: Dtype::U8, shape, bytes, .. } if shape.len() == 1 => Ok(bytes),
+            Array { dtype, shape, .. } => {
+                let found = format!("{dtype} {shape:?}");
                 Err(format!("an image of {} is {found}, expected the bytes of a JPEG", self.name("images")))
             }
         };

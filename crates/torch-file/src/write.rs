@@ -1,14 +1,12 @@
 //! Writer for checkpoints in the format of torch.save, which `torch.load` reads without any of our code: pickle protocol 2, and the bytes
 //! of each tensor in a stored entry of a zip archive.
 
-use super::array::row_major;
-use crate::error::{Error, Result};
-use crate::io::weights::{Stored, Weights};
-use crate::io::write_atomically;
+use crate::array::row_major;
+use crate::{Dtype, Error, Result};
+use globalsplat_files::write_atomically;
 use std::collections::HashMap;
 use std::io::{Cursor, Write};
 use std::path::Path;
-use tch::Kind;
 use zip::CompressionMethod;
 use zip::result::ZipError;
 use zip::write::{FileOptions, ZipWriter};
@@ -19,17 +17,52 @@ const ALIGNMENT: u16 = 64;
 const VERSION: &[u8] = b"3\n";
 
 /// Entries that Lightning requires. With them it accepts the file as a checkpoint of its own.
-const OF_LIGHTNING: &str = "pytorch-lightning_version";
+const LIGHTNING_VERSION_KEY: &str = "pytorch-lightning_version";
 const LIGHTNING_VERSION: &str = "2.0.0";
 const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 
-/// Writes a checkpoint atomically, with `weights` as its state dict and their metadata beside it. Lightning can read it too.
+/// A tensor to be written.
+#[derive(Debug, Clone, Copy)]
+pub struct TensorView<'a> {
+    /// Name in the state dict.
+    pub name: &'a str,
+    /// Type of the elements; not a quantized one.
+    pub dtype: Dtype,
+    /// Size of each dimension.
+    pub shape: &'a [usize],
+    /// Elements, little-endian and in row-major order.
+    pub bytes: &'a [u8],
+}
+
+impl TensorView<'_> {
+    fn check(&self) -> Result<()> {
+        let TensorView { name, dtype, shape, bytes } = self;
+        if dtype.is_quantized() {
+            return Err(Error::failed(format!("tensors of type {dtype} are not stored")));
+        }
+        let size = shape.iter().try_fold(dtype.size(), |size, &count| size.checked_mul(count));
+        match size == Some(bytes.len()) {
+            true => Ok(()),
+            false => {
+                let found = format!("{} bytes for {dtype} {shape:?}", bytes.len());
+                Err(Error::failed(format!("tensor {name} has {found}")))
+            }
+        }
+    }
+}
+
+/// Writes a checkpoint to `path` atomically: the dict {"state_dict": `tensors` by name, and the strings of `metadata` by their keys}. It
+/// also has the entries with which Lightning accepts it: "pytorch-lightning_version", "epoch" and "global_step".
 ///
 /// # Errors
-/// Returns an error if a tensor's type can't be stored, or if the file can't be written.
-pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
-    let tensors = Stored::all(&weights.tensors)?;
-    let pickle = pickle(&tensors, &weights.metadata)?;
+/// Returns an error if a tensor is quantized or its bytes don't fit its shape, or if the file can't be written.
+pub fn write_checkpoint(
+    path: &Path,
+    tensors: &[TensorView],
+    metadata: &HashMap<String, String>,
+) -> Result<()> {
+    tensors.iter().try_for_each(TensorView::check)?;
+    let pickle = pickle(tensors, metadata);
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: &str, contents: &[u8]| {
         let options = FileOptions::default()
@@ -41,8 +74,8 @@ pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
     let written = (|| {
         add("data.pkl", &pickle)?;
         add("byteorder", b"little")?;
-        for (key, (_, tensor)) in tensors.iter().enumerate() {
-            add(&format!("data/{key}"), &tensor.bytes)?;
+        for (key, tensor) in tensors.iter().enumerate() {
+            add(&format!("data/{key}"), tensor.bytes)?;
         }
         add("version", VERSION)
     })();
@@ -52,28 +85,20 @@ pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Result<Vec<u8>> {
+fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8> {
     // PROTO 2, EMPTY_DICT, MARK
     let mut p = Pickle(b"\x80\x02}(".into());
     p.text("state_dict");
     p.ordered_dict();
     p.0.push(b'(');
-    for (key, (name, Stored { kind, shape, .. })) in tensors.iter().enumerate() {
-        let storage = match kind {
-            Kind::Float => "FloatStorage",
-            Kind::Double => "DoubleStorage",
-            Kind::BFloat16 => "BFloat16Storage",
-            Kind::Half => "HalfStorage",
-            Kind::Int64 => "LongStorage",
-            other => return Err(Error::failed(format!("tensors of kind {other:?} are not stored"))),
-        };
+    for (key, TensorView { name, dtype, shape, .. }) in tensors.iter().enumerate() {
         p.text(name);
         p.global("torch._utils", "_rebuild_tensor_v2");
         p.0.push(b'(');
         // The persistent id of a storage, BINPERSID.
         p.0.push(b'(');
         p.text("storage");
-        p.global("torch", storage);
+        p.global("torch", dtype.storage_class());
         p.text(&key.to_string());
         p.text("cpu");
         p.integer(shape.iter().product());
@@ -90,7 +115,7 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
     // SETITEMS
     p.0.push(b'u');
     let mut strings: Vec<(&str, &str)> = metadata.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
-    strings.push((OF_LIGHTNING, LIGHTNING_VERSION));
+    strings.push((LIGHTNING_VERSION_KEY, LIGHTNING_VERSION));
     strings.sort();
     for (key, text) in strings {
         p.text(key);
@@ -102,7 +127,7 @@ fn pickle(tensors: &[(&str, Stored)], metadata: &HashMap<String, String>) -> Res
     }
     // SETITEMS, STOP
     p.0.extend(b"u.");
-    Ok(p.0)
+    p.0
 }
 
 /// A program for Python's stack machine, built instruction by instruction.

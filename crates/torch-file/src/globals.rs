@@ -1,37 +1,22 @@
 //! Names that a pickle may use, and those that it may call.
 
-use super::value::{Rebuild, Value};
-use tch::Kind;
+use crate::Dtype;
+use crate::value::{Rebuild, Value};
 
-/// Functions and types that tensors are assembled from.
-const KNOWN: [(&str, &str, Value); 23] = [
-    ("torch._utils", "_rebuild_tensor", Value::Rebuild(Rebuild::View)),
-    ("torch._utils", "_rebuild_tensor_v2", Value::Rebuild(Rebuild::View)),
+/// Functions and types that tensors are assembled from, beside the classes of storages.
+const TENSOR_GLOBALS: [(&str, &str, Value); 8] = [
+    ("torch._utils", "_rebuild_tensor", Value::Rebuild(Rebuild::Tensor)),
+    ("torch._utils", "_rebuild_tensor_v2", Value::Rebuild(Rebuild::Tensor)),
     ("torch._utils", "_rebuild_parameter", Value::Rebuild(Rebuild::Parameter)),
     ("torch._utils", "_rebuild_parameter_with_state", Value::Rebuild(Rebuild::Parameter)),
-    ("torch._tensor", "_rebuild_from_type_v2", Value::Rebuild(Rebuild::OfClass)),
+    ("torch._tensor", "_rebuild_from_type_v2", Value::Rebuild(Rebuild::FromType)),
     ("collections", "OrderedDict", Value::OrderedDict),
-    ("torch", "ByteStorage", Value::Dtype(Kind::Uint8)),
-    ("torch", "CharStorage", Value::Dtype(Kind::Int8)),
-    ("torch", "ShortStorage", Value::Dtype(Kind::Int16)),
-    ("torch", "IntStorage", Value::Dtype(Kind::Int)),
-    ("torch", "LongStorage", Value::Dtype(Kind::Int64)),
-    ("torch", "HalfStorage", Value::Dtype(Kind::Half)),
-    ("torch", "BFloat16Storage", Value::Dtype(Kind::BFloat16)),
-    ("torch", "FloatStorage", Value::Dtype(Kind::Float)),
-    ("torch", "DoubleStorage", Value::Dtype(Kind::Double)),
-    ("torch", "BoolStorage", Value::Dtype(Kind::Bool)),
-    ("torch", "ComplexFloatStorage", Value::Dtype(Kind::ComplexFloat)),
-    ("torch", "ComplexDoubleStorage", Value::Dtype(Kind::ComplexDouble)),
-    ("torch", "QInt8Storage", Value::Dtype(Kind::QInt8)),
-    ("torch", "QUInt8Storage", Value::Dtype(Kind::QUInt8)),
-    ("torch", "QInt32Storage", Value::Dtype(Kind::QInt32)),
-    ("torch", "UntypedStorage", Value::Dtype(Kind::Uint8)),
-    ("torch.storage", "UntypedStorage", Value::Dtype(Kind::Uint8)),
+    ("torch", "UntypedStorage", Value::Dtype(Dtype::U8)),
+    ("torch.storage", "UntypedStorage", Value::Dtype(Dtype::U8)),
 ];
 
 /// Functions and classes that only assemble data when Python calls them: the parts of settings, optimizers and training states.
-const HARMLESS: [(&str, &[&str]); 19] = [
+const DATA_CONSTRUCTORS: [(&str, &[&str]); 19] = [
     ("__builtin__", BUILTINS),
     ("builtins", BUILTINS),
     ("_codecs", &["encode"]),
@@ -72,18 +57,20 @@ const BUILTINS: &[&str] = &[
 ];
 
 /// Packages whose classes, recognized by their initial capital letter, hold settings and training states.
-const LIBRARIES: [&str; 6] =
+const DATA_PACKAGES: [&str; 6] =
     ["lightning", "lightning_fabric", "omegaconf", "pytorch_lightning", "torchmetrics", "yacs"];
 
 /// Returns the function or type with this name that tensors are assembled from.
-pub(super) fn known(module: &str, name: &str) -> Option<Value<'static>> {
-    KNOWN.into_iter().find(|(m, n, _)| (*m, *n) == (module, name)).map(|(.., value)| value)
+pub(crate) fn find_tensor_global(module: &str, name: &str) -> Option<Value<'static>> {
+    let storage = Dtype::from_storage_class(name).filter(|_| module == "torch").map(Value::Dtype);
+    let listed = || TENSOR_GLOBALS.into_iter().find(|(m, n, _)| (*m, *n) == (module, name));
+    storage.or_else(|| listed().map(|(.., value)| value))
 }
 
 /// Returns `true` if a call of this function or class does nothing but assemble data.
-pub(super) fn is_plain_constructor(module: &str, name: &str) -> bool {
+pub(crate) fn is_plain_constructor(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     let is_class = name.starts_with(|first: char| first.is_ascii_uppercase()) && !name.contains('.');
-    HARMLESS.iter().any(|(m, names)| *m == module && names.contains(&name))
-        || (is_class && LIBRARIES.contains(&package))
+    DATA_CONSTRUCTORS.iter().any(|(m, names)| *m == module && names.contains(&name))
+        || (is_class && DATA_PACKAGES.contains(&package))
 }

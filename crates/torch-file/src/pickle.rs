@@ -5,27 +5,25 @@
 //! value that contains itself is harmless. Each value takes at least one byte of the program, so the size of the result is proportional to
 //! the length of the pickle, whatever it contains.
 
-use super::globals::{is_plain_constructor, known};
-use super::value::{Id, Rebuild, Value, Values};
+use crate::globals::{find_tensor_global, is_plain_constructor};
+use crate::value::{Id, Rebuild, Value, Values};
 
 /// Treatment of values that aren't tensors, lists, dicts, strings or numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum UnknownGlobals {
-    /// Error, for files that need no such values.
-    Refused,
-    /// Kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is known to
+pub enum UnknownGlobals {
+    /// They are errors, for files that need no such values.
+    Refuse,
+    /// They are kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is known to
     /// only assemble data.
-    Kept,
+    Keep,
 }
 
-/// Executes the pickle at the start of `rest`, and leaves in `rest` the bytes after it.
+/// Executes the pickle at the start of `rest`, of protocol 2 to 5, and leaves in `rest` the bytes after it. Nothing is called: see
+/// [`UnknownGlobals`].
 ///
 /// # Errors
 /// Returns a description of what the pickle requests but may not, or of what is broken in it.
-pub(crate) fn unpickle<'a>(
-    rest: &mut &'a [u8],
-    unknown_globals: UnknownGlobals,
-) -> Result<Values<'a>, String> {
+pub fn unpickle<'a>(rest: &mut &'a [u8], unknown_globals: UnknownGlobals) -> Result<Values<'a>, String> {
     let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
     let mut machine = Machine { rest, unknown_globals, values, stack, marks, memo };
     loop {
@@ -63,7 +61,7 @@ impl<'a> Machine<'a> {
         let taken = self.take(bytes)?;
         let mut wide = [if taken.last().is_some_and(|&byte| byte >= 0x80) { 0xff } else { 0 }; 8];
         wide[..bytes].copy_from_slice(taken);
-        Ok(Value::Integer(i64::from_le_bytes(wide)))
+        Ok(Value::Int(i64::from_le_bytes(wide)))
     }
 
     fn text(&mut self, bytes: usize) -> Result<&'a str, String> {
@@ -103,7 +101,7 @@ impl<'a> Machine<'a> {
             Value::List(items) => items.extend_from_slice(values),
             // An instance of a subclass of list, or a set.
             Value::Object(_) => {}
-            other => return Err(format!("a pickle that appends to {}", other.name())),
+            other => return Err(format!("a pickle that appends to {}", other.type_name())),
         }
         self.stack.push(list);
         Ok(())
@@ -111,13 +109,16 @@ impl<'a> Machine<'a> {
 
     /// Adds `values`, alternating keys and values, to the dict on top of the stack.
     fn set_items(&mut self, values: &[Id]) -> Result<(), String> {
-        if !values.len().is_multiple_of(2) {
+        let (pairs, rest) = values.as_chunks();
+        if !rest.is_empty() {
             return Err("a pickle with a key without a value".into());
         }
         let dict = self.pop()?;
         match &mut self.values[dict] {
-            Value::Dict(items) | Value::Object(items) => items.extend_from_slice(values),
-            other => return Err(format!("a pickle that sets items of {}", other.name())),
+            Value::Dict(items) | Value::Object(items) => {
+                items.extend(pairs.iter().map(|&[key, value]| (key, value)));
+            }
+            other => return Err(format!("a pickle that sets items of {}", other.type_name())),
         }
         self.stack.push(dict);
         Ok(())
@@ -142,12 +143,12 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Pushes the value of a global name: a known one, or with [`UnknownGlobals::Kept`] one that has just its name.
+    /// Pushes the value of a global name: a known one, or with [`UnknownGlobals::Keep`] one that has just its name.
     fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
-        let value = match (known(module, name), self.unknown_globals) {
+        let value = match (find_tensor_global(module, name), self.unknown_globals) {
             (Some(value), _) => value,
-            (None, UnknownGlobals::Kept) => Value::Named { module, name },
-            (None, UnknownGlobals::Refused) => return Err(format!("a pickle that asks for {module}.{name}")),
+            (None, UnknownGlobals::Keep) => Value::Global { module, name },
+            (None, UnknownGlobals::Refuse) => return Err(format!("a pickle that asks for {module}.{name}")),
         };
         self.push(value);
         Ok(())
@@ -166,20 +167,18 @@ impl<'a> Machine<'a> {
         let strange = || "a pickle with a persistent id that is no storage".to_string();
         let of = |id: &Id| &self.values[*id];
         let (fields, whole) = match self.tuple(id) {
-            [fields @ .., whole] if fields.len() == 5 && self.unknown_globals == UnknownGlobals::Kept => {
-                (fields, of(whole) == &Value::Constant)
+            [fields @ .., whole] if fields.len() == 5 && self.unknown_globals == UnknownGlobals::Keep => {
+                (fields, of(whole) == &Value::None)
             }
             fields => (fields, true),
         };
         let [tag, dtype, key, device, length] = fields else { return Err(strange()) };
         match (of(tag), of(dtype), of(key), of(device), of(length)) {
-            (
-                Value::Text("storage"),
-                &Value::Dtype(dtype),
-                Value::Text(key),
-                Value::Text(_),
-                Value::Integer(_),
-            ) if whole => Ok(Value::Storage { dtype, key }),
+            (Value::Str("storage"), &Value::Dtype(dtype), Value::Str(key), Value::Str(_), Value::Int(_))
+                if whole =>
+            {
+                Ok(Value::Storage { dtype, key })
+            }
             _ => Err(strange()),
         }
     }
@@ -190,9 +189,9 @@ impl<'a> Machine<'a> {
         let is_object = |id: Id| is(id, |v| matches!(v, Value::Object(_)));
         match (&self.values[function], self.tuple(arguments)) {
             (Value::OrderedDict, []) => Ok(Value::Dict(vec![])),
-            (Value::Rebuild(Rebuild::View), &[storage, offset, size, stride, ..])
+            (Value::Rebuild(Rebuild::Tensor), &[storage, offset, size, stride, ..])
                 if is(storage, |v| matches!(v, Value::Storage { .. }))
-                    && is(offset, |v| matches!(v, Value::Integer(_)))
+                    && is(offset, |v| matches!(v, Value::Int(_)))
                     && is(size, |v| matches!(v, Value::Tuple(_)))
                     && is(stride, |v| matches!(v, Value::Tuple(_))) =>
             {
@@ -203,9 +202,9 @@ impl<'a> Machine<'a> {
             {
                 Ok(self.values[data].clone())
             }
-            (Value::Rebuild(Rebuild::OfClass), &[function, _class, arguments, ..]) => {
+            (Value::Rebuild(Rebuild::FromType), &[function, _class, arguments, ..]) => {
                 match &self.values[function] {
-                    Value::Rebuild(Rebuild::View | Rebuild::Parameter) => self.call(function, arguments),
+                    Value::Rebuild(Rebuild::Tensor | Rebuild::Parameter) => self.call(function, arguments),
                     _ => Ok(Value::Object(vec![])),
                 }
             }
@@ -213,20 +212,20 @@ impl<'a> Machine<'a> {
             (Value::Rebuild(_), _) => {
                 Err("a pickle with a tensor of other than storage, offset, size and stride".into())
             }
-            (&Value::Named { module, name }, _) => match is_plain_constructor(module, name) {
+            (&Value::Global { module, name }, _) => match is_plain_constructor(module, name) {
                 true => Ok(Value::Object(vec![])),
                 false => Err(format!("a pickle that calls {module}.{name}")),
             },
-            (other, _) => Err(format!("a pickle that calls {}", other.name())),
+            (other, _) => Err(format!("a pickle that calls {}", other.type_name())),
         }
     }
 
     /// Pushes an instance of `class`, which Python creates by `__new__` alone.
     fn instance(&mut self, class: Id) -> Result<(), String> {
         let made = match &self.values[class] {
-            Value::Named { .. } => Value::Object(vec![]),
+            Value::Global { .. } => Value::Object(vec![]),
             Value::OrderedDict => Value::Dict(vec![]),
-            other => return Err(format!("a pickle with an instance of {}", other.name())),
+            other => return Err(format!("a pickle with an instance of {}", other.type_name())),
         };
         self.push(made);
         Ok(())
@@ -263,12 +262,12 @@ impl<'a> Machine<'a> {
                 self.stack.extend([top, top]);
             }
             // NONE, NEWTRUE, NEWFALSE
-            b'N' => self.push(Value::Constant),
-            opcode @ (0x88 | 0x89) => self.push(Value::Truth(opcode == 0x88)),
+            b'N' => self.push(Value::None),
+            opcode @ (0x88 | 0x89) => self.push(Value::Bool(opcode == 0x88)),
             // BININT1, BININT2, BININT
             opcode @ (b'K' | b'M') => {
                 let number = self.unsigned(if opcode == b'K' { 1 } else { 2 })?;
-                self.push(Value::Integer(number as i64));
+                self.push(Value::Int(number as i64));
             }
             b'J' => {
                 let number = self.signed(4)?;
@@ -282,19 +281,19 @@ impl<'a> Machine<'a> {
                 }
                 bytes => {
                     self.take(bytes)?;
-                    self.push(Value::Constant);
+                    self.push(Value::LargeInt);
                 }
             },
             // BINFLOAT
             b'G' => {
-                self.take(8)?;
-                self.push(Value::Constant);
+                let bytes = self.take(8)?.try_into().expect("eight bytes");
+                self.push(Value::Float(f64::from_be_bytes(bytes)));
             }
             // SHORT_BINUNICODE, BINUNICODE, BINUNICODE8
             opcode @ (0x8c | b'X' | 0x8d) => {
                 let length = self.unsigned(length_bytes(opcode))?;
                 let text = self.text(length)?;
-                self.push(Value::Text(text));
+                self.push(Value::Str(text));
             }
             // SHORT_BINBYTES, BINBYTES, BINBYTES8, BYTEARRAY8
             opcode @ (b'C' | b'B' | 0x8e | 0x96) => {
@@ -310,7 +309,7 @@ impl<'a> Machine<'a> {
             // STACK_GLOBAL
             0x93 => {
                 let (name, module) = (self.pop()?, self.pop()?);
-                let (&Value::Text(module), &Value::Text(name)) = (&self.values[module], &self.values[name])
+                let (&Value::Str(module), &Value::Str(name)) = (&self.values[module], &self.values[name])
                 else {
                     return Err("a pickle with a name that is no string".into());
                 };

@@ -1,7 +1,7 @@
 //! The zip archive that torch.save writes: a pickle, and the bytes of its tensors, all stored without compression.
 
-use super::Storages;
-use crate::error::{Error, Result};
+use crate::Storages;
+use globalsplat_files::{Error, Result};
 use std::fmt::Display;
 use std::io::Cursor;
 use std::ops::Range;
@@ -10,14 +10,15 @@ use zip::CompressionMethod;
 use zip::read::ZipArchive;
 
 /// First bytes of an archive.
-pub(super) const MAGIC: &[u8] = b"PK\x03\x04";
+pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
-/// Parts of an archive, as byte ranges in its file. No two of them overlap.
+/// Parts of a file that torch.save wrote since torch 1.6, as byte ranges in the file. No two of them overlap. [`TorchFile`](crate::TorchFile)
+/// reads them; this type serves readers that call [`unpickle`](crate::unpickle) themselves.
 #[derive(Debug)]
-pub(crate) struct Archive {
+pub struct Archive {
     /// Byte range of `data.pkl`.
     pub pickle: Range<usize>,
-    /// Byte ranges of the tensors' storages, by the keys under which the pickle refers to them.
+    /// Byte ranges of the tensors' storages (`data/KEY`), by the keys under which the pickle refers to them.
     pub storages: Storages,
 }
 
@@ -35,7 +36,7 @@ impl Archive {
     ///
     /// # Errors
     /// Returns an error if the file is no such archive, is truncated, or has changed since it was written.
-    pub fn open(file: &Path, bytes: &[u8]) -> Result<Self> {
+    pub fn parse(file: &Path, bytes: &[u8]) -> Result<Self> {
         let refuse = |field: &str, found: &dyn Display, expected: &str| {
             Err(Error::input(file, field, found, expected))
         };

@@ -1,0 +1,218 @@
+//! Pickles and archives that are refused.
+
+use globalsplat_torch_file::{Archive, Array, TorchFile, UnknownGlobals, Value, unpickle};
+use std::io::{Cursor, Write};
+use std::path::Path;
+use zip::CompressionMethod;
+use zip::write::{FileOptions, ZipWriter};
+
+/// Returns a torch.save archive with `pickle` and the bytes of one tensor.
+fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
+    let mut zip = ZipWriter::new(Cursor::new(vec![]));
+    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
+        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
+        zip.write_all(contents).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+#[track_caller]
+fn assert_refused(mut pickle: &[u8], policies: &[UnknownGlobals], for_what: &str) {
+    for &policy in policies {
+        let error = unpickle(&mut pickle, policy).expect_err("a refusal");
+        assert!(error.contains(for_what), "{error:?} lacks {for_what:?}");
+    }
+}
+
+const REFUSE: &[UnknownGlobals] = &[UnknownGlobals::Refuse];
+const KEEP: &[UnknownGlobals] = &[UnknownGlobals::Keep];
+const BOTH: &[UnknownGlobals] = &[UnknownGlobals::Refuse, UnknownGlobals::Keep];
+
+/// Returns a BINUNICODE opcode with its argument.
+fn text(text: &str) -> Vec<u8> {
+    [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// Returns a BININT opcode with its argument.
+fn int(value: u32) -> Vec<u8> {
+    [b"J", &value.to_le_bytes()[..]].concat()
+}
+
+/// Returns the pickle of a tensor of the storage with a persistent id of these parts.
+fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
+    let tuple = |values: &[u32]| {
+        [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
+    };
+    [
+        b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
+        id.concat(),
+        b"tQ".to_vec(),
+        int(offset),
+        tuple(size),
+        tuple(stride),
+        b"\x89ccollections\nOrderedDict\n)RtR.".to_vec(),
+    ]
+    .concat()
+}
+
+fn float() -> Vec<u8> {
+    b"ctorch\nFloatStorage\n".to_vec()
+}
+
+#[test]
+fn functions_are_not_called() {
+    for module in ["os", "posix"] {
+        let call = [format!("c{module}\nsystem\n").into_bytes(), text("touch a_file"), b"\x85R.".to_vec()];
+        let program = [b"\x80\x02".to_vec(), call.concat()].concat();
+        assert_refused(&program, REFUSE, &format!("asks for {module}.system"));
+        assert_refused(&program, KEEP, &format!("calls {module}.system"));
+    }
+    assert_refused(b"\x80\x02c__builtin__\neval\nX\x01\x00\x00\x001\x85R.", KEEP, "calls __builtin__.eval");
+    assert_refused(b"\x80\x02c__builtin__\neval\n.", REFUSE, "asks for __builtin__.eval");
+    assert_refused(b"\x80\x04\x8c\x02os\x8c\x06system\x93.", REFUSE, "asks for os.system");
+    // The attribute of a class that only holds settings.
+    assert_refused(b"\x80\x02comegaconf\nA.b\n)R.", KEEP, "calls omegaconf.A.b");
+    let file = archive(b"\x80\x02cos\nsystem\n(X\x02\x00\x00\x00lstR.", &[], CompressionMethod::Stored);
+    let error = TorchFile::parse(Path::new("a.pt"), &file).unwrap_err().to_string();
+    assert!(error.contains("calls os.system") && error.contains("nothing was run"), "{error}");
+}
+
+/// Settings beside the tensors don't make a checkpoint unreadable.
+#[test]
+fn data_of_unknown_classes_are_kept() {
+    for pickle in [
+        b"\x80\x02cargparse\nNamespace\n)\x81}b.".as_slice(),
+        b"\x80\x02cpathlib\nPosixPath\nX\x01\x00\x00\x00/\x85R.",
+        b"\x80\x02comegaconf.dictconfig\nDictConfig\n)R}b.",
+        b"\x80\x02canything\nAtAll\n)\x81}b.",
+    ] {
+        let values = unpickle(&mut &pickle[..], UnknownGlobals::Keep).unwrap();
+        assert_eq!(values.get(values.root), &Value::Object(vec![]));
+    }
+}
+
+#[test]
+fn unsound_pickles_are_refused() {
+    assert_refused(b"\x80\x02]r\xff\xff\xff\xff.", BOTH, "memo 4294967295");
+    assert_refused(b"\x80\x02h\x00.", BOTH, "recalls memo 0, which is not there");
+    assert_refused(b"\x80\x02}K\x01a.", BOTH, "appends to a dict");
+    assert_refused(b"\x80\x02](X\x01\x00\x00\x00aNu.", BOTH, "sets items of a list");
+    assert_refused(b"\x80\x02}(X\x01\x00\x00\x00au.", BOTH, "a key without a value");
+    assert_refused(b"\x80\x02a.", BOTH, "takes what isn't there");
+    assert_refused(b"\x80\x02K\x01(0.", BOTH, "takes what isn't there");
+    assert_refused(b"\x80\x02t.", BOTH, "without a mark");
+    assert_refused(b"\x80\x02K\x01K\x02.", BOTH, "ends with 2 values");
+    assert_refused(b"\x80\x02X\xff\xff\xff\x7fabc.", BOTH, "cut off");
+    assert_refused(b"\x80\x02X\x01\x00\x00\x00\xff.", BOTH, "a string that is no UTF-8");
+    assert_refused(b"\x80\x06N.", BOTH, "protocol 6");
+    assert_refused(b"\x80\x02I1\n.", BOTH, "instruction 0x49, which no tensors need");
+    assert_refused(b"\x80\x04K\x01K\x02\x93.", BOTH, "a name that is no string");
+    assert_refused(b"\x80\x02)K\x01\x81.", BOTH, "an instance of a tuple");
+}
+
+#[test]
+fn values_may_contain_themselves() {
+    for pickle in [b"\x80\x02]q\x00h\x00a.".as_slice(), b"\x80\x02]q\x00(h\x00e."] {
+        let values = unpickle(&mut &pickle[..], UnknownGlobals::Refuse).unwrap();
+        assert_eq!(values.get(values.root), &Value::List(vec![values.root]));
+    }
+    // Deep nesting uses no stack.
+    let nested = [b"\x80\x02".to_vec(), b"]".repeat(100_000), b"a".repeat(99_999), b".".to_vec()].concat();
+    assert_eq!(unpickle(&mut nested.as_slice(), UnknownGlobals::Refuse).unwrap().iter().count(), 100_000);
+}
+
+#[test]
+fn only_storages_are_storages() {
+    for id in [
+        // A number instead of the storage's type, which libtorch would use as an address.
+        vec![text("storage"), int(u32::MAX), text("0"), text("cpu"), int(64)],
+        vec![text("module"), float(), text("0"), text("cpu"), int(64)],
+        vec![text("storage"), float(), int(0), text("cpu"), int(64)],
+        vec![text("storage"), float(), text("0"), int(0), int(64)],
+        vec![text("storage"), float(), text("0"), text("cpu"), text("64")],
+        vec![text("storage"), float(), text("0"), text("cpu")],
+        vec![],
+    ] {
+        assert_refused(&tensor_of(&id, 0, &[1], &[1]), BOTH, "a persistent id that is no storage");
+    }
+    // The last item of the format before torch 1.6 names the storage that this one is a part of. It must be None.
+    let with = |last: &[u8]| {
+        let id = [text("storage"), float(), text("0"), text("cpu"), int(64), last.to_vec()];
+        tensor_of(&id, 0, &[1], &[1])
+    };
+    assert_refused(&with(b"N"), REFUSE, "a persistent id that is no storage");
+    assert!(unpickle(&mut with(b"N").as_slice(), UnknownGlobals::Keep).is_ok());
+    assert_refused(&with(b"K\x00"), BOTH, "a persistent id that is no storage");
+    assert_refused(&with(b"G\0\0\0\0\0\0\0\0"), BOTH, "a persistent id that is no storage");
+
+    let call = |function: &str, arguments: &[u8]| {
+        [format!("\x02c{function}\n(").as_bytes(), arguments, b"tR."].concat()
+    };
+    for arguments in [b"".as_slice(), b"NK\x00))\x89)", b"K\x00K\x00))\x89)"] {
+        let pickle = [b"\x80".to_vec(), call("torch._utils\n_rebuild_tensor_v2", arguments)].concat();
+        assert_refused(&pickle, BOTH, "a tensor of other than storage");
+    }
+    for (function, arguments, found) in [
+        ("torch\nFloatStorage", b"K\x04".as_slice(), "calls a type"),
+        ("collections\nOrderedDict", b"]", "calls a function"),
+    ] {
+        assert_refused(&[b"\x80".to_vec(), call(function, arguments)].concat(), BOTH, found);
+    }
+}
+
+#[test]
+fn tensors_stay_inside_their_storages() {
+    let locate = |key: &str, offset: u32, size: &[u32], stride: &[u32]| {
+        let id = [text("storage"), float(), text(key), text("cpu"), int(64)];
+        let pickle = tensor_of(&id, offset, size, stride);
+        let values = unpickle(&mut pickle.as_slice(), UnknownGlobals::Refuse).unwrap();
+        let storages = [("0".to_string(), 100..164)].into();
+        Array::locate(&values, &storages, values.get(values.root))
+    };
+    assert_eq!(locate("0", 2, &[3, 2], &[4, 1]).unwrap().bytes, 108..148);
+    assert_eq!(locate("0", 0, &[16], &[1]).unwrap().bytes, 100..164);
+    for (key, offset, size, stride, found) in [
+        ("1", 0, [1].as_slice(), [1].as_slice(), "asks for data/1, which is not there"),
+        ("0", 0, &[17], &[1], "reaches beyond its data of 64 bytes"),
+        ("0", 15, &[2], &[1], "reaches beyond its data of 64 bytes"),
+        ("0", 1 << 30, &[2], &[1], "reaches beyond its data of 64 bytes"),
+        ("0", 0, &[i32::MAX as u32; 3], &[i32::MAX as u32; 3], "reaches beyond its data of 64 bytes"),
+        // Negative numbers.
+        ("0", u32::MAX, &[2], &[1], "is no plain tensor"),
+        ("0", 0, &[u32::MAX], &[1], "is no plain tensor"),
+        ("0", 0, &[2], &[1, 1], "is no plain tensor"),
+        ("0", 0, &[1; 9], &[1; 9], "is no plain tensor"),
+        // More elements than bytes, which a copy would have to store.
+        ("0", 0, &[1 << 30], &[0], "is no plain tensor"),
+    ] {
+        assert_eq!(locate(key, offset, size, stride).unwrap_err(), found, "{offset} {size:?} {stride:?}");
+    }
+}
+
+#[test]
+fn archives_that_inflate_are_refused() {
+    let refusal = |bytes: &[u8]| {
+        let error = Archive::parse(Path::new("a.pt"), bytes).expect_err("a refusal");
+        assert!(error.is_request(), "{error}");
+        error.to_string()
+    };
+    let pickle = b"\x80\x02}.";
+    let error = refusal(&archive(pickle, &[0; 1 << 20], CompressionMethod::Deflated));
+    assert!(error.contains("archive/data.pkl is compressed"), "{error}");
+    let mut bytes = archive(pickle, &[0; 64], CompressionMethod::Stored);
+    // The central directory's second entry claims 4 GB at its offset.
+    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
+    assert!(refusal(&bytes).contains("expected inside the file"));
+    // Both entries at the same offset: their checksums would be computed repeatedly.
+    let mut bytes = archive(pickle, pickle, CompressionMethod::Stored);
+    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    bytes[entry + 42..entry + 46].copy_from_slice(&[0; 4]);
+    assert!(refusal(&bytes).contains("in one place with another entry"));
+    // A changed byte of the tensor.
+    let mut bytes = archive(pickle, &[7; 64], CompressionMethod::Stored);
+    let data = bytes.windows(64).position(|window| window == [7; 64]).unwrap();
+    bytes[data] = 8;
+    assert!(refusal(&bytes).contains("archive/data/0 is damaged: its checksum differs"));
+    assert!(refusal(&bytes[..bytes.len() - 30]).contains("no whole zip archive"));
+}

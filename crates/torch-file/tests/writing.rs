@@ -1,0 +1,73 @@
+//! Checkpoints that the crate writes. `parity/tests/test_checkpoints.py` reads them with torch.
+
+use globalsplat_torch_file::{Array, Dtype, TensorView, TorchFile, Value, write_checkpoint};
+use std::collections::HashMap;
+
+const DTYPES: [Dtype; 12] = [
+    Dtype::U8,
+    Dtype::I8,
+    Dtype::I16,
+    Dtype::I32,
+    Dtype::I64,
+    Dtype::F16,
+    Dtype::BF16,
+    Dtype::F32,
+    Dtype::F64,
+    Dtype::Bool,
+    Dtype::C64,
+    Dtype::C128,
+];
+
+#[test]
+fn checkpoints_are_read_as_they_were_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.ckpt");
+    let names: Vec<String> = DTYPES.iter().map(|dtype| format!("a {dtype}")).collect();
+    let contents: Vec<Vec<u8>> =
+        DTYPES.iter().map(|dtype| (0..6 * dtype.size()).map(|i| i as u8).collect()).collect();
+    let mut tensors: Vec<TensorView> = names
+        .iter()
+        .zip(DTYPES)
+        .zip(&contents)
+        .map(|((name, dtype), bytes)| TensorView { name, dtype, shape: &[2, 3], bytes })
+        .collect();
+    tensors.push(TensorView { name: "scalar", dtype: Dtype::F32, shape: &[], bytes: &[0, 0, 128, 63] });
+    tensors.push(TensorView { name: "empty", dtype: Dtype::F32, shape: &[4, 0], bytes: &[] });
+    let metadata = HashMap::from([("settings".to_string(), "a = \"ä\"\n".to_string())]);
+    write_checkpoint(&path, &tensors, &metadata).unwrap();
+
+    let bytes = std::fs::read(&path).unwrap();
+    let file = TorchFile::parse(&path, &bytes).unwrap();
+    let Value::Dict(root) = file.values.get(file.values.root) else { panic!("no dict") };
+    let Some(Value::Dict(state)) = file.values.find(root, "state_dict") else { panic!("no state dict") };
+    assert_eq!(state.len(), tensors.len());
+    for tensor in &tensors {
+        let value = file.values.find(state, tensor.name).unwrap();
+        let array = Array::locate(&file.values, &file.storages, value).unwrap();
+        assert_eq!((array.dtype, array.shape.as_slice()), (tensor.dtype, tensor.shape), "{}", tensor.name);
+        assert!(array.is_contiguous() && bytes[array.bytes.clone()] == *tensor.bytes, "{}", tensor.name);
+        assert_eq!(array.bytes.start % 64, 0, "{}", tensor.name);
+    }
+    for (key, expected) in [
+        ("settings", Value::Str("a = \"ä\"\n")),
+        ("pytorch-lightning_version", Value::Str("2.0.0")),
+        ("epoch", Value::Int(0)),
+        ("global_step", Value::Int(0)),
+    ] {
+        assert_eq!(file.values.find(root, key), Some(&expected), "{key}");
+    }
+}
+
+#[test]
+fn tensors_that_cannot_be_stored_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.ckpt");
+    let refuse = |dtype, shape: &[usize], bytes: &[u8]| {
+        let tensor = TensorView { name: "a", dtype, shape, bytes };
+        write_checkpoint(&path, &[tensor], &HashMap::new()).unwrap_err().to_string()
+    };
+    assert_eq!(refuse(Dtype::QI8, &[1], &[0]), "tensors of type QI8 are not stored");
+    assert_eq!(refuse(Dtype::F32, &[2], &[0; 7]), "tensor a has 7 bytes for F32 [2]");
+    assert!(refuse(Dtype::F32, &[usize::MAX, 4], &[0; 7]).contains("has 7 bytes"));
+    assert!(!path.exists());
+}
