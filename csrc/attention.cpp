@@ -9,8 +9,8 @@
 #include <vector>
 
 #include "globalsplat-csrc/src/attention.rs.h"
-#include "raster/attend.h"
-#include "raster/rows.h"
+#include "kernels/attend.h"
+#include "kernels/rows.h"
 #include "room.h"
 #include "threads.h"
 

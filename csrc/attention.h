@@ -10,7 +10,7 @@ namespace globalsplat {
 // memory for this test can't be allocated.
 bool attention_takes(int64_t width, bool is_bf16);
 
-// Computes softmax(q kᵀ / √(d/h)) v over h adjacent heads (raster/attention.h). q is [B, n, d], k and v are [B, m, d] with m at least 1,
+// Computes softmax(q kᵀ / √(d/h)) v over h adjacent heads (kernels/attention.h). q is [B, n, d], k and v are [B, m, d] with m at least 1,
 // float32 or bfloat16 on the CPU, with any strides; arguments are addresses of live tensors. Returns the address of a new contiguous tensor
 // [B, n, d] of their kind that the caller owns. Differentiable once. Throws if shapes or types don't fit.
 size_t attention(size_t q, size_t k, size_t v, int64_t heads);

@@ -40,7 +40,7 @@ fn kernels(isa: &str, flags: &[&str]) {
     let mut build = cpp();
     // GCC 12 warns of undefined values in its own AVX-512 headers.
     build.flag_if_supported("-Wno-maybe-uninitialized");
-    build.define("GS_ISA", isa).flag("-ffp-contract=off").file("raster/kernels_isa.cpp");
+    build.define("GS_ISA", isa).flag("-ffp-contract=off").file("kernels/kernels_isa.cpp");
     for flag in flags {
         build.flag(flag);
     }
@@ -93,29 +93,29 @@ fn main() {
         .std("c++17")
         // libtorch is compiled with NDEBUG: without it some of its classes have more fields here than there.
         .define("NDEBUG", None)
-        // The heavy work is done in raster/ and in libtorch.
+        // The heavy work is done in kernels/ and in libtorch.
         .opt_level(1)
         .flag("-isystem")
         .flag(&include)
         .flag("-isystem")
         .flag(format!("{include}/torch/csrc/api/include"))
-        .includes([".", "raster"])
+        .includes([".", "kernels"])
         .files(["torch.cpp", "nccl.cpp"])
         .compile("globalsplat_torch");
 
     cpp()
         .files([
-            "raster/raster.cpp",
-            "raster/attend.cpp",
-            "raster/fit.cpp",
-            "raster/optim.cpp",
-            "raster/parallel.cpp",
-            "raster/kernels.cpp",
+            "kernels/raster.cpp",
+            "kernels/attend.cpp",
+            "kernels/fit.cpp",
+            "kernels/optim.cpp",
+            "kernels/parallel.cpp",
+            "kernels/kernels.cpp",
         ])
         .compile("globalsplat_raster");
     // GPU kernels give bit-identical results to the CPU, so no multiply-add is fused here either unless written so.
     cpp()
-        .includes(["raster", "cuda"])
+        .includes(["kernels", "cuda"])
         .flag("-ffp-contract=off")
         .files(["cuda/fitting.cpp", "cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
         .compile("globalsplat_cuda");

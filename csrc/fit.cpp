@@ -9,8 +9,8 @@
 #include "cuda/fitting.h"
 #include "cuda/torch_device.h"
 #include "globalsplat-csrc/src/fit.rs.h"
-#include "raster/fit.h"
-#include "raster/optim.h"
+#include "kernels/fit.h"
+#include "kernels/optim.h"
 #include "threads.h"
 
 namespace globalsplat {

@@ -14,7 +14,7 @@ struct AdamArguments;  // shared with Rust, see src/fit.rs
 // float64 if `picture` is and float32 otherwise. Differentiable with respect to `picture`. Throws on shapes that don't fit.
 void photometric(size_t picture, size_t photo, double absolute, double similar, rust::Slice<size_t> out);
 
-// Computes `factor` · the edge-aware smoothness of depths (raster/smooth.h), for depths [.., H, W] and photos [.., 3, H, W]. Devices, types
+// Computes `factor` · the edge-aware smoothness of depths (kernels/smooth.h), for depths [.., H, W] and photos [.., 3, H, W]. Devices, types
 // and ownership are as in photometric(). Differentiable with respect to the depths.
 void depth_smoothness(size_t depths, size_t photos, double factor, rust::Slice<size_t> out);
 

@@ -10,7 +10,7 @@
 #include <vector>
 
 #include "globalsplat-csrc/src/optim.rs.h"
-#include "raster/optim.h"
+#include "kernels/optim.h"
 #include "threads.h"
 
 namespace globalsplat {

@@ -11,7 +11,7 @@
 #include "cpu/backend.h"
 #include "cuda/backend.h"
 #include "globalsplat-csrc/src/render.rs.h"
-#include "raster/sh.h"
+#include "kernels/sh.h"
 
 namespace globalsplat {
 namespace {

@@ -35,17 +35,17 @@ compile() { # OBJECT SOURCE FLAG…
 # The slowest compilations come first.
 for sanitizer in $sanitizers; do
     for isa in $isas; do
-        compile "$sanitizer-$isa" raster/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
+        compile "$sanitizer-$isa" kernels/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in raster/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/{fitting,frame}.cpp checks/{checks,refusals,schedules}.cpp; do
-        compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/raster
+    for source in kernels/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/{fitting,frame}.cpp checks/{checks,refusals,schedules}.cpp; do
+        compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/kernels
     done
-    compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/raster
+    compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/kernels
     # ThreadSanitizer checks the emulated GPU threads, not the emulator that schedules them.
     case $sanitizer in
-    thread) compile thread-emulator cuda/emulator.cpp -O1 -g1 -DGS_UNDER_TSAN -Icsrc/raster ;;
-    *) compile "$sanitizer-emulator" cuda/emulator.cpp "${flags_of[$sanitizer]}" -Icsrc/raster ;;
+    thread) compile thread-emulator cuda/emulator.cpp -O1 -g1 -DGS_UNDER_TSAN -Icsrc/kernels ;;
+    *) compile "$sanitizer-emulator" cuda/emulator.cpp "${flags_of[$sanitizer]}" -Icsrc/kernels ;;
     esac
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do

@@ -428,7 +428,7 @@ fn instruction_sets_agree() {
 /// Compares the CUDA kernels, emulated on the CPU, with the CPU's own: images bit by bit, gradients within rounding.
 ///
 /// If the CPU has fused multiply-add, gradients differ only by the order of summation. `portable` rounds a product and a sum
-/// separately (`add_product` in csrc/raster/simd.h). Both kernels compute the loss behind a splat as the loss of the whole
+/// separately (`add_product` in csrc/kernels/simd.h). Both kernels compute the loss behind a splat as the loss of the whole
 /// pixel less the part in front of it, a difference that magnifies rounding. The two float32 gradients then differ by about as
 /// much as each differs from the float64 gradient, and this distance is the bound.
 #[test]

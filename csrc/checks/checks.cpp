@@ -24,12 +24,12 @@
 #include <thread>
 
 #include "../cuda/emulated.h"
-#include "../raster/attend.h"
-#include "../raster/fit.h"
-#include "../raster/kernels.h"
-#include "../raster/optim.h"
-#include "../raster/parallel.h"
-#include "../raster/rows.h"
+#include "../kernels/attend.h"
+#include "../kernels/fit.h"
+#include "../kernels/kernels.h"
+#include "../kernels/optim.h"
+#include "../kernels/parallel.h"
+#include "../kernels/rows.h"
 #include "refusals.h"
 #include "scenes.h"
 #include "schedules.h"

@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "../raster/raster.h"
+#include "../kernels/raster.h"
 
 namespace globalsplat::checks {
 

@@ -8,7 +8,7 @@
 #include "../cuda/emulated.h"
 #include "../cuda/fitting.h"
 #include "../cuda/frame.h"
-#include "../raster/kernels.h"
+#include "../kernels/kernels.h"
 
 namespace globalsplat::checks {
 namespace {

@@ -1,4 +1,4 @@
-// The CPU backend: it runs the rasterizer of raster/ on tensors' memory.
+// The CPU backend: it runs the rasterizer of kernels/ on tensors' memory.
 #pragma once
 
 #include "../backend.h"

@@ -7,8 +7,8 @@
 #include <vector>
 
 #include "../backend.h"
-#include "../raster/lens.h"
-#include "../raster/raster.h"
+#include "../kernels/lens.h"
+#include "../kernels/raster.h"
 
 namespace globalsplat::cpu {
 

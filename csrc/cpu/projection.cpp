@@ -3,8 +3,8 @@
 #include <algorithm>
 #include <vector>
 
-#include "../raster/kernels.h"
-#include "../raster/lens.h"
+#include "../kernels/kernels.h"
+#include "../kernels/lens.h"
 #include "backend.h"
 #include "memory.h"
 

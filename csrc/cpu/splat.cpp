@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "../arguments.h"
-#include "../raster/kernels.h"
+#include "../kernels/kernels.h"
 #include "backend.h"
 #include "cpu.h"
 #include "globalsplat-csrc/src/render.rs.h"

@@ -1,7 +1,7 @@
-// Losses that fit rendered images to photos on a GPU: the counterpart of ../raster/fit.h, in float32, as a sequence of kernels.
+// Losses that fit rendered images to photos on a GPU: the counterpart of ../kernels/fit.h, in float32, as a sequence of kernels.
 #pragma once
 
-#include "../raster/fit.h"
+#include "../kernels/fit.h"
 #include "device.h"
 
 namespace globalsplat::cuda {

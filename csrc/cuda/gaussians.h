@@ -1,4 +1,4 @@
-// Projection of Gaussians to splats, forward and backward: the maths of raster/project.h with one Gaussian per thread.
+// Projection of Gaussians to splats, forward and backward: the maths of kernels/project.h with one Gaussian per thread.
 #pragma once
 
 #include "lens.h"

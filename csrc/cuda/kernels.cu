@@ -1,5 +1,5 @@
 // All kernels for a GPU as one source, which NVRTC compiles for the current device when it is first needed. Any C++ compiler compiles it
-// against emulator.h for tests. The maths is that of raster/, with single values instead of vectors.
+// against emulator.h for tests. The maths is that of kernels/, with single values instead of vectors.
 #define GS_LANE
 #define GS_ISA lane
 #ifdef __CUDACC__

@@ -1,4 +1,4 @@
-// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch (raster/reach.h).
+// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch (kernels/reach.h).
 #pragma once
 
 #include "reach.h"

@@ -1,4 +1,4 @@
-// Losses that compare images with photos, and their gradients: the kernels of ../raster/ssim.h and smooth.h for GPUs. Results have the same
+// Losses that compare images with photos, and their gradients: the kernels of ../kernels/ssim.h and smooth.h for GPUs. Results have the same
 // bits as on the CPU except for sums over blocks. Each block writes one weighted partial sum to `parts`.
 #pragma once
 

@@ -1,4 +1,4 @@
-// Blends tiles, forward and backward: the maths of raster/pixel.h with one pixel per thread and one tile per block (spec 6.4 and 6.5).
+// Blends tiles, forward and backward: the maths of kernels/pixel.h with one pixel per thread and one tile per block (spec 6.4 and 6.5).
 //
 // Each half-warp has one of the tile's 4×4 blocks of pixels, and processes the splats that touch this block.
 #pragma once

@@ -1,9 +1,9 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
 use super::{Measured, Section, TimingStats};
+use crate::device::Stopwatch;
+use crate::device::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
 use crate::error::Result;
-use crate::eval::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
-use crate::optim::Stopwatch;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
 use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
@@ -93,7 +93,7 @@ pub struct Rate {
     pub share_of_peak: f64,
 }
 
-/// Floating-point operations per pair in `csrc/raster/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D 9.
+/// Floating-point operations per pair in `csrc/kernels/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D 9.
 const FORWARD_OPERATIONS: f64 = 38.;
 /// Floating-point operations per pair of the backward pass: 28 up to T as in the forward pass, w 1, q 8, the remainder 2, ν with a
 /// reciprocal 8, and the ten sums 19.
