@@ -4,7 +4,7 @@
 //!
 //! The output image shows the photo, the initial render, and the final render.
 
-use globalsplat::data::fit;
+use globalsplat::data::{fit, tensor_from_planes};
 use globalsplat::eval::psnr;
 use globalsplat::io::{read_image, tile_horizontally, write_png};
 use globalsplat::loss::{mse, ssim};
@@ -64,7 +64,7 @@ fn load(path: &Path) -> Result<(Tensor, Camera)> {
     let scale = LONGEST_SIDE / width.max(height);
     let side = |side: f64| ((side * scale).round() as u32).max(16);
     let (planes, camera) = fit(&image, &camera, ImageSize { width: side(width), height: side(height) });
-    Ok((planes.to_tensor(), camera))
+    Ok((tensor_from_planes(&planes), camera))
 }
 
 /// Returns round grey Gaussians scattered over the image, about one unit away, each about as large as their spacing.

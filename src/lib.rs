@@ -29,9 +29,10 @@
 pub mod bench;
 pub mod config;
 pub mod data;
-mod device;
+pub mod device;
 pub mod error;
 pub mod eval;
+mod ffi;
 pub mod io;
 pub mod loss;
 pub mod model;
@@ -43,10 +44,10 @@ pub mod reconstruct;
 pub mod refine;
 pub mod render;
 pub mod scene;
-pub mod synth;
 pub mod train;
 
 pub use error::{Error, Result};
+pub use globalsplat_synth as synth;
 
 /// Compiles the example of the README.
 #[cfg(doctest)]

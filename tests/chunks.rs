@@ -2,10 +2,11 @@
 
 mod common;
 
-use common::formats::assert_same_cameras;
+use common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
 use common::program::{arg, refuse, succeed};
 use globalsplat::data::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
+use image::RgbImage;
 use serde_json::Value;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
@@ -82,7 +83,7 @@ fn chunks_that_interrupted_work_left_are_taken_over() {
         let count = writer
             .go_on(
                 &SCENES.map(String::from),
-                || capture(SCENES[0]),
+                || Ok(capture(SCENES[0])?),
                 |number, capture| {
                     seen.push((number, capture.name.clone()));
                     Ok(())
@@ -103,7 +104,7 @@ fn chunks_that_interrupted_work_left_are_taken_over() {
     let others = ["room_1", "room_0", "room_2"].map(String::from);
     for (keys, first) in [(others, SCENES[0]), (SCENES.map(String::from), SCENES[1])] {
         let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
-        let error = writer.go_on(&keys, || capture(first), |_, _| Ok(())).unwrap_err().to_string();
+        let error = writer.go_on(&keys, || Ok(capture(first)?), |_, _| Ok(())).unwrap_err().to_string();
         assert!(error.contains("000000.torch: the output is a chunk already"), "{error}");
     }
 }
@@ -310,7 +311,7 @@ fn data_saved_on_another_device_are_read_here() {
         );
         let bytes = archive(&program, &data, CompressionMethod::Stored);
         let capture = Chunk::parse(Path::new("c.torch"), bytes).unwrap().capture("a").unwrap();
-        assert_eq!(capture.load_all(None).unwrap()[1].image.size(), [3, 16, 16]);
+        assert_eq!(capture.load_all(None).unwrap()[1].image.size(), (16, 16));
     }
 }
 
@@ -496,4 +497,21 @@ fn a_scene_is_opened_whatever_signs_its_key_has() {
         let told: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
         assert_eq!((told["kind"].as_str(), told["name"].as_str()), (Some("capture"), Some(name)));
     }
+}
+
+/// NeRF's synthetic captures hold the photos of each split in a folder of that name: such a folder is one capture, not a dataset with
+/// splits.
+#[test]
+fn a_capture_with_splits_is_one_scene_of_a_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    for split in ["train", "test"] {
+        let photos: Vec<String> = names().iter().map(|name| format!("{split}/{name}")).collect();
+        std::fs::create_dir(folder.path().join(split)).unwrap();
+        for photo in &photos {
+            RgbImage::new(WIDTH, HEIGHT).save(folder.path().join(photo)).unwrap();
+        }
+        let file = folder.path().join(format!("transforms_{split}.json"));
+        std::fs::write(file, transforms(&photos, &cameras()).to_string()).unwrap();
+    }
+    assert_eq!(Dataset::open(folder.path(), Split::Train).unwrap().scenes(), 1);
 }

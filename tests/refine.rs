@@ -7,7 +7,7 @@ use common::formats::{Format, rewrite, write_points};
 use common::program::{arg, command, refuse, room, succeed};
 use common::{captures, fox};
 use glam::DVec3;
-use globalsplat::data::{open_capture, points_of};
+use globalsplat::data::{load_all_views, open_capture, points_of};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::refine::{
     Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession, SpaceKind,
@@ -346,7 +346,7 @@ fn points_are_begun_with() {
             assert_eq!(point.colour, [1., 0., 0.2]);
         }
         // Half of the Gaussians are at points, the others on pixels.
-        let views = capture.load_all(None).unwrap();
+        let views = load_all_views(&capture, None).unwrap();
         let raw = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
             .expect("depths");
         let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();

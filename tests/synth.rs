@@ -4,7 +4,7 @@ mod common;
 
 use common::program::{arg, refuse, succeed, tiny_config};
 use glam::{DMat3, DVec3};
-use globalsplat::data::{Capture, Dataset, SceneGroup, Split, SyntheticDataset};
+use globalsplat::data::{Capture, Dataset, SceneGroup, Split, SyntheticDataset, load_all_views, load_views};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
 use npyz::NpyFile;
@@ -237,7 +237,7 @@ fn videos_are_data_like_any_other() {
     let views = |data: &Dataset| {
         let key = &keys(data)[1];
         let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
-        group.open().unwrap().capture(key).unwrap().load_all(None).unwrap()
+        load_all_views(&group.open().unwrap().capture(key).unwrap(), None).unwrap()
     };
     for (a, b) in views(&written).iter().zip(&views(&named)) {
         assert!((a.camera.c2w - b.camera.c2w).abs_diff_eq(glam::DMat4::ZERO, 1e-5));
@@ -261,7 +261,7 @@ fn pictures_that_a_user_names_are_seen() {
     let pink = |data: &Path| -> Vec<f64> {
         let data = Dataset::open(data, Split::Test).unwrap();
         let first = |capture: Capture| {
-            let view = capture.load(&[0], None).unwrap().remove(0);
+            let view = load_views(&capture, &[0], None).unwrap().remove(0);
             let channel = |index| -> tch::Tensor { view.image.select(0, index) };
             let excess = channel(0).minimum(&channel(2)) - channel(1) * 2.;
             excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as f64

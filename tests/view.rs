@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use common::browser::{Browser, Screenshots};
 use common::program::{arg, command, refuse, room, succeed};
 use common::{captures, skip};
-use globalsplat::data::open_capture;
+use globalsplat::data::{load_views, open_capture};
 use globalsplat::eval::psnr;
 use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb};
 use globalsplat::render::render_views;
@@ -139,7 +139,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
 /// Returns our own render from a capture's camera, and the photo, as large as the page.
 fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let size = ImageSize { width: SIDE, height: SIDE };
-    let view = open_capture(capture).unwrap().load(&[index], Some(size)).unwrap().remove(0);
+    let view = load_views(&open_capture(capture).unwrap(), &[index], Some(size)).unwrap().remove(0);
     let own = render_views(&read_splat(splat).unwrap().gaussians, &[view.camera]).unwrap().remove(0);
     (own.rgb.clamp(0., 1.), view.image)
 }

@@ -2,8 +2,8 @@
 
 use super::TimingStats;
 use super::peak_throughput::PeakThroughput;
+use crate::device::Stopwatch;
 use crate::model::{Precision, attention, by_libtorch};
-use crate::optim::Stopwatch;
 use crate::render::cpu::simd_level;
 use serde::Serialize;
 use tch::{Device, Kind, Tensor, no_grad};

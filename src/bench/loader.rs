@@ -2,8 +2,8 @@
 
 use super::video::write_videos;
 use crate::data::{DataConfig, LoadTimes, Loader, Sample, SceneGroups};
+use crate::device::{peak_memory_bytes, resident_memory_bytes};
 use crate::error::Result;
-use crate::eval::{peak_memory_bytes, resident_memory_bytes};
 use serde::Serialize;
 use std::path::Path;
 use std::sync::Arc;

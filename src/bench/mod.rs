@@ -20,7 +20,7 @@ pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
 pub use train::{Together, TrainReport, bench_train};
 
-use crate::optim::Stopwatch;
+use crate::device::Stopwatch;
 use serde::Serialize;
 use std::borrow::Cow;
 

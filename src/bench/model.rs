@@ -6,10 +6,10 @@ use super::peak_throughput::PeakThroughput;
 use super::train::synthetic_scene;
 use crate::config::Config;
 use crate::data::{Sample, ViewBatch};
+use crate::device::Stopwatch;
+use crate::device::{forget_peak_memory, peak_memory_bytes_on};
 use crate::error::Result;
-use crate::eval::{forget_peak_memory, peak_memory_bytes_on};
 use crate::model::{GlobalSplat, Precision};
-use crate::optim::Stopwatch;
 use serde::Serialize;
 use tch::{Device, nn, no_grad};
 

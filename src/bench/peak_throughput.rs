@@ -1,7 +1,7 @@
 //! Peak throughput of a device: a product of large square matrices, which all other products are compared with.
 
+use crate::device::Stopwatch;
 use crate::model::Precision;
-use crate::optim::Stopwatch;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
 /// Two square matrices, multiplied in the same way as in the model's linear layers.

@@ -2,8 +2,8 @@
 
 use super::{TimingStats, synthetic_scene};
 use crate::data::ViewBatch;
+use crate::device::Stopwatch;
 use crate::error::Result;
-use crate::optim::Stopwatch;
 use crate::refine::{Budget, Corrections, GaussianSpace, Photos, RefineConfig, Task, refine_timed};
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};

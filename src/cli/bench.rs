@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use globalsplat::bench::{
     RasterReport, TimingStats, bench_loader, bench_raster, bench_synth, synthetic_scene, synthetic_videos,
 };
-use globalsplat::data::{DataConfig, TrainingScenes, view_batch};
+use globalsplat::data::{DataConfig, TrainingScenes, load_all_views, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
 use globalsplat::scene::ImageSize;
@@ -114,9 +114,9 @@ impl Raster {
                 let splat = read_splat(splat)?;
                 warn(&splat.warnings);
                 let frame = splat.frame();
-                let views = open_capture(scene)?.load_all(None)?;
+                let views = load_all_views(&open_capture(scene)?, None)?;
                 let poses: Vec<_> = views.iter().map(|view| frame.pose_to_local(&view.camera.c2w)).collect();
-                let gaussians = frame.gaussians_to_local(&splat.gaussians, splat.origin);
+                let gaussians = splat.gaussians.to_local(&frame, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => synthetic_scene(self.gaussians, self.cameras, parse_size(&self.size)?),

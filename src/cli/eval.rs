@@ -5,11 +5,12 @@ use super::{
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::data::{Capture, Dataset, Holdout, Split, View};
+use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::{
     Baselines, CaptureScores, ContactSheet, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex,
-    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, peak_memory_bytes,
-    write_csv, write_evaluation, write_report,
+    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, write_csv,
+    write_evaluation, write_report,
 };
 use globalsplat::io::{
     InputFiles, WeightsFile, check_writable_dir, check_writable_png, checksum, weights_files,

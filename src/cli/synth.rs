@@ -2,7 +2,7 @@ use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::Error;
-use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, read_pictures, write_room};
+use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures, write_room};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
     InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy,
@@ -108,7 +108,7 @@ impl Synth {
         let depth_file = |capture: &Capture| depths.join(&capture.name).with_extension("npy");
         let made_before = writer.go_on(
             &videos.keys(),
-            || videos.capture(0),
+            || Ok(videos.capture(0)?),
             |number, capture| {
                 let file = depth_file(capture);
                 if self.depth && !file.exists() {
@@ -192,6 +192,7 @@ impl Synth {
 /// Returns images of a video side by side, from the first to the last.
 fn sheet_row(capture: &Capture) -> Result<Tensor, Error> {
     let shown: Vec<usize> = (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
-    let pictures: Vec<Tensor> = capture.load(&shown, None)?.into_iter().map(|view| view.image).collect();
+    let pictures: Vec<Tensor> =
+        load_views(capture, &shown, None)?.into_iter().map(|view| view.image).collect();
     Ok(tile_horizontally(&pictures))
 }

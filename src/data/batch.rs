@@ -1,6 +1,6 @@
 //! Batches of views: images and cameras as the tensors that the model and the renderer take.
 
-use super::capture::View;
+use super::view::View;
 use crate::render::Cameras;
 use crate::scene::{Camera, pose_to_rows};
 use glam::DMat4;

@@ -1,9 +1,9 @@
 //! Configuration of the data of a run.
 
-use super::holdout::Holdout;
 use crate::error::{Error, Result};
 use crate::io::expand_path;
 use crate::scene::ImageSize;
+use globalsplat_capture::Holdout;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 

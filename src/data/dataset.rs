@@ -1,12 +1,11 @@
 //! Datasets: many captures under one name (spec 10.8).
 
-use super::capture::Capture;
-use super::formats::{
-    CaptureFolders, Chunk, INDEX_FILE, capture_folders, folder_name, is_capture, open_capture,
-};
-use super::synthetic_dataset::SyntheticDataset;
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, read_text};
+use globalsplat_capture::{
+    CHUNK_INDEX_FILE, Capture, CaptureFolders, Chunk, capture_folders, folder_name, is_capture, open_capture,
+};
+use globalsplat_synth::SyntheticDataset;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -90,13 +89,14 @@ impl Dataset {
     /// looked for until they are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = SyntheticDataset::named(root)? {
-            let made_by = Some(videos.made_by());
+            let made_by = Some(videos.generator());
             let name = root.to_string_lossy().into_owned();
             return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![], made_by });
         }
         let name = folder_name(root);
-        let indexed =
-            [root.to_owned(), root.join(split.folder())].into_iter().find(|f| f.join(INDEX_FILE).is_file());
+        let indexed = [root.to_owned(), root.join(split.folder())]
+            .into_iter()
+            .find(|f| f.join(CHUNK_INDEX_FILE).is_file());
         let (groups, warnings) = match indexed {
             Some(folder) => (chunk_groups(&folder)?, vec![]),
             None => {
@@ -158,7 +158,7 @@ impl SceneGroup {
         match &self.source {
             Source::Chunk => {
                 inputs.add(&self.path);
-                inputs.add(&self.path.with_file_name(INDEX_FILE));
+                inputs.add(&self.path.with_file_name(CHUNK_INDEX_FILE));
             }
             Source::Folder => {
                 let (folder, output) = (resolved(&self.path), resolved(output));
@@ -190,14 +190,14 @@ impl OpenGroup {
     /// Fails if the scene doesn't exist or violates the requirements on captures.
     pub fn capture(&self, key: &str) -> Result<Capture> {
         match self {
-            OpenGroup::Chunk(chunk) => chunk.capture(key),
+            OpenGroup::Chunk(chunk) => Ok(chunk.capture(key)?),
             OpenGroup::Capture(capture) => Ok(Capture::clone(capture)),
         }
     }
 }
 
 fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
-    let file = folder.join(INDEX_FILE);
+    let file = folder.join(CHUNK_INDEX_FILE);
     let index: BTreeMap<String, String> = serde_json::from_str(&read_text(&file)?).map_err(|e| {
         Error::input(&file, "the index", format!("unusable ({e})"), "{scene: chunk's file name}")
     })?;

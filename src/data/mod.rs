@@ -1,34 +1,35 @@
-//! Captures: posed photos on disk. This module reads, checks and resizes them and converts them to tensors.
+//! Posed photos as tensors: batches of views, augmentation, and loading for training. Captures are read by the crate
+//! `globalsplat_capture`, synthetic ones are made by `globalsplat_synth`.
 
+mod augment;
 mod batch;
-mod capture;
+mod chunk_writer;
 mod config;
 mod dataset;
-mod formats;
-mod holdout;
+mod gaussian_room;
+mod jitter;
 mod loading;
-mod pixels;
 mod polyphase;
 mod room;
-mod synthetic_dataset;
+mod view;
 
 pub(crate) use batch::cameras_at;
 pub use batch::{ViewBatch, view_batch};
-pub use capture::{Capture, View};
+pub use chunk_writer::ChunkWriter;
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
-pub use formats::{
-    CameraPath, Chunk, ChunkWriter, FoundCaptures, INDEX_FILE, Point, find_captures, open_capture, points_of,
-    read_camera_path, write_cameras_json,
+pub use globalsplat_capture::{
+    CHUNK_INDEX_FILE as INDEX_FILE, CameraPath, Capture, Chunk, FoundCaptures, Holdout, Planes, Point,
+    find_captures, fit, open_capture, points_of, read_camera_path, write_cameras_json,
 };
-pub use holdout::Holdout;
+pub use globalsplat_synth::{SyntheticDataset, read_pictures};
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};
-pub use pixels::{Planes, fit};
 pub use polyphase::polyphase;
 pub use room::write_room;
-pub use synthetic_dataset::{SyntheticDataset, read_pictures};
+pub use view::{View, load_all_views, load_views, tensor_from_planes};
 
 // Exchanged between processes.
 pub(crate) use loading::News;
 // Used by the parity checks, which run every part separately.
-pub(crate) use pixels::{Jitter, Region, Resampler};
+pub(crate) use globalsplat_capture::{Region, Resampler};
+pub(crate) use jitter::Jitter;

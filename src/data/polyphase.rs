@@ -1,6 +1,6 @@
 //! Decomposition of a photo into several smaller views, each of which holds a share of its pixels (spec 9.8).
 
-use super::capture::View;
+use super::view::View;
 use crate::error::{Error, Result};
 use crate::scene::Camera;
 

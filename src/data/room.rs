@@ -1,11 +1,11 @@
 //! Procedural rooms, rendered by this crate's rasterizer, as captures on disk.
 
-use super::formats::write_cameras_json;
+use super::gaussian_room::Room;
 use crate::error::{Error, Result};
 use crate::io::{Splat, lock_parent, replace_dir, write_png, write_splat};
 use crate::render::render_views;
 use crate::scene::ImageSize;
-use crate::synth::Room;
+use globalsplat_capture::write_cameras_json;
 use std::path::Path;
 
 const PHOTOS: &str = "images";
@@ -29,7 +29,7 @@ pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> Res
             write_png(&folder.join(name), &view.rgb)?;
         }
         write_splat(&folder.join(TRUTH), &Splat::of(&gaussians)?)?;
-        write_cameras_json(&folder.join("cameras.json"), &names, &cameras)
+        Ok(write_cameras_json(&folder.join("cameras.json"), &names, &cameras)?)
     })
 }
 

@@ -4,7 +4,7 @@ use super::photo_source::LazyPhotos;
 use super::scene::split_views;
 use super::scores::{CaptureScores, nearest_context_baseline, score};
 use crate::data::{
-    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at,
+    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at, load_views,
 };
 use crate::error::{Error, Result};
 use crate::reconstruct::{reconstruct, spread_over_path};
@@ -134,7 +134,11 @@ impl HeldOutScene {
                 (capture, split)
             }
         };
-        Ok((capture.name.clone(), capture.load(&context, size)?, capture.load(&target, size)?))
+        Ok((
+            capture.name.clone(),
+            load_views(&capture, &context, size)?,
+            load_views(&capture, &target, size)?,
+        ))
     }
 }
 

@@ -27,7 +27,7 @@ impl SceneFrames {
     /// # Errors
     /// Fails if a photo can't be read.
     pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
-        capture.checksum(self.context.iter().chain(&self.target).copied())
+        Ok(capture.checksum(self.context.iter().chain(&self.target).copied())?)
     }
 
     /// Returns the file names of the target images without their extensions: six-digit frame numbers, as chunks name frames.

@@ -1,10 +1,10 @@
 //! Methods under evaluation: a model, given splats or given images, for a single scene or a whole dataset.
 
-use super::memory::{device_memory_bytes, peak_memory_bytes};
 use super::perceptual::Perceptual;
 use super::scene::EvalScene;
 use super::scores::{CaptureScores, ViewScore, score_view};
 use crate::data::View;
+use crate::device::{device_memory_bytes, peak_memory_bytes};
 use crate::error::{Error, Result};
 use crate::io::{
     InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,

@@ -1,6 +1,6 @@
 //! Photos that are loaded one at a time.
 
-use crate::data::{Capture, View};
+use crate::data::{Capture, View, load_views};
 use crate::error::Result;
 use crate::scene::ImageSize;
 use glam::DMat4;
@@ -63,7 +63,7 @@ impl LazyPhotos {
         match self {
             LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
             LazyPhotos::OnDisk { capture, indices, names, size } => {
-                let view = capture.load(&indices[i..=i], *size)?.remove(0);
+                let view = load_views(capture, &indices[i..=i], *size)?.remove(0);
                 Ok(View { name: names[i].clone(), ..view })
             }
         }

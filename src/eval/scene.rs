@@ -2,7 +2,7 @@
 
 use super::index::{EvaluationIndex, SceneFrames};
 use super::photo_source::LazyPhotos;
-use crate::data::{Capture, Holdout, SceneGroup, View};
+use crate::data::{Capture, Holdout, SceneGroup, View, load_views};
 use crate::error::{Error, Result};
 use crate::reconstruct::load_context;
 use crate::scene::ImageSize;
@@ -76,7 +76,7 @@ impl EvalScene {
         }
         let frames = loader.index.frames(key, capture.len())?.clone();
         let context = match loader.photo_size {
-            Some(size) => capture.load(&frames.context, Some(size))?,
+            Some(size) => load_views(capture, &frames.context, Some(size))?,
             None => vec![],
         };
         let picture_names = frames.picture_names();

@@ -9,8 +9,9 @@
 //! message Image   { int32 height = 1; int32 width = 2; int32 colorspace = 3; bytes encoded_image_string = 4; }
 //! ```
 
-use super::images::{encode_photo, rgb_from_tensor};
+use super::images::rgb_from_tensor;
 use crate::error::Result;
+use globalsplat_capture::encode_photo;
 use globalsplat_files::AppendFile;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};

@@ -7,7 +7,6 @@ mod event_file;
 mod event_reader;
 mod film;
 mod images;
-mod jpeg;
 mod mosaic;
 mod npy;
 mod pretrained;
@@ -23,9 +22,10 @@ pub use globalsplat_files::{
 
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
 pub use film::{Film, find_ffmpeg};
+pub use globalsplat_capture::{decode_photo, encode_photo, read_image};
 pub use images::{
-    Photo, check_writable_png, decode_photo, encode_photo, is_png_name, read_image, rgb_from_tensor,
-    tensor_from_rgb, tile_horizontally, tile_vertically, tiled_size, write_png,
+    check_writable_png, is_png_name, rgb_from_tensor, tensor_from_rgb, tile_horizontally, tile_vertically,
+    tiled_size, write_png,
 };
 pub use mosaic::Mosaic;
 pub use npy::write_npy;
@@ -39,14 +39,12 @@ pub use weights::{Weights, write_checkpoint, write_weights};
 pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
 
 pub(crate) use globalsplat_files::{
-    AppendFile, expand_path, files_and_keys, lock_parent, read_text, recover_dirs, remove_dir, replace_dir,
-    write_json,
+    AppendFile, expand_path, lock_parent, read_text, recover_dirs, remove_dir, replace_dir, write_json,
 };
 
 pub(crate) use event_file::EventFile;
 pub(crate) use event_reader::{EventReader, read_picture};
-pub(crate) use images::{
-    PHOTO_EXTENSIONS, encoded_image_size, enlarge, read_image_size, shrink, subsample, write_jpeg,
-};
+pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};
+pub(crate) use images::{enlarge, shrink, subsample, write_jpeg};
 pub(crate) use mosaic::shrink_factor;
 pub(crate) use pretrained::pretrained_folders;

@@ -1,6 +1,6 @@
 //! Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
-use crate::render::take_outputs;
+use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 

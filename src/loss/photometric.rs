@@ -1,7 +1,7 @@
 //! Photometric loss: absolute differences and structural similarity (SSIM, Wang et al. 2004), computed as by scikit-image's
 //! `structural_similarity` with Gaussian weights. (Spec 9.4.)
 
-use crate::render::take_outputs;
+use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 

@@ -3,7 +3,7 @@
 use super::address::{address, addresses};
 use super::muon::{self, Matrices};
 use crate::error::{Error, Result};
-use crate::render::take_outputs;
+use crate::ffi::take_outputs;
 use globalsplat_csrc::fit::{AdamArguments, adam};
 use globalsplat_csrc::optim::{self as ffi, AdamWNumbers, fused_adamw, norm, scale};
 use std::collections::BTreeMap;

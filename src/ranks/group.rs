@@ -2,7 +2,7 @@
 
 use super::place::Place;
 use crate::error::{Error, Result};
-use crate::render::take_outputs;
+use crate::ffi::take_outputs;
 use cxx::UniquePtr;
 use globalsplat_csrc::ranks as ffi;
 use serde::Serialize;

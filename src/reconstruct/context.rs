@@ -1,7 +1,7 @@
 //! Selection of the context views of a capture that a model sees.
 
 use super::spread::spread_over_path;
-use crate::data::{Capture, Holdout, View};
+use crate::data::{Capture, Holdout, View, load_views};
 use crate::error::Result;
 use crate::scene::ImageSize;
 
@@ -16,7 +16,7 @@ pub fn load_context(
     views: Option<usize>,
     size: ImageSize,
 ) -> Result<Vec<View>> {
-    capture.load(&context_views(capture, holdout, views), Some(size))
+    load_views(capture, &context_views(capture, holdout, views), Some(size))
 }
 
 /// Returns the indices of the views that [`load_context`] loads.

@@ -23,9 +23,9 @@ pub use session::{EvalPoint, Initial, RefineEvent, RefineOptions, RefineResult, 
 pub use space::{GaussianSpace, Space, TokenSpace};
 
 use crate::data::View;
+use crate::device::Stopwatch;
 use crate::error::{Error, Result};
 use crate::loss::{depth_smoothness, photometric};
-use crate::optim::Stopwatch;
 use crate::render::cpu::KernelThreads;
 use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render, render_views};
 use crate::scene::{Camera, Gaussians};

@@ -1,7 +1,7 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::view_selection::are_near_duplicates;
-use crate::data::{Capture, View, ViewBatch, view_batch};
+use crate::data::{Capture, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};
 use glam::DMat4;
@@ -54,7 +54,7 @@ pub fn load_photos(
         }
         // Photos of one size are loaded together, as they share the lens undistortion.
         for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {
-            views.extend(capture.load(group, size_of(group[0]))?);
+            views.extend(load_views(capture, group, size_of(group[0]))?);
         }
     }
     Ok(views)

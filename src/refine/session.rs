@@ -201,7 +201,7 @@ impl<'a> RefineSession<'a> {
     /// Transforms Gaussians from the session's frame to the capture's unit and axes. Returns them with means relative to an origin, and
     /// this origin in the capture's world.
     pub fn to_world(&self, gaussians: &Gaussians) -> (Gaussians, DVec3) {
-        (self.frame.gaussians_from_local(gaussians), self.frame.origin)
+        (gaussians.to_world_units(&self.frame), self.frame.origin)
     }
 
     /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
@@ -246,7 +246,7 @@ impl<'a> RefineSession<'a> {
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
         let start = match initial {
             Initial::Splat(gaussians, origin) => {
-                let local = self.frame.gaussians_to_local(gaussians, origin);
+                let local = gaussians.to_local(&self.frame, origin);
                 Start::Gaussians(RawGaussians::of(&local.to_device(self.options.device)))
             }
             Initial::Model { loaded, views } => {

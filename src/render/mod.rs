@@ -3,12 +3,11 @@
 pub mod cpu;
 pub mod cuda;
 mod harmonics;
-mod take_outputs;
 mod transform;
 mod views;
 
+use crate::ffi::take_outputs;
 pub use harmonics::{HarmonicLimits, fit_harmonics};
-pub(crate) use take_outputs::take_outputs;
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};
 

@@ -55,7 +55,7 @@ pub struct SplatRenderer {
 impl SplatRenderer {
     /// Creates a renderer in `frame` for `gaussians` of one scene, whose means are relative to `origin`.
     pub fn new(gaussians: &Gaussians, origin: DVec3, frame: LocalFrame) -> Self {
-        SplatRenderer { gaussians: frame.gaussians_to_local(gaussians, origin), frame }
+        SplatRenderer { gaussians: gaussians.to_local(&frame, origin), frame }
     }
 
     /// Moves the splat to `device`, which then renders it.

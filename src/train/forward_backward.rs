@@ -6,10 +6,10 @@
 
 use crate::config::Config;
 use crate::data::Sample;
+use crate::device::Stopwatch;
 use crate::error::Result;
 use crate::loss::{PerceptualLoss, Share, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, backward_from_grads, leaf};
-use crate::optim::Stopwatch;
 use crate::ranks::Group;
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use tch::{Tensor, no_grad};

@@ -5,10 +5,11 @@
 
 use super::forward_backward::ForwardBackward;
 use crate::data::Sample;
+use crate::device::Stopwatch;
 use crate::error::Result;
 use crate::loss::Share;
 use crate::model::GlobalSplat;
-use crate::optim::{Stopwatch, zero_grad};
+use crate::optim::zero_grad;
 use crate::ranks::Group;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};

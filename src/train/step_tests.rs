@@ -3,9 +3,9 @@
 use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
+use crate::device::Stopwatch;
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
-use crate::optim::Stopwatch;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};

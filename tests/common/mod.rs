@@ -1,92 +1,16 @@
-//! Test utilities: locating real data and golden tensors, skipping tests without them, and comparing tensors.
-#![allow(dead_code)] // every test binary uses only a part
+//! Test utilities that need libtorch or the program. The others are in the crate `globalsplat_test_kit`.
+#![allow(dead_code, unused_imports)] // every test binary uses only a part
 
 pub mod browser;
-pub mod formats;
 pub mod program;
+
+pub use globalsplat_test_kit::formats;
+pub use globalsplat_test_kit::{again, captures, fox, golden, skip};
 
 use globalsplat::io::find_pretrained;
 use globalsplat::loss::LpipsNetwork;
 use rand::{Rng, SeedableRng, rngs::StdRng};
-use std::fs::OpenOptions;
-use std::io::Write;
-use std::path::{Path, PathBuf};
-use std::process::Command;
 use tch::{Kind, Tensor};
-
-/// Reports that a test is skipped because `what` is missing, and why; its caller returns early. `GLOBALSPLAT_SKIPPED` names the
-/// file in which `make test` counts skipped tests. If `GLOBALSPLAT_NO_SKIPS` is set, skipping is a failure.
-pub fn skip(what: &str, why: &str) {
-    let set = |variable| std::env::var_os(variable).filter(|value| !value.is_empty());
-    assert!(set("GLOBALSPLAT_NO_SKIPS").is_none(), "no test may be skipped, but {why}");
-    println!("skipped: {why}");
-    if let Some(file) = set("GLOBALSPLAT_SKIPPED") {
-        let file = OpenOptions::new().create(true).append(true).open(file);
-        file.and_then(|mut file| file.write_all(format!("{what}\n").as_bytes())).expect("a file to count in");
-    }
-}
-
-/// Runs the test `name` of the current test binary again, by itself and with the environment `variables`; returns `true` if it
-/// passes, and what it was skipped for.
-pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
-    let skipped = tempfile::NamedTempFile::new().expect("a file");
-    let output = Command::new(std::env::current_exe().expect("a program"))
-        .args([name, "--exact"])
-        .env_remove("GLOBALSPLAT_NO_SKIPS")
-        .env("GLOBALSPLAT_SKIPPED", skipped.path())
-        .envs(variables.iter().copied())
-        .output()
-        .expect("a program that starts");
-    let told = String::from_utf8_lossy(&output.stdout);
-    assert!(told.contains("running 1 test"), "{name}: {told}");
-    (output.status.success(), std::fs::read_to_string(skipped.path()).expect("a file"))
-}
-
-/// Returns the folder that `variable` names, else `../shared/<name>`; if it doesn't exist, skips the test because `what` is
-/// missing.
-fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
-    let path = match std::env::var_os(variable) {
-        Some(path) => PathBuf::from(path),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared").join(name),
-    };
-    if path.is_dir() {
-        return Some(path);
-    }
-    skip(what, &format!("{} is not there; set {variable}", path.display()));
-    None
-}
-
-/// Returns the folder of golden tensors.
-pub fn golden() -> Option<PathBuf> {
-    outside("GLOBALSPLAT_GOLDEN", "golden", "golden tensors")
-}
-
-/// Returns real captures, at least one: folders with `cameras.json` and a published `reference.ply` under `re10k`.
-pub fn captures() -> Option<Vec<PathBuf>> {
-    let root = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?;
-    let root = if root.join("re10k").is_dir() { root.join("re10k") } else { root };
-    let mut captures: Vec<PathBuf> = std::fs::read_dir(&root)
-        .expect("a readable folder")
-        .map(|entry| entry.expect("a readable entry").path())
-        .filter(|path| path.join("cameras.json").is_file())
-        .collect();
-    captures.sort();
-    if captures.is_empty() {
-        skip("captures", &format!("no capture is in {}", root.display()));
-        return None;
-    }
-    Some(captures)
-}
-
-/// Returns a real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
-pub fn fox() -> Option<PathBuf> {
-    let fox = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?.join("nerfstudio/fox");
-    if fox.is_dir() {
-        return Some(fox);
-    }
-    skip("captures", &format!("{} is not there", fox.display()));
-    None
-}
 
 /// Returns `true` if the weights of LPIPS are available; otherwise, skips the test.
 pub fn has_lpips() -> bool {

@@ -5,7 +5,7 @@ use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use globalsplat::data::Capture;
+use globalsplat::data::{Capture, load_views};
 use globalsplat::io::{Splat, encode_photo, rgb_from_tensor};
 use globalsplat::render::DEFAULT_EPS2D;
 use globalsplat::scene::{Camera, ImageSize, LocalFrame, smooth_path};
@@ -115,7 +115,7 @@ fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>
     let (count, cameras) = (capture.len().min(MOST_PHOTOS), capture.cameras());
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
-        let view = capture.load(&[index], shrunk(&cameras[index]))?.remove(0);
+        let view = load_views(capture, &[index], shrunk(&cameras[index]))?.remove(0);
         let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
         let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
         Ok(PageCamera::of(view.name, &frame.camera_to_local(&view.camera), Some(photo)))

@@ -54,7 +54,7 @@ pub fn check_writable(path: &Path) -> Result<()> {
 /// Photos that can't be read, or a failed write.
 pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<()> {
     let frame = splat.frame();
-    let splat = Splat::of(&frame.gaussians_to_local(&splat.gaussians, splat.origin))?;
+    let splat = Splat::of(&splat.gaussians.to_local(&frame, splat.origin))?;
     let contents = Contents::of(name, &splat, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
     let text = page(&contents, &spz(&splat, &cameras)?)?.into_string();

@@ -1,8 +1,8 @@
 //! Cache of open groups, shared by all threads. The first thread that needs a group reads it.
 
 use super::scenes::SceneGroups;
-use crate::data::capture::Capture;
 use crate::error::Result;
+use globalsplat_capture::Capture;
 use std::sync::{Arc, Mutex, OnceLock};
 
 /// Number of groups that stay open while no thread uses them: two for a transition from one group to the next, and one more.

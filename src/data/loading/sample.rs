@@ -2,8 +2,8 @@
 
 use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
-use crate::data::pixels::CHANNELS;
 use crate::device::{PendingCopy, Upload};
+use globalsplat_capture::CHANNELS;
 use tch::{Device, Kind, Tensor};
 
 /// Largest value of a byte.

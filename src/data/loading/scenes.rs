@@ -1,9 +1,9 @@
 //! Sources of scenes: groups of scenes that are read together.
 
-use crate::data::capture::Capture;
 use crate::data::dataset::{Dataset, SceneGroup, Split};
 use crate::error::Result;
 use crate::io::InputFiles;
+use globalsplat_capture::Capture;
 use std::fmt;
 use std::path::{Path, PathBuf};
 

@@ -102,7 +102,7 @@ impl Splat {
 
     /// Returns the local frame in which the splat is rendered (spec 2.5).
     pub fn frame(&self) -> LocalFrame {
-        LocalFrame::from_gaussians(&self.gaussians, self.origin)
+        self.gaussians.local_frame(self.origin)
     }
 
     /// Returns a renderer of the splat for cameras in world coordinates.
@@ -280,7 +280,7 @@ pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &HarmonicLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.and(&(format_of(path)?.limits)());
     let frame = splat.frame();
-    let local = frame.gaussians_to_local(&splat.gaussians, splat.origin);
+    let local = splat.gaussians.to_local(&frame, splat.origin);
     let Gaussians { opacities, sh, .. } = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
     let gaussians = splat.gaussians.map(Tensor::shallow_clone);
     Ok(Splat { gaussians: Gaussians { opacities, sh, ..gaussians }, origin: splat.origin, warnings: vec![] })

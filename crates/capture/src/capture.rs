@@ -1,0 +1,640 @@
+//! The in-memory representation of a capture, common to all file formats.
+
+use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
+use crate::holdout::Holdout;
+use crate::image_source::ImageSource;
+use crate::pixels::{
+    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, looked_at, read_image_size,
+    undistort,
+};
+use glam::DMat4;
+use globalsplat_files::{Error, InputFiles, Result, files_and_keys};
+use image::RgbImage;
+use rayon::prelude::*;
+use std::borrow::Cow;
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::path::{Component, Path, PathBuf};
+use std::sync::Arc;
+
+/// A view whose pixels are not loaded.
+#[derive(Debug, Clone)]
+pub(crate) struct Frame {
+    pub image: ImageLocation,
+    /// Name of the image in the capture.
+    pub name: String,
+    /// Pinhole camera of the image after `distortion` is removed, at the size of the image file.
+    pub camera: Camera,
+    /// Distortion of the lens that took the image in the file.
+    pub distortion: Distortion,
+}
+
+/// Location of a view's image.
+#[derive(Debug, Clone)]
+pub(crate) enum ImageLocation {
+    /// An image file.
+    File(PathBuf),
+    /// A byte range of an in-memory file that holds many images.
+    Bytes {
+        file: Arc<Vec<u8>>,
+        bytes: Range<usize>,
+        /// Name that error messages use for the image.
+        name: PathBuf,
+    },
+    /// Image `index` of a source that computes images on request.
+    Source { source: Arc<dyn ImageSource>, index: usize },
+}
+
+impl ImageLocation {
+    /// Returns the path that error messages use for the image.
+    fn file(&self) -> &Path {
+        match self {
+            ImageLocation::File(path) | ImageLocation::Bytes { name: path, .. } => path,
+            ImageLocation::Source { source, .. } => Path::new(source.name()),
+        }
+    }
+
+    /// Returns the image as it is encoded in its file. An image that is computed is encoded as a JPEG.
+    fn read(&self) -> Result<Cow<'_, [u8]>> {
+        match self {
+            ImageLocation::File(path) => Ok(std::fs::read(path).map_err(Error::read(path))?.into()),
+            ImageLocation::Bytes { file, bytes, .. } => Ok(file[bytes.clone()].into()),
+            ImageLocation::Source { source, index } => Ok(encode_photo(&source.image(*index), true)?.into()),
+        }
+    }
+}
+
+/// Memory limit for photos that are decoded at the same time. A photo is small again once it is fitted to the model's image size.
+const DECODED_BYTES: u64 = 1 << 30;
+/// Memory per pixel while a photo is decoded: the decoder's 8-bit pixels and those with the distortion removed.
+const DECODED_BYTES_PER_PIXEL: u64 = 8;
+
+/// Posed photos of one scene. Images are read only when they are loaded.
+#[derive(Debug, Clone)]
+pub struct Capture {
+    /// Name of the folder, or key of the scene in a chunk.
+    pub name: String,
+    file: PathBuf,
+    /// Frames of all views. Those of the capture's own test part come last.
+    frames: Vec<Frame>,
+    /// Number of frames in the training part, which come first in `frames`.
+    train: usize,
+    is_complete: bool,
+    warnings: Vec<String>,
+}
+
+/// Record of what a format's reader leaves out or changes.
+#[derive(Debug, Default)]
+pub(crate) struct Changes {
+    /// Names of missing photos.
+    pub absent: Vec<String>,
+    /// Names of photos whose pose contained a scaled rotation, each with the scale factor that was removed.
+    pub scaled: Vec<(String, f64)>,
+    /// Descriptions of other changes, one line each.
+    pub lines: Vec<String>,
+}
+
+impl Changes {
+    /// Checks that enough photos are left if some are missing. The number of existing photos is `present`.
+    ///
+    /// # Errors
+    /// Fails if fewer than two photos are left and `purpose` needs photos.
+    pub fn check(&self, file: &Path, present: usize, purpose: Purpose) -> Result<()> {
+        match (self.absent.first(), purpose) {
+            (Some(name), Purpose::Photos) if present < FEWEST_VIEWS => {
+                let found = format!("{present} of {}, {name:?} is not there", present + self.absent.len());
+                Err(Error::input(file, "the number of frames with an image", found, "two or more"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Removes the scale from `c2w`, the pose of photo `name`, if its rotation is scaled. Returns any other pose unchanged.
+    pub fn unscaled(&mut self, name: &str, c2w: DMat4) -> DMat4 {
+        match nearest_rigid_of_scaled(&c2w) {
+            Ok((rigid, scale)) if check_pose(&c2w).is_err() => {
+                self.scaled.push((name.to_string(), scale));
+                rigid
+            }
+            _ => c2w,
+        }
+    }
+
+    /// Returns one line for each kind of change to the capture that `file` describes, of which `present` photos are left.
+    fn into_lines(self, file: &Path, present: usize) -> Vec<String> {
+        let file = file.display();
+        let mut lines = vec![];
+        if !self.absent.is_empty() {
+            let (count, all) = (self.absent.len(), present + self.absent.len());
+            let names = listed(self.absent.iter().map(String::as_str));
+            lines.push(format!("{file}: {count} of {all} photos are not there and left out: {names}"));
+        }
+        if let Some((_, factor)) = self.scaled.first() {
+            let names = listed(self.scaled.iter().map(|(name, _)| name.as_str()));
+            lines.push(format!(
+                "{file}: {} of {present} rotations are scaled, the first by {factor:.6}, which is taken out: {names}",
+                self.scaled.len()
+            ));
+        }
+        lines.extend(self.lines.into_iter().map(|line| format!("{file}: {line}")));
+        lines
+    }
+}
+
+/// Minimum number of views that a scene can be reconstructed from.
+const FEWEST_VIEWS: usize = 2;
+
+/// Formats the first few of `names` and the number of the remaining ones.
+pub(crate) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+    const SHOWN: usize = 3;
+    let more = names.len().saturating_sub(SHOWN);
+    let shown = names.take(SHOWN).collect::<Vec<_>>().join(", ");
+    if more == 0 { shown } else { format!("{shown} and {more} more") }
+}
+
+/// A photo and its camera.
+#[derive(Debug, Clone)]
+pub struct Photo {
+    /// Name of the image in the capture.
+    pub name: String,
+    /// Pixels.
+    pub image: Planes,
+    /// Camera at the size of `image`.
+    pub camera: Camera,
+}
+
+/// Purpose for which a capture is read.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Purpose {
+    /// The capture's photos, which must exist.
+    Photos,
+    /// The capture's cameras alone. A photo whose size is neither in the capture's file nor readable from the photo itself is
+    /// assumed to have this size.
+    Cameras(Option<ImageSize>),
+}
+
+impl Purpose {
+    /// Returns the size (width, height) of the photo `field`, for which `file` declares none. `asked` is the size read from the
+    /// photo itself.
+    pub(crate) fn size(self, file: &Path, field: &str, asked: Result<(u32, u32)>) -> Result<(u32, u32)> {
+        match (asked, self) {
+            (Ok(size), _) => Ok(size),
+            (Err(_), Purpose::Cameras(Some(ImageSize { width, height }))) => Ok((width, height)),
+            (Err(_), Purpose::Cameras(None)) => {
+                let expected = "one in the file, a photo to be asked, or --size WxH";
+                Err(Error::input(file, format!("the size of {field}"), "absent", expected))
+            }
+            (Err(e), Purpose::Photos) => Err(e),
+        }
+    }
+}
+
+impl Capture {
+    /// Checks the requirements common to all formats: at least two views, or one camera of a path; rigid poses; valid intrinsics.
+    /// If a photo's size differs from that in `frames` but the aspect ratio agrees, its intrinsics are scaled. `changes` lists what
+    /// the format's reader left out or changed.
+    pub(crate) fn new(
+        name: String,
+        file: PathBuf,
+        mut frames: Vec<Frame>,
+        changes: Changes,
+        purpose: Purpose,
+    ) -> Result<Self> {
+        let (least, expected) = match purpose {
+            Purpose::Photos => (FEWEST_VIEWS, "two or more"),
+            Purpose::Cameras(_) => (1, "one or more"),
+        };
+        changes.check(&file, frames.len(), purpose)?;
+        if frames.len() < least {
+            return Err(Error::input(&file, "the number of views", frames.len(), expected));
+        }
+        let is_complete = changes.absent.is_empty();
+        let warnings = check_frames(&file, &mut frames, changes, purpose)?;
+        let train = frames.len();
+        Ok(Capture { name, file, frames, train, is_complete, warnings })
+    }
+
+    /// Creates a capture whose images are computed by `source` on request: image i is seen by camera i, and named by its index.
+    ///
+    /// # Errors
+    /// Fails if there are fewer than two cameras, or a pose isn't rigid, or intrinsics are invalid. `file` is the path that error
+    /// messages name.
+    pub fn from_source(
+        name: String,
+        file: PathBuf,
+        cameras: &[Camera],
+        source: Arc<dyn ImageSource>,
+    ) -> Result<Self> {
+        let frame = |(index, &camera): (usize, &Camera)| Frame {
+            image: ImageLocation::Source { source: source.clone(), index },
+            name: format!("{index:06}"),
+            camera,
+            distortion: Distortion::default(),
+        };
+        let frames = cameras.iter().enumerate().map(frame).collect();
+        Capture::new(name, file, frames, Changes::default(), Purpose::Photos)
+    }
+
+    /// Adds `frames`, described by `file`, as the test part, which is held out unless another split is requested.
+    pub(crate) fn with_test(
+        mut self,
+        file: &Path,
+        mut frames: Vec<Frame>,
+        changes: Changes,
+        purpose: Purpose,
+    ) -> Result<Self> {
+        self.is_complete &= changes.absent.is_empty();
+        self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
+        self.frames.append(&mut frames);
+        Ok(self)
+    }
+
+    /// Inserts `lines` before the other warnings.
+    pub(crate) fn with_warnings(mut self, mut lines: Vec<String>) -> Self {
+        lines.append(&mut self.warnings);
+        self.warnings = lines;
+        self
+    }
+
+    /// Returns what was left out or changed when the capture was opened: one line for each kind of change, with counts and names.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// Returns `true` if every photo named by the capture exists, so that the indices of its views are those in the capture's file.
+    pub fn is_complete(&self) -> bool {
+        self.is_complete
+    }
+
+    /// Returns the indices of the context views and those of the held-out views. [`Holdout::None`] holds out the capture's own test
+    /// part, if it has one. Any other split is made of the remaining views alone and leaves the test part out.
+    pub fn split(&self, holdout: Holdout) -> (Vec<usize>, Vec<usize>) {
+        match holdout {
+            Holdout::None => (0..self.len()).partition(|&view| view < self.train),
+            Holdout::Every { .. } => holdout.split(self.train),
+        }
+    }
+
+    /// Returns `true` if the capture itself defines which views are held out.
+    pub fn has_test_part(&self) -> bool {
+        self.train < self.len()
+    }
+
+    /// Returns the indices of the views at which images from elsewhere are scored: the capture's own test part if it has one,
+    /// otherwise all views.
+    pub fn scored_views(&self) -> Vec<usize> {
+        if self.has_test_part() { (self.train..self.len()).collect() } else { (0..self.len()).collect() }
+    }
+
+    /// Returns the number of views.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Returns `true` if there are no views, which never happens: a capture has at least one camera.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Returns the file that describes the capture.
+    pub fn file(&self) -> &Path {
+        &self.file
+    }
+
+    /// Returns the cameras, at the sizes of the image files.
+    pub fn cameras(&self) -> Vec<Camera> {
+        self.frames.iter().map(|frame| frame.camera).collect()
+    }
+
+    /// Returns `true` if any photo has fewer pixels than `size` along a side. Fitting enlarges such a photo, which adds no detail.
+    pub fn has_smaller(&self, size: ImageSize) -> bool {
+        let is_smaller = |camera: &Camera| camera.height < size.height || camera.width < size.width;
+        self.frames.iter().any(|frame| is_smaller(&frame.camera))
+    }
+
+    /// Returns the names of the images, in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.frames.iter().map(|frame| frame.name.as_str())
+    }
+
+    /// Returns a unique file name without extension for the rendered image of each view. The names are those of the photos,
+    /// relative to the deepest folder that contains all of them. If the names differ only in their extensions, the extensions
+    /// become part of the names. If they aren't unique even then, numbers replace them.
+    pub fn picture_names(&self) -> Vec<String> {
+        self.picture_names_with(&[""])
+    }
+
+    /// Returns names like [`Capture::picture_names`] for several images of each view, whose names end in `suffixes`. No two of the
+    /// names with suffixes are equal.
+    pub fn picture_names_with(&self, suffixes: &[&str]) -> Vec<String> {
+        picture_names(&self.names().collect::<Vec<_>>(), suffixes)
+    }
+
+    /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
+    pub fn add_input_files(&self, inputs: &mut InputFiles) {
+        let described = described_in(&self.file);
+        inputs.add(&described);
+        // A COLMAP model consists of several files.
+        let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
+        let siblings = form.and_then(|_| std::fs::read_dir(described.parent()?).ok());
+        for sibling in siblings.into_iter().flatten().flatten() {
+            if Path::new(&sibling.file_name()).extension() == form {
+                inputs.add(&sibling.path());
+            }
+        }
+        for frame in &self.frames {
+            if let ImageLocation::File(photo) = &frame.image {
+                inputs.add_photo(photo);
+            }
+        }
+    }
+
+    /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`.
+    ///
+    /// # Errors
+    /// Fails if an image is missing, can't be decoded, or has another size than the capture declares.
+    pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
+        let lens = self.shared_lens(indices, size);
+        let pixels = |&index: &usize| {
+            let Camera { width, height, .. } = self.frames[index].camera;
+            u64::from(width) * u64::from(height)
+        };
+        let largest = indices.iter().map(pixels).max().unwrap_or(0).max(1);
+        let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
+        let mut views = vec![];
+        for indices in indices.chunks(at_once) {
+            let load = |&index: &usize| self.load_view(&self.frames[index], size, lens.as_ref());
+            let loaded: Vec<_> = indices.par_iter().map(load).collect();
+            // If several images can't be read, the error is that of the first one.
+            for view in loaded {
+                views.push(view?);
+            }
+        }
+        Ok(views)
+    }
+
+    /// Reads every view like [`Capture::load`].
+    ///
+    /// # Errors
+    /// Fails like [`Capture::load`].
+    pub fn load_all(&self, size: Option<ImageSize>) -> Result<Vec<Photo>> {
+        self.load(&(0..self.len()).collect::<Vec<_>>(), size)
+    }
+
+    /// Returns the lens of the first of several views, which most other views usually share. Returns `None` for a single view, for a
+    /// lens without distortion, and for the largest photos: the lens takes 16 bytes per pixel, and the size that the capture declares
+    /// isn't verified yet.
+    fn shared_lens(&self, indices: &[usize], size: Option<ImageSize>) -> Option<Lens> {
+        const MOST_PIXELS: u64 = 1 << 23;
+        let Frame { camera, distortion, .. } = &self.frames[*indices.first()?];
+        let is_shared = indices.len() > 1
+            && *distortion != Distortion::default()
+            && u64::from(camera.width) * u64::from(camera.height) <= MOST_PIXELS;
+        is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
+    }
+
+    /// Computes the CRC-32 of the views `indices`: the bytes of their photo files, and their cameras. Images that are computed
+    /// contribute their cameras alone.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read.
+    pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
+        let mut hasher = crc32fast::Hasher::new();
+        for index in indices {
+            let Frame { image, camera, distortion, .. } = &self.frames[index];
+            hasher.update(format!("{camera:?}{distortion:?}").as_bytes());
+            if !matches!(image, ImageLocation::Source { .. }) {
+                hasher.update(&image.read()?);
+            }
+        }
+        Ok(hasher.finalize())
+    }
+
+    fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<Photo> {
+        let image = self.read_photo(frame, size, lens)?;
+        let (planes, camera) = match size {
+            Some(size) => fit(&image, &frame.camera, size),
+            None => (Planes::from_rgb(&image), frame.camera),
+        };
+        Ok(Photo { name: frame.name.clone(), image: planes, camera })
+    }
+
+    /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
+    /// infinite in the sky. Returns `None` unless an [`ImageSource`] computes them.
+    pub fn depth(&self, index: usize) -> Option<Vec<f32>> {
+        match &self.frames[index].image {
+            ImageLocation::Source { source, index } => source.depth(*index),
+            ImageLocation::File(_) | ImageLocation::Bytes { .. } => None,
+        }
+    }
+
+    /// Returns the photo of view `index` at its camera's size, with lens distortion removed.
+    ///
+    /// # Errors
+    /// Fails like [`Capture::load`].
+    pub fn photo(&self, index: usize) -> Result<RgbImage> {
+        self.read_photo(&self.frames[index], None, None)
+    }
+
+    /// Reads the photo and removes lens distortion, at least in the part that fitting to `size` reads. Uses `lens` if it matches
+    /// the frame.
+    fn read_photo(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<RgbImage> {
+        if let ImageLocation::Source { source, index } = &frame.image {
+            return Ok(source.image(*index));
+        }
+        let photo = self.decode(frame, &frame.image.read()?)?;
+        if let Some(lens) = lens.filter(|lens| lens.is_of(&frame.distortion, &frame.camera)) {
+            return Ok(lens.undistort(photo.pixels));
+        }
+        let window = size.map(|size| looked_at(&frame.camera, size));
+        Ok(undistort(photo.pixels, &frame.distortion, &frame.camera, window))
+    }
+
+    fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<DecodedPhoto> {
+        let Camera { width, height, .. } = frame.camera;
+        let photo = decode_photo(encoded, frame.image.file(), (width, height))?;
+        if photo.pixels.dimensions() == (width, height) {
+            return Ok(photo);
+        }
+        let found = format!("{}×{} pixels", photo.pixels.width(), photo.pixels.height());
+        let expected = format!("{width}×{height} as in {}", self.file.display());
+        Err(Error::input(frame.image.file(), "the image", found, expected))
+    }
+
+    /// Returns the image file of view `index` as a pinhole camera would have written it. These are the original bytes if the image
+    /// is 8-bit RGB, upright and free of distortion.
+    ///
+    /// # Errors
+    /// Fails like [`Capture::load`].
+    pub fn encoded(&self, index: usize) -> Result<Vec<u8>> {
+        let frame = &self.frames[index];
+        let bytes = frame.image.read()?;
+        let photo = self.decode(frame, &bytes)?;
+        if photo.as_stored && frame.distortion == Distortion::default() {
+            return Ok(bytes.into_owned());
+        }
+        let pixels = undistort(photo.pixels, &frame.distortion, &frame.camera, None);
+        encode_photo(&pixels, photo.is_jpeg)
+    }
+}
+
+/// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.
+fn described_in(path: &Path) -> PathBuf {
+    let files = files_and_keys(path).rev().map(|(file, _)| file);
+    std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
+}
+
+/// Checks the cameras of `frames`, which `file` describes, fits them to their photos, and returns a line for each kind of change.
+fn check_frames(
+    file: &Path,
+    frames: &mut [Frame],
+    changes: Changes,
+    purpose: Purpose,
+) -> Result<Vec<String>> {
+    check_cameras(file, frames.iter().map(|frame| &frame.camera))?;
+    let mut lines = changes.into_lines(file, frames.len());
+    if matches!(purpose, Purpose::Photos) {
+        lines.extend(fit_cameras_to_photos(file, frames));
+    }
+    Ok(lines)
+}
+
+/// Scales the intrinsics of `frames` to photos whose size differs from that in `file` but whose aspect ratio agrees with it, and
+/// returns a line about it. A photo whose size can't be read keeps its camera; loading it reports the error.
+fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
+    let scaled = |frame: &Frame| match &frame.image {
+        ImageLocation::File(path) => scaled_to(&frame.camera, read_image_size(path).ok()?),
+        ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => None,
+    };
+    let scaled: Vec<_> = frames.par_iter().map(scaled).collect();
+    let count = frames.len();
+    let mut names = vec![];
+    let mut first = None;
+    for (frame, camera) in frames.iter_mut().zip(scaled) {
+        let Some(camera) = camera else { continue };
+        first.get_or_insert((frame.camera, camera));
+        frame.camera = camera;
+        names.push(frame.name.as_str());
+    }
+    let (said, found) = first?;
+    Some(format!(
+        "{}: {} of {count} photos have another size than it says, the first {}×{} pixels in place of {}×{}: their intrinsics \
+         are scaled: {}",
+        file.display(),
+        names.len(),
+        found.width,
+        found.height,
+        said.width,
+        said.height,
+        listed(names.into_iter())
+    ))
+}
+
+/// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
+/// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
+fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
+    let said = (camera.width, camera.height);
+    let choices = [(width, height), (height, width)];
+    if choices.contains(&said) {
+        return None;
+    }
+    let shares = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
+    let agrees = |&(width, height): &(u32, u32)| {
+        let (x, y) = (shares(width, said.0), shares(height, said.1));
+        let is_one_way = (width <= said.0) == (height <= said.1) || x == 1. || y == 1.;
+        let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
+        is_one_way && (x - y).abs() <= pixel(width, said.0) + pixel(height, said.1)
+    };
+    let (width, height) = choices.into_iter().find(agrees)?;
+    let (x, y) = (f64::from(width) / f64::from(said.0), f64::from(height) / f64::from(said.1));
+    Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
+}
+
+fn picture_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
+    let plain = |part: Component| match part {
+        Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+        Component::ParentDir => Some("up".to_string()),
+        _ => None,
+    };
+    let paths: Vec<Vec<String>> =
+        names.iter().map(|name| Path::new(name).components().filter_map(plain).collect()).collect();
+    let folders = || paths.iter().map(|path| &path[..path.len().saturating_sub(1)]);
+    let shared = |depth: &usize| {
+        let first = paths[0].get(*depth);
+        folders().all(|folder| folder.get(*depth).is_some_and(|name| Some(name) == first))
+    };
+    let skipped = if paths.is_empty() { 0 } else { (0..).take_while(shared).count() };
+    let below = |path: &Vec<String>| path[skipped..].join("/");
+    let stem = |path: &Vec<String>| Path::new(&below(path)).with_extension("").to_string_lossy().into_owned();
+    let numbered = |index: usize| format!("{index:06}");
+    let choices: [Vec<String>; 2] = [paths.iter().map(stem).collect(), paths.iter().map(below).collect()];
+    let is_unique = |names: &Vec<String>| {
+        let files =
+            names.iter().flat_map(|name| suffixes.iter().map(move |suffix| format!("{name}{suffix}")));
+        files.collect::<BTreeSet<_>>().len() == names.len() * suffixes.len()
+    };
+    choices.into_iter().find(is_unique).unwrap_or_else(|| (0..names.len()).map(numbered).collect())
+}
+
+/// Checks that poses are rigid and that intrinsics are valid.
+pub(crate) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a Camera>) -> Result<()> {
+    for (i, camera) in cameras.enumerate() {
+        let field = |name: String| format!("{name} of view {i}");
+        check_pose(&camera.c2w)
+            .map_err(|(found, expected)| Error::input(file, field("c2w".into()), found, expected))?;
+        camera
+            .intrinsics
+            .check(camera.width, camera.height)
+            .map_err(|(name, found, expected)| Error::input(file, field(name), found, expected))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{picture_names as names_with, scaled_to};
+    use crate::geometry::{Camera, Intrinsics};
+    use glam::DMat4;
+
+    fn picture_names(names: &[&str]) -> Vec<String> {
+        names_with(names, &[""])
+    }
+
+    #[test]
+    fn pictures_of_several_kinds_have_names_of_their_own() {
+        let suffixes = ["", "_depth"];
+        assert_eq!(names_with(&["x.png", "y.png"], &suffixes), ["x", "y"]);
+        assert_eq!(names_with(&["x.png", "x_depth.png"], &suffixes), ["x.png", "x_depth.png"]);
+        assert_eq!(names_with(&["x", "x_depth"], &suffixes), ["000000", "000001"]);
+    }
+
+    #[test]
+    fn cameras_are_scaled_where_the_aspect_agrees_to_a_pixel() {
+        let intrinsics = Intrinsics { fx: 500., fy: 510., cx: 250., cy: 180. };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 519, height: 339 };
+        let size = |photo| scaled_to(&camera, photo).map(|camera| (camera.width, camera.height));
+        for photo in [(519, 339), (339, 519), (519, 300), (260, 180), (600, 339), (64, 64), (1038, 600)] {
+            assert_eq!(size(photo), None, "{photo:?}");
+        }
+        // Halves and eighths, rounded down or up; twice the size; one row more. Below: width and height swapped.
+        for photo in [(259, 169), (260, 170), (64, 42), (65, 42), (1038, 678), (1037, 678), (519, 340)] {
+            assert_eq!(size(photo), Some(photo), "{photo:?}");
+        }
+        assert_eq!(size((170, 260)), Some((260, 170)));
+        let half = scaled_to(&Camera { width: 512, height: 340, ..camera }, (256, 170)).unwrap();
+        assert_eq!(half.intrinsics, Intrinsics { fx: 250., fy: 255., cx: 125., cy: 90. });
+    }
+
+    #[test]
+    fn pictures_are_named_as_photos_and_none_twice() {
+        assert_eq!(picture_names(&["images/000.png", "images/001.png"]), ["000", "001"]);
+        assert_eq!(picture_names(&["./images/left/0.png", "./images/right/0.png"]), ["left/0", "right/0"]);
+        assert_eq!(picture_names(&["left/0.png", "1.png"]), ["left/0", "1"]);
+        assert_eq!(picture_names(&["a/0.png", "a/0.jpg"]), ["0.png", "0.jpg"]);
+        assert_eq!(picture_names(&["0.v1.png", "0.v2.png"]), ["0.v1", "0.v2"]);
+        assert_eq!(picture_names(&["../a/0.png", "b/0.png"]), ["up/a/0", "b/0"]);
+        assert_eq!(picture_names(&["0.png", "0.png"]), ["000000", "000001"]);
+        assert_eq!(picture_names(&["000000", "000001"]), ["000000", "000001"]);
+        assert!(picture_names(&[]).is_empty());
+    }
+}

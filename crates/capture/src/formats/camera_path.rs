@@ -1,0 +1,112 @@
+//! Camera paths to render: the cameras of any capture, without its photos, or a `camera_path.json` of nerfstudio's viewer.
+//!
+//! The latter is {"camera_path": [{"camera_to_world": 16 numbers, row by row, OpenGL axes, "fov": vertical, in degrees}, …],
+//! "render_height", "render_width", and optionally "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
+
+use super::json::null_for_not_a_number;
+use super::transforms_json::{from_opengl, shown};
+use super::{cameras_json, is_capture, open_for, transforms_json};
+use crate::capture::{Purpose, check_cameras};
+use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
+use globalsplat_files::{Error, InputFiles, Result, read_text};
+use serde_json::Value;
+use std::path::Path;
+
+/// A sequence of cameras to render from.
+#[derive(Debug)]
+pub struct CameraPath {
+    /// Cameras in order, at least one.
+    pub cameras: Vec<Camera>,
+    /// Frame rate, if the file specifies one.
+    pub frames_per_second: Option<u32>,
+    /// Warnings as returned by [`Capture::warnings`](crate::data::Capture::warnings).
+    pub warnings: Vec<String>,
+    /// Files that the cameras were read from, and the existing photos of the capture.
+    pub inputs: InputFiles,
+}
+
+/// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) finds, or of a JSON file of any name.
+/// The keys of the JSON file tell its format: `frames` for a `transforms.json`, `camera_path` for nerfstudio's viewer, otherwise a
+/// `cameras.json`. Photos may be missing. If only a missing photo could tell its size, `size` is assumed.
+///
+/// # Errors
+/// Fails like [`open_capture`](super::open_capture).
+pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
+    let purpose = Purpose::Cameras(size);
+    let json =
+        match path.is_file() && path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json")) {
+            false => None,
+            true => {
+                let text = read_text(path)?;
+                // The reader of the format reports invalid JSON.
+                Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
+            }
+        };
+    let has = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
+    let capture = match (&json, is_capture(path)) {
+        (Some(json), _) if has("camera_path") => return of_viewer(path, json),
+        (Some(_), false) if has("frames") => transforms_json::read(path, purpose)?,
+        (Some(_), false) => cameras_json::read(path, purpose)?,
+        _ => open_for(path, purpose)?,
+    };
+    let warnings = capture.warnings().to_vec();
+    let mut inputs = InputFiles::default();
+    capture.add_input_files(&mut inputs);
+    Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None, warnings, inputs })
+}
+
+fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
+    let refuse = |field: &str, found: Option<&Value>, expected: &str| {
+        Error::input(file, field, shown(found), expected)
+    };
+    let number = |of: &Value, key: &str, field: &str, expected: &str, least: f64, most: f64| {
+        let value = of.get(key);
+        let number = value.and_then(Value::as_f64).filter(|number| *number > least && *number < most);
+        number.ok_or_else(|| refuse(field, value, expected))
+    };
+    if let Some(kind) = json.get("camera_type").filter(|kind| *kind != "perspective") {
+        return Err(refuse("camera_type", Some(kind), "\"perspective\""));
+    }
+    let side = |key: &str| {
+        let expected = "a number of pixels, 1 to 16384";
+        let side = number(json, key, key, expected, 0., 16385.)?;
+        if side < 1. || side.fract() != 0. {
+            Err(refuse(key, json.get(key), expected))
+        } else {
+            Ok(side as u32)
+        }
+    };
+    let (height, width) = (side("render_height")?, side("render_width")?);
+    let entries = json.get("camera_path").and_then(Value::as_array).filter(|entries| !entries.is_empty());
+    let entries =
+        entries.ok_or_else(|| refuse("camera_path", json.get("camera_path"), "a list of cameras"))?;
+    let camera = |(i, entry): (usize, &Value)| {
+        let named = |key: &str| format!("{key} of camera {i}");
+        let pose = entry.get("camera_to_world");
+        let numbers = pose.and_then(Value::as_array).into_iter().flatten();
+        let numbers: Vec<f64> = numbers.filter_map(Value::as_f64).collect();
+        let pose_refused = || refuse(&named("camera_to_world"), pose, "16 numbers");
+        let c2w = from_opengl(numbers.as_slice().try_into().map_err(|_| pose_refused())?);
+        let (c2w, _) = nearest_rigid_of_scaled(&c2w)
+            .map_err(|(found, expected)| Error::input(file, named("camera_to_world"), found, expected))?;
+        let fov = number(entry, "fov", &named("fov"), "degrees between 0 and 180", 0., 180.)?;
+        let (w, h) = (f64::from(width), f64::from(height));
+        let focal = h / 2. / (fov.to_radians() / 2.).tan();
+        let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };
+        Ok(Camera { intrinsics, c2w, width, height })
+    };
+    let cameras = entries.iter().enumerate().map(camera).collect::<Result<Vec<_>>>()?;
+    check_cameras(file, cameras.iter())?;
+    let rate = match (json.get("fps"), json.get("seconds")) {
+        (Some(_), _) => Some(number(json, "fps", "fps", "frames per second, 1 to 120", 0.5, 120.5)?),
+        (None, Some(_)) => {
+            let seconds = number(json, "seconds", "seconds", "a number above 0", 0., f64::INFINITY)?;
+            Some((cameras.len() as f64 / seconds).clamp(1., 120.))
+        }
+        (None, None) => None,
+    };
+    let mut inputs = InputFiles::default();
+    inputs.add(file);
+    let frames_per_second = rate.map(|rate| rate.round() as u32);
+    Ok(CameraPath { cameras, frames_per_second, warnings: vec![], inputs })
+}

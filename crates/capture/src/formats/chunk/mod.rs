@@ -1,0 +1,169 @@
+//! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key", "url",
+//! "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
+
+mod scenes;
+
+use super::Found;
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
+use crate::geometry::{Camera, Intrinsics};
+use crate::pixels::{Distortion, encoded_image_size};
+use glam::{DMat4, DVec4};
+use globalsplat_files::{Error, Result, files_and_keys};
+use globalsplat_torch_file::Archive;
+use scenes::{Scene, scenes};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// File extension of a chunk.
+pub const CHUNK_EXTENSION: &str = "torch";
+/// Name of the index file that identifies a folder of chunks: {key: chunk's file name}.
+pub const CHUNK_INDEX_FILE: &str = "index.json";
+/// Number of values of a camera: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three rows of
+/// w2c.
+const CAMERA_NUMBERS: usize = 18;
+
+/// A chunk in memory, with images still encoded.
+#[derive(Debug, Clone)]
+pub struct Chunk {
+    file: PathBuf,
+    bytes: Arc<Vec<u8>>,
+    scenes: Vec<Scene>,
+}
+
+/// Recognizes `CHUNK.torch#KEY`, or `CHUNK.torch` with a single scene.
+pub(super) fn find(path: &Path) -> Option<Found> {
+    if let Some((file, key)) = files_and_keys(path).find(|(file, _)| is_chunk(file)) {
+        return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
+    }
+    let file = is_chunk(path).then(|| path.to_owned())?;
+    Some(Box::new(move |purpose| Chunk::read(&file)?.only_capture(purpose)))
+}
+
+/// Returns `true` if `path` is a file with the extension of a chunk.
+fn is_chunk(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == CHUNK_EXTENSION) && path.is_file()
+}
+
+impl Chunk {
+    /// Reads a chunk. Executes nothing that it contains and trusts none of the sizes that it declares.
+    ///
+    /// # Errors
+    /// Fails if the file can't be read, is damaged, or holds anything other than scenes.
+    pub fn read(file: &Path) -> Result<Self> {
+        Self::parse(file, std::fs::read(file).map_err(Error::read(file))?)
+    }
+
+    /// Parses `bytes`, the contents of the chunk `file`.
+    ///
+    /// # Errors
+    /// Fails like [`Chunk::read`], except for errors of reading the file.
+    pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
+        let archive = Archive::parse(file, &bytes)?;
+        let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
+        let scenes =
+            scenes(&bytes, &archive).map_err(|found| Error::input(file, "data.pkl", found, expected))?;
+        Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
+    }
+
+    /// Returns the names of the scenes, in order.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.scenes.iter().map(|scene| scene.key.as_str())
+    }
+
+    /// Returns the scene `key`.
+    ///
+    /// # Errors
+    /// Fails if there is no such scene, or if it violates the requirements on captures.
+    pub fn capture(&self, key: &str) -> Result<Capture> {
+        self.capture_for(key, Purpose::Photos)
+    }
+
+    fn capture_for(&self, key: &str, purpose: Purpose) -> Result<Capture> {
+        match self.scenes.iter().find(|scene| scene.key == key) {
+            Some(scene) => self.capture_of(scene, purpose),
+            None => Err(Error::input(
+                &self.file,
+                "the scene",
+                format!("{key:?}, which is not there"),
+                self.choice(),
+            )),
+        }
+    }
+
+    /// Returns the scene of a chunk that has a single scene.
+    ///
+    /// # Errors
+    /// Fails if there are more scenes or none; otherwise like [`Chunk::capture`].
+    fn only_capture(&self, purpose: Purpose) -> Result<Capture> {
+        match self.scenes.as_slice() {
+            [scene] => self.capture_of(scene, purpose),
+            scenes => {
+                let file = self.file.display();
+                Err(Error::request(format!(
+                    "{file}: it holds {} scenes, expected {file}#KEY with {}",
+                    scenes.len(),
+                    self.choice()
+                )))
+            }
+        }
+    }
+
+    /// Lists the available scenes for an error message.
+    fn choice(&self) -> String {
+        const SHOWN: usize = 8;
+        let keys: Vec<&str> = self.keys().take(SHOWN).collect();
+        let more = if self.scenes.len() > SHOWN { ", …" } else { "" };
+        format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
+    }
+
+    fn capture_of(&self, scene: &Scene, purpose: Purpose) -> Result<Capture> {
+        let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
+        // A damaged frame is detected when it is loaded. Until then, assume the size of the other frames.
+        let sizes: Vec<_> =
+            scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
+        let undecodable = || Error::input(&named, "every image", "undecodable", "a JPEG or PNG");
+        let told = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
+        let usual = purpose.size(&named, "the images", told)?;
+        let cameras = scene.cameras(&self.bytes);
+        let frames = scene
+            .images
+            .iter()
+            .cloned()
+            .zip(cameras.chunks_exact(CAMERA_NUMBERS))
+            .zip(&sizes)
+            .enumerate()
+            .map(|(index, ((bytes, numbers), size))| {
+                let name = format!("{index:06}");
+                let camera = camera(numbers, size.unwrap_or(usual));
+                let photo = ImageLocation::Bytes { file: self.bytes.clone(), bytes, name: named.join(&name) };
+                Frame { image: photo, name, camera, distortion: Distortion::default() }
+            });
+        Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
+    }
+}
+
+/// Builds a camera from a chunk's values and the image's (width, height).
+fn camera(numbers: &[f32], (width, height): (u32, u32)) -> Camera {
+    let at = |i: usize| f64::from(numbers[i]);
+    let (w, h) = (f64::from(width), f64::from(height));
+    let row = |i: usize| DVec4::new(at(i), at(i + 1), at(i + 2), at(i + 3));
+    let w2c = DMat4::from_cols(row(6), row(10), row(14), DVec4::W).transpose();
+    let intrinsics = Intrinsics { fx: at(0) * w, fy: at(1) * h, cx: at(2) * w, cy: at(3) * h };
+    Camera { intrinsics, c2w: w2c.inverse(), width, height }
+}
+
+/// Returns a camera's 18 values in a chunk: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three
+/// rows of the world-to-camera matrix.
+pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
+    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+    let k = camera.intrinsics;
+    let mut numbers = [0f32; CAMERA_NUMBERS];
+    for (number, value) in numbers.iter_mut().zip([k.fx / w, k.fy / h, k.cx / w, k.cy / h]) {
+        *number = value as f32;
+    }
+    let rows = crate::geometry::pose_to_rows(&camera.c2w.inverse());
+    for (number, value) in numbers[6..].iter_mut().zip(rows) {
+        *number = value as f32;
+    }
+    numbers
+}

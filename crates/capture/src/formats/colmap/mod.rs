@@ -1,0 +1,405 @@
+//! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. The centre of
+//! pixel (0, 0) is at (½, ½), as everywhere in this crate. Points are read separately, on request (spec 10.4).
+
+mod fields;
+mod points;
+
+pub use points::{Point, points_of};
+
+use super::natural::natural_order;
+use super::photos::{find_photos, portable};
+use super::{Found, folder_name};
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, listed};
+use crate::geometry::{Camera, Intrinsics};
+use crate::pixels::Distortion;
+use fields::{Bytes, Words, is_comment};
+use glam::{DMat4, DQuat, DVec3};
+use globalsplat_files::{Error, Result, read_text};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Folders below a capture's folder that are searched for models, directly and in numbered subfolders, each with the folders that
+/// contain the model's photos. A dense model has its own photos, whose lens distortion is removed.
+const PLACES: [(&str, &[&str]); 3] =
+    [("sparse", &[""]), ("colmap/sparse", &["", "colmap"]), ("dense/sparse", &["dense"])];
+
+/// Folder of numbered subfolders, and the name of the model's folder in each of them. Each subfolder also has its own photos.
+const DENSE: (&str, &str) = ("dense", "sparse");
+
+/// Name of the folder of photos.
+const PHOTOS: &str = "images";
+
+/// Camera models in COLMAP's numbering, each with its number of parameters.
+const MODELS: [(&str, usize); 18] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
+];
+
+/// Supported camera models.
+const SUPPORTED: [&str; 6] =
+    ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
+
+/// Files of a model.
+struct Model {
+    cameras: PathBuf,
+    images: PathBuf,
+    /// Folders that the names of the photos may be relative to.
+    bases: Vec<PathBuf>,
+}
+
+impl Model {
+    /// Returns the model in `folder`, the binary one if both forms exist.
+    fn in_folder(folder: &Path, bases: &[PathBuf]) -> Option<Self> {
+        ["bin", "txt"].into_iter().find_map(|form| {
+            let file = |name: &str| Some(folder.join(format!("{name}.{form}"))).filter(|file| file.is_file());
+            Some(Model { cameras: file("cameras")?, images: file("images")?, bases: bases.to_vec() })
+        })
+    }
+
+    /// Returns every model of the capture in `folder`.
+    fn find_all(folder: &Path) -> Vec<Self> {
+        let mut models = vec![];
+        let mut look = |place: &Path, bases: &[PathBuf]| {
+            let places = numbered(place).into_iter().chain([place.to_owned()]);
+            models.extend(places.filter_map(|place| Model::in_folder(&place, bases)));
+        };
+        for (place, bases) in PLACES {
+            look(&folder.join(place), &bases.iter().map(|base| folder.join(base)).collect::<Vec<_>>());
+        }
+        for dense in numbered(&folder.join(DENSE.0)) {
+            look(&dense.join(DENSE.1), std::slice::from_ref(&dense));
+        }
+        // The folder itself may also be a model, or the `sparse` folder of a capture.
+        let canonical = folder.canonicalize().unwrap_or(folder.to_owned());
+        let bases: Vec<_> = canonical.ancestors().take(3).map(Path::to_owned).collect();
+        match canonical.ends_with(PLACES[0].0) {
+            true => look(folder, &bases),
+            false => models.extend(Model::in_folder(folder, &bases)),
+        }
+        models
+    }
+
+    fn is_text(&self) -> bool {
+        self.images.extension().is_some_and(|form| form == "txt")
+    }
+
+    fn images(&self) -> Result<Vec<ImageEntry>> {
+        if self.is_text() { images_of_text(&self.images) } else { images_of_bytes(&self.images) }
+    }
+}
+
+/// Returns the folders in `folder` whose names are numbers, in numeric order.
+fn numbered(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let is_number = |path: &PathBuf| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir()
+    };
+    let mut folders: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_number).collect();
+    folders.sort_by(natural_order);
+    folders
+}
+
+/// Maximum deviation of a quaternion's length from 1 that causes no warning.
+const UNIT_TOLERANCE: f64 = 1e-3;
+
+/// A line of cameras.txt.
+struct CameraEntry {
+    id: u32,
+    /// Name of the camera model. It may be missing from [`SUPPORTED`] if no image uses the camera.
+    model: String,
+    width: u64,
+    height: u64,
+    parameters: Vec<f64>,
+}
+
+/// The first line of an image in images.txt.
+struct ImageEntry {
+    id: u32,
+    /// World-to-camera rotation (w, x, y, z).
+    quaternion: [f64; 4],
+    translation: [f64; 3],
+    camera: u32,
+    name: String,
+}
+
+/// Recognizes a folder that contains a model.
+pub(super) fn find(folder: &Path) -> Option<Found> {
+    let (folder, models) = (folder.to_owned(), Model::find_all(folder));
+    (!models.is_empty()).then(|| -> Found { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
+}
+
+/// Reads the model with the most photos among `models`, the first one in case of a tie.
+fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Result<Capture> {
+    if models.len() == 1 {
+        return read(folder, &models[0], models[0].images()?, vec![], purpose);
+    }
+    let name = |model: &Model| {
+        model.images.parent().and_then(|place| place.strip_prefix(folder).ok()?.to_str().map(String::from))
+    };
+    let names: Vec<String> = models.iter().map(|model| name(model).unwrap_or_default()).collect();
+    // If no model can be read, the first one reports the error.
+    let sizes: Vec<Option<usize>> =
+        models.iter().map(|model| model.images().ok().map(|images| images.len())).collect();
+    let largest = (0..models.len()).rev().max_by_key(|&model| sizes[model]).expect("a model or more");
+    let model = models.swap_remove(largest);
+    let images = model.images()?;
+    let smaller: Vec<String> = names
+        .iter()
+        .zip(&sizes)
+        .filter(|(_, size)| **size < Some(images.len()))
+        .map(|(name, size)| match size {
+            Some(size) => format!("{name} ({size} photos)"),
+            None => format!("{name} (its images can't be read)"),
+        })
+        .collect();
+    let line = format!(
+        "the largest of {} models is taken, with {} photos; left out: {}",
+        sizes.len(),
+        images.len(),
+        listed(smaller.iter().map(String::as_str))
+    );
+    read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
+}
+
+/// Reads `images` of `model` as the capture in `folder`. Frames are ordered by name, with numbers in names compared by value.
+/// Frames with a missing photo are left out.
+fn read(
+    folder: &Path,
+    model: &Model,
+    images: Vec<ImageEntry>,
+    lines: Vec<String>,
+    purpose: Purpose,
+) -> Result<Capture> {
+    let entries = match model.is_text() {
+        true => cameras_of_text(&model.cameras)?,
+        false => cameras_of_bytes(&model.cameras)?,
+    };
+    let mut cameras = BTreeMap::new();
+    for camera in entries {
+        let id = camera.id;
+        if cameras.insert(id, camera).is_some() {
+            return Err(Error::input(&model.cameras, "the camera ids", format!("{id} twice"), "each once"));
+        }
+    }
+    let path = |name: &String| match Path::new(name).is_absolute() {
+        true => name.clone(),
+        false => format!("{PHOTOS}/{name}"),
+    };
+    let paths: Vec<String> = images.iter().map(|image| path(&image.name)).collect();
+    let photos = find_photos(&model.bases, &paths.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut lenses = BTreeMap::new();
+    let (mut frames, mut changes) = (vec![], Changes { lines, ..Changes::default() });
+    for (image, photo) in images.into_iter().zip(photos) {
+        let photo = match (photo.filter(|_| !image.name.is_empty()), purpose) {
+            (Some(photo), _) => photo,
+            (None, Purpose::Cameras(_)) => model.bases[0].join(PHOTOS).join(&image.name),
+            (None, Purpose::Photos) => {
+                changes.absent.push(image.name);
+                continue;
+            }
+        };
+        let refuse = |field: &str, found: String, expected: String| {
+            let field = format!("{field} of image {} ({})", image.id, image.name);
+            Err(Error::input(&model.images, field, found, expected))
+        };
+        let Some(camera) = cameras.get(&image.camera) else {
+            let expected = format!("one of the {} in {}", cameras.len(), model.cameras.display());
+            return refuse("camera id", image.camera.to_string(), expected);
+        };
+        let (camera, distortion) = match lenses.get(&camera.id) {
+            Some(lens) => *lens,
+            None => *lenses.entry(camera.id).or_insert(lens(&model.cameras, camera)?),
+        };
+        let [w, x, y, z] = image.quaternion;
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        let length = rotation.length();
+        if !(length > 0. && length.is_finite()) {
+            let expected = "a quaternion (w, x, y, z) of length 1, or of any above 0";
+            return refuse("rotation", format!("{:?}", image.quaternion), expected.into());
+        }
+        if (length - 1.).abs() > UNIT_TOLERANCE {
+            changes.scaled.push((image.name.clone(), length));
+        }
+        let translation = DVec3::from_array(image.translation);
+        if !translation.is_finite() {
+            return refuse("translation", format!("{:?}", image.translation), "finite numbers".into());
+        }
+        // Invert x ↦ Rx + t.
+        let inverse = rotation.normalize().conjugate();
+        let c2w = DMat4::from_rotation_translation(inverse, -(inverse * translation));
+        let camera = Camera { c2w, ..camera };
+        frames.push(Frame {
+            image: ImageLocation::File(photo),
+            name: portable(&image.name),
+            camera,
+            distortion,
+        });
+    }
+    frames.sort_by(|a, b| natural_order(&a.name, &b.name));
+    Capture::new(folder_name(folder), model.images.clone(), frames, changes, purpose)
+}
+
+/// Returns the camera, at the origin, and its distortion.
+fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
+    let refuse = |name: &str, found: String, expected: String| {
+        Error::input(file, format!("{name} of camera {}", entry.id), found, expected)
+    };
+    let size = |name: &str, size: u64| match u32::try_from(size) {
+        Ok(size) if size > 0 => Ok(size),
+        _ => Err(refuse(name, size.to_string(), "a number of pixels".into())),
+    };
+    let (width, height) = (size("width", entry.width)?, size("height", entry.height)?);
+    let none = Distortion::default();
+    let radial = |k1: f64, k2: f64| Distortion { radial: [k1, k2, 0., 0.], ..none };
+    let ([fx, fy, cx, cy], distortion) = match (entry.model.as_str(), entry.parameters.as_slice()) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], none),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], none),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], radial(k, 0.)),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], radial(k1, k2)),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+            ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial(k1, k2) })
+        }
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            let (radial, denominator) = ([k1, k2, k3, 0.], [k4, k5, k6]);
+            ([fx, fy, cx, cy], Distortion { radial, denominator, tangential: [p1, p2] })
+        }
+        (model, parameters) => {
+            let Some((_, count)) =
+                MODELS.iter().find(|(known, _)| SUPPORTED.contains(known) && *known == model)
+            else {
+                return Err(refuse("model", entry.model.clone(), format!("one of {}", SUPPORTED.join(", "))));
+            };
+            return Err(refuse(
+                "the parameters",
+                format!("{parameters:?}"),
+                format!("{count} parameters for {model}"),
+            ));
+        }
+    };
+    let intrinsics = Intrinsics { fx, fy, cx, cy };
+    intrinsics.check(width, height).map_err(|(name, found, expected)| refuse(&name, found, expected))?;
+    let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
+    distortion.check(&camera).map_err(|(found, expected)| refuse("the distortion", found, expected))?;
+    Ok((camera, distortion))
+}
+
+/// Reads lines of the form CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
+fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
+    let text = read_text(file)?;
+    let mut cameras = vec![];
+    for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
+        let mut words = Words { file, number, rest: line };
+        let id = words.parse("CAMERA_ID", "a whole number")?;
+        let model = words.parse("MODEL", "a camera model")?;
+        let (width, height) =
+            (words.parse("WIDTH", "a whole number")?, words.parse("HEIGHT", "a whole number")?);
+        let mut parameters = vec![];
+        while !words.rest.trim().is_empty() {
+            parameters.push(words.parse("PARAMS", "a number")?);
+        }
+        cameras.push(CameraEntry { id, model, width, height, parameters });
+    }
+    Ok(cameras)
+}
+
+/// Reads pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D as X Y POINT3D_ID, which may be empty.
+fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
+    let text = read_text(file)?;
+    let mut images = vec![];
+    let mut lines = (1..).zip(text.lines());
+    while let Some((number, line)) = lines.next() {
+        if is_comment(line) {
+            continue;
+        }
+        let mut words = Words { file, number, rest: line };
+        let id = words.parse("IMAGE_ID", "a whole number")?;
+        let mut quaternion = [0.; 4];
+        for (value, name) in quaternion.iter_mut().zip(["QW", "QX", "QY", "QZ"]) {
+            *value = words.parse(name, "a number")?;
+        }
+        let mut translation = [0.; 3];
+        for (value, name) in translation.iter_mut().zip(["TX", "TY", "TZ"]) {
+            *value = words.parse(name, "a number")?;
+        }
+        let camera = words.parse("CAMERA_ID", "a whole number")?;
+        // A name may contain spaces.
+        images.push(ImageEntry { id, quaternion, translation, camera, name: words.rest.trim().to_string() });
+        // This detects a missing second line, because an image's own line has ten words.
+        if let Some((number, points)) = lines.next()
+            && points.split_whitespace().count() % 3 != 0
+        {
+            let found = format!("{} words", points.split_whitespace().count());
+            let expected = "X, Y and POINT3D_ID of each point, or an empty line";
+            return Err(Error::input(file, format!("POINTS2D in line {number}"), found, expected));
+        }
+    }
+    Ok(images)
+}
+
+/// Reads the number of cameras (u64), then for each camera: id (u32), model (i32), width and height (u64), parameters (f64).
+fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
+    const SMALLEST: usize = 4 + 4 + 8 + 8 + 2 * 8;
+    let contents = std::fs::read(file).map_err(Error::read(file))?;
+    let mut bytes = Bytes { file, contents: &contents, at: 0 };
+    let mut cameras = vec![];
+    for i in 0..bytes.count("the number of cameras", SMALLEST)? {
+        let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
+        let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
+        let model = usize::try_from(number).ok().and_then(|number| MODELS.get(number));
+        // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
+        let (model, parameters) = model.ok_or_else(|| {
+            let expected = format!("one of {}", SUPPORTED.join(", "));
+            Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
+        })?;
+        let width = u64::from_le_bytes(bytes.take(|| format!("width of camera {id}"))?);
+        let height = u64::from_le_bytes(bytes.take(|| format!("height of camera {id}"))?);
+        let parameters = (0..*parameters)
+            .map(|_| bytes.number(|| format!("the parameters of camera {id}")))
+            .collect::<Result<_>>()?;
+        cameras.push(CameraEntry { id, model: model.to_string(), width, height, parameters });
+    }
+    bytes.end()?;
+    Ok(cameras)
+}
+
+/// Reads the number of images (u64), then for each image: id (u32), quaternion and translation (f64), camera id (u32), name
+/// (terminated by a 0), and the number of its points (u64), each x, y (f64) and an id (u64).
+fn images_of_bytes(file: &Path) -> Result<Vec<ImageEntry>> {
+    const POINT: usize = 24;
+    const SMALLEST: usize = 4 + 7 * 8 + 4 + 1 + 8;
+    let contents = std::fs::read(file).map_err(Error::read(file))?;
+    let mut bytes = Bytes { file, contents: &contents, at: 0 };
+    let mut images = vec![];
+    for i in 0..bytes.count("the number of images", SMALLEST)? {
+        let id = u32::from_le_bytes(bytes.take(|| format!("the id of image {i}, counted from 0,"))?);
+        let mut pose = [0.; 7];
+        for value in &mut pose {
+            *value = bytes.number(|| format!("the pose of image {id}"))?;
+        }
+        let [w, x, y, z, translation @ ..] = pose;
+        let camera = u32::from_le_bytes(bytes.take(|| format!("camera id of image {id}"))?);
+        let name = bytes.name(|| format!("name of image {id}"))?;
+        let points = bytes.count(&format!("the number of points of image {id}"), POINT)?;
+        bytes.at += points * POINT;
+        images.push(ImageEntry { id, quaternion: [w, x, y, z], translation, camera, name });
+    }
+    bytes.end()?;
+    Ok(images)
+}

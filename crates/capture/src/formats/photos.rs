@@ -1,0 +1,156 @@
+//! Search for the photos that a capture's file names.
+
+use crate::pixels::PHOTO_EXTENSIONS;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Reduction factors of the folders of smaller photos that tools create next to `images`: `images_2` and so on.
+const REDUCED: [u32; 3] = [2, 4, 8];
+
+/// Maximum number of leading folders of a name that may be skipped.
+const DEEPEST: usize = 16;
+
+/// Minimum number of photos of a capture.
+const FEWEST: usize = 2;
+
+/// Rule for turning names into paths: below `base`, without the first `skipped` folders, in a folder of smaller photos if
+/// `reduced`.
+#[derive(Clone, Copy)]
+struct Rule<'a> {
+    base: &'a Path,
+    skipped: usize,
+    reduced: Option<u32>,
+}
+
+/// Looks for the photos `names` below `bases` and returns the path of each photo that exists.
+///
+/// A name may come from another machine: with backslashes, without its extension or with one in different case, below a folder that
+/// doesn't exist here, or in `images` when only `images_2`, `images_4` or `images_8` exists. One rule applies to all names: the
+/// first that finds two photos without mapping different names to the same photo.
+pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
+    let deepest = names.iter().map(|name| parts(name).count()).max().unwrap_or(0);
+    let reductions = || std::iter::once(None).chain(REDUCED.map(Some));
+    let rules = bases.iter().flat_map(|base| {
+        (0..deepest.clamp(1, DEEPEST))
+            .flat_map(move |skipped| reductions().map(move |reduced| Rule { base, skipped, reduced }))
+    });
+    let mut best = (0, vec![None; names.len()]);
+    for rule in rules {
+        let found: Vec<_> = names.iter().map(|name| rule.find(name)).collect();
+        let there = || names.iter().zip(&found).filter(|(_, photo)| photo.is_some());
+        let photos = there().map(|(_, photo)| photo).collect::<BTreeSet<_>>().len();
+        let is_ambiguous = photos < there().map(|(name, _)| name).collect::<BTreeSet<_>>().len();
+        if photos > best.0 && !(is_ambiguous && rule.skipped > 0) {
+            best = (photos, found);
+            if photos >= FEWEST {
+                break;
+            }
+        }
+    }
+    best.1
+}
+
+/// Returns the name with `/` as the separator.
+pub(super) fn portable(name: &str) -> String {
+    name.replace('\\', "/")
+}
+
+fn parts(name: &str) -> impl Iterator<Item = &str> {
+    name.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".")
+}
+
+impl Rule<'_> {
+    fn find(&self, name: &str) -> Option<PathBuf> {
+        let as_written = match (self.skipped, self.reduced) {
+            (0, None) if !name.is_empty() => file_at(self.base.join(name)),
+            _ => None,
+        };
+        as_written.or_else(|| {
+            let mut parts = parts(name).skip(self.skipped).peekable();
+            let first = parts.next()?;
+            let mut path = self.base.to_owned();
+            match self.reduced {
+                None => path.push(first),
+                Some(factor) if parts.peek().is_some() => path.push(format!("{first}_{factor}")),
+                Some(_) => return None,
+            }
+            path.extend(parts);
+            file_at(path)
+        })
+    }
+}
+
+/// Returns the file at `path`, or the photo whose name differs only in the case of its extension or has an additional extension.
+fn file_at(path: PathBuf) -> Option<PathBuf> {
+    if path.is_file() {
+        return Some(path);
+    }
+    let extension = path.extension().unwrap_or_default();
+    let recased = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
+    let recased = recased.map(|extension| path.with_extension(extension));
+    let complete = |extension: &str| {
+        let mut path = path.clone().into_os_string();
+        path.push(format!(".{extension}"));
+        PathBuf::from(path)
+    };
+    let extensions = PHOTO_EXTENSIONS.iter();
+    let complete = extensions.flat_map(|known| [complete(known), complete(&known.to_ascii_uppercase())]);
+    recased.into_iter().chain(complete).find(|path| path.is_file())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns the paths, relative to a folder with `files`, that are found for `names`.
+    fn found(files: &[&str], names: &[&str]) -> Vec<Option<String>> {
+        let folder = tempfile::tempdir().unwrap();
+        for file in files {
+            let file = folder.path().join(file);
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, b"").unwrap();
+        }
+        let base = folder.path().to_owned();
+        let below = |path: PathBuf| path.strip_prefix(&base).unwrap().to_str().unwrap().to_string();
+        find_photos(std::slice::from_ref(&base), names).into_iter().map(|path| path.map(below)).collect()
+    }
+
+    fn all(names: &[&str]) -> Vec<Option<String>> {
+        names.iter().map(|name| Some(name.to_string())).collect()
+    }
+
+    #[test]
+    fn photos_are_found_however_their_paths_are_written() {
+        let files = ["images/a b (1).png", "images/c.JPG"];
+        for names in [
+            ["images/a b (1).png", "images/c.JPG"],
+            ["./images/a b (1)", "images\\c.jpg"],
+            ["C:\\Users\\me\\room\\images\\a b (1).png", "C:\\Users\\me\\room\\images\\c.JPG"],
+            ["/home/me/room/images/a b (1).png", "/home/me/room/images/c.JPG"],
+            ["room/images/a b (1).PNG", "room/images/c"],
+        ] {
+            assert_eq!(found(&files, &names), all(&files), "{names:?}");
+        }
+        assert_eq!(found(&["a.png", "b.png"], &["images/a.png", "images/b.png"]), all(&["a.png", "b.png"]));
+        assert_eq!(found(&["a.png"], &["", "images"]), [None, None]);
+    }
+
+    #[test]
+    fn smaller_photos_stand_for_those_that_are_not_there() {
+        let names = ["images/1/a.png", "images/1/b.png"];
+        let reduced = ["images_8/1/a.png", "images_8/1/b.png", "images_4/1/a.png", "images_4/1/b.png"];
+        assert_eq!(found(&reduced, &names), all(&reduced[2..]));
+        // A photo that was removed from one folder isn't taken from another.
+        let files = ["images/a.png", "images/b.png", "images_2/a.png", "images_2/b.png", "images_2/c.png"];
+        let names = ["images/a.png", "images/b.png", "images/c.png"];
+        assert_eq!(found(&files, &names), [all(&names[..2]), vec![None]].concat());
+    }
+
+    #[test]
+    fn one_photo_does_not_stand_for_two() {
+        assert_eq!(
+            found(&["0.png", "1.png"], &["left/0.png", "right/0.png", "left/1.png"]),
+            [None, None, None]
+        );
+    }
+}

@@ -1,0 +1,376 @@
+//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with OpenGL
+//! axes}]}, and lens parameters for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x` and
+//! `camera_angle_y` in radians, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes have a file of
+//! this kind for each split.
+
+use super::json::null_for_not_a_number;
+use super::natural::natural_order;
+use super::photos::{find_photos, portable};
+use super::{Found, file_in, folder_name};
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
+use crate::geometry::{Camera, Intrinsics, nearest_rigid_of_scaled};
+use crate::pixels::Distortion;
+use crate::pixels::read_image_size;
+use glam::{DMat4, DVec4};
+use globalsplat_files::{Error, Result, read_text};
+use serde_json::Value;
+use std::collections::HashSet;
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+
+/// File name that identifies a capture of this format.
+const FILE_NAME: &str = "transforms.json";
+
+/// Files of NeRF's synthetic scenes: training views, and test views, of which the first existing file is used.
+const TRAIN_FILE: &str = "transforms_train.json";
+const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
+
+/// nerfstudio's lists of training photos, and of test photos, of which the first existing list is used.
+const TRAIN_LIST: &str = "train_filenames";
+const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
+
+/// Names of the lenses that [`Distortion`] describes.
+const CAMERA_MODELS: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", FULL_OPENCV];
+
+/// Name of the lens model whose k4 to k6 form a denominator.
+const FULL_OPENCV: &str = "FULL_OPENCV";
+
+/// Groups of keys that together describe one property of a frame's lens. If a frame has one key of a group, the keys shared by all
+/// frames are ignored for this group.
+const FAMILIES: [&[&str]; 2] = [
+    &["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"],
+    &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params"],
+];
+
+/// Recognizes a folder with a `transforms.json`, or with a `transforms_train.json` and optional test files, or a file
+/// `transforms….json`.
+pub(super) fn find(path: &Path) -> Option<Found> {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
+    let file = if itself { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
+    if let Some(file) = file {
+        return Some(Box::new(move |purpose| read(&file, purpose)));
+    }
+    let train = file_in(path, TRAIN_FILE)?;
+    let mut others: Vec<PathBuf> = TEST_FILES.iter().filter_map(|name| file_in(path, name)).collect();
+    Some(Box::new(move |purpose| {
+        let mut capture = read(&train, purpose)?;
+        if !others.is_empty() {
+            let test = others.remove(0);
+            let (frames, changes, _) = read_frames(&test, purpose)?;
+            capture = capture.with_test(&test, frames, changes, purpose)?;
+        }
+        let unread = others.iter().map(|file| {
+            let views = read_frames(file, purpose).map_or(0, |(frames, ..)| frames.len());
+            format!(
+                "{}: its {views} views are left out, as {} has those to hold out",
+                file.display(),
+                TEST_FILES[0]
+            )
+        });
+        Ok(capture.with_warnings(unread.collect()))
+    }))
+}
+
+/// Reads the capture that `file` describes.
+pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
+    let (frames, changes, lists) = read_frames(file, purpose)?;
+    let new = |frames| Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose);
+    let Lists { train, test, unread } = lists;
+    // A camera path consists of all frames in order.
+    if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
+        return new(frames);
+    }
+    let (held_out, mut rest): (Vec<_>, Vec<_>) =
+        frames.into_iter().partition(|frame| test.contains(&listed(&frame.name)));
+    let others = rest.extract_if(.., |frame| {
+        let name = listed(&frame.name);
+        unread.contains(&name) || train.as_ref().is_some_and(|train| !train.contains(&name))
+    });
+    let others = others.count();
+    let warnings = (others > 0).then(|| {
+        let file = file.display();
+        format!("{file}: {others} frames are left out, as they are neither to learn from nor held out by its lists of filenames")
+    });
+    Ok(new(rest)?
+        .with_test(file, held_out, Changes::default(), purpose)?
+        .with_warnings(warnings.into_iter().collect()))
+}
+
+/// Normalizes the name of a photo, which lists may write in several ways.
+fn listed(name: &str) -> String {
+    portable(name).trim_start_matches("./").to_owned()
+}
+
+/// Names of photos in nerfstudio's lists.
+struct Lists {
+    /// Training photos, if there is such a list.
+    train: Option<HashSet<String>>,
+    /// Test photos.
+    test: HashSet<String>,
+    /// Validation photos, if there are also test photos.
+    unread: HashSet<String>,
+}
+
+impl Lists {
+    fn read(file: &Path, json: &Value) -> Result<Self> {
+        let list = |key: &str| match json.get(key) {
+            None | Some(Value::Null) => Ok(None),
+            Some(Value::Array(names)) => {
+                let name = |name: &Value| name.as_str().map(listed);
+                let names: Option<HashSet<_>> = names.iter().map(name).collect();
+                names.map(Some).ok_or_else(|| Error::input(file, key, "no names", "a list of file_paths"))
+            }
+            other => Err(Error::input(file, key, shown(other), "a list of file_paths")),
+        };
+        let [test, validation] = TEST_LISTS.map(list);
+        let mut lists = [test?, validation?].into_iter().flatten();
+        let (test, unread) = (lists.next().unwrap_or_default(), lists.next().unwrap_or_default());
+        Ok(Lists { train: list(TRAIN_LIST)?, test, unread })
+    }
+}
+
+fn root(file: &Path) -> &Path {
+    file.parent().unwrap_or(Path::new("."))
+}
+
+/// Reads the frames that `file` describes, ordered by name, with numbers in names compared by value. Frames with a missing image
+/// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed.
+fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
+    let text = read_text(file)?;
+    let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
+    let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
+        .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
+    let entries = match json.get("frames") {
+        Some(Value::Array(entries)) => entries,
+        other => return Err(Error::input(file, "frames", shown(other), "a list of frames")),
+    };
+    let fields: Vec<Fields> = entries
+        .iter()
+        .enumerate()
+        .map(|(index, frame)| Fields { file, index, frame, shared: &json, purpose })
+        .collect();
+    let names = fields.iter().map(Fields::file_path).collect::<Result<Vec<_>>>()?;
+    let mut bases = vec![root(file).to_owned()];
+    bases.extend(root(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
+    let photos = find_photos(&bases, &names);
+    let (mut frames, mut changes) = (vec![], Changes::default());
+    for ((fields, name), photo) in fields.iter().zip(names).zip(photos) {
+        match (photo, purpose) {
+            (Some(photo), _) => frames.push(fields.frame(photo, name, &mut changes)?),
+            (None, Purpose::Cameras(_)) => {
+                frames.push(fields.frame(root(file).join(name), name, &mut changes)?)
+            }
+            (None, Purpose::Photos) => changes.absent.push(name.to_string()),
+        }
+    }
+    frames.sort_by(|a, b| natural_order(&a.name, &b.name));
+    Ok((frames, changes, Lists::read(file, &json)?))
+}
+
+/// Describes a value of the file for an error message.
+pub(super) fn shown(value: Option<&Value>) -> String {
+    match value {
+        None => "absent".into(),
+        Some(Value::Null) => "null or NaN".into(),
+        Some(Value::Array(values)) => format!("a list of {}", values.len()),
+        Some(Value::Object(_)) => "an object".into(),
+        Some(value) => value.to_string(),
+    }
+}
+
+/// Returns the pose of 16 numbers, row by row, converted to OpenCV axes. OpenGL's y axis points up and its z axis backward, so
+/// those two columns change sign.
+pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
+    let opengl = DMat4::from_cols_array(entries).transpose();
+    opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
+}
+
+/// Returns `true` if `value` names the lens `model`.
+fn is_model(value: &Value, model: &str) -> bool {
+    value.as_str().is_some_and(|value| value.eq_ignore_ascii_case(model))
+}
+
+/// Fields of a frame, each either its own or the one shared by all frames.
+struct Fields<'a> {
+    file: &'a Path,
+    index: usize,
+    frame: &'a Value,
+    shared: &'a Value,
+    purpose: Purpose,
+}
+
+impl<'a> Fields<'a> {
+    /// Returns the value, and its name for error messages.
+    fn find(&self, key: &str) -> Option<(&'a Value, String)> {
+        if let Some(value) = self.frame.get(key) {
+            return Some((value, self.name(key)));
+        }
+        let family = FAMILIES.iter().find(|family| family.contains(&key)).copied().unwrap_or_default();
+        let has_own = family.iter().any(|key| self.frame.get(key).is_some());
+        let shared = self.shared.get(key).filter(|_| !has_own);
+        shared.map(|value| (value, key.to_string()))
+    }
+
+    fn name(&self, key: &str) -> String {
+        format!("{key} of frame {}", self.index)
+    }
+
+    fn number(&self, key: &str) -> Result<Option<f64>> {
+        let Some((value, name)) = self.find(key) else { return Ok(None) };
+        match value.as_f64() {
+            Some(number) => Ok(Some(number)),
+            None => Err(Error::input(self.file, name, shown(Some(value)), "a number")),
+        }
+    }
+
+    /// Reads a number of pixels.
+    fn size(&self, key: &str) -> Result<Option<u32>> {
+        match self.number(key)? {
+            None => Ok(None),
+            Some(size) if size >= 1. && size <= f64::from(u32::MAX) && size.fract() == 0. => {
+                Ok(Some(size as u32))
+            }
+            Some(size) => Err(self.refuse(key, size, "a number of pixels")),
+        }
+    }
+
+    /// Computes the focal length in pixels from an angle of view over `size` pixels: size / (2 tan(angle/2)).
+    fn focal_from_angle(&self, key: &str, size: u32) -> Result<Option<f64>> {
+        match self.number(key)? {
+            None => Ok(None),
+            Some(angle) if angle > 0. && angle < PI => Ok(Some(f64::from(size) / (2. * (angle / 2.).tan()))),
+            Some(angle) => Err(self.refuse(key, angle, "an angle between 0 and π")),
+        }
+    }
+
+    /// Returns an error that reports the existing value `found` of `key`.
+    fn refuse(&self, key: &str, found: impl std::fmt::Display, expected: &str) -> Error {
+        let name = self.find(key).map_or(key.to_string(), |(_, name)| name);
+        Error::input(self.file, name, found, expected)
+    }
+
+    fn file_path(&self) -> Result<&'a str> {
+        match self.frame.get("file_path") {
+            Some(Value::String(path)) if !path.is_empty() => Ok(path),
+            other => {
+                Err(Error::input(self.file, self.name("file_path"), shown(other), "the path of an image"))
+            }
+        }
+    }
+
+    fn frame(&self, image: PathBuf, name: &str, changes: &mut Changes) -> Result<Frame> {
+        self.check_camera_model()?;
+        let (width, height) = match (self.size("w")?, self.size("h")?) {
+            (Some(width), Some(height)) => (width, height),
+            _ => self.purpose.size(self.file, &format!("frame {}", self.index), read_image_size(&image))?,
+        };
+        let (c2w, scale) = self.c2w()?;
+        if scale != 1. {
+            changes.scaled.push((name.to_string(), scale));
+        }
+        let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w, width, height };
+        let distortion = self.distortion()?;
+        let refuse =
+            |name: &str, (found, expected)| Error::input(self.file, self.name(name), found, expected);
+        let intrinsics = camera.intrinsics.check(width, height);
+        intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
+        distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
+        Ok(Frame { image: ImageLocation::File(image), name: portable(name), camera, distortion })
+    }
+
+    /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of
+    /// the other axis. A missing principal point is the image centre.
+    fn intrinsics(&self, width: u32, height: u32) -> Result<Intrinsics> {
+        let focal = |length: &str, angle: &str, size: u32| match self.number(length)? {
+            Some(focal) => Ok(Some(focal)),
+            None => self.focal_from_angle(angle, size),
+        };
+        let (fx, fy) = (focal("fl_x", "camera_angle_x", width)?, focal("fl_y", "camera_angle_y", height)?);
+        let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
+            let expected = "a focal length in pixels, or camera_angle_x";
+            return Err(Error::input(self.file, self.name("fl_x"), "absent", expected));
+        };
+        let cx = self.number("cx")?.unwrap_or(f64::from(width) / 2.);
+        let cy = self.number("cy")?.unwrap_or(f64::from(height) / 2.);
+        Ok(Intrinsics { fx, fy, cx, cy })
+    }
+
+    fn distortion(&self) -> Result<Distortion> {
+        if let Some((value, name)) = self.find("distortion_params") {
+            return Err(Error::input(
+                self.file,
+                name,
+                shown(Some(value)),
+                "the coefficients by name, as in k1",
+            ));
+        }
+        let number = |key: &str| Ok::<_, Error>(self.number(key)?.unwrap_or(0.));
+        let (k4, k5, k6) = (number("k4")?, number("k5")?, number("k6")?);
+        let is_rational = self.find("camera_model").is_some_and(|(model, _)| is_model(model, FULL_OPENCV));
+        for (key, value) in [("k5", k5), ("k6", k6)] {
+            if value != 0. && !is_rational {
+                return Err(self.refuse(key, value, "0, or FULL_OPENCV as camera_model"));
+            }
+        }
+        let (k4, denominator) = if is_rational { (0., [k4, k5, k6]) } else { (k4, [0.; 3]) };
+        Ok(Distortion {
+            radial: [number("k1")?, number("k2")?, number("k3")?, k4],
+            denominator,
+            tangential: [number("p1")?, number("p2")?],
+        })
+    }
+
+    fn check_camera_model(&self) -> Result<()> {
+        if let Some((model, name)) = self.find("camera_model")
+            && !CAMERA_MODELS.iter().any(|known| is_model(model, known))
+        {
+            let expected = format!("one of {}", CAMERA_MODELS.join(", "));
+            return Err(Error::input(self.file, name, shown(Some(model)), expected));
+        }
+        if let Some((value, name)) = self.find("is_fisheye")
+            && value != &Value::Bool(false)
+        {
+            return Err(Error::input(
+                self.file,
+                name,
+                shown(Some(value)),
+                "false, as fisheye lenses aren't known",
+            ));
+        }
+        Ok(())
+    }
+
+    /// Returns `transform_matrix` with OpenCV axes, and the scale factor that was removed from its rotation.
+    fn c2w(&self) -> Result<(DMat4, f64)> {
+        let name = self.name("transform_matrix");
+        let value = self.frame.get("transform_matrix");
+        let rows: Vec<&[Value]> = value
+            .and_then(Value::as_array)
+            .into_iter()
+            .flatten()
+            .filter_map(Value::as_array)
+            .map(Vec::as_slice)
+            .collect();
+        if value.and_then(Value::as_array).is_none_or(|all| all.len() != 4)
+            || rows.len() != 4
+            || rows.iter().any(|row| row.len() != 4)
+        {
+            return Err(Error::input(self.file, name, shown(value), "a 4×4 matrix"));
+        }
+        let mut entries = [0.; 16];
+        for (i, value) in rows.iter().copied().flatten().enumerate() {
+            entries[i] = match value {
+                Value::Null => f64::NAN,
+                value => value.as_f64().ok_or_else(|| {
+                    let field = format!("row {}, column {} of {name}", i / 4, i % 4);
+                    Error::input(self.file, field, shown(Some(value)), "a number")
+                })?,
+            };
+        }
+        let c2w = from_opengl(&entries);
+        nearest_rigid_of_scaled(&c2w)
+            .map_err(|(found, expected)| Error::input(self.file, name, found, expected))
+    }
+}

@@ -1,0 +1,184 @@
+//! Local frame of a capture or a splat: an origin near the scene and a unit that fits its size.
+//!
+//! Positions far from the world's origin, or in a unit that is too large or too small for the scene, lose precision in float32 and
+//! don't suit absolute thresholds such as the near plane. World coordinates are float64. Only local coordinates are converted to
+//! float32.
+
+use super::{Camera, Similarity};
+use glam::{DMat4, DVec3};
+
+/// Relative rounding error of float64: smaller distances, relative to the largest coordinate, are ignored.
+const ROUNDING: f64 = 1e-14;
+
+/// A coordinate frame with the axes of the world: local = (world − origin) / scale.
+///
+/// If a scene is scaled by a power of two, the origin and scale of its frame are scaled exactly, so that local coordinates are
+/// bit-identical.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocalFrame {
+    /// Local origin, in world coordinates.
+    pub origin: DVec3,
+    /// Length of a local unit in world units, above 0.
+    pub scale: f64,
+}
+
+impl LocalFrame {
+    /// Typical distance from the origin in local units. The near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
+    const TYPICAL_DISTANCE: f64 = 16.;
+
+    /// Returns the frame of a capture, computed from its camera centres. The origin is their median along each axis, and the median
+    /// distance of the others from it is 16 local units. If all cameras are at one position, a local unit is a world unit.
+    pub fn from_cameras(cameras: &[Camera]) -> Self {
+        let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
+        Self::from_spheres(&centres, &vec![0.; centres.len()])
+    }
+
+    /// Returns the frame of spheres, such as Gaussians, at `points` with `radii`. The origin is the median of the points along each axis.
+    /// 16 local units are the median of a sphere's distance from it plus its radius. If the spheres have no extent, or there are none,
+    /// a local unit is a world unit.
+    pub fn from_spheres(points: &[DVec3], radii: &[f64]) -> Self {
+        let along = |axis: usize| median(points.iter().map(|point| point[axis]).collect());
+        let origin = DVec3::from_array([0, 1, 2].map(|axis| along(axis).unwrap_or(0.)));
+        let largest = points.iter().map(|point| point.abs().max_element()).fold(0., f64::max);
+        let reaches = points.iter().zip(radii).map(|(point, radius)| point.distance(origin) + radius);
+        let typical = median(reaches.filter(|reach| *reach > ROUNDING * largest).collect());
+        LocalFrame { origin, scale: typical.map_or(1., |typical| typical / Self::TYPICAL_DISTANCE) }
+    }
+
+    /// Returns the typical distance of the scene from the origin, in world units.
+    pub fn typical_distance(&self) -> f64 {
+        Self::TYPICAL_DISTANCE * self.scale
+    }
+
+    /// Converts a world point to local coordinates.
+    pub fn point_to_local(&self, point: DVec3) -> DVec3 {
+        (point - self.origin) / self.scale
+    }
+
+    /// Converts a local point to world coordinates.
+    pub fn point_to_world(&self, point: DVec3) -> DVec3 {
+        point * self.scale + self.origin
+    }
+
+    /// Converts a camera-to-world pose to camera-to-local.
+    pub fn pose_to_local(&self, c2w: &DMat4) -> DMat4 {
+        with_centre(c2w, self.point_to_local(c2w.w_axis.truncate()))
+    }
+
+    /// Converts a camera-to-local pose to camera-to-world.
+    pub fn pose_to_world(&self, c2l: &DMat4) -> DMat4 {
+        with_centre(c2l, self.point_to_world(c2l.w_axis.truncate()))
+    }
+
+    /// Converts a camera in world coordinates to local coordinates.
+    pub fn camera_to_local(&self, camera: &Camera) -> Camera {
+        Camera { c2w: self.pose_to_local(&camera.c2w), ..*camera }
+    }
+
+    /// Converts cameras in world coordinates to local coordinates.
+    pub fn cameras_to_local(&self, cameras: &[Camera]) -> Vec<Camera> {
+        cameras.iter().map(|camera| self.camera_to_local(camera)).collect()
+    }
+
+    /// Converts a similarity that maps to the world to one that maps to the local frame.
+    pub fn similarity_to_local(&self, to_world: &Similarity) -> Similarity {
+        Similarity {
+            translation: self.point_to_local(to_world.translation),
+            scale: to_world.scale / self.scale,
+            ..*to_world
+        }
+    }
+}
+
+fn with_centre(pose: &DMat4, centre: DVec3) -> DMat4 {
+    DMat4 { w_axis: centre.extend(1.), ..*pose }
+}
+
+/// Returns the lower median, or `None` if there are no values.
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Intrinsics;
+    use glam::DMat3;
+
+    fn camera(centre: DVec3) -> Camera {
+        let intrinsics = Intrinsics { fx: 1., fy: 1., cx: 0.5, cy: 0.5 };
+        let c2w = DMat4::from_translation(centre) * DMat4::from_rotation_y(0.3);
+        Camera { intrinsics, c2w, width: 1, height: 1 }
+    }
+
+    fn cameras(factor: f64, offset: DVec3) -> Vec<Camera> {
+        let place = |i: f64| DVec3::new(0.7 * i, (0.4 * i).sin(), 0.1 * i * i);
+        (0..9).map(|i| camera(place(f64::from(i)) * factor + offset)).collect()
+    }
+
+    #[test]
+    fn a_scene_scaled_by_a_power_of_two_has_the_same_local_bits() {
+        let plain = cameras(1., DVec3::ZERO);
+        let frame = LocalFrame::from_cameras(&plain);
+        for exponent in [-40, -20, -3, 5, 20, 40] {
+            let factor = f64::from(exponent).exp2();
+            let scaled = cameras(factor, DVec3::ZERO);
+            let other = LocalFrame::from_cameras(&scaled);
+            assert_eq!((other.origin, other.scale), (frame.origin * factor, frame.scale * factor));
+            for (a, b) in plain.iter().zip(&scaled) {
+                assert_eq!(frame.pose_to_local(&a.c2w), other.pose_to_local(&b.c2w));
+            }
+        }
+    }
+
+    #[test]
+    fn local_coordinates_keep_what_float32_loses_far_away() {
+        let plain = LocalFrame::from_cameras(&cameras(1., DVec3::ZERO));
+        for (factor, offset) in [(1e-6, DVec3::ZERO), (1e6, DVec3::ZERO), (1., DVec3::new(1e8, -3e7, 55.))] {
+            let frame = LocalFrame::from_cameras(&cameras(factor, offset));
+            for (a, b) in cameras(1., DVec3::ZERO).iter().zip(cameras(factor, offset)) {
+                let (a, local) = (plain.camera_to_local(a), frame.camera_to_local(&b));
+                assert!(a.c2w.abs_diff_eq(local.c2w, 1e-6), "{} {}", a.c2w, local.c2w);
+                assert!(frame.pose_to_world(&local.c2w).abs_diff_eq(b.c2w, 1e-7), "{factor} {offset}");
+            }
+        }
+    }
+
+    /// The unit is independent of long rests, at exactly one position or with jitter, and of a misplaced camera.
+    #[test]
+    fn rests_and_outliers_do_not_set_the_scale() {
+        let plain = cameras(1., DVec3::ZERO);
+        let typical = LocalFrame::from_cameras(&plain).scale;
+        let rests = [plain.clone(), vec![plain[4]; 100]].concat();
+        let outlier = [plain, vec![camera(DVec3::splat(1e7))]].concat();
+        for cameras in [rests, outlier] {
+            let scale = LocalFrame::from_cameras(&cameras).scale;
+            assert!((0.5..2.).contains(&(scale / typical)), "{scale} {typical}");
+        }
+    }
+
+    #[test]
+    fn cameras_in_one_place_keep_the_unit() {
+        let at = DVec3::new(448_265.12, 5_411_920.65, 135.4);
+        for cameras in [vec![], vec![camera(at)], vec![camera(at); 5]] {
+            let frame = LocalFrame::from_cameras(&cameras);
+            assert_eq!(frame.scale, 1.);
+            assert_eq!(frame.origin, cameras.first().map_or(DVec3::ZERO, |_| at));
+        }
+    }
+
+    #[test]
+    fn a_similarity_to_the_world_becomes_one_to_the_frame() {
+        let frame = LocalFrame::from_cameras(&cameras(3., DVec3::new(9., 8., 7.)));
+        let to_world = Similarity {
+            rotation: DMat3::from_rotation_x(0.4),
+            translation: DVec3::new(4., 5., 6.),
+            scale: 7.,
+        };
+        let apply = |to: &Similarity, x: DVec3| to.scale * (to.rotation * x) + to.translation;
+        let point = DVec3::new(0.3, -0.2, 0.9);
+        let expected = frame.point_to_local(apply(&to_world, point));
+        assert!(apply(&frame.similarity_to_local(&to_world), point).abs_diff_eq(expected, 1e-12));
+    }
+}

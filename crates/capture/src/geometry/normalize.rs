@@ -1,0 +1,204 @@
+//! Scene normalization (spec 2.1 and 2.2): one similarity per scene gives all scenes the same position, orientation and size.
+
+use glam::{DMat3, DMat4, DVec3};
+use globalsplat_files::{Error, Result};
+
+/// Relative rounding error of float64. If the spread of the cameras is at most this share of the largest coordinate (or not
+/// finite), they differ by rounding alone, and the scene keeps its size.
+const ROUNDING: f64 = 1e-14;
+
+/// Minimum length of a sum of unit vectors that still defines a direction.
+const MIN_DIRECTION: f64 = 1e-6;
+
+/// A similarity transform x ↦ scale · rotation · x + translation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Similarity {
+    /// Rotation matrix.
+    pub rotation: DMat3,
+    /// Translation, applied last.
+    pub translation: DVec3,
+    /// Uniform scale factor, above 0.
+    pub scale: f64,
+}
+
+impl Similarity {
+    /// Returns the camera-to-world pose that the similarity transforms into `c2w`: its camera sees the original world as `c2w` sees
+    /// the transformed one.
+    pub fn pose_before(&self, c2w: &DMat4) -> DMat4 {
+        let rotation = self.rotation.transpose();
+        let centre = rotation * (c2w.w_axis.truncate() - self.translation) / self.scale;
+        DMat4::from_mat3_translation(rotation * DMat3::from_mat4(*c2w), centre)
+    }
+}
+
+/// Result of [`normalize`].
+#[derive(Debug, Clone)]
+pub struct Normalization {
+    /// Camera-to-world poses in the normalized world, in the order of the input.
+    pub c2w: Vec<DMat4>,
+    /// Similarity from the normalized world to the capture's world. Its scale is the largest distance between two camera centres in
+    /// the capture divided by the extent in the normalized world.
+    pub world_from_normalized: Similarity,
+}
+
+/// Position and spread of a scene's cameras in the normalized world (spec 9.9). The normalization of spec 2.1 and 2.2 has extent 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placement {
+    /// Largest distance between two camera centres, above 0.
+    pub extent: f64,
+    /// Position of the mean camera on the z axis, along which it looks.
+    pub forward: f64,
+}
+
+impl Placement {
+    /// Returns the placement moved forward by `forward`, with the extent multiplied by exp(`larger`).
+    pub fn nudged(&self, [forward, larger]: [f64; 2]) -> Self {
+        Placement { extent: self.extent * larger.exp(), forward: self.forward + forward }
+    }
+}
+
+impl Normalization {
+    /// Returns the same cameras with another placement. The placement of `self` must have extent 1 and position 0.
+    pub fn placed(&self, Placement { extent, forward }: Placement) -> Self {
+        let offset = DVec3::Z * forward;
+        let moved = |pose: &DMat4| {
+            let mut pose = *pose;
+            pose.w_axis = (pose.w_axis.truncate() * extent + offset).extend(1.);
+            pose
+        };
+        let Similarity { rotation, translation, scale } = self.world_from_normalized;
+        let scale = scale / extent;
+        let translation = translation - scale * (rotation * offset);
+        Normalization {
+            c2w: self.c2w.iter().map(moved).collect(),
+            world_from_normalized: Similarity { rotation, translation, scale },
+        }
+    }
+}
+
+/// Moves the mean camera to the origin, looking along z, and scales the largest distance between two camera centres to 1. If the
+/// viewing directions cancel out, as for cameras all around an object, the axes of the first camera are used instead.
+///
+/// # Errors
+/// Fails if there are no cameras.
+pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
+    if c2w.is_empty() {
+        return Err(Error::request("a scene without cameras can't be normalized"));
+    }
+    let mean =
+        |column: usize| c2w.iter().map(|pose| pose.col(column).truncate()).sum::<DVec3>() / c2w.len() as f64;
+    let direction = |v: DVec3| (v.length() > MIN_DIRECTION).then(|| v.normalize());
+    let axes = direction(mean(2)).and_then(|forward| {
+        let right = direction(mean(1).cross(forward))?;
+        Some(DMat3::from_cols(right, forward.cross(right).normalize(), forward))
+    });
+    let axes = axes.unwrap_or_else(|| DMat3::from_mat4(c2w[0]));
+
+    let (origin, inverse) = (mean(3), axes.inverse());
+    let centre = |pose: &DMat4| pose.w_axis.truncate();
+    // Subtract the origin before multiplying: far from the world's origin, products would lose the digits in which centres differ.
+    let align = |pose: &DMat4| {
+        DMat4::from_mat3_translation(inverse * DMat3::from_mat4(*pose), inverse * (centre(pose) - origin))
+    };
+    let aligned: Vec<DMat4> = c2w.iter().map(align).collect();
+    let mut scale = 0f64;
+    for (i, a) in aligned.iter().enumerate() {
+        for b in &aligned[..i] {
+            scale = scale.max(centre(a).distance(centre(b)));
+        }
+    }
+    let largest = c2w.iter().map(|pose| centre(pose).abs().max_element()).fold(0., f64::max);
+    if !(scale > ROUNDING * largest && scale.is_finite()) {
+        scale = 1.;
+    }
+    let c2w = aligned
+        .into_iter()
+        .map(|mut pose| {
+            pose.w_axis = (centre(&pose) / scale).extend(1.);
+            pose
+        })
+        .collect();
+    let world_from_normalized = Similarity { rotation: axes, translation: origin, scale };
+    Ok(Normalization { c2w, world_from_normalized })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+
+    #[test]
+    fn cameras_all_around_a_thing_have_the_first_ones_axes() {
+        for (count, tilt) in [(2, 0.), (8, 0.), (8, 0.6)] {
+            // The cameras look at the origin, horizontally or from above.
+            let ring: Vec<DMat4> = (0..count)
+                .map(|i| {
+                    DMat4::from_rotation_y(0.3 + TAU * f64::from(i) / f64::from(count))
+                        * DMat4::from_rotation_x(tilt)
+                        * DMat4::from_translation(DVec3::NEG_Z)
+                })
+                .collect();
+            let Normalization { c2w, world_from_normalized } = normalize(&ring).unwrap();
+            assert!(DMat3::from_mat4(c2w[0]).abs_diff_eq(DMat3::IDENTITY, 1e-12), "{count}, {tilt}");
+            assert!(world_from_normalized.translation.with_y(0.).length() < 1e-12);
+            for (pose, before) in c2w.iter().zip(&ring) {
+                assert!(world_from_normalized.pose_before(before).abs_diff_eq(*pose, 1e-12));
+            }
+        }
+    }
+
+    /// Normalized cameras are the same in millimetres, kilometres or UTM coordinates, and bit-identical if the scene is scaled by a
+    /// power of two.
+    #[test]
+    fn unit_and_origin_do_not_matter() {
+        let pose =
+            |x: f64| DMat4::from_translation(DVec3::new(x, 0.3 * x * x, 0.1)) * DMat4::from_rotation_y(x);
+        let moved = |factor: f64, offset: DVec3| -> Vec<DMat4> {
+            let place =
+                |pose: DMat4| DMat4 { w_axis: (pose.w_axis.truncate() * factor + offset).extend(1.), ..pose };
+            [0., 0.1, 0.5, 0.7].map(|x| place(pose(x))).into()
+        };
+        let plain = normalize(&moved(1., DVec3::ZERO)).unwrap();
+        for exponent in [-60, -20, -3, 5, 20, 60] {
+            let factor = f64::from(exponent).exp2();
+            let other = normalize(&moved(factor, DVec3::ZERO)).unwrap();
+            assert_eq!(other.c2w, plain.c2w, "2^{exponent}");
+            let (a, b) = (other.world_from_normalized, plain.world_from_normalized);
+            assert_eq!((a.translation, a.scale), (b.translation * factor, b.scale * factor));
+        }
+        for (factor, offset) in
+            [(1e-6, DVec3::ZERO), (1e-13, DVec3::ZERO), (1e6, DVec3::ONE), (1., DVec3::splat(1e8))]
+        {
+            let other = normalize(&moved(factor, offset)).unwrap();
+            for (a, b) in other.c2w.iter().zip(&plain.c2w) {
+                assert!(a.abs_diff_eq(*b, 1e-6), "{factor} {offset}: {a} {b}");
+            }
+        }
+        let still = normalize(&[DMat4::from_translation(DVec3::splat(1e8)); 3]).unwrap();
+        assert_eq!(still.world_from_normalized.scale, 1.);
+    }
+
+    #[test]
+    fn in_any_place_the_cameras_are_the_captures() {
+        let pose = |x: f64, z: f64, turn: f64| {
+            DMat4::from_translation(DVec3::new(x, 0.5 * x, z)) * DMat4::from_rotation_y(turn)
+        };
+        let original = [pose(0., 0., 0.), pose(3., 0.4, 0.2), pose(-1., 4., -0.3)];
+        for (extent, forward) in [(1., 0.), (0.25, 0.5), (3., -0.2)] {
+            let placed = normalize(&original).unwrap().placed(Placement { extent, forward });
+            let Normalization { c2w, world_from_normalized } = placed;
+            let centres: Vec<DVec3> = c2w.iter().map(|pose| pose.w_axis.truncate()).collect();
+            let distances = [(0, 1), (0, 2), (1, 2)].map(|(a, b)| centres[a].distance(centres[b]));
+            assert!((distances.into_iter().fold(0., f64::max) - extent).abs() < 1e-12, "{distances:?}");
+            let mean = centres.iter().sum::<DVec3>() / 3.;
+            assert!(mean.abs_diff_eq(DVec3::Z * forward, 1e-12), "{mean}");
+            for (pose, before) in c2w.iter().zip(&original) {
+                let Similarity { rotation, translation, scale } = world_from_normalized;
+                let centre = scale * (rotation * pose.w_axis.truncate()) + translation;
+                assert!(centre.distance(before.w_axis.truncate()) < 1e-12);
+                let axes = rotation * DMat3::from_mat4(*pose);
+                assert!(axes.abs_diff_eq(DMat3::from_mat4(*before), 1e-12));
+            }
+        }
+    }
+}

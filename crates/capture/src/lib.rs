@@ -1,0 +1,27 @@
+#![doc = include_str!("../README.md")]
+
+mod capture;
+mod formats;
+mod geometry;
+mod holdout;
+mod image_source;
+mod pixels;
+
+pub use capture::{Capture, Photo};
+#[cfg(feature = "chunks")]
+pub use formats::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
+pub use formats::{
+    CameraPath, CaptureFolders, FoundCaptures, Point, capture_folders, find_captures, folder_name,
+    is_capture, open_capture, points_of, read_camera_path, write_cameras_json,
+};
+pub use geometry::{
+    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, check_pose, normalize,
+    orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
+};
+pub use globalsplat_files::{Error, Result};
+pub use holdout::Holdout;
+pub use image_source::ImageSource;
+pub use pixels::{
+    CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, encode_photo, fit,
+    looked_at, read_image, read_image_size,
+};

@@ -1,0 +1,155 @@
+//! Fitting an image to the model's size (spec 9.2), with exact intrinsics.
+
+use super::planes::Planes;
+use super::resample::{self, Region, Resampler};
+use crate::geometry::{Camera, ImageSize};
+use image::RgbImage;
+use std::ops::Range;
+
+/// Divisor of the width after the first resize.
+const WIDTH_MULTIPLE: f64 = 8.;
+
+/// The largest centred rectangle of a target aspect ratio in a camera's image, and the first resize.
+struct Cut {
+    region: Region,
+    /// Size of the rectangle after the first resize.
+    size: ImageSize,
+    /// Scale of the first resize along x and y. `corner` is the top left corner of the rectangle after it.
+    scale: (f64, f64),
+    corner: (f64, f64),
+}
+
+impl Cut {
+    fn of(camera: &Camera, size: ImageSize) -> Self {
+        let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
+        let scaled = full_width * f64::from(size.height) / full_height;
+        let width = ((scaled / WIDTH_MULTIPLE).round() * WIDTH_MULTIPLE).max(WIDTH_MULTIPLE);
+        let height = f64::from(size.height);
+        let (scale_x, scale_y) = (width / full_width, height / full_height);
+
+        let aspect = f64::from(size.width) / height;
+        // At least one pixel is left, however elongated the target size is.
+        let (cut_width, cut_height) =
+            ((height * aspect).min(width).round().max(1.), (width / aspect).min(height).round().max(1.));
+        let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
+        Cut {
+            // Only the part that is kept is resampled.
+            region: Region {
+                left: left / scale_x,
+                top: top / scale_y,
+                width: cut_width / scale_x,
+                height: cut_height / scale_y,
+            },
+            size: ImageSize { height: cut_height as u32, width: cut_width as u32 },
+            scale: (scale_x, scale_y),
+            corner: (left, top),
+        }
+    }
+}
+
+fn is_as_large(camera: &Camera, size: ImageSize) -> bool {
+    (camera.height, camera.width) == (size.height, size.width)
+}
+
+/// Returns the columns and rows of `camera`'s image that [`fit`] reads.
+pub fn looked_at(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
+    if is_as_large(camera, size) {
+        return [0..camera.width as usize, 0..camera.height as usize];
+    }
+    let cut = Cut::of(camera, size);
+    resample::looked_at((camera.width, camera.height), cut.region, cut.size)
+}
+
+/// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
+/// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet.
+pub fn fit(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
+    if is_as_large(camera, size) {
+        return (Planes::from_rgb(image), *camera);
+    }
+    let cut = Cut::of(camera, size);
+    let planes = resample(image, cut.region, cut.size);
+    let intrinsics = camera.intrinsics.resized(cut.scale.0, cut.scale.1).cropped(cut.corner.0, cut.corner.1);
+
+    let (planes, intrinsics) = if cut.size == size {
+        (planes, intrinsics)
+    } else {
+        let (width, height) = (f64::from(cut.size.width), f64::from(cut.size.height));
+        let region = Region { left: 0., top: 0., width, height };
+        let scale = (f64::from(size.width) / width, f64::from(size.height) / height);
+        (resample(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
+    };
+    (planes, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })
+}
+
+fn resample(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
+    let mut planes = Planes::new(size.width, size.height);
+    Resampler::default().resample(image, region, size, planes.bytes_mut());
+    planes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Intrinsics;
+    use glam::DMat4;
+
+    fn camera(width: u32, height: u32) -> Camera {
+        let (w, h) = (f64::from(width), f64::from(height));
+        let intrinsics = Intrinsics { fx: 500., fy: 510., cx: w / 2., cy: h / 2. };
+        Camera { intrinsics, c2w: DMat4::IDENTITY, width, height }
+    }
+
+    #[test]
+    fn a_wide_image_is_cut_to_a_square() {
+        let (image, fitted) = fit(&RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
+        assert_eq!(image.to_rgb().dimensions(), (256, 256));
+        // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
+        let k = fitted.intrinsics;
+        assert!((k.fx - 500. * 456. / 640.).abs() < 1e-9 && (k.fy - 510. * 256. / 360.).abs() < 1e-9);
+        assert!((k.cx - 128.).abs() < 1e-9 && (k.cy - 128.).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_tall_image_is_cut_too() {
+        let (image, fitted) = fit(&RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
+        assert_eq!(image.to_rgb().dimensions(), (192, 128));
+        assert!((fitted.intrinsics.cx - 96.).abs() < 1e-9);
+        assert!((fitted.intrinsics.cy - 64.).abs() < 1.); // cut at a whole pixel
+    }
+
+    #[test]
+    fn a_line_is_cut_out_of_a_square() {
+        for size in [[1, 4000], [4000, 1], [11, 2000]] {
+            let (image, fitted) = fit(&RgbImage::new(40, 40), &camera(40, 40), size.into());
+            let (width, height) = image.to_rgb().dimensions();
+            assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
+            looked_at(&camera(40, 40), size.into());
+        }
+    }
+
+    #[test]
+    fn what_a_pixel_sees_does_not_change() {
+        // A bright dot on black keeps its ray. The dot's position in the fitted image is its centroid.
+        let (x, y) = (300u32, 200u32);
+        let mut image = RgbImage::new(640, 360);
+        for dy in 0..8 {
+            for dx in 0..8 {
+                image.put_pixel(x + dx, y + dy, image::Rgb([255; 3]));
+            }
+        }
+        let before = camera(640, 360);
+        let (fitted, after) = fit(&image, &before, [128, 128].into());
+        let (mut weight, mut sx, mut sy) = (0., 0., 0.);
+        for (px, py, p) in fitted.to_rgb().enumerate_pixels() {
+            let v = f64::from(p.0[0]);
+            (weight, sx, sy) = (weight + v, sx + v * (f64::from(px) + 0.5), sy + v * (f64::from(py) + 0.5));
+        }
+        let ray = |k: Intrinsics, u: f64, v: f64| ((u - k.cx) / k.fx, (v - k.cy) / k.fy);
+        let found = ray(after.intrinsics, sx / weight, sy / weight);
+        let expected = ray(before.intrinsics, f64::from(x) + 4., f64::from(y) + 4.);
+        assert!(
+            (found.0 - expected.0).abs() < 2e-3 && (found.1 - expected.1).abs() < 2e-3,
+            "{found:?} {expected:?}"
+        );
+    }
+}

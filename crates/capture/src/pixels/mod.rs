@@ -1,0 +1,20 @@
+//! Processing of a photo between its file and a network: decoding, removal of lens distortion, cropping, resizing.
+
+mod codec;
+mod distortion;
+mod fit;
+mod jpeg;
+mod lens;
+mod planes;
+mod resample;
+
+pub use codec::{
+    DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
+    read_image_size,
+};
+pub use fit::{fit, looked_at};
+pub use planes::{CHANNELS, Planes};
+pub use resample::{Region, Resampler};
+
+pub(crate) use distortion::Distortion;
+pub(crate) use lens::{Lens, undistort};

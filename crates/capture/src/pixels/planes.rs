@@ -1,0 +1,78 @@
+//! Images in the layout of the model: one plane per colour channel.
+
+use image::{Rgb, RgbImage};
+
+/// Number of colour channels of an image.
+pub const CHANNELS: usize = 3;
+
+/// An 8-bit image, `[3, H, W]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Planes {
+    width: usize,
+    height: usize,
+    bytes: Vec<u8>,
+}
+
+impl Planes {
+    /// Creates a black image.
+    pub(super) fn new(width: u32, height: u32) -> Self {
+        let (width, height) = (width as usize, height as usize);
+        Planes { width, height, bytes: vec![0; CHANNELS * width * height] }
+    }
+
+    /// Converts an interleaved image to planes.
+    pub fn from_rgb(image: &RgbImage) -> Self {
+        let mut planes = Planes::new(image.width(), image.height());
+        take_apart(image, &mut planes.bytes);
+        planes
+    }
+
+    /// Converts the planes to an interleaved image.
+    pub fn to_rgb(&self) -> RgbImage {
+        let pixels = self.width * self.height;
+        let at = |x: u32, y: u32| y as usize * self.width + x as usize;
+        RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
+            Rgb(std::array::from_fn(|channel| self.bytes[channel * pixels + at(x, y)]))
+        })
+    }
+
+    /// Returns the pixels, `[3, H, W]`, row by row.
+    pub(super) fn bytes_mut(&mut self) -> &mut [u8] {
+        &mut self.bytes
+    }
+
+    /// Returns (height, width) in pixels.
+    pub fn size(&self) -> (usize, usize) {
+        (self.height, self.width)
+    }
+
+    /// Returns the pixels, `[3, H, W]`, row by row.
+    pub fn as_bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+/// Writes the channels of `image` into `planes`, `[3, H, W]`.
+pub(super) fn take_apart(image: &RgbImage, planes: &mut [u8]) {
+    let pixels = planes.len() / CHANNELS;
+    let (red, rest) = planes.split_at_mut(pixels);
+    let (green, blue) = rest.split_at_mut(pixels);
+    let planes = red.iter_mut().zip(green).zip(blue);
+    for (((red, green), blue), pixel) in planes.zip(image.as_raw().chunks_exact(CHANNELS)) {
+        (*red, *green, *blue) = (pixel[0], pixel[1], pixel[2]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn planes_are_the_image() {
+        let image = RgbImage::from_fn(7, 5, |x, y| Rgb([x as u8 * 30, y as u8 * 40, (x * y) as u8]));
+        let planes = Planes::from_rgb(&image);
+        assert_eq!(planes.to_rgb(), image);
+        assert_eq!(planes.size(), (5, 7));
+        assert_eq!(planes.as_bytes()[7 * 5 + 7 * 2 + 3], image.get_pixel(3, 2).0[1]);
+    }
+}

@@ -1,0 +1,23 @@
+#![doc = include_str!("../README.md")]
+
+mod dataset;
+mod light;
+mod maker;
+mod material;
+mod mesh;
+mod noise;
+mod open;
+mod room;
+mod sensor;
+mod shapes;
+mod texture;
+mod things;
+mod tracer;
+mod tree;
+mod video;
+mod walk;
+
+pub use dataset::{SyntheticDataset, read_pictures};
+pub use globalsplat_capture::{Error, Result};
+pub use texture::Texture;
+pub use video::{Video, VideoSettings};

@@ -1,0 +1,199 @@
+//! A synthetic scene and a video of it.
+
+use super::light::Sky;
+use super::maker::Maker;
+use super::sensor::{Hash, Sensor};
+use super::texture::Texture;
+use super::tracer::{SampleChoice, Tracer};
+use super::walk::{Exhibit, Place, walk};
+use super::{open, room, things};
+use glam::{DMat4, Vec2, Vec3, vec2, vec3};
+use globalsplat_capture::{Camera, ImageSize, Intrinsics};
+use image::RgbImage;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use std::fmt;
+use std::sync::Arc;
+
+/// Rays per pixel along each side.
+const RAYS: u32 = 2;
+/// Fraction of scenes with an object to walk around.
+const EXHIBITS: f64 = 0.4;
+/// Fraction of these objects that hang on a wall, if there are walls.
+const HUNG: f64 = 0.35;
+/// Maximum number of scenes that are built until one has a free camera path.
+const WORLDS: u64 = 20;
+
+/// Settings common to all videos of a dataset.
+#[derive(Debug, Clone)]
+pub struct VideoSettings {
+    /// Number of images per video.
+    pub frames: usize,
+    /// Size of an image.
+    pub size: ImageSize,
+    /// Images of the user that are shown on some of the objects.
+    pub pictures: Vec<Arc<Texture>>,
+}
+
+/// A scene and its cameras. Images are rendered on request.
+pub struct Video {
+    tracer: Tracer,
+    sensor: Sensor,
+    cameras: Vec<Camera>,
+    seed: u32,
+}
+
+impl Video {
+    /// Number of camera rays per pixel. Each of them samples a lamp by one shadow ray.
+    pub const RAYS_PER_PIXEL: u32 = RAYS * RAYS;
+
+    /// Creates video number `index` of `seed`. The result doesn't depend on the number of threads.
+    pub fn new(seed: u64, index: u64, settings: &VideoSettings) -> Video {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        (0..WORLDS)
+            .find_map(|attempt| {
+                random.set_stream(index.wrapping_mul(WORLDS).wrapping_add(attempt));
+                random.set_word_pos(0);
+                Video::attempt(random.clone(), settings)
+            })
+            .expect("a way through one of many worlds")
+    }
+
+    fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
+        let mut make = Maker::new(random, settings.pictures.clone());
+        let (place, exhibit, sky) = world(&mut make);
+        let tracer = Tracer::new(std::mem::take(&mut make.parts), sky);
+        let poses = walk(&mut make, &tracer, place, exhibit, settings.frames)?;
+        let cameras = cameras(&mut make, poses, settings.size);
+        let seen = mean_light(&tracer, &cameras);
+        let sensor = Sensor::draw(&mut make, seen);
+        let seed = make.within(0..u32::MAX);
+        Some(Video { tracer, sensor, cameras, seed })
+    }
+
+    /// Returns the cameras of the images.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// Returns the number of triangles in the scene.
+    pub fn triangles(&self) -> usize {
+        self.tracer.triangles()
+    }
+
+    /// Renders image `index`.
+    pub fn photo(&self, index: usize) -> RgbImage {
+        let camera = &self.cameras[index];
+        let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
+        let half = 0.5 * vec2(camera.width as f32, camera.height as f32);
+        let spread = 1. / (camera.intrinsics.fx as f32 * RAYS as f32);
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        RgbImage::from_fn(camera.width, camera.height, |x, y| {
+            let pixel = y * camera.width + x;
+            let mut random = Hash::new(self.seed, index as u32, pixel);
+            let mut light = Vec3::ZERO;
+            for sample in 0..Self::RAYS_PER_PIXEL {
+                let cell = vec2((sample % RAYS) as f32, (sample / RAYS) as f32);
+                let jitter = vec2(random.uniform(), random.uniform());
+                let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
+                let on_lamp = vec2(random.uniform(), random.uniform());
+                let choice = SampleChoice { turn: sample as usize, on_lamp };
+                let radiance = self.tracer.look(eye, towards(camera, at), spread, choice);
+                // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
+                light += radiance.min(Vec3::splat(8.));
+            }
+            let place = (vec2(x as f32, y as f32) - half) / half;
+            let mean = light / Self::RAYS_PER_PIXEL as f32;
+            image::Rgb(self.sensor.bytes(mean, exposure, place, index as u32, pixel))
+        })
+    }
+
+    /// Returns the depths along the camera's axis at the pixel centres of image `index`, row by row, in metres. They are infinite
+    /// in the sky.
+    pub fn depth(&self, index: usize) -> Vec<f32> {
+        let camera = &self.cameras[index];
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        let axis = camera.c2w.z_axis.truncate().as_vec3();
+        let rows = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+        rows.map(|(x, y)| {
+            let ray = towards(camera, vec2(x as f32 + 0.5, y as f32 + 0.5));
+            self.tracer.free(eye, ray, f32::INFINITY) * ray.dot(axis)
+        })
+        .collect()
+    }
+}
+
+/// Prints a summary without the triangles.
+impl fmt::Debug for Video {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "a video of {} frames, number {}", self.cameras.len(), self.seed)
+    }
+}
+
+/// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
+fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
+    let mut sky = open::sky(make);
+    let place = match make.within(0..100) {
+        0..55 => room::room(make, &mut sky),
+        55..75 => room::box_of_shapes(make, &mut sky),
+        _ => open::landscape(make, &sky),
+    };
+    let exhibit = make.chance(EXHIBITS).then(|| match place.walls {
+        Some(behind) if make.chance(HUNG) => {
+            let (spot, front) = on_a_wall(make, place, behind);
+            things::hung(make, spot, front)
+        }
+        _ => things::exhibit(make, (0.5 * (place.least + place.most)).with_y(0.)),
+    });
+    (place, exhibit, sky)
+}
+
+/// Returns a position on a wall, and the direction away from the wall.
+fn on_a_wall(make: &mut Maker, place: Place, behind: f32) -> (Vec3, Vec3) {
+    let (least, most) = (place.least - behind, place.most + behind);
+    let share = vec3(make.within(0.2..0.8), make.within(0.3..0.75), make.within(0.2..0.8));
+    let spot = least + share * (most - least);
+    match make.within(0..4) {
+        0 => (spot.with_x(least.x), Vec3::X),
+        1 => (spot.with_x(most.x), Vec3::NEG_X),
+        2 => (spot.with_z(least.z), Vec3::Z),
+        _ => (spot.with_z(most.z), Vec3::NEG_Z),
+    }
+}
+
+fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
+    let (width, height) = (f64::from(size.width), f64::from(size.height));
+    let focal = f64::from(make.scaled(0.55, 1.6)) * width.min(height);
+    let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
+    let camera = |c2w| Camera { intrinsics, c2w, width: size.width, height: size.height };
+    poses.into_iter().map(camera).collect()
+}
+
+/// Returns the unit direction from the camera through `at`, in pixels.
+fn towards(camera: &Camera, at: Vec2) -> Vec3 {
+    let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+    let x = (at.x - cx as f32) / fx as f32;
+    let y = (at.y - cy as f32) / fy as f32;
+    let [right, down, forward] =
+        [camera.c2w.x_axis, camera.c2w.y_axis, camera.c2w.z_axis].map(|axis| axis.truncate().as_vec3());
+    (x * right + y * down + forward).normalize()
+}
+
+/// Returns the geometric mean of the radiance of a few rays of a few images. With it, a lamp or a window in the image doesn't
+/// darken everything else.
+fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
+    const SIDE: usize = 8;
+    let mut sum = Vec3::ZERO;
+    let picked = [0, cameras.len() / 2, cameras.len() - 1];
+    for camera in picked.map(|index| &cameras[index]) {
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        for i in 0..SIDE * SIDE {
+            let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
+            let at = cell * vec2(camera.width as f32, camera.height as f32);
+            let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
+            let radiance = tracer.look(eye, towards(camera, at), 0.05, choice);
+            sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
+        }
+    }
+    (sum / (picked.len() * SIDE * SIDE) as f32).map(f32::exp)
+}

@@ -1,0 +1,148 @@
+//! Writer of chunks.
+
+use crate::error::{Error, Result};
+use crate::io::{write_atomically, write_json};
+use globalsplat_capture::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Chunk, Holdout, camera_numbers};
+use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Writes chunks and their index into a folder.
+#[derive(Debug)]
+pub struct ChunkWriter {
+    folder: PathBuf,
+    /// Size of the images in bytes after which a chunk is written.
+    chunk_bytes: usize,
+    waiting: Vec<SceneToPickle>,
+    waiting_bytes: usize,
+    chunks: usize,
+    index: BTreeMap<String, String>,
+}
+
+impl ChunkWriter {
+    /// Creates a writer of chunks of about `chunk_bytes` in the existing folder `folder`.
+    ///
+    /// # Errors
+    /// Fails if the folder already holds chunks.
+    pub fn new(folder: &Path, chunk_bytes: usize) -> Result<Self> {
+        let index = folder.join(CHUNK_INDEX_FILE);
+        if index.exists() {
+            return Err(Error::input(
+                folder,
+                "the output",
+                "a folder of chunks already",
+                "one without index.json",
+            ));
+        }
+        Ok(ChunkWriter {
+            folder: folder.to_owned(),
+            chunk_bytes,
+            waiting: vec![],
+            waiting_bytes: 0,
+            chunks: 0,
+            index: BTreeMap::new(),
+        })
+    }
+
+    /// Takes over the chunks that an interrupted run of the same work left: those of its first scenes. `keys` are the names of all
+    /// scenes in order. `make` creates the first scene again, for comparison. `each` is called with every existing scene. Returns
+    /// their number.
+    ///
+    /// # Errors
+    /// Fails if the chunks belong to other work, or if `make` or `each` fails.
+    pub fn go_on(
+        &mut self,
+        keys: &[String],
+        make: impl FnOnce() -> Result<Capture>,
+        mut each: impl FnMut(usize, &Capture) -> Result<()>,
+    ) -> Result<usize> {
+        let mut make = Some(make);
+        loop {
+            let file = self.folder.join(self.chunk_name());
+            if !file.exists() {
+                return Ok(self.index.len());
+            }
+            let other = || Error::input(&file, "the output", "a chunk already", "a folder without chunks");
+            let chunk = Chunk::read(&file)?;
+            for key in chunk.keys() {
+                let capture = chunk.capture(key)?;
+                let number = self.index.len();
+                if keys.get(number).is_none_or(|wanted| wanted != key) {
+                    return Err(other());
+                }
+                if let Some(make) = make.take()
+                    && !is_same(&capture, &make()?)?
+                {
+                    return Err(other());
+                }
+                each(number, &capture)?;
+                self.index.insert(key.to_owned(), self.chunk_name());
+            }
+            self.chunks += 1;
+        }
+    }
+
+    /// Adds a capture under its name. JPEG and PNG files are copied bit for bit unless their lens distorts, they need rotating, or
+    /// they don't have three channels of 8 bits. Those are encoded again, a JPEG as a JPEG of high quality, everything else as a
+    /// PNG. The views of the capture's own test part are left out.
+    ///
+    /// # Errors
+    /// Fails if the name is already taken, if a photo can't be read, or if a file can't be written.
+    pub fn add(&mut self, capture: &Capture) -> Result<()> {
+        if let Some(chunk) = self.index.get(&capture.name) {
+            let found = format!("{:?}, which {chunk} holds already", capture.name);
+            return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
+        }
+        let (views, _) = capture.split(Holdout::None);
+        let image = |&view| Ok(EncodedImage { bytes: capture.encoded(view)? });
+        let images = views.par_iter().map(image).collect::<Result<Vec<_>>>()?;
+        let bytes: usize = images.iter().map(|image| image.bytes.len()).sum();
+        if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
+            self.write_chunk()?;
+        }
+        self.index.insert(capture.name.clone(), self.chunk_name());
+        self.waiting_bytes += bytes;
+        self.waiting.push(SceneToPickle {
+            key: capture.name.clone(),
+            url: String::new(),
+            timestamps: (0..views.len() as i64).collect(),
+            cameras: capture.cameras()[..views.len()].iter().flat_map(camera_numbers).collect(),
+            images,
+        });
+        Ok(())
+    }
+
+    /// Writes the remaining scenes and the index, without which the chunks aren't found. Returns the number of chunks.
+    ///
+    /// # Errors
+    /// Fails if a file can't be written.
+    pub fn finish(mut self) -> Result<usize> {
+        if !self.waiting.is_empty() {
+            self.write_chunk()?;
+        }
+        write_json(&self.folder.join(CHUNK_INDEX_FILE), &self.index)?;
+        Ok(self.chunks)
+    }
+
+    fn chunk_name(&self) -> String {
+        format!("{:06}.{CHUNK_EXTENSION}", self.chunks)
+    }
+
+    fn write_chunk(&mut self) -> Result<()> {
+        let file = self.folder.join(self.chunk_name());
+        let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
+        // An existing file with the same bytes was left by an interrupted run of the same work.
+        if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes.as_slice() {
+            return Err(Error::input(&file, "the output", "a chunk already", "a folder without chunks"));
+        }
+        write_atomically(&file, |writer| writer.write_all(bytes.as_slice()).map_err(Error::write(&file)))?;
+        (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
+        Ok(())
+    }
+}
+
+/// Returns `true` if both captures have equally many photos and the same first photo.
+fn is_same(a: &Capture, b: &Capture) -> Result<bool> {
+    Ok(a.len() == b.len() && a.encoded(0)? == b.encoded(0)?)
+}

@@ -1,0 +1,137 @@
+//! Devices: asynchronous copies from the host to a GPU on a stream of their own, events that time the GPU's work, and memory use. On the
+//! CPU the same calls run synchronously.
+
+mod memory;
+mod stopwatch;
+
+pub(crate) use memory::{
+    device_memory_bytes, forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes,
+};
+pub use memory::{peak_memory_bytes, total_memory_bytes};
+pub use stopwatch::Stopwatch;
+
+use crate::ffi::take_outputs;
+use cxx::UniquePtr;
+use globalsplat_csrc::device as ffi;
+use std::fmt;
+use std::time::{Duration, Instant};
+use tch::{Device, Kind, Tensor};
+
+pub(crate) use ffi::leave_out_tf32;
+
+/// Returns the CUDA device index, or `None` for a device that isn't a CUDA device.
+fn gpu(device: Device) -> Option<i32> {
+    match device {
+        Device::Cuda(number) => Some(number as i32),
+        _ => None,
+    }
+}
+
+/// Event for timing the work of a device: on a GPU, it is reached when all work queued before it is done.
+pub(crate) enum DeviceEvent {
+    Host(Instant),
+    Gpu(UniquePtr<ffi::Mark>),
+}
+
+impl DeviceEvent {
+    /// Records an event now, without waiting for the GPU.
+    pub fn now(device: Device) -> Self {
+        match gpu(device) {
+            Some(gpu) => DeviceEvent::Gpu(ffi::mark(gpu).expect("a GPU that works")),
+            None => DeviceEvent::Host(Instant::now()),
+        }
+    }
+
+    /// Returns the time elapsed since `earlier`, an event of the same device. Waits until the GPU has reached both events.
+    pub fn since(&self, earlier: &DeviceEvent) -> Duration {
+        match (self, earlier) {
+            (DeviceEvent::Gpu(mark), DeviceEvent::Gpu(earlier)) => {
+                let milliseconds = mark.since(earlier).expect("a GPU that works");
+                Duration::from_secs_f64(1e-3 * milliseconds.max(0.))
+            }
+            (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
+            _ => panic!("moments of two devices"),
+        }
+    }
+}
+
+impl fmt::Debug for DeviceEvent {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("DeviceEvent")
+    }
+}
+
+/// Copies tensors from the host to a device; copies to a GPU overlap with its work.
+pub(crate) struct Upload {
+    device: Device,
+    stream: Option<UniquePtr<ffi::CopyStream>>,
+}
+
+impl Upload {
+    /// Creates an upload to `device`, to be reused for all copies to it.
+    pub fn to(device: Device) -> Self {
+        let stream = gpu(device).map(|gpu| ffi::copy_stream(gpu).expect("a GPU that works"));
+        Upload { device, stream }
+    }
+
+    /// Returns the destination device.
+    pub fn device(&self) -> Device {
+        self.device
+    }
+
+    /// Returns uninitialized bytes on the host, in page-locked memory if the device is a GPU, so that they are copied without
+    /// an intermediate buffer.
+    pub fn bytes(&self, shape: &[i64]) -> Tensor {
+        if self.stream.is_none() {
+            return Tensor::empty(shape, (Kind::Uint8, Device::Cpu));
+        }
+        // SAFETY: on success the C++ side has stored a new tensor in `out`.
+        let done = unsafe { take_outputs(|out| ffi::page_locked_bytes(shape, out)) };
+        let [bytes] = done.expect("memory");
+        bytes
+    }
+
+    /// Starts copying `tensors` from the host; the caller may drop them immediately.
+    pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> PendingCopy<N> {
+        match &self.stream {
+            Some(stream) => {
+                let addresses = tensors.map(|t| t.as_ptr() as usize);
+                // SAFETY: the tensors outlive the call.
+                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }.expect("memory"))
+            }
+            None => PendingCopy::Done(tensors.map(|t| t.to_device(self.device))),
+        }
+    }
+}
+
+impl fmt::Debug for Upload {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.debug_struct("Upload").field("device", &self.device).finish_non_exhaustive()
+    }
+}
+
+/// Copy of tensors in progress.
+pub(crate) enum PendingCopy<const N: usize> {
+    Done([Tensor; N]),
+    Gpu(UniquePtr<ffi::Copies>),
+}
+
+impl<const N: usize> PendingCopy<N> {
+    /// Returns the tensors on the device. Work queued on the device from now on waits for the copy; the host doesn't.
+    pub fn wait(self) -> [Tensor; N] {
+        match self {
+            PendingCopy::Done(tensors) => tensors,
+            PendingCopy::Gpu(copies) => {
+                // SAFETY: on success the C++ side has stored new tensors in `out`.
+                let done = unsafe { take_outputs(|out| copies.hand_over(out)) };
+                done.expect("a GPU that works")
+            }
+        }
+    }
+}
+
+impl<const N: usize> fmt::Debug for PendingCopy<N> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("PendingCopy")
+    }
+}
