@@ -42,6 +42,7 @@ use globalsplat::Error;
 use globalsplat::data::Capture;
 use globalsplat::error::panic_message;
 use globalsplat::scene::ImageSize;
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic;
 use std::path::Path;
 use std::process::ExitCode;
@@ -133,8 +134,14 @@ pub fn main() -> ExitCode {
     globalsplat::model::flush_denormals();
     #[cfg(target_os = "linux")]
     let _guard = oversubscription::start_guard();
-    // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence.
-    panic::set_hook(Box::new(|_| {}));
+    // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
+    // RUST_BACKTRACE=1 a backtrace.
+    panic::set_hook(Box::new(|_| {
+        let backtrace = Backtrace::capture();
+        if backtrace.status() == BacktraceStatus::Captured {
+            eprintln!("{backtrace}");
+        }
+    }));
     let result = panic::catch_unwind(|| {
         if !cli.command.is_shared() {
             ranks::refuse()?;
@@ -144,9 +151,12 @@ pub fn main() -> ExitCode {
     let code = match result {
         Ok(Ok(())) => DONE,
         Ok(Err(error)) => {
-            let error_of_ours = error.downcast_ref::<Error>();
-            tell(&error.to_string(), error_of_ours.is_some_and(Error::is_distributed));
-            if error_of_ours.is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
+            let message = error.to_string();
+            // An error of the lower crates is one of the library's.
+            let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
+            let error = error.or_else(|other| other.downcast::<Error>()).ok();
+            tell(&message, error.as_ref().is_some_and(Error::is_distributed));
+            if error.as_ref().is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
         }
         Err(panic) => {
             tell(&format!("internal error (please report): {}", panic_message(&*panic)), false);

@@ -12,8 +12,8 @@ use zip::read::ZipArchive;
 /// First bytes of an archive.
 pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
-/// Parts of a file that torch.save wrote since torch 1.6, as byte ranges in the file. No two of them overlap. [`TorchFile`](crate::TorchFile)
-/// reads them; this type serves readers that call [`unpickle`](crate::unpickle) themselves.
+/// Parts of a file that torch.save wrote since torch 1.6, as byte ranges in the file. No two of them overlap.
+/// [`TorchFile`](crate::TorchFile) reads them; this type serves readers that call [`unpickle`](crate::unpickle) themselves.
 #[derive(Debug)]
 pub struct Archive {
     /// Byte range of `data.pkl`.

@@ -13,8 +13,8 @@ use crate::value::{Id, Rebuild, Value, Values};
 pub enum UnknownGlobals {
     /// They are errors, for files that need no such values.
     Refuse,
-    /// They are kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is known to
-    /// only assemble data.
+    /// They are kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is
+    /// known to only assemble data.
     Keep,
 }
 
