@@ -24,6 +24,6 @@ fn main() -> Result<()> {
     // The model works in a normalized coordinate system; this transforms the result back to the capture's own.
     let splat = reconstruction.to_splat()?;
     write_splat(Path::new(out), &splat)?;
-    println!("{out}: {} Gaussians from {} photos", splat.gaussians.count(), views.len());
+    println!("{out}: {} Gaussians from {} photos", splat.len(), views.len());
     Ok(())
 }

@@ -170,7 +170,7 @@ fn splats_and_weights_replace_nothing_that_is_read() {
     }
     // The input splat may be replaced: it is read before.
     succeed(&["convert", splat, splat, "--sh-degree", "0"]);
-    assert_eq!(read_splat(&files.splat).unwrap().sh_degree(), 0);
+    assert_eq!(read_splat(&files.splat).unwrap().sh_degree, 0);
     let id = |path: &Path| fs::metadata(path).unwrap().ino();
     let before = id(&files.splat);
     succeed(&["refine", "--splat", splat, "--scene", room, "--steps", "2", "--out", splat]);

@@ -13,6 +13,7 @@ use globalsplat::refine::{
     Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession, SpaceKind,
     gaussians_from_photos,
 };
+use globalsplat::scene::Gaussians;
 use serde_json::Value;
 use std::path::Path;
 use tch::Kind;
@@ -170,8 +171,8 @@ fn photos_from_one_place_are_shown_at_one_distance() {
     let done = command(&arguments).output().unwrap();
     let told = String::from_utf8_lossy(&done.stderr);
     assert!(done.status.success() && told.contains("tell no depth"), "{told}");
-    let means = read_splat(&out).unwrap().gaussians.means;
-    assert_eq!(means.isfinite().all().int64_value(&[]), 1);
+    let means = read_splat(&out).unwrap().means;
+    assert!(means.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
 }
 
 /// An interrupted refinement returns a splat at any time, once there is one.
@@ -230,7 +231,7 @@ fn units_and_origin_change_nothing() {
         let out = folder.path().join("a.ply");
         let options = ["--gaussians", "500", "--steps", "40", "--json", "--holdout", "every:3+1"];
         let done = told(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
-        (number(&done, "/held_out/after/psnr"), read_splat(&out).unwrap().gaussians)
+        (number(&done, "/held_out/after/psnr"), Gaussians::from_splat(&read_splat(&out).unwrap()))
     };
     let (plain, gaussians) = refined(1., DVec3::ZERO);
     for exponent in [-20, -3, 10] {
@@ -256,7 +257,7 @@ fn a_splat_becomes_better_or_stays() {
     let (ground_truth, dull, out) =
         (room.join("truth.ply"), folder.path().join("dull.ply"), folder.path().join("a.ply"));
     let mut splat = read_splat(&ground_truth).unwrap();
-    splat.gaussians.sh = &splat.gaussians.sh * 0.5;
+    splat.sh.as_flattened_mut().iter_mut().for_each(|coefficient| *coefficient *= 0.5);
     write_splat(&dull, &splat).unwrap();
     let refined = |from: &Path| {
         let steps = ["--steps", "150", "--json"];
@@ -269,7 +270,7 @@ fn a_splat_becomes_better_or_stays() {
     let (before, after) = (number(&done, "/shown/before/psnr"), number(&done, "/shown/after/psnr"));
     assert!(after > before + 5., "{before} → {after}");
     assert_eq!(done["held_out"], Value::Null);
-    assert_eq!(read_splat(&out).unwrap().gaussians.count(), splat.gaussians.count());
+    assert_eq!(read_splat(&out).unwrap().len(), splat.len());
     // Its photos are its own renders: no splat is better.
     let done = refined(&ground_truth);
     assert_eq!(done["shown"]["before"], done["shown"]["after"]);
@@ -332,9 +333,8 @@ fn points_are_begun_with() {
     for format in [Format::ColmapText, Format::ColmapBinary] {
         let (_folder, room) = room();
         assert!(points_of(&open_capture(&room).unwrap()).unwrap().is_empty());
-        let ground_truth = read_splat(&room.join("truth.ply")).unwrap().gaussians;
-        let means: Vec<f64> =
-            Vec::try_from(ground_truth.means.to_kind(Kind::Double).contiguous().view([-1])).unwrap();
+        let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
+        let means: Vec<f64> = ground_truth.means.as_flattened().iter().map(|&x| f64::from(x)).collect();
         rewrite(&room, format);
         let capture = open_capture(&room).unwrap();
         assert!(points_of(&capture).unwrap().is_empty());
@@ -420,7 +420,7 @@ fn what_cannot_be_refined_is_told_in_one_sentence() {
     // A splat elsewhere.
     let away = folder.path().join("away.ply");
     let mut splat = read_splat(&room.join("truth.ply")).unwrap();
-    splat.gaussians.means = &splat.gaussians.means - 1000.;
+    splat.means.as_flattened_mut().iter_mut().for_each(|coordinate| *coordinate -= 1000.);
     write_splat(&away, &splat).unwrap();
     assert!(with(&["--splat", arg(&away)]).contains("see nothing"));
     assert!(!out.exists());

@@ -11,8 +11,8 @@ use globalsplat::eval::psnr;
 use globalsplat::io::{
     Splat, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
 };
-use globalsplat::render::transform;
-use globalsplat::scene::{Camera, LocalFrame, Similarity};
+use globalsplat::render::{SplatRenderer, transform};
+use globalsplat::scene::{Camera, Gaussians, LocalFrame, Similarity};
 use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -52,8 +52,8 @@ fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
 
 /// Returns `splat` transformed by `to`, to match a capture transformed by `to`. Its origin is the translation.
 fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
-    let gaussians = transform(&splat.gaussians, &Similarity { translation: DVec3::ZERO, ..*to });
-    Splat { origin: to.translation, ..Splat::of(&gaussians).unwrap() }
+    let about_origin = Similarity { translation: DVec3::ZERO, ..*to };
+    transform(&Gaussians::from_splat(splat), &about_origin).to_splat(to.translation).unwrap()
 }
 
 fn told(arguments: &[&str]) -> Value {
@@ -138,11 +138,11 @@ fn powers_of_two_change_no_bit() {
             "--out",
             arg(&pictures),
         ]);
-        (read_splat(&out).unwrap().gaussians, fs::read(&pictures).unwrap())
+        (Gaussians::from_splat(&read_splat(&out).unwrap()), fs::read(&pictures).unwrap())
     };
     let (plain, pictures) = made(&room, "plain");
     let cameras = open_capture(&room).unwrap().cameras();
-    let seen = ground_truth.renderer().render(&cameras).unwrap();
+    let seen = SplatRenderer::from_splat(&ground_truth).render(&cameras).unwrap();
     for exponent in [-20, -3, 5, 20] {
         let factor = f64::from(exponent).exp2();
         let scene = of(&format!("scene{exponent}"));
@@ -154,7 +154,7 @@ fn powers_of_two_change_no_bit() {
         assert!(gaussians.quaternions.equal(&plain.quaternions) && gaussians.sh.equal(&plain.sh));
         assert!(pictures == same, "2^{exponent}");
         let cameras = open_capture(&scene).unwrap().cameras();
-        let scaled = moved_splat(&ground_truth, &to).renderer().render(&cameras).unwrap();
+        let scaled = SplatRenderer::from_splat(&moved_splat(&ground_truth, &to)).render(&cameras).unwrap();
         for (a, b) in seen.iter().zip(&scaled) {
             assert!(a.rgb.equal(&b.rgb) && a.alpha.equal(&b.alpha), "2^{exponent}");
             assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");

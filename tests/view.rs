@@ -12,7 +12,7 @@ use globalsplat::data::{load_views, open_capture};
 use globalsplat::eval::psnr;
 use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb};
 use globalsplat::render::render_views;
-use globalsplat::scene::ImageSize;
+use globalsplat::scene::{Gaussians, ImageSize};
 use serde_json::{Value, json};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -140,7 +140,8 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
 fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let size = ImageSize { width: SIDE, height: SIDE };
     let view = load_views(&open_capture(capture).unwrap(), &[index], Some(size)).unwrap().remove(0);
-    let own = render_views(&read_splat(splat).unwrap().gaussians, &[view.camera]).unwrap().remove(0);
+    let own =
+        render_views(&Gaussians::from_splat(&read_splat(splat).unwrap()), &[view.camera]).unwrap().remove(0);
     (own.rgb.clamp(0., 1.), view.image)
 }
 

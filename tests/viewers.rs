@@ -12,7 +12,7 @@ use globalsplat::data::open_capture;
 use globalsplat::eval::psnr;
 use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb};
 use globalsplat::render::render_views;
-use globalsplat::scene::{Camera, ImageSize, Intrinsics};
+use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -83,7 +83,7 @@ fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Va
 
 /// Returns the corners of the bounding box of the means.
 fn bounds(splat: &Splat) -> [Vec<f64>; 2] {
-    let means = splat.gaussians.means.view([-1, 3]).to_kind(Kind::Double);
+    let means = Gaussians::from_splat(splat).means.view([-1, 3]).to_kind(Kind::Double);
     [means.amin([0i64].as_slice(), false), means.amax([0i64].as_slice(), false)]
         .map(|corner| Vec::try_from(corner).unwrap())
 }
@@ -120,14 +120,15 @@ fn public_viewers_show_our_splats_as_we_do() {
     ];
     for (name, original, file, least) in files {
         let splat = read_splat(&original).unwrap();
-        let own = render_views(&splat.gaussians, &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
+        let own =
+            render_views(&Gaussians::from_splat(&splat), &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
         screenshots.save(&format!("{name}-own"), &own);
         let ending = file.extension().unwrap().to_str().unwrap();
         for (viewer, page) in &viewers {
             let what = format!("{name}, .{ending}, in {viewer}");
             let (told, picture) = show(&mut browser, page, &file, &camera);
             screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);
-            assert_eq!(told["count"].as_i64(), Some(splat.gaussians.count()), "{what}");
+            assert_eq!(told["count"].as_i64(), Some(splat.len() as i64), "{what}");
             for (corner, own) in ["low", "high"].iter().zip(bounds(&splat)) {
                 // Spark stores means in half precision.
                 for (a, b) in numbers(&told[*corner]).iter().zip(own) {

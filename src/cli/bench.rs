@@ -11,7 +11,7 @@ use globalsplat::bench::{
 use globalsplat::data::{DataConfig, TrainingScenes, load_all_views, view_batch};
 use globalsplat::error::Error;
 use globalsplat::io::{check_writable_dir, read_splat};
-use globalsplat::scene::ImageSize;
+use globalsplat::scene::{Gaussians, ImageSize};
 use std::path::PathBuf;
 use std::sync::Arc;
 use tch::Device;
@@ -113,10 +113,11 @@ impl Raster {
             (Some(splat), Some(scene)) => {
                 let splat = read_splat(splat)?;
                 warn(&splat.warnings);
-                let frame = splat.frame();
+                let gaussians = Gaussians::from_splat(&splat);
+                let frame = gaussians.local_frame(splat.origin);
                 let views = load_all_views(&open_capture(scene)?, None)?;
                 let poses: Vec<_> = views.iter().map(|view| frame.pose_to_local(&view.camera.c2w)).collect();
-                let gaussians = splat.gaussians.to_local(&frame, splat.origin);
+                let gaussians = gaussians.to_local(&frame, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
             _ => synthetic_scene(self.gaussians, self.cameras, parse_size(&self.size)?),

@@ -2,9 +2,8 @@
 
 use anyhow::Result;
 use glam::{DMat4, DVec3};
-use globalsplat::io::Splat;
 use globalsplat::render::SplatRenderer;
-use globalsplat::scene::{Camera, ImageSize, Intrinsics, orbit_around_point};
+use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics, orbit_around_point};
 use tch::Kind;
 
 /// Returns the median rendered depth of the capture's middle camera, over the pixels with an alpha of at least 0.5; if there
@@ -15,13 +14,14 @@ pub fn median_depth(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<f64>
     Ok(if seen.numel() == 0 { renderer.frame().typical_distance() } else { seen.median().double_value(&[]) })
 }
 
-/// Returns cameras on an orbit around the opacity-weighted centre of the splat, far enough away to see most of it.
-pub fn orbit_around_splat(
-    splat: &Splat,
+/// Returns cameras on an orbit around the opacity-weighted centre of the Gaussians `g` of one scene, far enough away to see most of them.
+/// Their means are relative to `origin`.
+pub fn orbit_around_gaussians(
+    g: &Gaussians,
+    origin: DVec3,
     ImageSize { width, height }: ImageSize,
     frames: usize,
 ) -> Vec<Camera> {
-    let g = &splat.gaussians;
     let means = g.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = g.opacities.view([-1, 1]).to_kind(Kind::Double);
     let total = weights.sum(Kind::Double).clamp_min(f64::MIN_POSITIVE);
@@ -32,9 +32,9 @@ pub fn orbit_around_splat(
         .divide(&total)
         .sqrt()
         .double_value(&[]);
-    let centre = splat.origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
+    let centre = origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
     // Gaussians that all have the same mean: use their size instead of the spread.
-    let radius = 3. * if spread > 0. { spread } else { splat.frame().typical_distance() };
+    let radius = 3. * if spread > 0. { spread } else { g.local_frame(origin).typical_distance() };
     let (w, h) = (f64::from(width), f64::from(height));
     let focal = w.min(h);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };

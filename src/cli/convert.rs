@@ -1,16 +1,14 @@
-use super::{cameras::orbit_around_splat, open_capture, print_json, splat_out, warn};
+use super::{cameras::orbit_around_gaussians, open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{
-    InputFiles, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
+    InputFiles, ShLimits, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
 };
-use globalsplat::render::HarmonicLimits;
-use globalsplat::scene::{Camera, ImageSize, LocalFrame};
+use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, splat_frame};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use tch::{Kind, Tensor};
 
 /// Number and size of views on an orbit around a splat, if no capture is given.
 const VIEWS: usize = 8;
@@ -70,10 +68,10 @@ impl Convert {
         warn(&original.warnings);
         // Before the file is replaced, in case input and output are the same.
         let from = description(&self.from, &original)?;
-        let degree = self.sh_degree.unwrap_or(original.sh_degree());
+        let degree = self.sh_degree.map_or(original.sh_degree, |degree| degree as usize);
         let limits = match self.for_viewers {
-            true => HarmonicLimits::of_viewers(degree),
-            false => HarmonicLimits::up_to(degree),
+            true => ShLimits::for_viewers(degree),
+            false => ShLimits::up_to(degree),
         };
         let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
         let fitted = match &capture {
@@ -87,7 +85,7 @@ impl Convert {
             Some(capture) => LocalFrame::from_cameras(&capture.cameras()).origin,
             // A splat that already has an origin keeps it.
             None if original.origin != DVec3::ZERO => original.origin,
-            None => original.frame().origin,
+            None => splat_frame(&original).origin,
         });
         splat_out::write(&self.to, &written, origin)?;
         let copy = read_splat(&self.to)?;
@@ -95,10 +93,10 @@ impl Convert {
 
         let cameras = match &capture {
             Some(capture) => capture.cameras(),
-            None => orbit_around_splat(&original, SIZE, VIEWS),
+            None => orbit_around_gaussians(&Gaussians::from_splat(&original), original.origin, SIZE, VIEWS),
         };
         if capture.is_none() {
-            self.tell_cut(&original, &fit(&[])?.gaussians.sh);
+            self.tell_cut(&original, &fit(&[])?);
         }
         let psnr = psnr_between(&original, &copy, &cameras)?;
         let views = cameras.len();
@@ -116,9 +114,13 @@ impl Convert {
     }
 
     /// Warns if coefficients are out of the representable range and no capture was given to fit the others to.
-    fn tell_cut(&self, original: &Splat, held: &Tensor) {
-        let cut = original.gaussians.sh.narrow(2, 0, held.size()[2]).not_equal_tensor(held);
-        let share = 100. * cut.to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+    fn tell_cut(&self, original: &Splat, held: &Splat) {
+        let coefficients = |index: usize| {
+            let pairs = original.sh_of(index).iter().zip(held.sh_of(index));
+            pairs.flat_map(|(original, held)| original.iter().zip(held))
+        };
+        let cut = (0..held.len()).flat_map(coefficients).filter(|(original, held)| original != held).count();
+        let share = 100. * cut as f64 / (3 * held.sh.len()) as f64;
         if share > 0. {
             let who = if self.for_viewers { "viewers hold" } else { "the format holds" };
             eprintln!(
@@ -133,8 +135,8 @@ impl Convert {
 fn description(path: &Path, splat: &Splat) -> Result<Value> {
     Ok(json!({
         "splat": path.to_string_lossy(),
-        "gaussians": splat.gaussians.count(),
-        "sh_degree": splat.sh_degree(),
+        "gaussians": splat.len(),
+        "sh_degree": splat.sh_degree,
         "bytes": std::fs::metadata(path)?.len(),
     }))
 }

@@ -6,6 +6,7 @@ use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split};
 use globalsplat::error::Error;
 use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
+use globalsplat::scene::Gaussians;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
@@ -72,13 +73,13 @@ fn range(t: &Tensor) -> Value {
 fn splat(path: &Path) -> Result<Value> {
     let splat = read_splat(path)?;
     warn(&splat.warnings);
-    let g = &splat.gaussians;
+    let g = Gaussians::from_splat(&splat);
     let axis = |i: usize| range(&(g.means.select(-1, i as i64).to_kind(Kind::Double) + splat.origin[i]));
     let origin = (splat.origin != DVec3::ZERO).then(|| splat.origin.to_array());
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
-        "sh_degree": splat.sh_degree(),
+        "sh_degree": splat.sh_degree,
         "bytes": std::fs::metadata(path)?.len(),
         "x": axis(0),
         "y": axis(1),

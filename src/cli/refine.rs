@@ -9,7 +9,7 @@ use globalsplat::data::{Capture, Holdout, View};
 use globalsplat::error::Error;
 use globalsplat::eval::{CaptureScores, ContactSheet, Perceptual, process_age, score_views};
 use globalsplat::io::{
-    InputFiles, Splat, check_writable_png, check_writable_splat, read_splat, splat_files, weights_files,
+    InputFiles, check_writable_png, check_writable_splat, read_splat, splat_files, weights_files,
 };
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
@@ -174,6 +174,7 @@ impl Refine {
         if let Some(splat) = &splat {
             warn(&splat.warnings);
         }
+        let initial_gaussians = splat.as_ref().map(|splat| (Gaussians::from_splat(splat), splat.origin));
         let loaded = needs_model
             .then(|| model::load(self.weights.as_deref(), Some(Precision::F32), options.device))
             .transpose()?;
@@ -191,8 +192,8 @@ impl Refine {
             !stop.is_requested()
         };
         let mut session = RefineSession::load(&capture, &shown, &held_out, &options, clock, watch)?;
-        let initial = match (&splat, &loaded) {
-            (Some(splat), _) => Initial::Splat(&splat.gaussians, splat.origin),
+        let initial = match (&initial_gaussians, &loaded) {
+            (Some((gaussians, origin)), _) => Initial::Splat(gaussians, *origin),
             (None, Some(loaded)) => Initial::Model { loaded, views: self.views },
             (None, None) => Initial::Photos,
         };
@@ -223,7 +224,7 @@ impl Refine {
             Some(splat) => splat,
             None => {
                 let (gaussians, origin) = session.to_world(&result.gaussians);
-                refined = Splat { origin, ..Splat::of(&gaussians)? };
+                refined = gaussians.to_splat(origin)?;
                 &refined
             }
         };

@@ -2,8 +2,9 @@
 
 use glam::DVec3;
 use globalsplat::error::Result;
-use globalsplat::io::{Splat, check_writable_origin, fit_splat, write_local_splat, write_splat};
-use globalsplat::render::HarmonicLimits;
+use globalsplat::io::{
+    ShLimits, Splat, check_writable_origin, fit_splat, rounding_warning, write_local_splat, write_splat,
+};
 use globalsplat::scene::Camera;
 use std::path::Path;
 
@@ -12,12 +13,12 @@ use std::path::Path;
 /// # Errors
 /// A request error that names the file.
 pub fn check_origin(path: &Path, is_local: bool) -> Result<()> {
-    if is_local { check_writable_origin(path) } else { Ok(()) }
+    if is_local { Ok(check_writable_origin(path)?) } else { Ok(()) }
 }
 
 /// Calls [`write`] with spherical harmonics fitted to the range of the format, so that the splat looks the same from `cameras`.
 pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: Option<DVec3>) -> Result<()> {
-    let limits = HarmonicLimits::up_to(splat.sh_degree());
+    let limits = ShLimits::up_to(splat.sh_degree);
     write(path, &fit_splat(path, splat, &limits, cameras)?, local_origin)
 }
 
@@ -25,10 +26,10 @@ pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: O
 /// and their loss of precision in float32 is reported on standard error.
 pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<()> {
     if let Some(origin) = local_origin {
-        return write_local_splat(path, &splat.with_origin(origin));
+        return Ok(write_local_splat(path, &splat.with_origin(origin))?);
     }
-    if let Some(loss) = splat.world_loss() {
+    if let Some(loss) = rounding_warning(splat) {
         eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
-    write_splat(path, splat)
+    Ok(write_splat(path, splat)?)
 }

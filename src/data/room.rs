@@ -2,9 +2,10 @@
 
 use super::gaussian_room::Room;
 use crate::error::{Error, Result};
-use crate::io::{Splat, lock_parent, replace_dir, write_png, write_splat};
+use crate::io::{lock_parent, replace_dir, write_png, write_splat};
 use crate::render::render_views;
 use crate::scene::ImageSize;
+use glam::DVec3;
 use globalsplat_capture::write_cameras_json;
 use std::path::Path;
 
@@ -28,7 +29,7 @@ pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> Res
         for (name, view) in names.iter().zip(&rendered) {
             write_png(&folder.join(name), &view.rgb)?;
         }
-        write_splat(&folder.join(TRUTH), &Splat::of(&gaussians)?)?;
+        write_splat(&folder.join(TRUTH), &gaussians.to_splat(DVec3::ZERO)?)?;
         Ok(write_cameras_json(&folder.join("cameras.json"), &names, &cameras)?)
     })
 }

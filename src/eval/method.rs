@@ -93,7 +93,7 @@ impl Method<'_> {
         let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
                 let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
-                let splat = Splat::of(&made.gaussians)?;
+                let splat = made.gaussians.to_splat(DVec3::ZERO)?;
                 // The normalized world is already a local frame.
                 let frame = LocalFrame { origin: DVec3::ZERO, scale: 1. };
                 let renderer = SplatRenderer::new(&made.gaussians, DVec3::ZERO, frame);
@@ -102,7 +102,7 @@ impl Method<'_> {
             }
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
-                let renderer = splat.renderer().to_device(device);
+                let renderer = SplatRenderer::from_splat(&splat).to_device(device);
                 (PictureSource::Splat(renderer, scene.target.poses()), Some(splat), None)
             }
             Method::Renders(folder) => (PictureSource::Folder(folder.clone()), None, None),
@@ -111,7 +111,7 @@ impl Method<'_> {
             first: Some(source.picture(&scene, 0)?),
             scene,
             source,
-            gaussians: splat.as_ref().map(|splat| splat.gaussians.count()),
+            gaussians: splat.as_ref().map(|splat| splat.len() as i64),
             splat_bytes: splat.as_ref().map(Splat::ply_bytes),
             forward_seconds,
             warnings: splat.map(|splat| splat.warnings).unwrap_or_default(),

@@ -19,6 +19,10 @@ mod weights_file;
 pub use globalsplat_files::{
     InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, write_atomically,
 };
+pub use globalsplat_splat_file::{
+    ShLimits, Splat, check_writable_origin, check_writable_splat, find_splat, is_splat_name, limits_of,
+    origin_file, read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
+};
 
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
 pub use film::{Film, find_ffmpeg};
@@ -31,10 +35,7 @@ pub use mosaic::Mosaic;
 pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::{shard_index, write_sharded};
-pub use splat::{
-    Splat, check_writable_origin, check_writable_splat, find_splat, fit_splat, is_splat_name, origin_file,
-    read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
-};
+pub use splat::{fit_splat, rounding_warning};
 pub use weights::{Weights, write_checkpoint, write_weights};
 pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
 

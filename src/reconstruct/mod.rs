@@ -82,9 +82,15 @@ impl Reconstruction {
     /// # Errors
     /// Fails if there is more than one scene.
     pub fn to_splat(&self) -> Result<Splat> {
+        let (gaussians, origin) = self.in_world_about_origin();
+        gaussians.to_splat(origin)
+    }
+
+    /// Returns the Gaussians in the capture's world like [`Reconstruction::in_world`], but with means relative to the mean camera, whose
+    /// position is the second value.
+    pub fn in_world_about_origin(&self) -> (Gaussians, DVec3) {
         let about_origin = Similarity { translation: DVec3::ZERO, ..self.world_from_normalized };
-        let splat = Splat::of(&transform(&self.gaussians, &about_origin))?;
-        Ok(Splat { origin: self.world_from_normalized.translation, ..splat })
+        (transform(&self.gaussians, &about_origin), self.world_from_normalized.translation)
     }
 }
 

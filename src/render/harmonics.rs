@@ -7,8 +7,8 @@
 use crate::scene::{Camera, Gaussians, SH_C0};
 use glam::{DMat4, DVec3};
 use globalsplat_csrc::render::sh_basis;
+use globalsplat_splat_file::ShLimits;
 use rayon::prelude::*;
-use std::ops::RangeInclusive;
 use tch::Tensor;
 
 /// Number of spherical harmonics of a colour channel, up to degree 3.
@@ -28,60 +28,10 @@ const OUTSIDE: f64 = 1e-6;
 /// Camera depth in local units at or below which nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
-/// Range of coefficients that a file format or a viewer supports.
-#[derive(Debug, Clone)]
-pub struct HarmonicLimits {
-    /// Maximum degree of the spherical harmonics.
-    pub degree: i64,
-    /// Range of the coefficient of degree 0.
-    pub constant: RangeInclusive<f64>,
-    /// Range of the coefficients of all higher degrees.
-    pub others: RangeInclusive<f64>,
-}
-
-impl HarmonicLimits {
-    /// Returns limits that allow any value up to `degree`.
-    pub fn up_to(degree: i64) -> Self {
-        HarmonicLimits { degree, constant: f64::MIN..=f64::MAX, others: f64::MIN..=f64::MAX }
-    }
-
-    /// Returns the limits of browser viewers, which apply to any file format: Spark and Babylon.js store the view-independent colour of a
-    /// Gaussian in [0, 1] and the other coefficients within ±1, one byte each.
-    pub fn of_viewers(degree: i64) -> Self {
-        let constant = 0.5 / SH_C0;
-        HarmonicLimits { degree, constant: -constant..=constant, others: -1. ..=127. / 128. }
-    }
-
-    /// Returns the intersection of both limits.
-    pub fn and(&self, other: &Self) -> Self {
-        let both = |a: &RangeInclusive<f64>, b: &RangeInclusive<f64>| {
-            a.start().max(*b.start())..=a.end().min(*b.end())
-        };
-        HarmonicLimits {
-            degree: self.degree.min(other.degree),
-            constant: both(&self.constant, &other.constant),
-            others: both(&self.others, &other.others),
-        }
-    }
-
-    fn of(&self, basis: usize) -> (f64, f64) {
-        let range = if basis == 0 { &self.constant } else { &self.others };
-        let bases = (self.degree + 1) * (self.degree + 1);
-        if (basis as i64) < bases { (*range.start(), *range.end()) } else { (0., 0.) }
-    }
-
-    fn clamped(&self, coefficients: &Coefficients) -> Coefficients {
-        std::array::from_fn(|basis| {
-            let (low, high) = self.of(basis);
-            coefficients[basis].map(|coefficient| coefficient.clamp(low, high))
-        })
-    }
-}
-
 /// Returns the Gaussians with coefficients within `limits`. `gaussians` are [1, N, ..], float32 on the host, in the cameras' local frame
 /// (spec 2.5). Coefficients within the limits stay. Others are clamped, or, if any of `cameras` sees the Gaussian, fitted so that the
 /// cameras see its colours as closely as possible. The opacity of a Gaussian that would be too dark is raised.
-pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &HarmonicLimits) -> Gaussians {
+pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimits) -> Gaussians {
     let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
     let (means, scales) = (numbers(&gaussians.means), numbers(&gaussians.scales));
     let (opacities, sh) = (numbers(&gaussians.opacities), numbers(&gaussians.sh));
@@ -94,7 +44,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
             for (basis, colour) in sh[3 * bases * index..][..3 * bases].chunks_exact(3).enumerate() {
                 coefficients[basis] = [0, 1, 2].map(|channel| f64::from(colour[channel]));
             }
-            if limits.clamped(&coefficients) == coefficients {
+            if clamp(&coefficients, limits) == coefficients {
                 return (coefficients, f64::from(opacities[index]));
             }
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
@@ -103,7 +53,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
             Fit::of(mean, REACH * radius, coefficients, &cameras, limits).best(f64::from(opacities[index]))
         })
         .collect();
-    let kept = bases.min(((limits.degree + 1) * (limits.degree + 1)) as usize);
+    let kept = bases.min((limits.degree + 1).pow(2));
     let sh: Vec<f32> = fitted
         .iter()
         .flat_map(|(coefficients, _)| coefficients[..kept].as_flattened().iter().map(|&c| c as f32))
@@ -118,6 +68,14 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &Harmoni
 
 type Coefficients = [[f64; 3]; BASES];
 
+/// Clamps coefficients to `limits`.
+fn clamp(coefficients: &Coefficients, limits: &ShLimits) -> Coefficients {
+    std::array::from_fn(|basis| {
+        let (low, high) = limits.range_of(basis);
+        coefficients[basis].map(|coefficient| coefficient.clamp(low, high))
+    })
+}
+
 /// Least-squares problem for the coefficients of one Gaussian.
 struct Fit<'a> {
     original: Coefficients,
@@ -125,7 +83,7 @@ struct Fit<'a> {
     seen: Vec<([f64; BASES], f64)>,
     /// Quadratic cost of a change of the coefficients: Σ weight·Y·Yᵀ over cameras, plus a small multiple of the identity.
     cost: [[f64; BASES]; BASES],
-    limits: &'a HarmonicLimits,
+    limits: &'a ShLimits,
 }
 
 impl<'a> Fit<'a> {
@@ -134,7 +92,7 @@ impl<'a> Fit<'a> {
         radius: f64,
         original: Coefficients,
         cameras: &[(Camera, DMat4)],
-        limits: &'a HarmonicLimits,
+        limits: &'a ShLimits,
     ) -> Self {
         let mut seen: Vec<_> = cameras
             .iter()
@@ -157,7 +115,7 @@ impl<'a> Fit<'a> {
     /// Returns the fitted coefficients and the opacity.
     fn best(mut self, opacity: f64) -> (Coefficients, f64) {
         if self.seen.is_empty() {
-            return (self.limits.clamped(&self.original), opacity);
+            return (clamp(&self.original, self.limits), opacity);
         }
         let fitted = self.solve();
         let dark = self.darkness(&fitted);
@@ -173,7 +131,7 @@ impl<'a> Fit<'a> {
     }
 
     fn solve(&self) -> Coefficients {
-        let mut solution = self.limits.clamped(&self.original);
+        let mut solution = clamp(&self.original, self.limits);
         (0..3).for_each(|channel| self.solve_channel(channel, &mut solution));
         solution
     }
@@ -186,7 +144,7 @@ impl<'a> Fit<'a> {
         });
         for _ in 0..ROUNDS {
             for (basis, costs) in self.cost.iter().enumerate() {
-                let (low, high) = self.limits.of(basis);
+                let (low, high) = self.limits.range_of(basis);
                 let before = solution[basis][channel];
                 let after = (before - slope[basis] / costs[basis]).clamp(low, high);
                 solution[basis][channel] = after;
@@ -270,7 +228,7 @@ mod tests {
 
     #[test]
     fn cameras_see_the_same_with_smaller_coefficients() {
-        let limits = HarmonicLimits { degree: 3, constant: -3. ..=3., others: -1. ..=1. };
+        let limits = ShLimits { degree: 3, dc: -3. ..=3., rest: -1. ..=1. };
         let original = gaussians(3.);
         let fitted = fit_harmonics(&original, &cameras(5), &limits);
         let clamped = fit_harmonics(&original, &[], &limits);
@@ -286,7 +244,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_bright_becomes_opaque() {
-        let limits = HarmonicLimits { degree: 0, constant: -1.77..=1.77, others: 0. ..=0. };
+        let limits = ShLimits { degree: 0, dc: -1.77..=1.77, rest: 0. ..=0. };
         let mut original = gaussians(0.);
         original.sh = Tensor::zeros_like(&original.sh);
         let _ = original.sh.narrow(2, 0, 1).fill_(3.5 / SH_C0); // 4 times the maximum that a screen shows

@@ -7,7 +7,7 @@ mod transform;
 mod views;
 
 use crate::ffi::take_outputs;
-pub use harmonics::{HarmonicLimits, fit_harmonics};
+pub use harmonics::fit_harmonics;
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};
 

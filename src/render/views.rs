@@ -4,6 +4,7 @@ use super::{Cameras, DEFAULT_EPS2D, render};
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, LocalFrame};
 use glam::DVec3;
+use globalsplat_splat_file::Splat;
 use tch::{Device, Tensor};
 
 /// Rendered image of one camera.
@@ -56,6 +57,16 @@ impl SplatRenderer {
     /// Creates a renderer in `frame` for `gaussians` of one scene, whose means are relative to `origin`.
     pub fn new(gaussians: &Gaussians, origin: DVec3, frame: LocalFrame) -> Self {
         SplatRenderer { gaussians: gaussians.to_local(&frame, origin), frame }
+    }
+
+    /// Creates a renderer of `splat` in its own local frame.
+    pub fn from_splat(splat: &Splat) -> Self {
+        SplatRenderer::from_gaussians(&Gaussians::from_splat(splat), splat.origin)
+    }
+
+    /// Creates a renderer for `gaussians` of one scene, whose means are relative to `origin`, in their own local frame.
+    pub fn from_gaussians(gaussians: &Gaussians, origin: DVec3) -> Self {
+        SplatRenderer::new(gaussians, origin, gaussians.local_frame(origin))
     }
 
     /// Moves the splat to `device`, which then renders it.

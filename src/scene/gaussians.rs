@@ -1,14 +1,7 @@
 //! 3D Gaussians as the model outputs them and the rasterizer renders them, and their unconstrained parameters.
 
+use globalsplat_splat_file::{MIN_SCALE, OPACITY_MARGIN};
 use tch::{Device, Kind, Tensor};
-
-/// Distance of opacities from 0 and 1, whose logits are infinite.
-const OPACITY_MARGIN: f64 = 1e-6;
-/// Spherical harmonic Y_0, which converts between a colour and an SH coefficient.
-pub(crate) const SH_C0: f64 = 0.28209479177387814;
-
-/// Minimum scale, so that logarithms are finite.
-pub(crate) const MIN_SCALE: f64 = 1e-30;
 
 /// 3D Gaussians of B scenes with N Gaussians each.
 #[derive(Debug)]

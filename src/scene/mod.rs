@@ -5,11 +5,14 @@
 mod gaussians;
 mod local_gaussians;
 mod rays;
+mod splat;
 
+pub(crate) use gaussians::sigmoid;
 pub use gaussians::{Gaussians, RawGaussians};
-pub(crate) use gaussians::{MIN_SCALE, SH_C0, sigmoid};
 pub use globalsplat_capture::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, normalize,
     orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
 };
+pub(crate) use globalsplat_splat_file::SH_C0;
 pub(crate) use rays::plucker_rays;
+pub use splat::splat_frame;

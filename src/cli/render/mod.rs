@@ -6,13 +6,14 @@ mod shots;
 use super::{model, open_capture, parse_size, print_json, progress, stop_flag, view, warn};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
+use glam::DVec3;
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, InputFiles, Splat, read_splat, splat_files, tiled_size, weights_files};
+use globalsplat::io::{DepthScale, InputFiles, read_splat, splat_files, tiled_size, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::render::{RenderedView, SplatRenderer};
-use globalsplat::scene::{Camera, ImageSize};
+use globalsplat::scene::{Camera, Gaussians, ImageSize};
 use output::Output;
 use serde_json::json;
 use shots::Shots;
@@ -97,10 +98,10 @@ impl Render {
         view::check_writable(page)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         self.inputs(capture.as_ref()).check_file(page)?;
-        let splat = self.splat(capture.as_ref())?;
+        let (splat, origin) = self.gaussians(capture.as_ref())?;
         let name = capture.as_ref().map_or_else(|| view::name_of(page), |capture| capture.name.clone());
-        view::write_page(page, &name, &splat, capture.as_ref())?;
-        let (gaussians, bytes) = (splat.gaussians.count(), std::fs::metadata(page)?.len());
+        view::write_page(page, &name, &splat, origin, capture.as_ref())?;
+        let (gaussians, bytes) = (splat.count(), std::fs::metadata(page)?.len());
         if self.json {
             print_json(&json!({ "page": page.to_string_lossy(), "gaussians": gaussians, "bytes": bytes }));
         } else {
@@ -112,9 +113,9 @@ impl Render {
     fn pictures(&self, out: &Path) -> Result<()> {
         Output::check(out, self.fps)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
-        let splat = self.splat(capture.as_ref())?;
-        let renderer = splat.renderer();
-        let shots = self.shots(&splat, &renderer, capture.as_ref())?;
+        let (gaussians, origin) = self.gaussians(capture.as_ref())?;
+        let renderer = SplatRenderer::from_gaussians(&gaussians, origin);
+        let shots = self.shots((&gaussians, origin), &renderer, capture.as_ref())?;
         let scale = if self.depth { Some(depth_scale(&renderer, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
@@ -137,7 +138,7 @@ impl Render {
         if self.json {
             let written: Vec<_> = written.iter().map(|file| file.to_string_lossy()).collect();
             print_json(
-                &json!({ "views": shots.cameras.len(), "gaussians": splat.gaussians.count(), "files": written }),
+                &json!({ "views": shots.cameras.len(), "gaussians": gaussians.count(), "files": written }),
             );
         } else {
             println!("{}: {} views", out.display(), shots.cameras.len());
@@ -145,26 +146,32 @@ impl Render {
         Ok(())
     }
 
-    fn splat(&self, capture: Option<&Capture>) -> Result<Splat> {
+    /// Returns the Gaussians, and the origin of their means in the world.
+    fn gaussians(&self, capture: Option<&Capture>) -> Result<(Gaussians, DVec3)> {
         let (Some(weights), Some(capture)) = (&self.weights, capture) else {
             let splat = read_splat(self.splat.as_ref().expect("clap asks for one of the two"))?;
             warn(&splat.warnings);
-            return Ok(splat);
+            return Ok((Gaussians::from_splat(&splat), splat.origin));
         };
         let loaded = model::load(Some(weights), Some(Precision::F32), Device::Cpu)?;
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
-        Ok(reconstruct(&loaded, &photos, &[])?.to_splat()?)
+        Ok(reconstruct(&loaded, &photos, &[])?.in_world_about_origin())
     }
 
-    fn shots(&self, splat: &Splat, renderer: &SplatRenderer, capture: Option<&Capture>) -> Result<Shots> {
+    fn shots(
+        &self,
+        (gaussians, origin): (&Gaussians, DVec3),
+        renderer: &SplatRenderer,
+        capture: Option<&Capture>,
+    ) -> Result<Shots> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let frames = self.frames.map(|frames| frames as usize);
         let shots = match (&self.path, capture) {
             (Some(path), _) => Shots::along(path, size, frames, renderer)?,
             (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, renderer)?,
             (None, Some(capture)) => Shots::of(capture, size, frames, renderer, &self.suffixes())?,
-            (None, None) => Shots::around(splat, size, frames),
+            (None, None) => Shots::around(gaussians, origin, size, frames),
         };
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }

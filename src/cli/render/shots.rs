@@ -1,12 +1,13 @@
 //! Cameras of `render`.
 
-use super::super::cameras::{median_depth, orbit_around_splat};
+use super::super::cameras::{median_depth, orbit_around_gaussians};
 use crate::cli::warn;
 use anyhow::Result;
+use glam::DVec3;
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
-use globalsplat::io::{InputFiles, Splat};
+use globalsplat::io::InputFiles;
 use globalsplat::render::SplatRenderer;
-use globalsplat::scene::{Camera, ImageSize, orbit_around_cameras, smooth_path};
+use globalsplat::scene::{Camera, Gaussians, ImageSize, orbit_around_cameras, smooth_path};
 use std::path::Path;
 
 const FRAMES_PER_SECOND: u32 = 20;
@@ -56,10 +57,15 @@ impl Shots {
         Ok(Shots::numbered(orbit))
     }
 
-    /// Returns cameras on an orbit around the splat.
-    pub fn around(splat: &Splat, size: Option<ImageSize>, frames: Option<usize>) -> Self {
+    /// Returns cameras on an orbit around `gaussians`, whose means are relative to `origin`.
+    pub fn around(
+        gaussians: &Gaussians,
+        origin: DVec3,
+        size: Option<ImageSize>,
+        frames: Option<usize>,
+    ) -> Self {
         let size = size.unwrap_or(ImageSize { width: DEFAULT_SIZE, height: DEFAULT_SIZE });
-        Shots::numbered(orbit_around_splat(splat, size, frames.unwrap_or(DEFAULT_FRAMES)))
+        Shots::numbered(orbit_around_gaussians(gaussians, origin, size, frames.unwrap_or(DEFAULT_FRAMES)))
     }
 
     /// Returns the cameras at `path`, or `frames` of them on a smooth path through these.

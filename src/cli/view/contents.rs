@@ -1,14 +1,14 @@
 //! Data about the scene that is embedded in a page.
 
-use super::super::cameras::{median_depth, orbit_around_splat};
+use super::super::cameras::{median_depth, orbit_around_gaussians};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use globalsplat::data::{Capture, load_views};
-use globalsplat::io::{Splat, encode_photo, rgb_from_tensor};
-use globalsplat::render::DEFAULT_EPS2D;
-use globalsplat::scene::{Camera, ImageSize, LocalFrame, smooth_path};
+use globalsplat::io::{encode_photo, rgb_from_tensor};
+use globalsplat::render::{DEFAULT_EPS2D, SplatRenderer};
+use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
 /// Maximum length of a photo's longer side, in pixels.
@@ -63,22 +63,27 @@ struct Lens {
 }
 
 impl Contents {
-    /// Creates the contents for `splat`, which is in the local frame `frame`, with the cameras of `capture` or, without one, on
+    /// Creates the contents for `gaussians`, which are in the local frame `frame`, with the cameras of `capture` or, without one, on
     /// an orbit.
     ///
     /// # Errors
     /// Photos that can't be read.
-    pub fn of(name: &str, splat: &Splat, capture: Option<&Capture>, frame: &LocalFrame) -> Result<Self> {
+    pub fn of(
+        name: &str,
+        gaussians: &Gaussians,
+        capture: Option<&Capture>,
+        frame: &LocalFrame,
+    ) -> Result<Self> {
         let (cameras, all) = match capture {
             Some(capture) => (photographed(capture, frame)?, frame.cameras_to_local(&capture.cameras())),
             None => {
-                let orbit = orbit_around_splat(splat, SIZE, ORBIT);
+                let orbit = orbit_around_gaussians(gaussians, DVec3::ZERO, SIZE, ORBIT);
                 let named =
                     (1_usize..).zip(&orbit).map(|(i, camera)| PageCamera::of(i.to_string(), camera, None));
                 (named.collect(), orbit)
             }
         };
-        let distance = median_depth(&splat.renderer(), &all)?;
+        let distance = median_depth(&SplatRenderer::from_gaussians(gaussians, DVec3::ZERO), &all)?;
         let path = match capture {
             Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MOST_FRAMES))?,
             None => [&all[..], &all[..1]].concat(),

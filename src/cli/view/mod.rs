@@ -8,6 +8,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::error::Error;
 use globalsplat::io::read_splat;
+use globalsplat::scene::Gaussians;
 use serde_json::json;
 use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
@@ -42,12 +43,12 @@ impl View {
         remove_pages(&std::env::temp_dir());
         // Only its owner can read the file. It must remain after this program exits, since the browser reads it then.
         let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile()?;
-        write_page(page.path(), &name, &splat, capture.as_ref())?;
+        write_page(page.path(), &name, &Gaussians::from_splat(&splat), splat.origin, capture.as_ref())?;
         let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
         let opened = open::that_detached(&page);
         if self.json {
             print_json(
-                &json!({ "page": page.to_string_lossy(), "gaussians": splat.gaussians.count(), "opened": opened.is_ok() }),
+                &json!({ "page": page.to_string_lossy(), "gaussians": splat.len(), "opened": opened.is_ok() }),
             );
         } else {
             println!("{}", page.display());

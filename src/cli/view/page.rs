@@ -4,11 +4,11 @@ use super::contents::Contents;
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use glam::DVec3;
 use globalsplat::data::Capture;
 use globalsplat::error::Error;
-use globalsplat::io::{self, Splat, check_writable_file, fit_splat, write_atomically, write_splat};
-use globalsplat::render::HarmonicLimits;
-use globalsplat::scene::Camera;
+use globalsplat::io::{self, ShLimits, Splat, check_writable_file, fit_splat, write_atomically, write_splat};
+use globalsplat::scene::{Camera, Gaussians};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::Path;
 
@@ -48,16 +48,23 @@ pub fn check_writable(path: &Path) -> Result<()> {
     Ok(check_writable_file(path)?)
 }
 
-/// Writes an interactive page of `splat`, with the photos of `capture`, as one file at `path`.
+/// Writes an interactive page of `gaussians` of one scene, whose means are relative to `origin`, with the photos of `capture`, as one file
+/// at `path`.
 ///
 /// # Errors
 /// Photos that can't be read, or a failed write.
-pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Capture>) -> Result<()> {
-    let frame = splat.frame();
-    let splat = Splat::of(&splat.gaussians.to_local(&frame, splat.origin))?;
-    let contents = Contents::of(name, &splat, capture, &frame)?;
+pub fn write_page(
+    path: &Path,
+    name: &str,
+    gaussians: &Gaussians,
+    origin: DVec3,
+    capture: Option<&Capture>,
+) -> Result<()> {
+    let frame = gaussians.local_frame(origin);
+    let local = gaussians.to_local(&frame, origin);
+    let contents = Contents::of(name, &local, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
-    let text = page(&contents, &spz(&splat, &cameras)?)?.into_string();
+    let text = page(&contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?)?.into_string();
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
 }
 
@@ -65,7 +72,7 @@ pub fn write_page(path: &Path, name: &str, splat: &Splat, capture: Option<&Captu
 fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
-    write_splat(&file, &fit_splat(&file, splat, &HarmonicLimits::of_viewers(splat.sh_degree()), cameras)?)?;
+    write_splat(&file, &fit_splat(&file, splat, &ShLimits::for_viewers(splat.sh_degree), cameras)?)?;
     Ok(std::fs::read(file)?)
 }
 

@@ -1,6 +1,6 @@
 //! Directions of coordinate axes. Formats of splats have x to the right, y down, z forward; SPZ usually has y up, z back.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Axes whose reversal changes the sign of a spherical harmonic, in the order of spec 6.3 from degree 1: y, z, x; xy, yz, …

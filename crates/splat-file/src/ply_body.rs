@@ -1,7 +1,7 @@
 //! Rows of a PLY, among any other elements and properties (spec 10.9).
 
-use super::ply_header::{Element, Encoding, Header, Kind, Scalar};
-use crate::error::{Error, Result};
+use crate::ply_header::{Element, Encoding, Header, Kind, Scalar};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. Other elements and properties are

@@ -1,6 +1,6 @@
 //! Origin of a splat's coordinates, in a file beside it (spec 10.18): `room.ply.origin.json` for `room.ply`.
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use glam::DVec3;
 use globalsplat_files::{PartialFile, check_writable_file};
 use serde::{Deserialize, Serialize};
@@ -34,14 +34,14 @@ pub fn splat_files(path: &Path) -> [PathBuf; 2] {
 /// # Errors
 /// Returns a request error that names the file.
 pub fn check_writable_origin(path: &Path) -> Result<()> {
-    Ok(check_writable_file(&origin_file(path))?)
+    check_writable_file(&origin_file(path))
 }
 
 /// Returns the origin of the splat at `path`, or zero if it has no origin file.
 ///
 /// # Errors
 /// Returns an error if the file can't be read or has no origin.
-pub(super) fn read_origin(path: &Path) -> Result<DVec3> {
+pub(crate) fn read_origin(path: &Path) -> Result<DVec3> {
     let path = origin_file(path);
     if !path.is_file() {
         return Ok(DVec3::ZERO);
@@ -58,7 +58,7 @@ pub(super) fn read_origin(path: &Path) -> Result<DVec3> {
 ///
 /// # Errors
 /// Returns the error of `write`, or an error if the origin file can't be written.
-pub(super) fn write_with_origin(
+pub(crate) fn write_with_origin(
     path: &Path,
     origin: DVec3,
     write: impl FnOnce() -> Result<()>,
@@ -72,5 +72,5 @@ pub(super) fn write_with_origin(
     let json = serde_json::to_vec_pretty(&Contents { origin: origin.to_array() }).expect("numbers");
     partial.file.write_all(&json).map_err(Error::write(&file))?;
     write()?;
-    Ok(partial.keep()?)
+    partial.keep()
 }

@@ -1,21 +1,18 @@
-//! Niantic's SPZ (spec 10.13): a byte for most values, grouped by kind over all Gaussians, compressed. Versions 1 to 4 are read. Version 3
-//! is written: it is the oldest whose rotations are precise enough, and programs that read version 4 read it too.
+//! Values of an SPZ's streams.
 
-mod axes;
-mod container;
-
-use super::invalid::InvalidGaussians;
-use super::values::{Values, normalized};
-use super::{Contents, Splat};
-use crate::error::{Error, Result};
-use crate::render::HarmonicLimits;
-use axes::Axes;
-use container::{Description, Streams};
+use super::axes::Axes;
+use super::container::{self, Description, Streams};
+use crate::formats::{Codec, Contents};
+use crate::invalid::InvalidGaussians;
+use crate::rotations::normalized;
+use crate::splat::logit_of_opacity;
+use crate::{Error, Result, ShLimits, Splat};
 use half::f16;
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::path::Path;
 
-pub(super) use container::recognizes;
+/// Functions of the format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits });
 
 /// Factor of an SH coefficient of degree 0, to which ½ is added.
 const COLOUR_SCALE: f64 = 0.15;
@@ -36,7 +33,7 @@ const SH_BITS: [u32; 2] = [8, 7];
 ///
 /// # Errors
 /// Returns an error for another version or a higher SH degree, or if the file is damaged, truncated, or claims more than it can hold.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (description, streams) = container::read(path, bytes)?;
     let Description { version, fractional_bits, axes, .. } = description;
     let fixed = |bytes: &[u8; 3]| {
@@ -66,22 +63,29 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         1 | 2 => streams.rotations.as_chunks().0.iter().map(|&bytes| first_three(bytes)).collect::<Vec<_>>(),
         _ => streams.rotations.as_chunks().0.iter().map(|&bytes| smallest_three(bytes)).collect(),
     };
-    let values = Values {
+    let splat = Splat {
         means: coordinates.as_chunks().0.iter().map(|&mean| axes.position(mean)).collect(),
-        scales: threes(&streams.scales, &|byte| (f64::from(byte) / LOG_SCALE_STEPS + LOG_SCALE_BEGIN).exp()),
+        log_scales: threes(&streams.scales, &|byte| f64::from(byte) / LOG_SCALE_STEPS + LOG_SCALE_BEGIN),
         quaternions: rotations.into_iter().map(|rotation| axes.rotation(rotation)).collect(),
-        opacities: streams.opacities.iter().map(|&byte| f32::from(byte) / 255.).collect(),
-        bases,
+        opacity_logits: streams
+            .opacities
+            .iter()
+            .map(|&byte| logit_of_opacity(f64::from(byte) / 255.))
+            .collect(),
         sh,
+        sh_degree: description.sh_degree,
+        ..Splat::default()
     };
-    Ok(values.into_contents(InvalidGaussians::default()))
+    let mut invalid = InvalidGaussians::default();
+    invalid.add_all(&splat);
+    Ok(Contents { splat, invalid })
 }
 
 /// Returns the limits of coefficients that a byte can represent.
-pub(super) fn limits() -> HarmonicLimits {
+fn limits() -> ShLimits {
     let largest = f64::from(pack_sh(f32::MAX, SH_BITS[1]));
-    let (constant, others) = (0.5 / COLOUR_SCALE, (largest - 128.) / 128.);
-    HarmonicLimits { degree: 3, constant: -constant..=constant, others: -1. ..=others }
+    let (dc, rest) = (0.5 / COLOUR_SCALE, (largest - 128.) / 128.);
+    ShLimits { degree: 3, dc: -dc..=dc, rest: -1. ..=rest }
 }
 
 /// Unpacks a rotation from x, y and z; w isn't negative.
@@ -122,10 +126,9 @@ fn pack_smallest_three([w, x, y, z]: [f32; 4]) -> [u8; 4] {
 /// Writes an SPZ. Scales, colours and spherical harmonics outside of the range of a byte are clamped to it.
 ///
 /// # Errors
-/// Returns an error if a value isn't finite, a position is too far away for 24 bits, or the file can't be written.
-pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
-    let values = Values::of(path, splat)?;
-    let farthest = values.means.as_flattened().iter().fold(0f32, |farthest, x| farthest.max(x.abs()));
+/// Returns an error if a position is too far away for 24 bits, or the file can't be written.
+fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let farthest = splat.means.as_flattened().iter().fold(0f32, |farthest, x| farthest.max(x.abs()));
     let fits = |bits: &u32| f64::from(farthest) * f64::from(1u32 << bits) <= MAX_FIXED;
     let Some(fractional_bits) = (0..=MAX_FRACTIONAL_BITS).rev().find(fits) else {
         let limit = format!("at most {MAX_FIXED} in an SPZ");
@@ -137,30 +140,32 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let axes = Axes::RUB;
     let byte = |number: f64| number.round() as u8; // values outside of the range become 0 or 255
     let (mut positions, mut harmonics) = (vec![], vec![]);
-    for mean in &values.means {
+    for mean in &splat.means {
         for coordinate in axes.position(*mean) {
             let fixed = (f64::from(coordinate) * f64::from(1u32 << fractional_bits)).round() as i32;
             positions.extend(&fixed.to_le_bytes()[..3]);
         }
     }
     let signs = axes.harmonics();
-    for index in 0..values.count() {
-        for (basis, (colour, sign)) in values.sh_of(index)[1..].iter().zip(signs).enumerate() {
+    for index in 0..splat.len() {
+        for (basis, (colour, sign)) in splat.sh_of(index)[1..].iter().zip(signs).enumerate() {
             let bits = SH_BITS[usize::from(basis >= 3)];
             harmonics.extend(colour.map(|channel| pack_sh(sign * channel, bits)));
         }
     }
-    let colours = (0..values.count()).flat_map(|index| values.sh_of(index)[0]);
-    let scales = values.scales.as_flattened().iter();
+    let colours = (0..splat.len()).flat_map(|index| splat.sh_of(index)[0]);
+    let scales = splat.log_scales.as_flattened().iter();
     let streams = Streams {
         positions,
-        opacities: values.opacities.iter().map(|&opacity| byte(f64::from(opacity) * 255.)).collect(),
+        opacities: (0..splat.len()).map(|index| byte(f64::from(splat.opacity(index)) * 255.)).collect(),
         colours: colours.map(|dc| byte((f64::from(dc) * COLOUR_SCALE + 0.5) * 255.)).collect(),
-        scales: scales.map(|&s| byte((f64::from(s).ln() - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
-        rotations: values.quaternions.iter().flat_map(|&q| pack_smallest_three(axes.rotation(q))).collect(),
+        scales: scales.map(|&log| byte((f64::from(log) - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
+        rotations: (0..splat.len())
+            .flat_map(|index| pack_smallest_three(axes.rotation(splat.unit_quaternion(index))))
+            .collect(),
         harmonics,
     };
-    let description = Description::written(values.count(), values.bases.isqrt() - 1, fractional_bits);
+    let description = Description::written(splat.len(), splat.sh_degree, fractional_bits);
     container::write(path, &description, &streams)
 }
 

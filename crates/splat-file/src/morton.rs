@@ -4,7 +4,7 @@
 const BITS: u32 = 21;
 
 /// Returns the indices of `means` along Morton's curve through their bounding box. In the same cell, the lower index comes first.
-pub(super) fn morton_order(means: &[[f32; 3]]) -> Vec<usize> {
+pub(crate) fn morton_order(means: &[[f32; 3]]) -> Vec<usize> {
     let bounds: [(f64, f64); 3] = std::array::from_fn(|axis| {
         means.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), mean| {
             (low.min(f64::from(mean[axis])), high.max(f64::from(mean[axis])))

@@ -1,7 +1,8 @@
 //! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
 use super::axes::Axes;
-use crate::error::{Error, Result};
+use super::{MAGIC, recognizes};
+use crate::{Error, Result};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -9,10 +10,6 @@ use globalsplat_files::write_atomically;
 use std::io::{Read, Write};
 use std::path::Path;
 
-/// First bytes of every version, after gzip is decompressed.
-const MAGIC: [u8; 4] = *b"NGSP";
-/// First bytes of gzip. In the next byte, the flags, the upper three bits are 0.
-const GZIP: [u8; 3] = [0x1f, 0x8b, 8];
 /// Size of the header in bytes, up to version 3 (`GZIP_HEADER`) and since version 4 (`PLAIN_HEADER`).
 const GZIP_HEADER: usize = 16;
 const PLAIN_HEADER: usize = 32;
@@ -94,11 +91,6 @@ impl Description {
         }
         Ok(())
     }
-}
-
-/// Returns `true` if `bytes` begin like an SPZ of any version.
-pub fn recognizes(bytes: &[u8]) -> bool {
-    bytes.starts_with(&MAGIC) || (bytes.starts_with(&GZIP) && bytes.get(3).is_some_and(|flags| flags < &0x20))
 }
 
 pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {

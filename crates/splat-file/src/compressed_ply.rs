@@ -1,16 +1,15 @@
 //! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits per Gaussian, with values between the bounds of a chunk of 256 Gaussians,
 //! and a byte for each spherical harmonic above degree 0.
 
-use super::invalid::InvalidGaussians;
-use super::morton::morton_order;
-use super::ply::bases_of_rest;
-use super::ply_body::columns;
-use super::ply_header::{Header, Kind, Scalar};
-use super::values::{Values, normalized};
-use super::{Contents, Splat};
-use crate::error::{Error, Result};
-use crate::render::HarmonicLimits;
-use crate::scene::SH_C0;
+use crate::formats::Contents;
+use crate::invalid::InvalidGaussians;
+use crate::morton::morton_order;
+use crate::ply::degree_of_rest;
+use crate::ply_body::columns;
+use crate::ply_header::{Header, Kind, Scalar};
+use crate::rotations::normalized;
+use crate::splat::logit_of_opacity;
+use crate::{Error, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::f64::consts::SQRT_2;
 use std::path::Path;
@@ -31,7 +30,7 @@ const MAX_LOG_SCALE: f32 = 20.;
 const SH_RANGE: f64 = 8.;
 
 /// Returns `true` if `bytes` are a compressed PLY.
-pub(super) fn recognizes(bytes: &[u8]) -> bool {
+pub(crate) fn recognizes(bytes: &[u8]) -> bool {
     let header = Header::begins(bytes).then(|| Header::parse(Path::new(""), bytes).ok()).flatten();
     header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
 }
@@ -40,7 +39,7 @@ pub(super) fn recognizes(bytes: &[u8]) -> bool {
 ///
 /// # Errors
 /// Returns an error if anything is missing or of another type, or if the file is truncated.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
     expect_type(path, &header, "vertex", &owned(&WORDS), Scalar::U32)?;
@@ -66,8 +65,9 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         return Err(Error::input(path, "the number of chunks", chunks.len(), expected));
     }
 
-    let (rest, bases) = read_rest(path, bytes, &header, words.len())?;
-    let mut values = Values::with_capacity(words.len(), bases);
+    let (rest, sh_degree) = read_rest(path, bytes, &header, words.len())?;
+    let mut splat = Splat { sh_degree, ..Splat::default() };
+    let bases = splat.bases();
     for (index, &[position, rotation, scale, colour]) in words.iter().enumerate() {
         let bounds = chunks[index / CHUNK];
         let between = |bounds: &[f32], parts: [f64; 3]| -> [f32; 3] {
@@ -76,36 +76,36 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
                 (low * (1. - parts[axis]) + high * parts[axis]) as f32
             })
         };
-        values.means.push(between(&bounds[..6], unpack(position, WIDE)));
-        values.scales.push(between(&bounds[6..12], unpack(scale, WIDE)).map(f32::exp));
-        values.quaternions.push(unpack_rotation(rotation));
+        splat.means.push(between(&bounds[..6], unpack(position, WIDE)));
+        splat.log_scales.push(between(&bounds[6..12], unpack(scale, WIDE)));
+        splat.quaternions.push(unpack_rotation(rotation));
         let [red, green, blue, opacity] = unpack(colour, COLOUR);
         let colour = match bounds.get(12..) {
             Some(bounds @ [_, ..]) => between(bounds, [red, green, blue]),
             _ => [red, green, blue].map(|channel| channel as f32),
         };
-        values.opacities.push(opacity as f32);
-        values.sh.push(colour.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
+        splat.opacity_logits.push(logit_of_opacity(opacity));
+        splat.sh.push(colour.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
         let rest = &rest[index * 3 * (bases - 1)..];
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
-        values.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
+        splat.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
     }
-    Ok(values.into_contents(invalid))
+    invalid.add_all(&splat);
+    Ok(Contents { splat, invalid })
 }
 
-/// Returns the bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and the number of spherical
-/// harmonics of all degrees per channel.
+/// Returns the bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and the degree.
 fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result<(Vec<u8>, usize)> {
-    let Some(element) = header.element("sh") else { return Ok((vec![], 1)) };
+    let Some(element) = header.element("sh") else { return Ok((vec![], 0)) };
     let names: Vec<String> =
         (0..).map(|k| format!("f_rest_{k}")).take_while(|name| element.has(name)).collect();
-    let bases = bases_of_rest(path, names.len())? as usize;
+    let degree = degree_of_rest(path, names.len())?;
     if element.count != count {
         let field = "the number of rows of the element sh";
         return Err(Error::input(path, field, element.count, format!("{count}, as many as Gaussians")));
     }
     expect_type(path, header, "sh", &names, Scalar::U8)?;
-    Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, bases))
+    Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, degree))
 }
 
 /// Checks that the packed properties have the type `scalar`.
@@ -125,38 +125,37 @@ fn bound_names(of: &[&str; 3]) -> Vec<String> {
 }
 
 /// Returns the limits of coefficients. Degree 0 has none, because each chunk has its own bounds of colours.
-pub(super) fn limits() -> HarmonicLimits {
-    HarmonicLimits { others: -SH_RANGE / 2. ..=SH_RANGE / 2., ..HarmonicLimits::up_to(3) }
+pub(crate) fn limits() -> ShLimits {
+    ShLimits { rest: -SH_RANGE / 2. ..=SH_RANGE / 2., ..ShLimits::up_to(3) }
 }
 
 /// Writes a compressed PLY, with Gaussians in Morton order, so that those of a chunk are near each other.
 ///
 /// # Errors
-/// Returns an error if a value isn't finite, or if the file can't be written.
-pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
-    let values = Values::of(path, splat)?;
-    let order = morton_order(&values.means);
+/// Returns an error if the file can't be written.
+pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let order = morton_order(&splat.means);
     let (mut bounds, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {
         let of_chunk = |number: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f32; 3]> {
             chunk.iter().map(|&index| number(index)).collect()
         };
-        let means = Bounded::of(of_chunk(&|index| values.means[index]));
+        let means = Bounded::of(of_chunk(&|index| splat.means[index]));
         let log_scales = Bounded::of(of_chunk(&|index| {
-            values.scales[index].map(|scale| scale.ln().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+            splat.log_scales[index].map(|log_scale| log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
         }));
         let colours = Bounded::of(of_chunk(&|index| {
-            values.sh_of(index)[0].map(|dc| (f64::from(dc) * SH_C0 + 0.5) as f32)
+            splat.sh_of(index)[0].map(|dc| (f64::from(dc) * SH_C0 + 0.5) as f32)
         }));
         for bounded in [&means, &log_scales, &colours] {
             bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
         }
         for (row, &index) in chunk.iter().enumerate() {
             let [red, green, blue] = colours.parts(row);
-            let colour = [red, green, blue, f64::from(values.opacities[index])];
+            let colour = [red, green, blue, f64::from(splat.opacity(index))];
             let packed = [
                 pack(means.parts(row), WIDE),
-                pack_rotation(values.quaternions[index]),
+                pack_rotation(splat.unit_quaternion(index)),
                 pack(log_scales.parts(row), WIDE),
                 pack(colour, COLOUR),
             ];
@@ -164,11 +163,11 @@ pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
         }
     }
     let rest = order.iter().flat_map(|&index| {
-        let rest = &values.sh_of(index)[1..];
+        let rest = &splat.sh_of(index)[1..];
         (0..3).flat_map(move |channel| rest.iter().map(move |of_basis| pack_sh(of_basis[channel])))
     });
     let rest: Vec<u8> = rest.collect();
-    let header = header(values.count(), values.bases);
+    let header = header(splat.len(), splat.bases());
     write_atomically(path, |writer| {
         let parts = [header.as_bytes(), &bounds, &words, &rest];
         parts.iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))

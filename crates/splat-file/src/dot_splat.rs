@@ -1,11 +1,10 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use super::invalid::InvalidGaussians;
-use super::values::{Values, normalized};
-use super::{Contents, Splat, recognize};
-use crate::error::{Error, Result};
-use crate::render::HarmonicLimits;
-use crate::scene::SH_C0;
+use crate::formats::{Contents, is_recognized};
+use crate::invalid::InvalidGaussians;
+use crate::rotations::normalized;
+use crate::splat::{log_of_scale, logit_of_opacity};
+use crate::{Error, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::path::Path;
 
@@ -16,7 +15,7 @@ const BYTES: usize = 32;
 ///
 /// # Errors
 /// Returns an error if the file doesn't consist of whole Gaussians.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
         let found = format!("{} bytes", bytes.len());
@@ -29,56 +28,63 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         })
     };
     let colour = |byte: u8| ((f64::from(byte) / 255. - 0.5) / SH_C0) as f32;
-    let values = Values {
+    let scales: Vec<_> = gaussians.iter().map(|gaussian| three(&gaussian[12..24])).collect();
+    let splat = Splat {
         means: gaussians.iter().map(|gaussian| three(&gaussian[..12])).collect(),
-        scales: gaussians.iter().map(|gaussian| three(&gaussian[12..24])).collect(),
-        bases: 1,
-        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| colour(gaussian[at]))).collect(),
-        opacities: gaussians.iter().map(|gaussian| f32::from(gaussian[27]) / 255.).collect(),
+        log_scales: scales.iter().map(|scale| scale.map(log_of_scale)).collect(),
+        linear_scales: Some(scales),
         quaternions: gaussians
             .iter()
             .map(|gaussian| normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)))
             .collect(),
+        opacity_logits: gaussians
+            .iter()
+            .map(|gaussian| logit_of_opacity(f64::from(gaussian[27]) / 255.))
+            .collect(),
+        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| colour(gaussian[at]))).collect(),
+        ..Splat::default()
     };
-    Ok(values.into_contents(InvalidGaussians::default()))
+    let mut invalid = InvalidGaussians::default();
+    invalid.add_all(&splat);
+    Ok(Contents { splat, invalid })
 }
 
 /// Returns the limits of coefficients: colours that a screen shows, independent of the view direction.
-pub(super) fn limits() -> HarmonicLimits {
-    HarmonicLimits { degree: 0, constant: -0.5 / SH_C0..=0.5 / SH_C0, others: 0. ..=0. }
+pub(crate) fn limits() -> ShLimits {
+    ShLimits { degree: 0, dc: -0.5 / SH_C0..=0.5 / SH_C0, rest: 0. ..=0. }
 }
 
 /// Writes a `.splat`. The Gaussians of the largest volume times opacity come first, for viewers that show a file while it loads.
 ///
 /// # Errors
-/// Returns an error if there is no Gaussian, a value isn't finite, or the file can't be written.
-pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
-    let values = Values::of(path, splat)?;
-    if values.count() == 0 {
+/// Returns an error if there is no Gaussian, or the file can't be written.
+pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    if splat.is_empty() {
         return Err(Error::failed(format!(
             "{}: a .splat holds one Gaussian at least, found 0",
             path.display()
         )));
     }
-    let importance = |&index: &usize| {
-        let volume: f64 = values.scales[index].iter().map(|&scale| f64::from(scale)).product();
-        volume * f64::from(values.opacities[index])
+    let importance = |index: usize| {
+        let volume: f64 = splat.scale(index).iter().map(|&scale| f64::from(scale)).product();
+        volume * f64::from(splat.opacity(index))
     };
-    let mut order: Vec<usize> = (0..values.count()).collect();
-    order.sort_by(|a, b| importance(b).total_cmp(&importance(a)));
+    let importance: Vec<f64> = (0..splat.len()).map(importance).collect();
+    let mut order: Vec<usize> = (0..splat.len()).collect();
+    order.sort_by(|&a, &b| importance[b].total_cmp(&importance[a]));
     write_atomically(path, |writer| {
         for (place, index) in order.into_iter().enumerate() {
             let mut gaussian = Vec::with_capacity(BYTES);
-            for number in values.means[index].iter().chain(&values.scales[index]) {
+            for number in splat.means[index].iter().chain(&splat.scale(index)) {
                 gaussian.extend(number.to_le_bytes());
             }
-            let colour = values.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
+            let colour = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
             gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
-            gaussian.push((values.opacities[index] * 255.).round() as u8);
-            gaussian.extend(values.quaternions[index].map(|part| (part * 128. + 128.).round() as u8));
+            gaussian.push((splat.opacity(index) * 255.).round() as u8);
+            gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));
             // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't
             // take the file for that format.
-            if place == 0 && recognize(&gaussian).is_some() {
+            if place == 0 && is_recognized(&gaussian) {
                 gaussian[0] ^= 1;
             }
             writer.write_all(&gaussian).map_err(Error::write(path))?;

@@ -1,17 +1,15 @@
 //! Gaussians of a file that can't be drawn, which are either refused, or left out and counted (spec 10.9).
 
-use crate::error::{Error, Result};
-use crate::scene::Gaussians;
+use crate::{Error, Result, Splat};
 use std::collections::BTreeSet;
 use std::path::Path;
-use tch::Tensor;
 
 /// Maximum number of properties that a warning names.
 const NAMED: usize = 6;
 
 /// Gaussians of a file that have an invalid value, one that isn't finite or is out of its range.
 #[derive(Debug, Default)]
-pub(super) struct InvalidGaussians {
+pub(crate) struct InvalidGaussians {
     rows: BTreeSet<usize>,
     properties: Vec<String>,
     /// Field, found value and expected value of the first invalid Gaussian.
@@ -35,9 +33,23 @@ impl InvalidGaussians {
         self.first.get_or_insert_with(|| [field(), found.to_string(), expected.into()]);
     }
 
-    /// Returns `true` if Gaussian `row` is invalid.
-    pub fn contains(&self, row: usize) -> bool {
-        self.rows.contains(&row)
+    /// Adds the Gaussians of `splat` that have a value that isn't finite, or a negative scale. Gaussians that are invalid already are
+    /// skipped.
+    pub fn add_all(&mut self, splat: &Splat) {
+        for row in 0..splat.len() {
+            if self.rows.contains(&row) {
+                continue;
+            }
+            let mut check = |property: &str, values: &[f32], min: f32| {
+                if let Some(&bad) = values.iter().find(|&&value| !(value.is_finite() && value >= min)) {
+                    let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
+                    self.add(row, property, || format!("the {property} of Gaussian {row}"), bad, expected);
+                }
+            };
+            check("position", &splat.means[row], f32::MIN);
+            check("scale", &splat.scale(row), 0.);
+            check("colour", splat.sh_of(row).as_flattened(), f32::MIN);
+        }
     }
 
     /// Refuses the file at `path` if it has invalid Gaussians.
@@ -54,23 +66,23 @@ impl InvalidGaussians {
         }
     }
 
-    /// Removes the invalid ones from `gaussians`, which were read from `path`, and reports them in `warnings`.
-    pub fn leave_out(self, path: &Path, gaussians: &Gaussians, warnings: &mut Vec<String>) -> Gaussians {
-        let all = gaussians.count();
+    /// Returns `splat`, which was read from `path`, without the invalid ones, and reports them in its warnings.
+    pub fn leave_out(self, path: &Path, splat: Splat) -> Splat {
         if self.rows.is_empty() {
-            return gaussians.map(Tensor::shallow_clone);
+            return splat;
         }
         let mut names = self.properties[..self.properties.len().min(NAMED)].join(", ");
         if self.properties.len() > NAMED {
             names += &format!(" and {} more", self.properties.len() - NAMED);
         }
-        warnings.push(format!(
-            "{}: {} of {all} Gaussians are left out, whose numbers aren't finite or are out of range: {names}",
+        let kept: Vec<usize> = (0..splat.len()).filter(|row| !self.rows.contains(row)).collect();
+        let mut valid = splat.select(&kept);
+        valid.warnings.push(format!(
+            "{}: {} of {} Gaussians are left out, whose numbers aren't finite or are out of range: {names}",
             path.display(),
-            self.rows.len()
+            self.rows.len(),
+            splat.len()
         ));
-        let kept: Vec<i64> = (0..all).filter(|&row| !self.rows.contains(&(row as usize))).collect();
-        let kept = Tensor::from_slice(&kept);
-        gaussians.map(|tensor| tensor.index_select(1, &kept))
+        valid
     }
 }

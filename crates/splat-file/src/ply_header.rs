@@ -1,6 +1,6 @@
 //! Header of a PLY: the encoding of its numbers, and its elements and properties (spec 10.9).
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Encoding of numbers.

@@ -3,16 +3,13 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use super::invalid::InvalidGaussians;
-use super::ply_body::columns;
-use super::ply_header::{Header, Scalar};
-use super::{Contents, Splat, all_finite};
-use crate::error::{Error, Result};
-use crate::render::HarmonicLimits;
-use crate::scene::{MIN_SCALE, RawGaussians, SH_C0};
+use crate::formats::Contents;
+use crate::invalid::InvalidGaussians;
+use crate::ply_body::columns;
+use crate::ply_header::{Header, Scalar};
+use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::path::Path;
-use tch::{Device, Kind, Tensor};
 
 /// Maximum logarithm of a scale: larger scales exceed float32.
 const MAX_LOG_SCALE: f32 = 88.;
@@ -22,7 +19,7 @@ const COLOURS: [[&str; 3]; 3] =
     [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
 /// Returns `true` if `bytes` begin like a PLY.
-pub(super) fn recognizes(bytes: &[u8]) -> bool {
+pub(crate) fn recognizes(bytes: &[u8]) -> bool {
     Header::begins(bytes)
 }
 
@@ -32,7 +29,7 @@ pub(super) fn recognizes(bytes: &[u8]) -> bool {
 ///
 /// # Errors
 /// Returns an error if a property is missing, or if the file is a point cloud or truncated.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let vertex = header.element("vertex");
     let has = |name: &str| vertex.is_some_and(|vertex| vertex.has(name));
@@ -41,21 +38,22 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         return Err(Error::input(path, "the element vertex", found, "the properties of a 3D Gaussian splat"));
     }
     let rest = (0..).take_while(|k| has(&format!("f_rest_{k}"))).count();
-    let bases = bases_of_rest(path, rest)?;
+    let sh_degree = degree_of_rest(path, rest)?;
+    let mut splat = Splat { sh_degree, ..Splat::default() };
+    let bases = splat.bases();
     let mut names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
-    let mut warnings = vec![];
     let colours = COLOURS.into_iter().find(|names| names.iter().all(|name| has(name)));
     let colours = colours.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
     if let Some(colours) = colours {
         names[3..6].clone_from_slice(&owned(colours));
         let said = format!("colours are those of {}, for want of f_dc_*", colours.join(", "));
-        warnings.push(format!("{}: {said}", path.display()));
+        splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let is_flat = !has("scale_2") && has("scale_1");
     if is_flat {
         names.retain(|name| name != "scale_2");
         let said = "Gaussians are flat in their third direction, for want of scale_2";
-        warnings.push(format!("{}: {said}", path.display()));
+        splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let mut values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;
     if let Some((colours, vertex)) = colours.zip(vertex) {
@@ -63,26 +61,24 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     }
     let invalid = find_invalid(&names, &values);
 
-    let (n, width) = ((values.len() / names.len()) as i64, names.len() as i64);
-    let table = Tensor::from_slice(&values).view([1, n, width]);
-    let mut at = 0;
-    let mut next = |width: i64| {
-        at += width;
-        table.narrow(2, at - width, width).contiguous()
-    };
-    let means = next(3);
-    let dc = next(3).unsqueeze(2); // [1, N, 1, 3]
-    let rest = next(3 * (bases - 1)).view([1, n, 3, bases - 1]).transpose(2, 3); // channel-major to basis-major
-    let opacity_logits = next(1).squeeze_dim(-1);
-    let log_scales = match is_flat {
-        true => {
-            Tensor::cat(&[next(2), Tensor::full([1, n, 1], MIN_SCALE.ln(), (Kind::Float, Device::Cpu))], 2)
-        }
-        false => next(3),
-    };
-    let sh = Tensor::cat(&[dc, rest], 2);
-    let raw = RawGaussians { means, opacity_logits, log_scales, quaternions: next(4), sh };
-    Ok(Contents { gaussians: raw.activate(), invalid, warnings })
+    for vertex in values.chunks_exact(names.len()) {
+        let (means, vertex) = vertex.split_at(3);
+        let (dc, vertex) = vertex.split_at(3);
+        let (rest, vertex) = vertex.split_at(3 * (bases - 1));
+        splat.means.push([0, 1, 2].map(|axis| means[axis]));
+        splat.sh.push([0, 1, 2].map(|channel| dc[channel]));
+        splat
+            .sh
+            .extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| rest[channel * (bases - 1) + basis])));
+        splat.opacity_logits.push(vertex[0]);
+        splat.log_scales.push(match is_flat {
+            true => [vertex[1], vertex[2], MIN_SCALE.ln() as f32],
+            false => [1, 2, 3].map(|column| vertex[column]),
+        });
+        let quaternion = &vertex[vertex.len() - 4..];
+        splat.quaternions.push([0, 1, 2, 3].map(|part| quaternion[part]));
+    }
+    Ok(Contents { splat, invalid })
 }
 
 /// Converts the colours in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, to spherical harmonics of degree 0.
@@ -101,15 +97,12 @@ fn harmonics_from_colours(scalar: Option<Scalar>, width: usize, values: &mut [f3
     }
 }
 
-/// Returns the number of spherical harmonics per colour channel for a number of f_rest properties.
-pub(super) fn bases_of_rest(path: &Path, rest: usize) -> Result<i64> {
-    match rest {
-        0 | 9 | 24 | 45 => Ok(rest as i64 / 3 + 1),
-        _ => {
-            let expected = "0, 9, 24 or 45 (SH degree 0 to 3)";
-            Err(Error::input(path, "f_rest_*", format!("{rest} properties"), expected))
-        }
-    }
+/// Returns the degree of the spherical harmonics for a number of f_rest properties.
+pub(crate) fn degree_of_rest(path: &Path, rest: usize) -> Result<usize> {
+    [0, 9, 24, 45].into_iter().position(|count| count == rest).ok_or_else(|| {
+        let expected = "0, 9, 24 or 45 (SH degree 0 to 3)";
+        Error::input(path, "f_rest_*", format!("{rest} properties"), expected)
+    })
 }
 
 /// Finds Gaussians with values that aren't finite or scales that are too large. Logits of 0 and 1 and the logarithm of 0, which other
@@ -133,36 +126,43 @@ fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
 }
 
 /// Returns the limits of coefficients: a PLY can hold any number.
-pub(super) fn limits() -> HarmonicLimits {
-    HarmonicLimits::up_to(3)
+pub(crate) fn limits() -> ShLimits {
+    ShLimits::up_to(3)
 }
 
-/// Writes one scene, [1, N, ..], atomically.
+/// Writes a PLY, atomically. Infinite logits and logarithms, which not every program reads, become those of [`OPACITY_MARGIN`] and
+/// [`MIN_SCALE`].
 ///
 /// # Errors
-/// Returns an error if a value isn't finite, or if the file can't be written.
-pub(super) fn write(path: &Path, splat: &Splat) -> Result<()> {
-    let (n, bases) = (splat.gaussians.count(), splat.bases());
-    let g = RawGaussians::of(&splat.gaussians);
-    let dc = g.sh.narrow(2, 0, 1).view([n, 3]);
-    let rest =
-        g.sh.narrow(2, 1, bases - 1).view([n, bases - 1, 3]).transpose(1, 2).reshape([n, 3 * (bases - 1)]);
-    let means = g.means.view([n, 3]);
-    let normals = means.zeros_like();
-    let (logits, log_scales) = (g.opacity_logits.view([n, 1]), g.log_scales.view([n, 3]));
-    let table = Tensor::cat(&[means, normals, dc, rest, logits, log_scales, g.quaternions.view([n, 4])], 1);
-    all_finite(path, &table)?;
-
-    let header = header(n, bases);
-    let values = Vec::<f32>::try_from(table.flatten(0, 1))?;
+/// Returns an error if the file can't be written.
+pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+    let max_logit = ((1. - OPACITY_MARGIN) / OPACITY_MARGIN).ln() as f32;
+    let finite = |number: f32, min: f32, max: f32| match number.is_finite() {
+        true => number,
+        false => number.clamp(min, max),
+    };
+    let header = header(splat.len(), splat.bases());
     write_atomically(path, |writer| {
         writer.write_all(header.as_bytes()).map_err(Error::write(path))?;
-        values.iter().try_for_each(|v| writer.write_all(&v.to_le_bytes())).map_err(Error::write(path))
+        let mut row = vec![];
+        for index in 0..splat.len() {
+            let sh = splat.sh_of(index);
+            row.clear();
+            row.extend(splat.means[index]);
+            row.extend([0.; 3]);
+            row.extend(sh[0]);
+            row.extend((0..3).flat_map(|channel| sh[1..].iter().map(move |of_basis| of_basis[channel])));
+            row.push(finite(splat.opacity_logits[index], -max_logit, max_logit));
+            row.extend(splat.log_scales[index].map(|log| finite(log, MIN_SCALE.ln() as f32, MAX_LOG_SCALE)));
+            row.extend(splat.quaternions[index]);
+            row.iter().try_for_each(|v| writer.write_all(&v.to_le_bytes())).map_err(Error::write(path))?;
+        }
+        Ok(())
     })
 }
 
 /// Returns the header that [`write`] writes before the values of `n` Gaussians with `bases` spherical harmonics.
-fn header(n: i64, bases: i64) -> String {
+fn header(n: usize, bases: usize) -> String {
     let means_and_normals = owned(["x", "y", "z", "nx", "ny", "nz"]);
     let names = [means_and_normals, sh_names(bases), shape_names()].concat();
     let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {n}\n");
@@ -177,7 +177,7 @@ fn owned<const N: usize>(names: [&str; N]) -> Vec<String> {
     names.map(String::from).into()
 }
 
-fn sh_names(bases: i64) -> Vec<String> {
+fn sh_names(bases: usize) -> Vec<String> {
     let dc = (0..3).map(|k| format!("f_dc_{k}"));
     dc.chain((0..3 * (bases - 1)).map(|k| format!("f_rest_{k}"))).collect()
 }
@@ -188,9 +188,9 @@ fn shape_names() -> Vec<String> {
 }
 
 /// Returns the size in bytes of the file that [`write`] would write.
-pub(super) fn size(splat: &Splat) -> u64 {
+pub(crate) fn size(splat: &Splat) -> u64 {
     /// Number of values of position, normal, opacity, scale and rotation.
-    const NUMBERS: i64 = 14;
-    let (n, bases) = (splat.gaussians.count(), splat.bases());
+    const NUMBERS: usize = 14;
+    let (n, bases) = (splat.len(), splat.bases());
     header(n, bases).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64
 }

@@ -1,0 +1,186 @@
+//! File formats of splats: a module for each format, and an entry in [`FORMATS`]. The extension determines the format that is written; a
+//! file that is read is recognized by its contents, where that is possible.
+
+use crate::invalid::InvalidGaussians;
+use crate::origin::{read_origin, write_with_origin};
+use crate::rotations::with_rotation;
+use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, spz};
+use glam::DVec3;
+use globalsplat_files::check_writable_file;
+use std::path::{Path, PathBuf};
+
+/// Contents of a file as a format's reader returns them, before its Gaussians are checked.
+pub(crate) struct Contents {
+    pub splat: Splat,
+    pub invalid: InvalidGaussians,
+}
+
+/// Functions of a format.
+pub(crate) struct Codec {
+    pub read: fn(&Path, &[u8]) -> Result<Contents>,
+    pub write: fn(&Path, &Splat) -> Result<()>,
+    pub limits: fn() -> ShLimits,
+}
+
+/// A splat file format.
+struct Format {
+    /// Suffix of file names, in lower case.
+    ending: &'static str,
+    /// Function that returns `true` if bytes are certainly in this format.
+    recognizes: fn(&[u8]) -> bool,
+    /// Functions of the format, or `None` if this build lacks the feature that it needs.
+    codec: Option<Codec>,
+}
+
+/// All formats. The first one whose suffix matches, or that recognizes a file, is used.
+const FORMATS: [Format; 4] = [
+    Format {
+        ending: ".compressed.ply",
+        recognizes: compressed_ply::recognizes,
+        codec: Some(Codec {
+            read: compressed_ply::read,
+            write: compressed_ply::write,
+            limits: compressed_ply::limits,
+        }),
+    },
+    Format {
+        ending: ".ply",
+        recognizes: ply::recognizes,
+        codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits }),
+    },
+    Format { ending: ".spz", recognizes: spz::recognizes, codec: spz::CODEC },
+    Format {
+        ending: ".splat",
+        recognizes: |_| false,
+        codec: Some(Codec { read: dot_splat::read, write: dot_splat::write, limits: dot_splat::limits }),
+    },
+];
+
+impl Format {
+    /// Returns the functions of the format, which is that of the file at `path`.
+    ///
+    /// # Errors
+    /// Returns an error if this build lacks the feature that the format needs.
+    fn codec(&self, path: &Path) -> Result<&Codec> {
+        self.codec.as_ref().ok_or_else(|| {
+            let expected = "another format, or a build of globalsplat-splat-file with its feature spz";
+            Error::input(path, "the format", self.ending, expected)
+        })
+    }
+}
+
+/// Returns the format that belongs to the extension of `path`.
+///
+/// # Errors
+/// Returns an error for an unknown extension.
+fn format_of(path: &Path) -> Result<&'static Format> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
+        let found = path.extension().map_or("absent".into(), |ending| format!(".{}", ending.display()));
+        Error::input(path, "the ending", found, ".ply, .compressed.ply, .spz or .splat")
+    })
+}
+
+/// Returns `true` if `path` has the extension of a splat format.
+pub fn is_splat_name(path: &Path) -> bool {
+    format_of(path).is_ok()
+}
+
+/// Returns the path of the splat `name` in `folder`, in any format, or if there is none, the path of the missing PLY.
+pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
+    let candidates = FORMATS.map(|format| folder.join(format!("{name}{}", format.ending)));
+    candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| folder.join(format!("{name}.ply")))
+}
+
+/// Checks that a splat could be written at `path`. Call it before the work starts.
+///
+/// # Errors
+/// Returns an error for an unknown extension or a format that this build can't write, or a request error that names the path.
+pub fn check_writable_splat(path: &Path) -> Result<()> {
+    format_of(path)?.codec(path)?;
+    check_writable_file(path)
+}
+
+/// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
+///
+/// # Errors
+/// Returns an error for an unknown extension, or a format that this build can't write.
+pub fn limits_of(path: &Path) -> Result<ShLimits> {
+    Ok((format_of(path)?.codec(path)?.limits)())
+}
+
+/// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
+/// length 0 are left out, and counted in [`Splat::warnings`].
+///
+/// # Errors
+/// Returns an error for an unknown extension, or if the file can't be read or violates its format, a Gaussian has a value that isn't finite
+/// or is out of range, or no Gaussian can be drawn.
+pub fn read_splat(path: &Path) -> Result<Splat> {
+    let Contents { splat, invalid } = read_contents(path)?;
+    invalid.refuse(path)?;
+    drawable(path, splat.len(), splat)
+}
+
+/// Reads a splat like [`read_splat`], but also leaves out the Gaussians with invalid values.
+///
+/// # Errors
+/// Returns the errors of [`read_splat`], except for invalid values.
+pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
+    let Contents { splat, invalid } = read_contents(path)?;
+    drawable(path, splat.len(), invalid.leave_out(path, splat))
+}
+
+fn read_contents(path: &Path) -> Result<Contents> {
+    let named = format_of(path)?;
+    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    (recognize(&bytes).unwrap_or(named).codec(path)?.read)(path, &bytes)
+}
+
+/// Returns the format whose magic number `bytes` begin with.
+fn recognize(bytes: &[u8]) -> Option<&'static Format> {
+    FORMATS.iter().find(|format| (format.recognizes)(bytes))
+}
+
+/// Returns `true` if readers would recognize `bytes` as the beginning of a file in another format than `.splat`.
+pub(crate) fn is_recognized(bytes: &[u8]) -> bool {
+    recognize(bytes).is_some()
+}
+
+/// Creates the splat from the valid Gaussians of a file that has `all` in total, without those that have no rotation.
+fn drawable(path: &Path, all: usize, valid: Splat) -> Result<Splat> {
+    let splat = valid.without_missing_rotations(path.display());
+    if splat.is_empty() && all > 0 {
+        let found = format!("{all}, none of which can be drawn");
+        let expected = "finite numbers, and rotations whose length isn't 0";
+        return Err(Error::input(path, "the number of Gaussians", found, expected));
+    }
+    Ok(Splat { origin: read_origin(path)?, ..splat })
+}
+
+/// Writes a splat atomically in world coordinates, in the format of the extension of `path`. The origin file of an older splat there is
+/// removed. Gaussians whose quaternion has length 0 are left out; [`Splat::without_missing_rotations`] counts them.
+///
+/// # Errors
+/// Returns an error for an unknown extension, or if a list of the splat has the wrong length, or the format can't hold the Gaussians, for
+/// example because a value isn't finite, or the file can't be written.
+pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
+    match splat.origin == DVec3::ZERO {
+        true => write_local_splat(path, splat),
+        false => write_local_splat(path, &splat.with_origin(DVec3::ZERO)),
+    }
+}
+
+/// Writes a splat like [`write_splat`], but with coordinates relative to its origin, which is written to
+/// [`origin_file`](crate::origin_file) unless it is zero.
+///
+/// # Errors
+/// Returns the errors of [`write_splat`].
+pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
+    let codec = format_of(path)?.codec(path)?;
+    splat.check_lengths()?;
+    let (rotated, _) = with_rotation(splat);
+    write_with_origin(path, splat.origin, || {
+        rotated.check_finite(path)?;
+        (codec.write)(path, &rotated)
+    })
+}

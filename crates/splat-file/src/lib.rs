@@ -1,0 +1,24 @@
+#![doc = include_str!("../README.md")]
+
+mod compressed_ply;
+mod dot_splat;
+mod formats;
+mod invalid;
+mod limits;
+mod morton;
+mod origin;
+mod ply;
+mod ply_body;
+mod ply_header;
+mod rotations;
+mod splat;
+mod spz;
+
+pub use formats::{
+    check_writable_splat, find_splat, is_splat_name, limits_of, read_splat, read_splat_without_invalid,
+    write_local_splat, write_splat,
+};
+pub use globalsplat_files::{Error, Result};
+pub use limits::ShLimits;
+pub use origin::{check_writable_origin, origin_file, splat_files};
+pub use splat::{MIN_SCALE, OPACITY_MARGIN, SH_C0, Splat};

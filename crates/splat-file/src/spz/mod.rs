@@ -1,0 +1,26 @@
+//! Niantic's SPZ (spec 10.13): a byte for most values, grouped by kind over all Gaussians, compressed. Versions 1 to 4 are read. Version 3
+//! is written: it is the oldest whose rotations are precise enough, and programs that read version 4 read it too.
+
+#[cfg(feature = "spz")]
+mod axes;
+#[cfg(feature = "spz")]
+mod codec;
+#[cfg(feature = "spz")]
+mod container;
+
+#[cfg(feature = "spz")]
+pub(crate) use codec::CODEC;
+
+/// The functions of the format are absent from a build without the feature `spz`.
+#[cfg(not(feature = "spz"))]
+pub(crate) const CODEC: Option<crate::formats::Codec> = None;
+
+/// First bytes of every version, after gzip is decompressed.
+const MAGIC: [u8; 4] = *b"NGSP";
+/// First bytes of gzip. In the next byte, the flags, the upper three bits are 0.
+const GZIP: [u8; 3] = [0x1f, 0x8b, 8];
+
+/// Returns `true` if `bytes` begin like an SPZ of any version.
+pub(crate) fn recognizes(bytes: &[u8]) -> bool {
+    bytes.starts_with(&MAGIC) || (bytes.starts_with(&GZIP) && bytes.get(3).is_some_and(|flags| flags < &0x20))
+}

@@ -1,0 +1,237 @@
+//! Invalid files, and files of which only a part of the Gaussians can be drawn.
+
+mod common;
+
+use common::{
+    assert_says, body_of_ply, endings, files_with_invalid_values, random_splat, refused, refused_file, set,
+    small_gaussians, write_changed_ply, write_ply, written,
+};
+use globalsplat_splat_file::{read_splat, read_splat_without_invalid, write_splat};
+
+fn in_header(bytes: &mut Vec<u8>, from: &str, to: &str) {
+    let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+    bytes.splice(at..at + from.len(), to.bytes());
+}
+
+#[test]
+fn bad_plys() {
+    let header = |from: &'static str, to: &'static str| refused("ply", |bytes| in_header(bytes, from, to));
+    assert_says(&header("little", "middle"), &["the format is binary_middle_endian", "ascii"]);
+    assert_says(&header("format", "comment"), &["the line format is absent"]);
+    assert_says(
+        &header("vertex 300", "vertex many"),
+        &["rows of the element vertex is many", "a whole number"],
+    );
+    assert_says(&header("element vertex 300\n", ""), &["the property x is without an element"]);
+    assert_says(&header("element vertex", "element point"), &["the element vertex is absent"]);
+    assert_says(&header("float opacity", "half opacity"), &["the type of opacity is half"]);
+    assert_says(&header("float opacity", "float half opacity"), &["the type of opacity is \"float half\""]);
+    assert_says(&header("float opacity", "list float opacity"), &["the type of opacity"]);
+    assert_says(&header("float opacity", "list uchar float opacity"), &["property opacity is a list"]);
+    assert_says(&header("f_rest_8", "f_rest_9"), &["f_rest_* is 8 properties", "0, 9, 24 or 45"]);
+    assert_says(&header("vertex 300", "vertex 1000000000"), &["the body is cut short", "104000000000 bytes"]);
+    assert_says(&header("vertex 300", "vertex 18446744073709551615"), &["the body is cut short"]);
+    assert_says(&header("binary_little_endian", "ascii"), &["in row 0 of vertex is", "expected a number"]);
+    let list = |kind: &str| {
+        let line = format!("element face 1000000000000\nproperty list {kind} int i\nelement vertex");
+        refused("ply", |bytes| in_header(bytes, "element vertex", &line))
+    };
+    assert_says(&list("uchar"), &["the body is cut short"]);
+    let lengths = |length: f64| {
+        let line = "element face 1\nproperty list double int i\nelement vertex";
+        refused("ply", |bytes| {
+            in_header(bytes, "element vertex", line);
+            let body = body_of_ply(bytes);
+            bytes.splice(body..body, length.to_le_bytes());
+        })
+    };
+    assert_says(&lengths(-1.), &["the length of the list i in row 0 of face is -1", "a whole number"]);
+    assert_says(&lengths(f64::NAN), &["the length of the list i", "NaN"]);
+    assert_says(&lengths(1e300), &["the body is cut short"]);
+}
+
+#[test]
+fn bad_compressed_plys() {
+    let header =
+        |from: &'static str, to: &'static str| refused("compressed.ply", |bytes| in_header(bytes, from, to));
+    assert_says(&header("element chunk", "element chunks"), &["the element chunk is absent"]);
+    assert_says(
+        &header("element chunk 2", "element chunk 1"),
+        &["the number of chunks is 1, expected 2 for 300"],
+    );
+    assert_says(&header("vertex 300", "vertex 4000000000"), &["the body is cut short"]);
+    assert_says(&header("float max_b", "float most_b"), &["property max_b is absent"]);
+    assert_says(
+        &header("uint packed_scale", "int packed_scale"),
+        &["the type of packed_scale is another", "uint"],
+    );
+    assert_says(&header("uchar f_rest_3", "char f_rest_3"), &["the type of f_rest_3 is another", "uchar"]);
+    assert_says(
+        &header("element sh 300", "element sh 299"),
+        &["rows of the element sh is 299, expected 300"],
+    );
+    assert_says(&header("uchar f_rest_8", "uchar f_rest_x"), &["f_rest_* is 8 properties"]);
+    assert_says(
+        &refused("compressed.ply", |bytes| bytes.truncate(bytes.len() - 1)),
+        &["the body is cut short"],
+    );
+    let bound = refused("compressed.ply", |bytes| {
+        let body = body_of_ply(bytes);
+        bytes[body..body + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    });
+    assert_says(&bound, &["min_x of chunk 0 is NaN", "a finite number"]);
+}
+
+#[test]
+fn bad_splats() {
+    assert_says(
+        &refused("splat", |bytes| bytes.truncate(33)),
+        &["the length is 33 bytes", "32 bytes for each"],
+    );
+    assert_says(&refused("splat", |bytes| bytes.clear()), &["the length is 0 bytes"]);
+    let number = |at: usize, value: f32| {
+        refused("splat", |bytes| bytes[64 + at..][..4].copy_from_slice(&value.to_le_bytes()))
+    };
+    assert_says(&number(4, f32::NAN), &["the position of Gaussian 2 is NaN", "finite numbers"]);
+    assert_says(&number(20, -1.), &["the scale of Gaussian 2 is -1", "0 or more"]);
+}
+
+/// Values that a format can't store are refused, and nothing is written.
+#[test]
+fn numbers_that_do_not_fit() {
+    let folder = tempfile::tempdir().unwrap();
+    for ending in endings() {
+        let path = folder.path().join(format!("a.{ending}"));
+        let splat = random_splat(3, 1, 1);
+        let mut changed = [(); 5].map(|()| splat.clone());
+        changed[0].means[1] = [f32::NAN; 3];
+        changed[1].log_scales[2][1] = f32::INFINITY;
+        changed[2].quaternions[0][3] = f32::INFINITY;
+        changed[3].opacity_logits[1] = f32::NAN;
+        changed[4].sh[5][0] = f32::NEG_INFINITY;
+        for splat in changed {
+            let error = write_splat(&path, &splat).unwrap_err();
+            assert_says(&error.to_string(), &["numbers that aren't finite"]);
+            assert!(!error.is_request());
+        }
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+/// Rotations of length 0 are dropped by readers and writers, and counted, since the rasterizer doesn't draw such Gaussians.
+#[test]
+fn gaussians_without_a_rotation_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut splat = random_splat(300, 1, 11);
+    splat.quaternions[100..150].fill([0.; 4]);
+    let drawable = splat.clone().without_missing_rotations("the splat");
+    assert_eq!(drawable.len(), 250);
+    let expected = "the splat: 50 of 300 Gaussians are left out, whose rotations have length 0";
+    assert_eq!(drawable.warnings, [expected]);
+    for ending in endings() {
+        let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
+        assert_eq!((copy.len(), copy.warnings.len()), (250, 0), "{ending}");
+    }
+    // Files of other programs: zeros, and values that underflow, in a PLY; the middle of the byte range in a .splat.
+    let mut columns = small_gaussians();
+    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
+    let ply = folder.path().join("zero.ply");
+    write_ply(&ply, &columns, &[]);
+    let dot_splat = written(folder.path(), "zero.splat", &random_splat(3, 0, 1));
+    let mut bytes = std::fs::read(&dot_splat).unwrap();
+    bytes[32 + 28..64].fill(128);
+    std::fs::write(&dot_splat, bytes).unwrap();
+    for path in [&ply, &dot_splat] {
+        let splat = read_splat(path).unwrap();
+        assert_eq!(splat.len(), 2);
+        let told = "1 of 3 Gaussians are left out, whose rotations have length 0";
+        assert_eq!(splat.warnings, [format!("{}: {told}", path.display())]);
+    }
+}
+
+/// Gaussians with invalid values are refused with the field's name, or left out and counted.
+#[test]
+fn invalid_values_are_refused_or_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    for (path, field, property) in files_with_invalid_values(folder.path()) {
+        assert_says(&refused_file(&path), &[field, "`globalsplat convert` leaves out"]);
+        let repaired = read_splat_without_invalid(&path).unwrap();
+        assert_eq!(repaired.len(), 2);
+        let expected = format!(
+            "{}: 1 of 3 Gaussians are left out, whose numbers aren't finite or are out of range: {property}",
+            path.display()
+        );
+        assert_eq!(repaired.warnings, [expected]);
+        for ending in endings() {
+            let copy = read_splat(&written(folder.path(), &format!("repaired.{ending}"), &repaired)).unwrap();
+            assert_eq!((copy.len(), copy.warnings.len()), (2, 0), "{ending}");
+        }
+    }
+    // Each property is named once, up to a maximum number; a Gaussian counts once.
+    let many = write_changed_ply(folder.path(), "many.ply", |columns| {
+        columns.iter_mut().for_each(|(_, values)| values[0] = f64::NAN);
+        set(columns, "y", 2, f64::NAN);
+    });
+    let repaired = read_splat_without_invalid(&many).unwrap();
+    assert_says(
+        &repaired.warnings[0],
+        &["2 of 3 Gaussians", ": x, y, z, f_dc_0, f_dc_1, f_dc_2 and 17 more"],
+    );
+    let none = write_changed_ply(folder.path(), "none.ply", |columns| {
+        columns.iter_mut().for_each(|(_, values)| *values = [f64::NAN; 3]);
+    });
+    let error = read_splat_without_invalid(&none).unwrap_err().to_string();
+    assert_says(&error, &["the number of Gaussians is 3, none of which"]);
+}
+
+/// An invalid bound of a chunk of a compressed PLY makes all of the chunk's Gaussians invalid.
+#[test]
+fn compressed_gaussians_without_bounds_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = written(folder.path(), "a.compressed.ply", &random_splat(300, 0, 4));
+    let mut bytes = std::fs::read(&path).unwrap();
+    let body = body_of_ply(&bytes);
+    bytes[body + 4..][..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(&path, bytes).unwrap();
+    let repaired = read_splat_without_invalid(&path).unwrap();
+    assert_eq!(repaired.len(), 44);
+    assert_says(&repaired.warnings[0], &["256 of 300 Gaussians are left out", ": min_y"]);
+}
+
+/// A PLY without the properties that make Gaussians of points is reported as a point cloud.
+#[test]
+fn point_clouds_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("points.ply");
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| name.len() == 1);
+    columns.extend(["red", "green", "blue"].map(|name| (name, [200.; 3])));
+    write_ply(&path, &columns, &["red", "green", "blue"].map(|name| (name, "uchar")));
+    let told = ["points.ply: the element vertex is a point cloud, without opacity, scale_* and rot_*"];
+    assert_says(&refused_file(&path), &told);
+    for absent in ["opacity", "scale_0", "rot_2", "f_dc_1"] {
+        let mut columns = small_gaussians();
+        columns.retain(|(name, _)| *name != absent);
+        write_ply(&path, &columns, &[]);
+        assert_says(&refused_file(&path), &[&format!("property {absent} is absent")]);
+    }
+}
+
+/// A build without SPZ says so, whatever the file's name, before anything is written.
+#[cfg(not(feature = "spz"))]
+#[test]
+fn spz_needs_its_feature() {
+    let folder = tempfile::tempdir().unwrap();
+    let expected = ["the format is .spz", "its feature spz"];
+    for name in ["a.spz", "a.splat"] {
+        let path = folder.path().join(name);
+        std::fs::write(&path, [0x1f, 0x8b, 8, 0]).unwrap();
+        assert_says(&refused_file(&path), &expected);
+    }
+    let path = folder.path().join("b.spz");
+    assert_says(&write_splat(&path, &random_splat(3, 0, 1)).unwrap_err().to_string(), &expected);
+    let error = globalsplat_splat_file::check_writable_splat(&path).unwrap_err();
+    assert_says(&error.to_string(), &expected);
+    assert_says(&globalsplat_splat_file::limits_of(&path).unwrap_err().to_string(), &expected);
+    assert!(!path.exists());
+}

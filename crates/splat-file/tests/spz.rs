@@ -1,0 +1,202 @@
+//! SPZ: its bytes, older versions, and invalid files.
+#![cfg(feature = "spz")]
+
+mod common;
+
+use common::{assert_says, largest_error, random_splat, refused, refused_file, written};
+use globalsplat_splat_file::{Splat, read_splat, read_splat_without_invalid, write_splat};
+use std::io::{Read, Write};
+
+/// An SPZ file has the values of the first Gaussian at the offsets of SPZ's documentation.
+#[test]
+fn an_spz_is_as_documented() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = Splat::new(
+        1,
+        vec![[1., 2., 3.]],
+        vec![[-1., -2., -3.]],
+        vec![[0.9, 0.1, 0.2, 0.3]],
+        vec![0.5],
+        vec![[0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]],
+    )
+    .unwrap();
+    let bytes = std::fs::read(written(folder.path(), "one.spz", &splat)).unwrap();
+    let mut unfolded = vec![];
+    flate2::bufread::GzDecoder::new(&bytes[..]).read_to_end(&mut unfolded).unwrap();
+    assert_eq!(unfolded[..4], *b"NGSP");
+    assert_eq!(unfolded[4..16], [3, 0, 0, 0, 1, 0, 0, 0, 1, 21, 0, 0], "version, Gaussians, degree, bits");
+    // Niantic's library gives these bytes for these values, except for positions, which it stores with 12 fractional bits, and
+    // coefficients.
+    assert_eq!(unfolded[25..36], hex("9f83878b908070de52aac4")[..]);
+    // Bytes of the coefficients: −0.1·128 + 128 and so on; y and z change their sign.
+    assert_eq!(unfolded[36..], hex("73665a4d4033dae6f3"));
+    let fixed = |at: usize| i32::from_le_bytes([0, unfolded[at], unfolded[at + 1], unfolded[at + 2]]) >> 8;
+    assert_eq!([16, 19, 22].map(fixed), [1 << 21, -(2 << 21), -(3 << 21)]);
+}
+
+fn hex(text: &str) -> Vec<u8> {
+    let digits = text.as_bytes().chunks_exact(2);
+    digits.map(|two| u8::from_str_radix(std::str::from_utf8(two).unwrap(), 16).unwrap()).collect()
+}
+
+/// Each of the four versions of SPZ gives the same Gaussian, from bytes written by the format's documentation.
+#[test]
+fn older_versions_of_spz_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let head = |version: u8| [b"NGSP", &[version, 0, 0, 0, 1, 0, 0, 0, 1, 12, 0, 0][..]].concat();
+    let shape = hex("9f83878b908070");
+    let harmonics = hex("706858504030d8e8f0");
+    // Positions 1, 2 and 3 as half-precision floats, and with 12 fractional bits; x, y and z of the rotation in a byte each.
+    let halves = [0x3c00u16, 0xc000, 0xc200].map(u16::to_le_bytes).concat();
+    let one = [head(1), halves, shape.clone(), hex("8d6558"), harmonics.clone()].concat();
+    let two = [head(2), hex("00100000e0ff00d0ff"), shape.clone(), hex("8d6558"), harmonics.clone()].concat();
+    let three = [head(3), hex("00100000e0ff00d0ff"), shape, hex("de52aac4"), harmonics].concat();
+    // File written by Niantic's library.
+    let four = hex(
+        "4e4753500400000001000000010c000620000000000000000000000000000000120000000000000009000000000000000a0000000000000\
+         001000000000000000c0000000000000003000000000000000c0000000000000003000000000000000d000000000000000400000000000\
+         00012000000000000000900000000000000\
+         28b52ffd200949000000100000e0ff00d0ff28b52ffd20010900009f28b52ffd200319000083878b28b52ffd200319000090807028b52ff\
+         d2004210000de52aac428b52ffd2009490000706858504030d8e8f0",
+    );
+    for (version, bytes) in [(1, gzip(&one)), (2, gzip(&two)), (3, gzip(&three)), (4, four)] {
+        let path = folder.path().join(format!("{version}.spz"));
+        std::fs::write(&path, bytes).unwrap();
+        let splat = read_splat(&path).unwrap_or_else(|e| panic!("{e}"));
+        let near = |found: &[f32], expected: &[f32], step: f64| {
+            let error = largest_error(found, expected);
+            assert!(error <= step, "version {version}: {found:?}, not {expected:?}");
+        };
+        near(&splat.means[0], &[1., 2., 3.], 0.);
+        near(&splat.log_scales[0], &[-1., -2., -3.], 1. / 32.);
+        let length = 0.95f32.sqrt();
+        near(&splat.quaternions[0], &[0.9 / length, 0.1 / length, 0.2 / length, 0.3 / length], 0.006);
+        near(&[splat.opacity(0)], &[0.622_459], 0.51 / 255.);
+        let expected = [0.1, 0.2, 0.3, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+        near(splat.sh.as_flattened(), &expected, 1. / 32. + 1e-6);
+    }
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(vec![], flate2::Compression::default());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+/// The axes that an extension of an SPZ names are applied: here those of PLYs, for which no sign changes.
+#[test]
+fn the_axes_of_an_spz_are_applied() {
+    let folder = tempfile::tempdir().unwrap();
+    let with_axes = |number: u32| {
+        let head = [b"NGSP", &[3, 0, 0, 0, 1, 0, 0, 0, 1, 12, 2, 0][..]].concat();
+        let extension = [0xADBE_0003u32, 4, number].map(u32::to_le_bytes).concat();
+        let unknown = [0x1234_0001u32, 4, 0].map(u32::to_le_bytes).concat();
+        let streams = hex("00100000e0ff00d0ff9f83878b908070de52aac4706858504030d8e8f0");
+        let path = folder.path().join(format!("{number}.spz"));
+        std::fs::write(&path, gzip(&[head, streams, unknown, extension].concat())).unwrap();
+        path
+    };
+    let [rub, rdf] = [4, 6].map(|number| read_splat(&with_axes(number)).unwrap());
+    let [x, y, z] = rub.means[0];
+    assert_eq!(rdf.means[0], [x, -y, -z]);
+    // The order of degree 1 is y, z, x.
+    let signs = [1f32, -1., -1., 1.];
+    let turned = rub.sh.iter().zip(signs).map(|(colour, sign)| colour.map(|channel| sign * channel));
+    assert_eq!(rdf.sh, turned.collect::<Vec<_>>());
+    let [w, x, y, z] = rub.quaternions[0];
+    assert_eq!(rdf.quaternions[0], [w, x, -y, -z]);
+    assert_says(&refused_file(&with_axes(9)), &["the coordinate system is 9", "1 to 8"]);
+}
+
+#[test]
+fn bad_spzs() {
+    let unfolded = |change: &dyn Fn(&mut Vec<u8>)| {
+        refused("spz", |bytes| {
+            let mut inside = vec![];
+            flate2::bufread::GzDecoder::new(&bytes[..]).read_to_end(&mut inside).unwrap();
+            change(&mut inside);
+            *bytes = gzip(&inside);
+        })
+    };
+    assert_says(&unfolded(&|inside| inside[0] = b'n'), &["the first bytes is", "NGSP"]);
+    assert_says(&unfolded(&|inside| inside[4] = 5), &["the version is 5, expected 1 to 4"]);
+    assert_says(&unfolded(&|inside| inside[4] = 4), &["the version in gzip is 4, expected 1 to 3"]);
+    assert_says(&unfolded(&|inside| inside[12] = 4), &["the SH degree is 4, expected 0 to 3"]);
+    assert_says(&unfolded(&|inside| inside[13] = 31), &["fractional bits is 31, expected 0 to 30"]);
+    assert_says(&unfolded(&|inside| inside[8] += 1), &["the body is cut short", "for 301 Gaussians"]);
+    assert_says(&unfolded(&|inside| inside.truncate(9)), &["the header is 9 bytes"]);
+    let claim = unfolded(&|inside| inside[8..12].copy_from_slice(&1_000_000_000u32.to_le_bytes()));
+    assert_says(&claim, &["the number of Gaussians is 1000000000, 29000000000 bytes", "256 times"]);
+    let bomb = unfolded(&|inside| {
+        inside[8..12].copy_from_slice(&200_000u32.to_le_bytes());
+        inside.resize(6_000_000, 0);
+    });
+    assert_says(&bomb, &["the number of Gaussians is 200000", "256 times the file's bytes"]);
+    let extension = unfolded(&|inside| {
+        inside[14] = 2;
+        inside.extend([3, 0, 0xbe, 0xad, 9, 0, 0, 0, 6]);
+    });
+    assert_says(&extension, &["an extension is cut short: 1 bytes, expected 9 bytes"]);
+    assert_says(&refused("spz", |bytes| bytes.truncate(100)), &["damaged", "a whole gzip"]);
+    assert_says(&refused("spz", |bytes| *bytes.last_mut().unwrap() ^= 1), &["the end is damaged"]);
+    assert_says(&refused("spz", |bytes| *bytes = b"no gzip".to_vec()), &["the file is no SPZ"]);
+}
+
+/// A table of contents that doesn't match the data is refused.
+#[test]
+fn bad_spzs_of_version_4() {
+    let plain = |change: &dyn Fn(&mut Vec<u8>)| {
+        refused("spz", |bytes| {
+            let head = [b"NGSP", &[4, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 5, 32, 0, 0, 0][..], &[0; 12]].concat();
+            let streams = [9, 1, 3, 3, 4].map(|length| zstd::encode_all(&vec![128; length][..], 1).unwrap());
+            let entries = streams.iter().flat_map(|one| [(one.len() as u64).to_le_bytes(), [0; 8]].concat());
+            *bytes = [head, entries.collect(), streams.concat()].concat();
+            change(bytes);
+        })
+    };
+    assert_says(&plain(&|bytes| bytes[4] = 3), &["the version outside of gzip is 3, expected 4"]);
+    assert_says(&plain(&|bytes| bytes.truncate(20)), &["the header is 20 bytes, expected 32"]);
+    assert_says(&plain(&|bytes| bytes[15] = 200), &["the table of contents is at 32", "200 entries"]);
+    assert_says(&plain(&|bytes| bytes[16..20].fill(255)), &["the table of contents is at 4294967295"]);
+    assert_says(&plain(&|bytes| bytes[15] = 4), &["stream"]);
+    assert_says(&plain(&|bytes| bytes[32..40].fill(255)), &["stream 0 is cut short"]);
+    assert_says(&plain(&|bytes| bytes[8] = 2), &["stream 0 is 9 bytes or more, expected 18 bytes for 2"]);
+    assert_says(&plain(&|bytes| bytes[12] = 1), &["stream 5 is absent, expected one of 9 bytes"]);
+    assert_says(&plain(&|bytes| bytes[32 + 5 * 16] = 0), &["stream 0 is damaged"]);
+    assert_says(&plain(&|bytes| bytes[8..12].fill(255)), &["the number of Gaussians is 4294967295"]);
+}
+
+/// Positions that 24 bits can't hold are refused, and nothing is written. Values that nearly exceed the range are as exact as 24 bits allow.
+#[test]
+fn positions_have_24_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut far = random_splat(3, 1, 1);
+    far.means[1] = [1e7; 3];
+    let error = write_splat(&folder.path().join("a.spz"), &far).unwrap_err().to_string();
+    assert_says(&error, &["a coordinate is 10000000, expected at most 8388607"]);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    far.means[1] = [-8_388_000.; 3];
+    let near = read_splat(&written(folder.path(), "a.spz", &far)).unwrap();
+    assert!(largest_error(near.means.as_flattened(), far.means.as_flattened()) <= 0.5);
+}
+
+/// The oldest version has half-precision floats, which needn't be finite.
+#[test]
+fn positions_of_version_1_are_checked() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("half.spz");
+    std::fs::write(&path, gzip(&half_precision())).unwrap();
+    let told = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
+    assert_says(&refused_file(&path), &told);
+    let repaired = read_splat_without_invalid(&path).unwrap();
+    assert_eq!(repaired.len(), 2);
+    assert_says(&repaired.warnings[0], &["1 of 3 Gaussians are left out", ": position"]);
+}
+
+/// Returns the decompressed contents of an SPZ of version 1, in which one of three Gaussians has a NaN.
+fn half_precision() -> Vec<u8> {
+    let head = [b"NGSP", &[1, 0, 0, 0, 3, 0, 0, 0, 0, 12, 0, 0][..]].concat();
+    let halves = [0x3c00u16, 0x3c00, 0x4400, 0x3c00, 0x7e00, 0x4400, 0xbc00, 0x3c00, 0x4400];
+    let rest = [vec![200; 3], vec![128; 9], vec![130; 9], vec![128; 9]].concat();
+    [head, halves.map(u16::to_le_bytes).concat(), rest].concat()
+}

@@ -1,0 +1,54 @@
+//! Splats fitted to the format of a file, and the precision of their positions in it.
+
+use crate::error::Result;
+use crate::render::fit_harmonics;
+use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
+use glam::DVec3;
+use globalsplat_splat_file::{ShLimits, Splat, limits_of};
+use std::path::Path;
+
+/// Maximum ratio of the spacing of float32 positions to the scene's typical distance whose effect on rendered images is invisible.
+const MAX_SPACING_RATIO: f64 = 1e-4;
+
+/// Returns `splat` with spherical harmonics within `limits` and those of the format of `path`, which look the same from `cameras`.
+///
+/// # Errors
+/// Returns an error for an unknown extension.
+pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camera]) -> Result<Splat> {
+    let limits = limits.intersect(&limits_of(path)?);
+    let gaussians = Gaussians::from_splat(splat);
+    let frame = gaussians.local_frame(splat.origin);
+    let local = gaussians.to_local(&frame, splat.origin);
+    let fitted = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
+    // Logits of opacities that stay are kept to the bit.
+    let logits = RawGaussians::of(&fitted).opacity_logits;
+    let kept = RawGaussians::from_splat(splat).opacity_logits;
+    let logits = logits.where_self(&fitted.opacities.not_equal_tensor(&gaussians.opacities), &kept);
+    let sh = Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec();
+    Ok(Splat {
+        opacity_logits: Vec::try_from(logits.flatten(0, -1))?,
+        sh,
+        sh_degree: fitted.sh.size()[2].isqrt() as usize - 1,
+        warnings: vec![],
+        ..splat.clone()
+    })
+}
+
+/// Returns a message about the rounding of positions to float32 when `splat` is written in world coordinates, if it is visible in rendered
+/// images.
+pub fn rounding_warning(splat: &Splat) -> Option<String> {
+    if splat.origin == DVec3::ZERO {
+        return None;
+    }
+    let frame = splat_frame(splat);
+    let farthest = frame.origin.abs().max_element();
+    let spacing = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
+    let share = spacing / frame.typical_distance();
+    (share > MAX_SPACING_RATIO).then(|| {
+        format!(
+            "positions are rounded: {farthest:.3e} units from the origin, float32 has one every {spacing} units, {:.2} % of the \
+             scene's typical distance",
+            100. * share
+        )
+    })
+}
