@@ -15,9 +15,9 @@ chmod +x "$out/rustc"
 export RUSTC_WORKSPACE_WRAPPER="$out/rustc" CXXFLAGS="--coverage" LLVM_PROFILE_FILE="$out/profile/%m.profraw"
 rm -rf "$out/profile"
 find "$out" -name '*.gcda' -delete
-test=$(cargo test --release --locked --no-default-features --test fuzz_seeds --no-run --message-format json |
-    sed -n 's/.*"executable":"\([^"]*fuzz_seeds[^"]*\)".*/\1/p' | tail -1)
-"$test" >/dev/null
+test=$(cargo test --release --locked --test library --no-run --message-format json |
+    sed -n 's/.*"executable":"\([^"]*library-[^"]*\)".*/\1/p' | tail -1)
+"$test" fuzz_seeds:: >/dev/null
 
 tools=$(rustc --print sysroot)/lib/rustlib/$(rustc -vV | sed -n 's/host: //p')/bin
 "$tools/llvm-profdata" merge -sparse "$out"/profile/*.profraw -o "$out/profile/all"

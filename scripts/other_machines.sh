@@ -5,7 +5,7 @@
 #                                        folder with a space that only its owner may write to, in another language and time zone,
 #                                        without standard input; then the demo at a reduced size
 #   scripts/other_machines.sh small      tests of numerical code, on one core with SSE2
-#   scripts/other_machines.sh ordinary view splat    only tests/view.rs and tests/splat.rs of the `ordinary` tests
+#   scripts/other_machines.sh ordinary view splat    only view.rs and splat.rs of the `ordinary` tests
 # Fails at the end if a test failed. If run as root, it makes the folders above the repository accessible to other users until it ends.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -23,50 +23,59 @@ end() {
 }
 trap end EXIT
 
-# The tests given by name, or all if none is given; lib and main are the unit tests of the library and the program.
+# The tests given by name, or all if none is given: a file tests/*/NAME.rs, or lib and main, the unit tests of the library and the program.
 chosen=("${@:2}")
-targets=()
 for name in "${chosen[@]}"; do
-    case "$name" in
-    lib) targets+=(--lib) ;;
-    main) targets+=(--bin globalsplat) ;;
-    *) targets+=(--test "$name") ;;
-    esac
+    [[ " lib main " == *" $name "* ]] || compgen -G "tests/*/$name.rs" >/dev/null || {
+        echo "other_machines: there is no test $name, expected lib, main or the name of a file in a folder of tests/" >&2
+        exit 2
+    }
 done
-built="$("${CARGO:-cargo}" test --release --locked --no-run "${targets[@]}" 2>&1)" || {
+built="$("${CARGO:-cargo}" test --release --locked --no-run -p globalsplat 2>&1)" || {
     echo "$built" >&2
     exit 1
 }
-# One line per test binary: its name (lib, main or the name of a file in tests/) and its path.
-tests="$(sed -nE 's|^ *Executable (unittests src/)?(tests/)?([a-z_]+)\.rs \((.*)\)$|\3 \4|p' <<<"$built")"
+# One line per test binary: its name (lib, main or the name of a folder in tests/) and its path.
+tests="$(sed -nE 's#^ *Executable (unittests src/(lib|main)\.rs|tests/([a-z]+)/main\.rs) \((.*)\)$#\2\3 \4#p' <<<"$built")"
 
 # Tests that do not depend on these conditions and are slow or only check text: output of compilers and other programs, reductions across
 # processes, out of memory. They run here only if given by name.
-alike=" architecture citations cuda distributed refused_memory viewers "
+alike=(architecture citations cuda distributed refused_memory viewers)
 
 failed=()
 # Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.
 run() {
-    local as=$1 name program ran=false
+    local as=$1 name binary filters
     shift
     : >"$GLOBALSPLAT_SKIPPED"
     chmod a+rw "$GLOBALSPLAT_SKIPPED"
-    while read -r name program; do
-        [ $# -eq 0 ] || [[ " $* " == *" $name "* ]] || continue
-        if [ ${#chosen[@]} -gt 0 ]; then
-            [[ " ${chosen[*]} " == *" $name "* ]] || continue
-        else
-            [[ $alike != *" $name "* ]] || continue
-        fi
-        [ "${program:0:1}" = / ] || program="$repository/$program"
-        echo "$as: $name"
-        ran=true
-        "$as" "$program" --quiet </dev/null || failed+=("$as: $name")
+    while read -r name binary; do
+        filters=()
+        case "$name" in
+        lib | main)
+            [[ $# -eq 0 || " $* " == *" $name "* ]] || continue
+            [[ ${#chosen[@]} -eq 0 || " ${chosen[*]} " == *" $name "* ]] || continue
+            ;;
+        *)
+            local file module
+            for file in tests/"$name"/*.rs; do
+                module="$(basename "$file" .rs)"
+                [[ $module != main ]] || continue
+                [[ $# -eq 0 || " $* " == *" $module "* ]] || continue
+                if [ ${#chosen[@]} -gt 0 ]; then
+                    [[ " ${chosen[*]} " == *" $module "* ]] || continue
+                else
+                    [[ " ${alike[*]} " != *" $module "* ]] || continue
+                fi
+                filters+=("$module::")
+            done
+            [ ${#filters[@]} -gt 0 ] || continue
+            ;;
+        esac
+        [ "${binary:0:1}" = / ] || binary="$repository/$binary"
+        echo "$as: $name ${filters[*]}"
+        "$as" "$binary" --quiet "${filters[@]}" </dev/null || failed+=("$as: $name")
     done <<<"$tests"
-    $ran || {
-        echo "other_machines: $as has no test named ${chosen[*]}" >&2
-        exit 2
-    }
     [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 

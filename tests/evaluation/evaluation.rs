@@ -1,0 +1,477 @@
+//! The evaluation protocol on a dataset: `eval --data ROOT --index FILE --out DIR`.
+
+use crate::common::has_lpips;
+use crate::common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
+use globalsplat::data::{Dataset, Split};
+use globalsplat::eval::read_evaluation;
+use globalsplat::io::{Weights, read_image, read_weights, write_png, write_sharded};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// Dataset of three rooms with five 256×256 photos each in `captures/`, the same in `chunks/`, their splats in `splats/`, and
+/// an index of two of them that also names a missing scene.
+struct Set {
+    folder: TempDir,
+}
+
+impl Set {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let captures = folder.path().join("captures");
+        rooms(&captures, 3, 5, 256);
+        succeed(&["pack", arg(&captures), "--out", arg(&folder.path().join("chunks"))]);
+        std::fs::create_dir(folder.path().join("splats")).unwrap();
+        for room in ["room_000", "room_001", "room_002"] {
+            let splat = folder.path().join(format!("splats/{room}.ply"));
+            std::fs::copy(captures.join(room).join("truth.ply"), splat).unwrap();
+        }
+        let set = Set { folder };
+        let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
+        set.write_index(&json!({"room_002": frames, "room_000": frames, "absent": frames, "left_out": null}));
+        set
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn write_index(&self, index: &Value) {
+        std::fs::write(self.path("re10k_3v.json"), index.to_string()).unwrap();
+    }
+
+    /// Returns the arguments for a subject and a dataset.
+    fn arguments(&self, subject: &[&str], data: &str) -> Vec<String> {
+        let (data, index, out) = (self.path(data), self.path("re10k_3v.json"), self.path("out"));
+        let rest = ["--data", arg(&data), "--index", arg(&index), "--out", arg(&out)];
+        ["eval"].iter().chain(subject).chain(&rest).map(|argument| argument.to_string()).collect()
+    }
+}
+
+/// Runs the command without LPIPS, which takes longer than all the rest.
+fn run(arguments: &[String], folder: &Path) -> (Option<i32>, String, String) {
+    let output = command(&text(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
+}
+
+#[test]
+fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    for data in ["chunks", "captures"] {
+        let (code, out, err) = run(&set.arguments(&["--splat", arg(&splats)], data), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        assert!(out.contains("2 of 3 scenes") && out.contains("LPIPS-VGG absent"), "{out}");
+        assert!(err.contains("left out: lpips_vgg and lpips_alex") && err.contains("make weights"), "{err}");
+        let evaluation = read_evaluation(&set.path("out")).unwrap();
+        let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
+        assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));
+        // The photos were rendered from these splats: the only difference is the photos' 8-bit rounding.
+        assert!(evaluation.summary.psnr > 50. && evaluation.summary.ssim > 0.999, "{:?}", evaluation.summary);
+        assert_eq!((evaluation.dataset.as_str(), evaluation.context_views), ("re10k", 3));
+        let views: Vec<&str> =
+            evaluation.scenes[0].scores.views.iter().map(|view| view.image.as_str()).collect();
+        assert_eq!(views, ["000001", "000003"]);
+        for file in ["report.html", "scores.json", "scores.csv", "scenes/room_000.jpg"] {
+            assert!(set.path("out").join(file).is_file(), "{file}");
+        }
+        let csv = std::fs::read_to_string(set.path("out/scores.csv")).unwrap();
+        assert_eq!(csv.lines().count(), 1 + 2 * 2);
+        std::fs::remove_dir_all(set.path("out")).unwrap();
+    }
+}
+
+#[test]
+fn a_stopped_sweep_goes_on_with_what_it_has() {
+    let set = Set::new();
+    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
+    let arguments = set.arguments(&["--precision", "f32", "--weights", arg(&weights)], "chunks");
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let first = read_evaluation(&set.path("out")).unwrap();
+    let efficiency = first.efficiency.expect("a model's cost");
+    assert_eq!(efficiency.timed_scenes, 1, "the first scene warms up");
+    assert!(efficiency.forward_seconds > 0. && efficiency.peak_memory_bytes > 1_000_000);
+    assert_eq!(first.image_size, [32, 32]);
+
+    // One scene's scores are incomplete, as if it hadn't been done yet; those of the other are reused unchecked.
+    let kept = set.path("out/scenes/room_000.json");
+    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
+    scores["psnr"] = json!(99.5);
+    std::fs::write(&kept, scores.to_string()).unwrap();
+    std::fs::write(set.path("out/scenes/room_002.json"), "{\"scene\": \"room_002\", \"psn").unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!(second.scenes[0].scores.psnr, 99.5);
+    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+
+    // Scores of another subject must not be mixed with these.
+    let splats = set.path("splats");
+    let error = refuse(&text(&set.arguments(&["--splat", arg(&splats)], "chunks")));
+    assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
+    // Scores of the same weights in another precision must not, either.
+    let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
+    let (code, _, err) = run(&half, set.folder.path());
+    // The line before it may warn that bf16 is slower.
+    let refusal = err.lines().last().unwrap_or_default();
+    assert!(
+        code == Some(2) && refusal.contains("evaluation.json: the evaluation is of tiny.safetensors"),
+        "{err}"
+    );
+    let elsewhere = set.path("half");
+    let half: Vec<String> = half
+        .into_iter()
+        .map(|a| if a == arg(&set.path("out")) { arg(&elsewhere).into() } else { a })
+        .collect();
+    assert_eq!(run(&half, set.folder.path()).0, Some(0));
+    let half = read_evaluation(&elsewhere).unwrap();
+    assert_eq!(half.method, "tiny bf16");
+    assert_ne!(half.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+    assert!((half.scenes[1].scores.psnr - first.scenes[1].scores.psnr).abs() < 0.2);
+
+    let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
+    set.write_index(&index);
+    let error = refuse(&text(&arguments));
+    assert!(error.contains("choose another --out"), "{error}");
+}
+
+#[test]
+fn what_changed_since_is_scored_again() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let first = read_evaluation(&set.path("out")).unwrap();
+    // Replace a splat by that of another scene.
+    std::fs::copy(splats.join("room_001.ply"), splats.join("room_000.ply")).unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert!(second.scenes[0].scores.psnr < first.scenes[0].scores.psnr - 10.);
+    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+
+    // LPIPS is added once its weights are available.
+    if !has_lpips() {
+        return;
+    }
+    assert!(second.scenes.iter().all(|scene| scene.scores.lpips_alex.is_none()));
+    succeed(&text(&arguments));
+    let third = read_evaluation(&set.path("out")).unwrap();
+    assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
+}
+
+/// Replaces the contents of the file at `path` without changing its size or modification time.
+fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
+    let metadata = std::fs::metadata(path).unwrap();
+    let (length, modified) = (metadata.len() as usize, metadata.modified().unwrap());
+    assert!(bytes.len() <= length, "{} bytes for {length}", bytes.len());
+    // Decoders ignore bytes behind an image's end.
+    bytes.resize(length, 0);
+    std::fs::write(path, bytes).unwrap();
+    let file = std::fs::File::options().write(true).open(path).unwrap();
+    file.set_times(std::fs::FileTimes::new().set_modified(modified)).unwrap();
+}
+
+#[test]
+fn what_changed_unnoticed_is_scored_again() {
+    let set = Set::new();
+    let photo = set.path("captures/room_000/images/001.png");
+    std::fs::write(&photo, [std::fs::read(&photo).unwrap(), vec![0; 1 << 20]].concat()).unwrap();
+    let arguments = set.arguments(&["--splat", arg(&set.path("splats"))], "captures");
+    let psnr = || {
+        let (code, _, err) = run(&arguments, set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        let evaluation = read_evaluation(&set.path("out")).unwrap();
+        evaluation.scenes.iter().map(|scene| scene.scores.psnr).collect::<Vec<_>>()
+    };
+    let first = psnr();
+    // Scores that are reused as long as nothing changes.
+    let kept = set.path("out/scenes/room_002.json");
+    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
+    scores["psnr"] = json!(99.5);
+    std::fs::write(&kept, scores.to_string()).unwrap();
+
+    let read = |name: &str| std::fs::read(set.path(name)).unwrap();
+    replace_unnoticed(&set.path("splats/room_000.ply"), read("splats/room_001.ply"));
+    let second = psnr();
+    assert!(second[0] < first[0] - 10. && second[1] == 99.5, "another splat: {first:?} and {second:?}");
+    replace_unnoticed(&photo, read("captures/room_002/images/000.png"));
+    let third = psnr();
+    assert!(third[0] != second[0] && third[1] == 99.5, "another photo: {second:?} and {third:?}");
+    let cameras = "captures/room_000/cameras.json";
+    let mut moved: Value = serde_json::from_slice(&read(cameras)).unwrap();
+    moved["views"][1]["c2w"][0][3] = json!(0.123);
+    std::fs::write(set.path(cameras), moved.to_string()).unwrap();
+    let fourth = psnr();
+    assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
+}
+
+#[test]
+fn sharded_weights_are_told_apart_by_their_shards() {
+    let set = Set::new();
+    let weights = read_weights(&tiny_weights(set.folder.path(), &set.path("captures"))).unwrap();
+    let plain = set.path("sharded.safetensors");
+    let index = write_sharded(&plain, &weights, 20_000).unwrap();
+    let index_text = std::fs::read(&index).unwrap();
+    let arguments =
+        |weights: &Path| set.arguments(&["--precision", "f32", "--weights", arg(weights)], "chunks");
+    // The name that they would have as one file, and the name of the index, give the same fingerprint.
+    for name in [&plain, &index] {
+        let (code, _, err) = run(&arguments(name), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+    }
+    let first = read_evaluation(&set.path("out")).unwrap();
+    let scale = |tensor: tch::Tensor| tensor * 1.5;
+    let tensors = weights.tensors.into_iter().map(|(name, tensor)| (name, scale(tensor))).collect();
+    write_sharded(&plain, &Weights { tensors, ..weights }, 20_000).unwrap();
+    assert_eq!(std::fs::read(&index).unwrap(), index_text, "the index alone doesn't tell");
+    for name in [&plain, &index] {
+        let error = refuse(&text(&arguments(name)));
+        let expected = "evaluation.json: the evaluation is of sharded.safetensors.index.json";
+        assert!(error.contains(expected) && error.contains("choose another --out"), "{error}");
+    }
+    std::fs::remove_dir_all(set.path("out")).unwrap();
+    assert_eq!(run(&arguments(&plain), set.folder.path()).0, Some(0));
+    let second = read_evaluation(&set.path("out")).unwrap();
+    assert_ne!(first.summary.psnr, second.summary.psnr);
+}
+
+#[test]
+fn made_up_videos_are_told_apart_by_what_they_depend_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let made_by = |pictures: &str| {
+        let name = format!("synth:seed=1,scenes=1{pictures}");
+        Dataset::open(Path::new(&name), Split::Test).unwrap().made_by().map(String::from)
+    };
+    let with_pictures = |grey: f64| {
+        let picture = tch::Tensor::full([3, 16, 16], grey, (tch::Kind::Float, tch::Device::Cpu));
+        write_png(&folder.path().join("a.png"), &picture).unwrap();
+        made_by(&format!(",pictures={}", folder.path().display()))
+    };
+    let (black, grey) = (with_pictures(0.), with_pictures(0.5));
+    assert!(black != grey && with_pictures(0.5) == grey, "{black:?} and {grey:?}");
+    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != grey));
+}
+
+/// Returns the largest resident size of this process's terminated children, in bytes.
+fn peak_of_children() -> u64 {
+    // SAFETY: rusage is plain data for which zero is valid, and getrusage only writes to it.
+    let usage = unsafe {
+        let mut usage: libc::rusage = std::mem::zeroed();
+        libc::getrusage(libc::RUSAGE_CHILDREN, &mut usage);
+        usage
+    };
+    usage.ru_maxrss as u64 * if cfg!(target_os = "macos") { 1 } else { 1024 }
+}
+
+#[test]
+fn photos_are_scored_one_at_a_time() {
+    // Each takes 24 MB as a tensor, and as much again as a render.
+    const PHOTOS: u64 = 40;
+    let (width, height) = (1632, 1224);
+    let folder = tempfile::tempdir().unwrap();
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images).unwrap();
+    let rows = tch::Tensor::linspace(0., 1., height, (tch::Kind::Float, tch::Device::Cpu));
+    let photo = rows.view([1, height, 1]).expand([3, height, width], false);
+    write_png(&images.join("000.png"), &photo).unwrap();
+    let frame = |i: u64| {
+        let file = format!("images/{i:03}.png");
+        if i > 0 {
+            std::fs::hard_link(images.join("000.png"), folder.path().join(&file)).unwrap();
+        }
+        let at = i as f64 * 0.05;
+        let pose = json!([[1., 0., 0., at], [0., 1., 0., 0.], [0., 0., 1., 2.], [0., 0., 0., 1.]]);
+        json!({"file_path": file, "transform_matrix": pose})
+    };
+    let frames: Vec<Value> = (0..PHOTOS).map(frame).collect();
+    let capture = json!({
+        "w": width, "h": height, "fl_x": 1300., "fl_y": 1300., "cx": 816., "cy": 612., "frames": frames,
+    });
+    std::fs::write(folder.path().join("transforms.json"), capture.to_string()).unwrap();
+    let (_rooms, room) = room();
+    let (splat, sheet) = (room.join("truth.ply"), folder.path().join("sheet.png"));
+    let scene = ["--scene", arg(folder.path()), "--json"];
+    for subject in [&["--splat", arg(&splat), "--sheet", arg(&sheet)][..], &["--renders", arg(&images)]] {
+        let arguments: Vec<String> =
+            ["eval"].iter().chain(subject).chain(&scene).map(|argument| argument.to_string()).collect();
+        let (code, out, err) = run(&arguments, folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        let scores: Value = serde_json::from_str(&out).unwrap();
+        assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
+        let is_shrunk = err.contains("sheet.png: pictures are shrunk to 1/2");
+        assert_eq!(is_shrunk, subject.contains(&"--sheet"), "{err}");
+        let peak = peak_of_children();
+        assert!(peak < PHOTOS * 24_000_000, "{subject:?}: {peak} bytes");
+    }
+    // 40 rows of three images of 816×612, and the gaps.
+    let size = read_image(&sheet).unwrap().dimensions();
+    assert_eq!(size, (3 * 816 + 2 * 4, PHOTOS as u32 * 612 + (PHOTOS as u32 - 1) * 4));
+}
+
+#[test]
+fn anybodys_pictures_are_scored_by_an_index() {
+    let set = Set::new();
+    for (room, folder) in [("room_000", "renders/room_000"), ("room_002", "renders/room_002/color")] {
+        let folder = set.path(folder);
+        std::fs::create_dir_all(&folder).unwrap();
+        for frame in [1, 3] {
+            let photo = set.path(&format!("captures/{room}/images/{frame:03}.png"));
+            std::fs::copy(photo, folder.join(format!("{frame:06}.png"))).unwrap();
+        }
+    }
+    let renders = set.path("renders");
+    let arguments = set.arguments(&["--renders", arg(&renders), "--name", "the photos", "--json"], "chunks");
+    let (code, out, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(0), "{err}");
+    let told: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(told["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
+    assert_eq!(read_evaluation(&set.path("out")).unwrap().method, "the photos");
+}
+
+#[test]
+fn a_scene_that_fails_is_named_and_the_others_are_scored() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
+    let photo = set.path("captures/room_002/images/003.png");
+    let bytes = std::fs::read(&photo).unwrap();
+    std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
+    let (code, _, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("room_002: ") && err.contains("images/003.png: the image is undecodable"), "{err}");
+    assert!(err.contains("1 scenes could not be scored"), "{err}");
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (1, 1));
+    assert_eq!(evaluation.failures[0].scene, "room_002");
+
+    // Once the photo is repaired, the same command does the rest.
+    std::fs::write(&photo, bytes).unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 0));
+}
+
+#[test]
+fn several_indices_make_one_report() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let more = set.path("acid_2v.json");
+    std::fs::write(&more, json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string()).unwrap();
+    let mut arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
+    arguments.extend(["--index".into(), arg(&more).into()]);
+    let (code, _, err) = run(&arguments, set.folder.path());
+    assert_eq!(code, Some(0), "{err}");
+    let report = std::fs::read_to_string(set.path("out/report.html")).unwrap();
+    assert!(report.contains("room_001") && report.contains("room_002"));
+    assert_eq!(read_evaluation(&set.path("out/acid_2v")).unwrap().dataset, "acid");
+    let twice = set.path("other/acid_2v.json");
+    std::fs::create_dir(set.path("other")).unwrap();
+    std::fs::copy(&more, &twice).unwrap();
+    arguments.extend(["--index".into(), arg(&twice).into()]);
+    assert!(refuse(&text(&arguments)).contains("two of them would go to"));
+}
+
+#[test]
+fn what_data_sets_are_called_is_told_apart() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let frames = std::fs::read(set.path("re10k_3v.json")).unwrap();
+    let named = |data: &str, index: &str| -> Vec<String> {
+        std::fs::write(set.path(index), &frames).unwrap();
+        let mut arguments = set.arguments(&["--splat", arg(&splats)], data);
+        let at = arguments.iter().position(|argument| argument == "--index").expect("an index");
+        arguments[at + 1] = arg(&set.path(index)).into();
+        arguments
+    };
+    // The index has two names, and the folder has neither.
+    let mut ambiguous = named("chunks", "acid_from_re10k_3v.json");
+    let error = refuse(&text(&ambiguous));
+    assert!(error.contains("acid_from_re10k_3v.json: ") && error.contains("acid or re10k"), "{error}");
+    assert!(error.contains("--dataset"), "{error}");
+    assert!(!set.path("out").exists(), "nothing was begun");
+    ambiguous.extend(["--dataset".into(), "ACID".into()]);
+    assert_eq!(run(&ambiguous, set.folder.path()).0, Some(0));
+    assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, "acid");
+
+    // The folder name decides; a part of a word doesn't count.
+    for folder in ["acid/test", "placid/test"] {
+        std::fs::create_dir_all(set.path(folder)).unwrap();
+        for file in ["000000.torch", "index.json"] {
+            std::fs::copy(set.path("chunks").join(file), set.path(folder).join(file)).unwrap();
+        }
+    }
+    for (folder, index, name) in [
+        ("acid", "acid_from_re10k_3v.json", "acid"),
+        ("acid/test", "acid_from_re10k_3v.json", "acid"),
+        ("placid/test", "index_3v.json", "placid"),
+    ] {
+        std::fs::remove_dir_all(set.path("out")).unwrap();
+        let (code, _, err) = run(&named(folder, index), set.folder.path());
+        assert_eq!(code, Some(0), "{err}");
+        assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, name);
+    }
+    let error = refuse(&text(&named("acid/test", "re10k_3v.json")));
+    assert!(error.contains("acid") && error.contains("re10k") && error.contains("--dataset"), "{error}");
+
+    // Another dataset whose folder has the same name.
+    let error = refuse(&text(&named("acid/test", "index_3v.json")));
+    assert!(
+        error.contains("evaluation.json: the evaluation is of ") && error.contains("placid/test"),
+        "{error}"
+    );
+    assert!(error.contains("choose another --out"), "{error}");
+}
+
+#[test]
+fn what_an_index_gets_wrong_is_named() {
+    let set = Set::new();
+    let splats = set.path("splats");
+    let one = splats.join("room_000.ply");
+    let error = refuse(&text(&set.arguments(&["--splat", arg(&one)], "chunks")));
+    assert!(error.contains("room_000.ply: what is to be scored is no folder"), "{error}");
+    let arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
+    set.write_index(&json!({"room_000": {"context": [0, 7], "target": [1]}}));
+    let error = fail(&text(&arguments), 1);
+    let expected = "re10k_3v.json: a frame of scene room_000 is 7, expected one of the scene's 5, 0 to 4";
+    assert!(error.contains(expected), "{error}");
+    set.write_index(&json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
+    let error = refuse(&text(&arguments));
+    assert!(error.contains("none of the 3 in the data set chunks"), "{error}");
+    std::fs::remove_file(set.path("splats/room_000.ply")).unwrap();
+    set.write_index(&json!({"room_000": {"context": [0, 3], "target": [1]}}));
+    let error = fail(&text(&arguments), 1);
+    assert!(error.contains("room_000: ") && error.contains("room_000.ply can't be read"), "{error}");
+    std::fs::remove_file(set.path("chunks/000000.torch")).unwrap();
+    let error = fail(&text(&arguments), 1);
+    assert!(error.contains("room_000: ") && error.contains("000000.torch can't be read"), "{error}");
+}
+
+#[test]
+fn the_first_scene_that_can_be_judged_warms_up() {
+    let set = Set::new();
+    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
+    std::fs::write(set.path("captures/room_000/images/000.png"), "no photo").unwrap();
+    let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
+    set.write_index(&json!({"room_000": frames, "room_001": frames, "room_002": frames}));
+    let (code, _, err) = run(&set.arguments(&["--weights", arg(&weights)], "captures"), set.folder.path());
+    assert_eq!(code, Some(1), "{err}");
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 1));
+    let efficiency = evaluation.efficiency.expect("a model's cost");
+    assert_eq!(efficiency.timed_scenes, 1);
+    assert!(efficiency.peak_memory_bytes > 1_000_000);
+    let [first, second] = evaluation.scenes.as_slice() else { panic!("two scenes") };
+    assert!(first.warm_up && first.peak_memory_bytes.is_some());
+    assert!(!second.warm_up && second.peak_memory_bytes.is_none());
+}
+
+#[test]
+fn scores_of_somebody_else_are_kept() {
+    let set = Set::new();
+    let (splats, scores) = (set.path("splats"), set.path("out/scores.csv"));
+    std::fs::create_dir(set.path("out")).unwrap();
+    std::fs::write(&scores, "mine").unwrap();
+    let (code, _, err) = run(&set.arguments(&["--splat", arg(&splats)], "chunks"), set.folder.path());
+    assert!(code == Some(2) && err.contains("a scores.csv that no evaluation wrote"), "{err}");
+    assert_eq!(std::fs::read_to_string(&scores).unwrap(), "mine");
+}

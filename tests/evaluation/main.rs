@@ -1,0 +1,10 @@
+//! Tests of what follows training: reconstruction at other sizes and places, refinement, evaluation, the report.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod evaluation;
+mod high_resolution;
+mod placing;
+mod refine;
+mod report;

@@ -1,0 +1,450 @@
+//! Refinement of splats on photos improves held-out views, is bit-identical with any number of threads, and reports impossible
+//! requests in one sentence.
+
+use crate::common::formats::{Format, rewrite, write_points};
+use crate::common::program::{arg, command, refuse, room, succeed};
+use crate::common::{captures, fox};
+use glam::DVec3;
+use globalsplat::data::{load_all_views, open_capture, points_of};
+use globalsplat::io::{read_splat, write_splat};
+use globalsplat::refine::{
+    Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession, SpaceKind,
+    gaussians_from_photos,
+};
+use globalsplat::scene::Gaussians;
+use serde_json::Value;
+use std::path::Path;
+use tch::Kind;
+
+/// Writes a video of a synthetic scene as chunks, and returns the path of its scene.
+fn world(folder: &Path, size: &str) -> String {
+    let out = folder.join("world");
+    succeed(&["synth", "--out", arg(&out), "--seed", "7", "--frames", "12", "--size", size]);
+    format!("{}#7_000000", out.join("000000.torch").display())
+}
+
+fn told(arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeed(arguments)).expect("JSON")
+}
+
+fn number(value: &Value, path: &str) -> f64 {
+    value.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} in {value}"))
+}
+
+/// Refinement from photos alone shows held-out views better than the initial Gaussians do, and writes the splat.
+#[test]
+fn photos_alone_become_a_splat() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, out, sheet) =
+        (world(folder.path(), "64"), folder.path().join("a.ply"), folder.path().join("a.png"));
+    let done = told(&[
+        "refine",
+        "--scene",
+        &scene,
+        "--out",
+        arg(&out),
+        "--holdout",
+        "every:4+1",
+        "--gaussians",
+        "2000",
+        "--steps",
+        "120",
+        "--sheet",
+        arg(&sheet),
+        "--json",
+    ]);
+    let (before, after) = (number(&done, "/held_out/before/psnr"), number(&done, "/held_out/after/psnr"));
+    assert!(after > before + 3., "{before} → {after}");
+    assert_eq!(done["gaussians"], 2000);
+    assert_eq!(done["steps"], 120);
+    let curve = done["held_out"]["curve"].as_array().unwrap();
+    assert!(curve.last().unwrap()["psnr"] == done["held_out"]["after"]["psnr"]);
+    // The reported scores are those of the written splat.
+    let scored = told(&["eval", "--splat", arg(&out), "--scene", &scene, "--json"]);
+    let held_out: Vec<f64> = [1, 5, 9].map(|i| number(&scored, &format!("/views/{i}/psnr"))).into();
+    assert!((held_out.iter().sum::<f64>() / 3. - after).abs() < 0.01, "{held_out:?}, told {after}");
+    assert!(sheet.is_file());
+}
+
+/// The number of threads does not change the bytes with the same steps and seed, in either space; another seed gives others.
+#[test]
+fn threads_do_not_change_the_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = world(folder.path(), "48");
+    // Enough steps to improve on the initial splat, which would be kept otherwise.
+    for (space, steps) in [
+        (&["--gaussians", "500"][..], "30"),
+        (&["--from", "weights", "--gaussians", "6000"], "30"),
+        (&["--space", "both"], "80"),
+    ] {
+        let bytes = |name: &str, threads: &str, seed: &str| {
+            let out = folder.path().join(name);
+            let mut arguments =
+                vec!["refine", "--scene", &scene, "--out", arg(&out), "--steps", steps, "--seed", seed];
+            arguments.extend(["--set", "relocate_every=7"]);
+            arguments.extend(space);
+            let done = command(&arguments).env("OMP_NUM_THREADS", threads).output().unwrap();
+            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+            std::fs::read(out).unwrap()
+        };
+        let one = bytes("one.ply", "1", "3");
+        assert!(one == bytes("three.ply", "3", "3"), "{space:?}: threads change the bytes");
+        assert!(one != bytes("other.ply", "1", "4"), "{space:?}: another seed changes nothing");
+    }
+}
+
+/// Rewrites the views of a room's cameras.json.
+fn rewrite_views(room: &Path, change: impl FnOnce(Vec<Value>) -> Vec<Value>) {
+    let file = room.join("cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let views = cameras["views"].as_array().unwrap().clone();
+    cameras["views"] = change(views).into();
+    std::fs::write(&file, cameras.to_string()).unwrap();
+}
+
+/// Returns the positions of the cameras, [V][3].
+fn centres(views: &[Value]) -> Vec<[f64; 3]> {
+    let number = |view: &Value, axis: usize| view["c2w"][axis][3].as_f64().unwrap();
+    views.iter().map(|view| [0, 1, 2].map(|axis| number(view, axis))).collect()
+}
+
+fn put_centre(view: &mut Value, centre: [f64; 3]) {
+    (0..3).for_each(|axis| view["c2w"][axis][3] = centre[axis].into());
+}
+
+/// Repeated photos, from exactly the same position or from nearby positions, as of a camera at rest, change the result only by
+/// chance.
+#[test]
+fn photos_of_one_place_count_once() {
+    let reached = |copies: usize, jitter: f64| {
+        let (folder, room) = room();
+        let whole = room.join("whole.json");
+        std::fs::copy(room.join("cameras.json"), &whole).unwrap();
+        rewrite_views(&room, |views| {
+            let shown: Vec<Value> =
+                views.into_iter().enumerate().filter(|(i, _)| i % 3 != 1).map(|(_, view)| view).collect();
+            let centres = centres(&shown);
+            let extent =
+                centres.iter().map(|c| DVec3::from(*c).distance(centres[0].into())).fold(0., f64::max);
+            let copy = |(index, view): (usize, &Value), copy: usize| {
+                let mut view = view.clone();
+                // Offsets are within a ball; the first copy is at the original position.
+                let phase = (7 * index + 13 * copy) as f64;
+                let off = DVec3::new(phase.sin(), (1.7 * phase).cos(), (2.3 * phase).sin()) * jitter * extent;
+                let off = if copy == 0 { DVec3::ZERO } else { off };
+                put_centre(&mut view, (DVec3::from(centres[index]) + off).to_array());
+                view
+            };
+            let copies = (0..copies).flat_map(|k| shown.iter().enumerate().map(move |of| copy(of, k)));
+            copies.collect()
+        });
+        let out = folder.path().join("a.ply");
+        let options = ["--gaussians", "2000", "--steps", "200", "--json"];
+        told(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+        std::fs::copy(&whole, room.join("cameras.json")).unwrap();
+        let scores = told(&["eval", "--splat", arg(&out), "--scene", arg(&room), "--json"]);
+        [1, 4, 7].map(|view| number(&scores, &format!("/views/{view}/psnr"))).iter().sum::<f64>() / 3.
+    };
+    let plain = reached(1, 0.);
+    for (copies, jitter) in [(2, 0.), (3, 1e-9), (5, 1e-4), (3, 1e-2)] {
+        let copied = reached(copies, jitter);
+        assert!((copied - plain).abs() < 1.5, "{copies} copies, {jitter}: {copied}, without them {plain}");
+    }
+}
+
+/// Cameras that don't move give no depth: a warning says so, and the photos are placed at one distance.
+#[test]
+fn photos_from_one_place_are_shown_at_one_distance() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    rewrite_views(&room, |mut views| {
+        let first = centres(&views)[0];
+        views.iter_mut().for_each(|view| put_centre(view, first));
+        // Otherwise all of them would be near duplicates, which is fine.
+        (0..3).for_each(|row| views[1]["c2w"][row] = views[0]["c2w"][row].clone());
+        views
+    });
+    let arguments =
+        ["refine", "--scene", arg(&room), "--out", arg(&out), "--gaussians", "500", "--steps", "20"];
+    let done = command(&arguments).output().unwrap();
+    let told = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success() && told.contains("tell no depth"), "{told}");
+    let means = read_splat(&out).unwrap().means;
+    assert!(means.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
+}
+
+/// An interrupted refinement returns a splat at any time, once there is one.
+#[test]
+fn work_that_is_ended_early_keeps_what_there_is() {
+    let (_folder, room) = room();
+    let capture = open_capture(&room).unwrap();
+    let options = RefineOptions {
+        config: RefineConfig::default(),
+        space: SpaceKind::Gaussians,
+        budget: Budget::Steps(1_000_000),
+        gaussians: 300,
+        seed: 0,
+        correct_poses: false,
+        correct_exposures: false,
+        size: None,
+        device: tch::Device::Cpu,
+    };
+    let all: Vec<usize> = (0..capture.len()).collect();
+    // Returns the number of steps done if the work stops at the first event of a kind.
+    let steps = |ends: fn(&RefineEvent) -> bool| {
+        let now = std::time::Instant::now();
+        let mut session =
+            RefineSession::load(&capture, &all, &[], &options, now, move |event| !ends(&event))?;
+        session.start(Initial::Photos)?;
+        let result = session.run()?;
+        assert_eq!(result.gaussians.count(), 300);
+        assert_eq!(result.gaussians.means.isfinite().all().int64_value(&[]), 1);
+        Ok::<u64, globalsplat::Error>(result.steps)
+    };
+    for nothing_yet in [
+        |event: &RefineEvent| matches!(event, RefineEvent::Loading(_)),
+        |event: &RefineEvent| *event == RefineEvent::Starting(0),
+    ] {
+        let why = steps(nothing_yet).unwrap_err().to_string();
+        assert!(why.starts_with("stopped before") && why.ends_with("nothing is written"), "{why}");
+    }
+    assert_eq!(steps(|event| *event == RefineEvent::Starting(2)).unwrap(), 0);
+    let tenth = |event: &RefineEvent| matches!(event, RefineEvent::Optimizing { steps: 10, .. });
+    assert_eq!(steps(tenth).unwrap(), 10);
+}
+
+/// A capture scaled by a power of two gives bit-identical results up to the scale; one in any other unit, or far from the
+/// origin, is reconstructed as well.
+#[test]
+fn units_and_origin_change_nothing() {
+    let refined = |factor: f64, offset: DVec3| {
+        let (folder, room) = room();
+        rewrite_views(&room, |mut views| {
+            let places = centres(&views);
+            for (view, place) in views.iter_mut().zip(places) {
+                put_centre(view, (DVec3::from(place) * factor + offset).to_array());
+            }
+            views
+        });
+        let out = folder.path().join("a.ply");
+        let options = ["--gaussians", "500", "--steps", "40", "--json", "--holdout", "every:3+1"];
+        let done = told(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+        (number(&done, "/held_out/after/psnr"), Gaussians::from_splat(&read_splat(&out).unwrap()))
+    };
+    let (plain, gaussians) = refined(1., DVec3::ZERO);
+    for exponent in [-20, -3, 10] {
+        let factor = f64::from(exponent).exp2();
+        let (psnr, scaled) = refined(factor, DVec3::ZERO);
+        assert_eq!(psnr, plain, "2^{exponent}");
+        assert!((&scaled.means / factor).equal(&gaussians.means), "2^{exponent}");
+        assert!(
+            scaled.opacities.equal(&gaussians.opacities) && scaled.sh.equal(&gaussians.sh),
+            "2^{exponent}"
+        );
+    }
+    for (factor, offset) in [(1e-3, DVec3::ZERO), (1e5, DVec3::ZERO), (1., DVec3::new(4.5e5, 5.4e6, 135.))] {
+        let (psnr, _) = refined(factor, offset);
+        assert!((psnr - plain).abs() < 1.5, "{factor} {offset}: {psnr}, plainly {plain}");
+    }
+}
+
+/// A splat is improved, or kept unchanged if it can't be.
+#[test]
+fn a_splat_becomes_better_or_stays() {
+    let (folder, room) = room();
+    let (ground_truth, dull, out) =
+        (room.join("truth.ply"), folder.path().join("dull.ply"), folder.path().join("a.ply"));
+    let mut splat = read_splat(&ground_truth).unwrap();
+    splat.sh.as_flattened_mut().iter_mut().for_each(|coefficient| *coefficient *= 0.5);
+    write_splat(&dull, &splat).unwrap();
+    let refined = |from: &Path| {
+        let steps = ["--steps", "150", "--json"];
+        told(
+            &[&["refine", "--splat", arg(from), "--scene", arg(&room), "--out", arg(&out)][..], &steps]
+                .concat(),
+        )
+    };
+    let done = refined(&dull);
+    let (before, after) = (number(&done, "/shown/before/psnr"), number(&done, "/shown/after/psnr"));
+    assert!(after > before + 5., "{before} → {after}");
+    assert_eq!(done["held_out"], Value::Null);
+    assert_eq!(read_splat(&out).unwrap().len(), splat.len());
+    // Its photos are its own renders: no splat is better.
+    let done = refined(&ground_truth);
+    assert_eq!(done["shown"]["before"], done["shown"]["after"]);
+    assert!(number(&done, "/shown/after/psnr") > 55.);
+}
+
+/// On real photos, held-out views score far above the baseline that uses the input photos.
+#[test]
+fn real_photos_become_a_splat() {
+    for capture in captures().unwrap_or_default() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("a.ply");
+        let done = told(&[
+            "refine",
+            "--scene",
+            arg(&capture),
+            "--out",
+            arg(&out),
+            "--holdout",
+            "every:3+1",
+            "--size",
+            "128x128",
+            "--gaussians",
+            "8192",
+            "--steps",
+            "250",
+            "--json",
+        ]);
+        let after = number(&done, "/held_out/after/psnr");
+        assert!(after > 24., "{}: {after}", capture.display());
+    }
+}
+
+/// Photos of several sizes, with lens distortion, and more of them than are used, are accepted.
+#[test]
+fn many_photos_are_used_as_they_are() {
+    let Some(fox) = fox() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("a.ply");
+    let done = told(&[
+        "refine",
+        "--scene",
+        arg(&fox),
+        "--out",
+        arg(&out),
+        "--views",
+        "12",
+        "--steps",
+        "10",
+        "--gaussians",
+        "3000",
+        "--json",
+    ]);
+    assert_eq!(done["photos"], 12);
+}
+
+/// Points of a COLMAP model, text or binary, initialize Gaussians.
+#[test]
+fn points_are_begun_with() {
+    for format in [Format::ColmapText, Format::ColmapBinary] {
+        let (_folder, room) = room();
+        assert!(points_of(&open_capture(&room).unwrap()).unwrap().is_empty());
+        let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
+        let means: Vec<f64> = ground_truth.means.as_flattened().iter().map(|&x| f64::from(x)).collect();
+        rewrite(&room, format);
+        let capture = open_capture(&room).unwrap();
+        assert!(points_of(&capture).unwrap().is_empty());
+        write_points(&room.join("sparse/0"), format, &means);
+        let points = points_of(&capture).unwrap();
+        assert_eq!(points.len() * 3, means.len());
+        for (point, expected) in points.iter().zip(means.chunks(3)) {
+            assert_eq!(point.position.to_array(), expected);
+            assert_eq!(point.colour, [1., 0., 0.2]);
+        }
+        // Half of the Gaussians are at points, the others on pixels.
+        let views = load_all_views(&capture, None).unwrap();
+        let raw = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
+            .expect("depths");
+        let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
+        let at_points = begun
+            .chunks(3)
+            .filter(|mean| points.iter().any(|p| p.position.distance(DVec3::from_slice(mean)) < 1e-5));
+        assert_eq!((begun.len(), at_points.count()), (3000, 500));
+    }
+}
+
+/// Small pose errors and exposure differences are estimated, for a room whose splat is known.
+#[test]
+fn what_photos_hide_is_found_out() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    let file = room.join("cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let views = cameras["views"].as_array_mut().unwrap();
+    // Alternating shifts, so that the mean doesn't change.
+    let shift = 0.03;
+    let last = views.len() - views.len() % 2;
+    for (index, view) in views[..last].iter_mut().enumerate() {
+        let x = &mut view["c2w"][0][3];
+        *x = (x.as_f64().unwrap() + if index % 2 == 0 { shift } else { -shift }).into();
+    }
+    std::fs::write(&file, cameras.to_string()).unwrap();
+    let photo = room.join(cameras["views"][0]["image"].as_str().unwrap());
+    let picture = image::open(&photo).unwrap().to_rgb8();
+    image::RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
+        image::Rgb(picture.get_pixel(x, y).0.map(|v| (f32::from(v) * 0.8).round() as u8))
+    })
+    .save(&photo)
+    .unwrap();
+    let refined = |more: &[&str]| {
+        let ground_truth = room.join("truth.ply");
+        let base =
+            ["refine", "--splat", arg(&ground_truth), "--scene", arg(&room), "--out", arg(&out), "--json"];
+        let steps = ["--steps", "300", "--set", "means=1e-4", "--set", "poses=2e-3"];
+        told(&[&base[..], &steps, more].concat())
+    };
+    let (as_told, corrected) = (refined(&[]), refined(&["--correct-poses", "--correct-exposures"]));
+    assert_eq!(as_told["corrections"], serde_json::json!([]));
+    let [before, after] = [&as_told, &corrected].map(|done| number(done, "/shown/after/psnr"));
+    assert!(after > before + 3., "{before} → {after}");
+    let of = &corrected["corrections"];
+    assert_eq!(of.as_array().unwrap().len(), cameras["views"].as_array().unwrap().len());
+    let exposure = number(of, "/0/exposure/1") / number(of, "/1/exposure/1");
+    assert!((exposure - 0.8).abs() < 0.03, "{exposure}");
+}
+
+#[test]
+fn what_cannot_be_refined_is_told_in_one_sentence() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    let base = ["refine", "--scene", arg(&room), "--out", arg(&out)];
+    let with = |more: &[&str]| refuse(&[&base[..], more].concat());
+    assert!(with(&["--set", "view=3"]).contains("--set view=3: unknown field"));
+    assert!(with(&["--set", "views=\"a\""]).contains("--set views"));
+    assert!(with(&["--set", "views"]).contains("expected KEY=VALUE"));
+    for value in ["views=0", "sh_every=0", "resolution_schedule=[0.1,0.1]", "means=nan", "prune_opacity=-1"] {
+        assert!(with(&["--set", value]).contains(&format!("--set {value}: expected ")));
+    }
+    assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));
+    assert!(with(&["--seconds", "1e300"]).contains("--seconds is 1000"));
+    for size in ["64x8", "10x10", "2000x1"] {
+        assert!(with(&["--size", size]).contains(&format!("--size {size}: expected 11 pixels or more")));
+    }
+    assert!(with(&["--from", "nothing", "--space", "tokens"]).contains("nor tokens"));
+    assert!(with(&["--space", "tokens", "--correct-poses"]).contains("corrects no photos"));
+    assert!(with(&["--views", "1"]).contains("--views is 1, expected 2 or more"));
+    // A splat elsewhere.
+    let away = folder.path().join("away.ply");
+    let mut splat = read_splat(&room.join("truth.ply")).unwrap();
+    splat.means.as_flattened_mut().iter_mut().for_each(|coordinate| *coordinate -= 1000.);
+    write_splat(&away, &splat).unwrap();
+    assert!(with(&["--splat", arg(&away)]).contains("see nothing"));
+    assert!(!out.exists());
+}
+
+/// Images as narrow as SSIM allows are accepted; narrower ones are refused before they are read.
+#[test]
+fn narrow_photos_are_taken_or_refused() {
+    let (folder, room) = room();
+    let out = folder.path().join("a.ply");
+    let options = ["--gaussians", "300", "--steps", "0", "--size", "400x11"];
+    succeed(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+    let options = ["--gaussians", "300", "--steps", "3", "--size", "400x11"];
+    succeed(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+    for entry in std::fs::read_dir(room.join("images")).unwrap() {
+        let path = entry.unwrap().path();
+        image::open(&path).unwrap().crop_imm(0, 0, 40, 10).save(&path).unwrap();
+    }
+    rewrite_views(&room, |mut views| {
+        views.iter_mut().for_each(|view| view["intrinsic"][1][2] = 5.into());
+        views
+    });
+    let file = room.join("cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    cameras["image_shape"] = vec![10, 40].into();
+    std::fs::write(&file, cameras.to_string()).unwrap();
+    let why = crate::common::program::fail(&["refine", "--scene", arg(&room), "--out", arg(&out)], 2);
+    assert!(why.contains("40×10, expected 11 pixels or more along each side"), "{why}");
+}

@@ -1,0 +1,515 @@
+//! Chunks: writing, reading back, and invalid files.
+
+use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
+use crate::common::program::{arg, refuse, succeed};
+use globalsplat::data::write_room;
+use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
+use image::RgbImage;
+use serde_json::Value;
+use std::io::{Cursor, Write};
+use std::path::{Path, PathBuf};
+use zip::write::FileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+const SCENES: [&str; 3] = ["room_0", "room_1", "room_2"];
+
+/// Writes three small captures to `folder`, packs them into chunks of two scenes and of one in `folder/chunks`, and returns
+/// that folder.
+fn packed(folder: &Path) -> PathBuf {
+    let chunks = folder.join("chunks");
+    std::fs::create_dir(&chunks).unwrap();
+    let mut bytes = 0;
+    for (seed, name) in SCENES.iter().enumerate() {
+        write_room(&folder.join(name), seed as u64, 3, [24, 32].into()).unwrap();
+        if seed < 2 {
+            let images = std::fs::read_dir(folder.join(name).join("images")).unwrap();
+            bytes += images.map(|image| image.unwrap().metadata().unwrap().len() as usize).sum::<usize>();
+        }
+    }
+    let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
+    for name in SCENES {
+        writer.add(&open_capture(&folder.join(name)).unwrap()).unwrap();
+    }
+    assert_eq!(writer.finish().unwrap(), 2);
+    chunks
+}
+
+#[test]
+fn a_packed_capture_comes_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let dataset = Dataset::open(&chunks, Split::Test).unwrap();
+    assert_eq!((dataset.scenes(), dataset.groups().len()), (3, 2));
+    for group in dataset.groups() {
+        let open = group.open().unwrap();
+        for key in &group.keys {
+            let (found, expected) =
+                (open.capture(key).unwrap(), open_capture(&folder.path().join(key)).unwrap());
+            assert_eq!(&found.name, key);
+            // The values of a chunk are float32.
+            let cameras: Vec<_> = expected.cameras();
+            for (a, b) in found.cameras().iter().zip(&cameras) {
+                assert!(a.c2w.abs_diff_eq(b.c2w, 1e-6));
+                let (k, l) = (a.intrinsics.to_rows(), b.intrinsics.to_rows());
+                assert!(k.iter().zip(l).all(|(a, b)| (a - b).abs() < 1e-4), "{k:?} {l:?}");
+            }
+            for (a, b) in found.load_all(None).unwrap().iter().zip(expected.load_all(None).unwrap()) {
+                assert_eq!(a.image, b.image);
+            }
+        }
+    }
+    let one =
+        open_capture(&PathBuf::from(format!("{}#room_1", chunks.join("000000.torch").display()))).unwrap();
+    assert_eq!(one.names().collect::<Vec<_>>(), ["000000", "000001", "000002"]);
+    let alone = open_capture(&chunks.join("000001.torch")).unwrap();
+    assert_same_cameras(&alone, &dataset.groups()[1].open().unwrap().capture("room_2").unwrap().cameras());
+}
+
+#[test]
+fn chunks_that_interrupted_work_left_are_taken_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let files = ["index.json", "000000.torch", "000001.torch"].map(|name| chunks.join(name));
+    let read = || files.each_ref().map(|file| std::fs::read(file).unwrap());
+    let before = read();
+    let capture = |name: &str| open_capture(&folder.path().join(name));
+    let bytes = files[1].metadata().unwrap().len() as usize;
+    for lost in [&files[..1], &[files[0].clone(), files[2].clone()]] {
+        lost.iter().for_each(|file| std::fs::remove_file(file).unwrap());
+        let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
+        let mut seen = vec![];
+        let count = writer
+            .go_on(
+                &SCENES.map(String::from),
+                || Ok(capture(SCENES[0])?),
+                |number, capture| {
+                    seen.push((number, capture.name.clone()));
+                    Ok(())
+                },
+            )
+            .unwrap();
+        assert_eq!(count, if lost.len() == 1 { 3 } else { 2 });
+        let expected: Vec<_> = SCENES[..count].iter().map(|name| name.to_string()).enumerate().collect();
+        assert_eq!(seen, expected);
+        for name in &SCENES[count..] {
+            writer.add(&capture(name).unwrap()).unwrap();
+        }
+        assert_eq!(writer.finish().unwrap(), 2);
+        assert_eq!(read(), before);
+    }
+    // Chunks of other captures, recognized by their names or their photos.
+    std::fs::remove_file(&files[0]).unwrap();
+    let others = ["room_1", "room_0", "room_2"].map(String::from);
+    for (keys, first) in [(others, SCENES[0]), (SCENES.map(String::from), SCENES[1])] {
+        let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
+        let error = writer.go_on(&keys, || Ok(capture(first)?), |_, _| Ok(())).unwrap_err().to_string();
+        assert!(error.contains("000000.torch: the output is a chunk already"), "{error}");
+    }
+}
+
+#[test]
+fn a_data_set_is_found_split_by_split() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let root = folder.path().join("set");
+    std::fs::create_dir(&root).unwrap();
+    std::fs::rename(&chunks, root.join("test")).unwrap();
+    let dataset = Dataset::open(&root, Split::Test).unwrap();
+    assert_eq!((dataset.name.as_str(), dataset.scenes()), ("set", 3));
+    // Folders of captures are datasets as well.
+    let captures = Dataset::open(folder.path(), Split::Train).unwrap();
+    assert!(captures.groups().iter().any(|group| group.keys == ["room_0"]));
+}
+
+#[test]
+fn what_is_in_the_folder_of_one_part_is_not_in_the_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("set");
+    let write = |name: &str| write_room(&root.join(name), 0, 3, [24, 24].into()).unwrap();
+    let scenes = |split: Split| -> Vec<String> {
+        let dataset = Dataset::open(&root, split).unwrap();
+        dataset.groups().iter().flat_map(|group| group.keys.clone()).collect()
+    };
+    write("test/seen_never");
+    let error = Dataset::open(&root, Split::Train).unwrap_err().to_string();
+    assert!(error.contains("without captures but those in") && error.contains("test"), "{error}");
+    write("a");
+    write("more/b");
+    assert_eq!(scenes(Split::Train), ["a", "b"]);
+    assert_eq!(scenes(Split::Test), ["seen_never"]);
+    std::fs::rename(root.join("test"), root.join("train")).unwrap();
+    assert_eq!(scenes(Split::Test), ["a", "b"]);
+    assert_eq!(scenes(Split::Train), ["seen_never"]);
+}
+
+#[test]
+fn pack_and_inspect_tell_what_they_did() {
+    let folder = tempfile::tempdir().unwrap();
+    write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
+    let (room, out) = (folder.path().join("room"), folder.path().join("out"));
+    let told: Value =
+        serde_json::from_str(&succeed(&["pack", arg(&room), "--out", arg(&out), "--json"])).unwrap();
+    assert_eq!(
+        (told["scenes"].as_u64(), told["views"].as_u64(), told["chunks"].as_u64()),
+        (Some(1), Some(3), Some(1))
+    );
+    let chunk = out.join("000000.torch");
+    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&chunk), "--json"])).unwrap();
+    assert_eq!((told["kind"].as_str(), told["views"]["room"].as_u64()), (Some("chunk"), Some(3)));
+    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&out), "--json"])).unwrap();
+    assert_eq!((told["kind"].as_str(), told["scenes"].as_u64()), (Some("data set"), Some(1)));
+    let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
+    assert!(again.contains("a folder of chunks already"), "{again}");
+    let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
+    assert!(twice.contains("which 000000.torch holds already"), "{twice}");
+}
+
+/// Returns a torch.save archive with `pickle` and the bytes of one tensor.
+fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
+    let mut zip = ZipWriter::new(Cursor::new(vec![]));
+    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
+        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
+        zip.write_all(contents).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+fn refusal(bytes: Vec<u8>) -> String {
+    let error = Chunk::parse(Path::new("chunk.torch"), bytes).expect_err("a refusal");
+    assert!(error.is_request(), "{error}");
+    error.to_string()
+}
+
+#[track_caller]
+fn assert_refused(pickle: &[u8], for_what: &str) {
+    let error = refusal(archive(pickle, &[0; 64], CompressionMethod::Stored));
+    assert!(error.contains(for_what), "{error:?} lacks {for_what:?}");
+}
+
+/// Returns a BINUNICODE opcode with its argument.
+fn text(text: &str) -> Vec<u8> {
+    [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// Returns a BININT opcode with its argument.
+fn int(value: u32) -> Vec<u8> {
+    [b"J", &value.to_le_bytes()[..]].concat()
+}
+
+/// Returns a pickled tensor of `size` with `stride` at `offset` of a storage that claims to have 64 elements.
+fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
+    let id = [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cpu"), int(64)];
+    tensor_of(&id, offset, size, stride)
+}
+
+/// Returns a pickled tensor of the storage with a persistent id of these parts.
+fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
+    let tuple = |values: &[u32]| {
+        [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
+    };
+    [
+        b"ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
+        id.concat(),
+        b"tQ".to_vec(),
+        int(offset),
+        tuple(size),
+        tuple(stride),
+        b"\x89ccollections\nOrderedDict\n)RtR".to_vec(),
+    ]
+    .concat()
+}
+
+/// Returns the pickle of a list of one scene with one view, its fields given.
+fn scene(cameras: &[u8], timestamps: &[u8], image: &[u8]) -> Vec<u8> {
+    let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+    [
+        b"\x80\x02](}(".to_vec(),
+        entry("key", &text("a")),
+        entry("url", &text("")),
+        entry("cameras", cameras),
+        entry("timestamps", timestamps),
+        entry("images", &[b"](", image, b"e"].concat()),
+        b"ue.".to_vec(),
+    ]
+    .concat()
+}
+
+fn good_cameras() -> Vec<u8> {
+    tensor("FloatStorage", 0, &[1, 18], &[18, 1])
+}
+
+fn good_timestamps() -> Vec<u8> {
+    tensor("LongStorage", 0, &[1], &[1])
+}
+
+#[test]
+fn what_a_pickle_may_not_do_is_not_done() {
+    let folder = tempfile::tempdir().unwrap();
+    let trap = folder.path().join("trap");
+    // Call that Python would execute: os.system("touch trap").
+    let command = format!("touch {}", trap.display());
+    for module in ["os", "posix"] {
+        let program =
+            [format!("\x02c{module}\nsystem\n").into_bytes(), text(&command), b"\x85R.".to_vec()].concat();
+        let program = [b"\x80", program.as_slice()].concat();
+        assert_refused(&program, &format!("asks for {module}.system"));
+    }
+    assert_refused(b"\x80\x02c__builtin__\neval\n.", "asks for __builtin__.eval");
+    assert_refused(
+        b"\x80\x02ctorch.jit._pickle\nbuild_intlist\n.",
+        "asks for torch.jit._pickle.build_intlist",
+    );
+    assert!(!trap.exists());
+}
+
+#[test]
+fn pickles_of_other_values_are_refused() {
+    let nested = [b"\x80\x02".to_vec(), b"]".repeat(100_000), b"a".repeat(99_999), b".".to_vec()].concat();
+    assert_refused(&nested, "scene 0 is a list, expected a dict");
+    // A list that contains itself.
+    assert_refused(b"\x80\x02]q\x00h\x00a.", "scene 0 is a list, expected a dict");
+    assert_refused(b"\x80\x02]q\x00(h\x00e.", "scene 0 is a list, expected a dict");
+    assert_refused(b"\x80\x02}(K\x01K\x02u.", "a dict, expected a list of scenes");
+    assert_refused(b"\x80\x02K\x01.", "an integer, expected a list of scenes");
+    assert_refused(b"\x80\x02](K\x01e.", "scene 0 is an integer, expected a dict");
+    assert_refused(b"\x80\x02](}e.", "scene 0 has no images");
+}
+
+#[test]
+fn storages_that_are_absent_are_named() {
+    let float = b"ctorch\nFloatStorage\n".to_vec();
+    let cameras =
+        tensor_of(&[text("storage"), float, text("1"), text("cpu"), int(64)], 0, &[1, 18], &[18, 1]);
+    assert_refused(
+        &scene(&cameras, &good_timestamps(), &tensor("ByteStorage", 0, &[4], &[1])),
+        "cameras of scene 0 asks for data/1, which is not there",
+    );
+}
+
+#[test]
+fn data_saved_on_another_device_are_read_here() {
+    let png = {
+        let folder = tempfile::tempdir().unwrap();
+        write_room(&folder.path().join("room"), 1, 2, [16, 16].into()).unwrap();
+        std::fs::read(folder.path().join("room/images/000.png")).unwrap()
+    };
+    let camera = [0.5f32, 0.5, 0.5, 0.5, 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.];
+    let data =
+        [camera.map(f32::to_le_bytes).concat(), camera.map(f32::to_le_bytes).concat(), png.clone()].concat();
+    for device in ["cuda:0", "mps:0", "nowhere"] {
+        let on = |dtype: &str, offset: u32, size: &[u32], stride: &[u32]| {
+            let dtype = format!("ctorch\n{dtype}\n").into_bytes();
+            tensor_of(&[text("storage"), dtype, text("0"), text(device), int(64)], offset, size, stride)
+        };
+        let image = on("ByteStorage", 144, &[png.len() as u32], &[1]);
+        let program = scene(
+            &on("FloatStorage", 0, &[2, 18], &[18, 1]),
+            &on("LongStorage", 0, &[2], &[1]),
+            &image.repeat(2),
+        );
+        let bytes = archive(&program, &data, CompressionMethod::Stored);
+        let capture = Chunk::parse(Path::new("c.torch"), bytes).unwrap().capture("a").unwrap();
+        assert_eq!(capture.load_all(None).unwrap()[1].image.size(), (16, 16));
+    }
+}
+
+#[test]
+fn what_is_said_again_and_again_takes_no_more_than_it_says() {
+    // One image and one scene, each referenced many times by two bytes.
+    for (views, scenes, fits) in [(50, 50, true), (2000, 50, true), (2000, 2000, false)] {
+        let count = views as u32;
+        let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+        let image = [tensor("ByteStorage", 0, &[4], &[1]), b"q\x01".to_vec(), b"h\x01".repeat(views - 1)];
+        let program = [
+            b"\x80\x02](}q\x00(".to_vec(),
+            entry("key", &text("a")),
+            entry("url", &text("")),
+            entry("cameras", &tensor("FloatStorage", 0, &[count, 18], &[18, 1])),
+            entry("timestamps", &tensor("LongStorage", 0, &[count], &[1])),
+            entry("images", &[b"](", image.concat().as_slice(), b"e"].concat()),
+            b"u".to_vec(),
+            b"h\x00".repeat(scenes - 1),
+            b"e.".to_vec(),
+        ];
+        let bytes = archive(&program.concat(), &vec![0; 72 * views], CompressionMethod::Stored);
+        match Chunk::parse(Path::new("c.torch"), bytes) {
+            Ok(chunk) => assert!(fits && chunk.keys().count() == scenes),
+            Err(error) => assert!(!fits && error.to_string().contains("has no room"), "{error}"),
+        }
+    }
+}
+
+#[test]
+fn tensors_stay_inside_their_data() {
+    let image = |offset, size, stride| tensor("ByteStorage", offset, &[size], &[stride]);
+    // The data has 64 bytes, too few for 18 floats, whatever the pickle says about the storage.
+    assert_refused(
+        &scene(&good_cameras(), &good_timestamps(), &image(0, 4, 1)),
+        "cameras of scene 0 reaches beyond its data of 64 bytes",
+    );
+    let whole = |image: &[u8]| {
+        let bytes = scene(&good_cameras(), &good_timestamps(), image);
+        archive(&bytes, &[0; 72], CompressionMethod::Stored)
+    };
+    for (image, found) in [
+        (image(0, 73, 1), "images of scene 0 reaches beyond its data of 72 bytes"),
+        (image(70, 3, 1), "reaches beyond"),
+        (image(u32::MAX, 3, 1), "images of scene 0 is no plain tensor"),
+        (image(1 << 30, 3, 1), "reaches beyond"),
+        (image(0, 8, 2), "is no plain tensor"),
+        (image(0, 1 << 30, 0), "is no plain tensor"),
+        (image(0, u32::MAX, 1), ""),
+        (tensor("FloatStorage", 0, &[4], &[1]), "expected the bytes of a JPEG"),
+        (text("x"), "images of scene 0 has a string, expected a tensor"),
+    ] {
+        let error = refusal(whole(&image));
+        assert!(error.contains(found), "{error:?} lacks {found:?}");
+    }
+    let double = tensor("DoubleStorage", 0, &[1, 8], &[8, 1]);
+    assert_refused(&scene(&double, &good_timestamps(), &image(0, 4, 1)), "expected F32 [1, 18]");
+    // A tensor of exactly the data's size is accepted here, and then isn't a valid image.
+    let chunk = Chunk::parse(Path::new("chunk.torch"), whole(&image(0, 72, 1))).unwrap();
+    assert_eq!(chunk.keys().collect::<Vec<_>>(), ["a"]);
+    let error = chunk.capture("a").unwrap_err().to_string();
+    assert!(error.contains("chunk.torch#a: every image is undecodable"), "{error}");
+}
+
+#[test]
+fn archives_that_inflate_are_refused() {
+    let pickle = scene(&good_cameras(), &good_timestamps(), &text("x"));
+    let error = refusal(archive(&pickle, &[0; 1 << 20], CompressionMethod::Deflated));
+    assert!(error.contains("archive/data.pkl is compressed"), "{error}");
+}
+
+#[test]
+fn damage_is_noticed() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = packed(folder.path()).join("000001.torch");
+    let bytes = std::fs::read(&file).unwrap();
+    for length in (0..bytes.len()).step_by(97) {
+        refusal(bytes[..length].to_vec());
+    }
+    // Any flipped bit in a chunk: the reader must not crash, and images must not change unnoticed.
+    let image = bytes.windows(4).position(|window| window == b"\x89PNG").unwrap();
+    for position in (0..bytes.len()).step_by(31).chain(image..image + 64) {
+        let mut flipped = bytes.clone();
+        flipped[position] ^= 1 << (position % 8);
+        let read = Chunk::parse(Path::new("chunk.torch"), flipped);
+        if (image..image + 64).contains(&position) {
+            assert!(read.unwrap_err().to_string().contains("its checksum differs"));
+        }
+    }
+}
+
+#[test]
+fn what_is_wrong_with_a_scene_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let chunks = packed(folder.path());
+    let chunk = chunks.join("000000.torch");
+    let named = format!("{}#room_9", chunk.display());
+    let error = refuse(&["inspect", &named]);
+    let expected = "the scene is \"room_9\", which is not there, expected one of its 2: room_0, room_1";
+    assert!(error.contains(expected), "{error}");
+    let error = open_capture(&chunk).unwrap_err().to_string();
+    assert!(error.contains("it holds 2 scenes, expected") && error.contains("#KEY"), "{error}");
+
+    // A NaN in a camera: 18 float32 and an image.
+    let cameras = [f32::NAN; 18].map(f32::to_le_bytes).concat();
+    let png = std::fs::read(folder.path().join("room_0/images/000.png")).unwrap();
+    let image = tensor("ByteStorage", 72, &[png.len() as u32], &[1]);
+    let program = scene(&good_cameras(), &good_timestamps(), &image);
+    let bytes = archive(&program, &[cameras, png].concat(), CompressionMethod::Stored);
+    let error = Chunk::parse(Path::new("c.torch"), bytes).unwrap().capture("a").unwrap_err().to_string();
+    assert!(error.contains("c.torch#a: the number of views is 1, expected two or more"), "{error}");
+
+    std::fs::remove_file(&chunk).unwrap();
+    let dataset = Dataset::open(&chunks, Split::Train).unwrap();
+    let error = dataset.groups()[0].open().unwrap_err().to_string();
+    assert!(error.contains("000000.torch can't be read"), "{error}");
+    for (index, found) in [
+        ("[]", "unusable"),
+        ("{\"a\": \"../b.torch\"}", "the chunk of a is ../b.torch"),
+        ("{\"a\": 3}", "unusable"),
+    ] {
+        std::fs::write(chunks.join("index.json"), index).unwrap();
+        let error = Dataset::open(&chunks, Split::Train).unwrap_err().to_string();
+        assert!(error.contains("index.json") && error.contains(found), "{error}");
+    }
+}
+
+/// Returns a chunk of one scene with two views of one photo, whose dict has `entries` besides `images`.
+fn chunk_of(entries: &[(&str, Vec<u8>)], cameras: &[f32]) -> Chunk {
+    let mut png = Cursor::new(vec![]);
+    image::RgbImage::new(16, 16).write_to(&mut png, image::ImageFormat::Png).unwrap();
+    let (png, numbers) = (png.into_inner(), cameras.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>());
+    let image = tensor("ByteStorage", numbers.len() as u32, &[png.len() as u32], &[1]);
+    let images = [b"](".to_vec(), image.repeat(2), b"e".to_vec()].concat();
+    let entry = |key: &str, value: &[u8]| [&text(key), value].concat();
+    let program = [
+        b"\x80\x02](}(".to_vec(),
+        entries.iter().flat_map(|(key, value)| entry(key, value)).collect(),
+        entry("images", &images),
+        b"ue.".to_vec(),
+    ];
+    let bytes = archive(&program.concat(), &[numbers, png].concat(), CompressionMethod::Stored);
+    Chunk::parse(Path::new("c.torch"), bytes).unwrap()
+}
+
+#[test]
+fn cameras_images_and_a_key_are_all_that_a_scene_needs() {
+    let camera = |x: f32| [0.5, 0.6, 0.5, 0.5, 0., 0., 1., 0., 0., x, 0., 1., 0., 0., 0., 0., 1., 0.];
+    let cameras = [camera(0.), camera(2.)].concat();
+    let dense = tensor("FloatStorage", 0, &[2, 18], &[18, 1]);
+    let expected = chunk_of(&[("key", text("a#b")), ("cameras", dense)], &cameras).capture("a#b").unwrap();
+    assert_eq!(expected.len(), 2);
+    let poses = expected.cameras();
+    assert!((poses[1].c2w.w_axis.x + 2.).abs() < 1e-9 && (poses[1].intrinsics.fy - 9.6).abs() < 1e-6);
+    // Stored in column-major order, and then as every other row of a larger tensor.
+    let transposed: Vec<f32> = (0..18).flat_map(|i| [cameras[i], cameras[18 + i]]).collect();
+    let spread = [camera(0.), camera(9.), camera(2.)].concat();
+    for (numbers, stride) in [(transposed, [1, 2]), (spread, [36, 1])] {
+        let strided = tensor("FloatStorage", 0, &[2, 18], &stride);
+        let found = chunk_of(&[("cameras", strided), ("key", text("a#b"))], &numbers).capture("a#b").unwrap();
+        assert_same_cameras(&found, &poses);
+    }
+}
+
+#[test]
+fn a_scene_is_opened_whatever_signs_its_key_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path().join("a#b.torch#c");
+    let names = ["#", "x#y", "x.torch#y", "x#y.png"];
+    for name in names {
+        write_room(&place.join(name), 1, 3, [24, 24].into()).unwrap();
+    }
+    let chunks = place.join("chunks");
+    std::fs::create_dir(&chunks).unwrap();
+    let mut writer = ChunkWriter::new(&chunks, 1 << 30).unwrap();
+    for name in names {
+        writer.add(&open_capture(&place.join(name)).unwrap()).unwrap();
+    }
+    writer.finish().unwrap();
+    for name in names {
+        let named = format!("{}#{name}", chunks.join("000000.torch").display());
+        assert_eq!(open_capture(Path::new(&named)).unwrap().name, name);
+        let told: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
+        assert_eq!((told["kind"].as_str(), told["name"].as_str()), (Some("capture"), Some(name)));
+    }
+}
+
+/// NeRF's synthetic captures hold the photos of each split in a folder of that name: such a folder is one capture, not a dataset with
+/// splits.
+#[test]
+fn a_capture_with_splits_is_one_scene_of_a_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    for split in ["train", "test"] {
+        let photos: Vec<String> = names().iter().map(|name| format!("{split}/{name}")).collect();
+        std::fs::create_dir(folder.path().join(split)).unwrap();
+        for photo in &photos {
+            RgbImage::new(WIDTH, HEIGHT).save(folder.path().join(photo)).unwrap();
+        }
+        let file = folder.path().join(format!("transforms_{split}.json"));
+        std::fs::write(file, transforms(&photos, &cameras()).to_string()).unwrap();
+    }
+    assert_eq!(Dataset::open(folder.path(), Split::Train).unwrap().scenes(), 1);
+}

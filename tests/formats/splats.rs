@@ -1,0 +1,302 @@
+//! Splats on their way through the program: what `convert` loses, what every command leaves out, and renders before and after. The formats
+//! themselves are tested in crates/splat-file.
+
+#[path = "../../crates/splat-file/tests/common/mod.rs"]
+mod splat_files;
+
+use crate::common::program::{arg, refuse, room, succeed};
+use globalsplat::io::{ShLimits, Splat, fit_splat, read_splat, write_splat};
+use globalsplat::render::render_views;
+use globalsplat::scene::{Camera, Gaussians, Intrinsics, RawGaussians};
+use serde_json::Value;
+use splat_files::{
+    ENDINGS, Random, assert_says, files_with_invalid_values, random_splat, small_gaussians,
+    write_changed_ply, write_ply, written,
+};
+use std::io::Write;
+
+/// Gaussians keep the bits of a splat's parameters, and give them back unless they are infinite.
+#[test]
+fn splats_are_gaussians_and_back() {
+    let mut splat = random_splat(300, 2, 3);
+    let raw = RawGaussians::from_splat(&splat);
+    let gaussians = Gaussians::from_splat(&splat);
+    assert!(raw.activate().scales.equal(&gaussians.scales) && raw.means.equal(&gaussians.means));
+    assert_eq!(Vec::<f32>::try_from(raw.log_scales.flatten(0, -1)).unwrap(), splat.log_scales.as_flattened());
+    assert_eq!(raw.sh.size(), [1, 300, 9, 3]);
+    assert_eq!(raw.sh.double_value(&[0, 7, 8, 1]), f64::from(splat.sh_of(7)[8][1]));
+    let origin = glam::DVec3::new(1e6, 2., 3.);
+    let back = gaussians.to_splat(origin).unwrap();
+    assert_eq!((&back.means, &back.quaternions, &back.sh), (&splat.means, &splat.quaternions, &splat.sh));
+    assert_eq!((back.origin, back.sh_degree), (origin, 2));
+    let error = splat_files::largest_error(back.log_scales.as_flattened(), splat.log_scales.as_flattened());
+    assert!(error < 1e-6, "{error}");
+    for index in 0..300 {
+        assert!((back.opacity(index) - splat.opacity(index)).abs() < 2e-6);
+    }
+    // Gaussians that aren't drawn, and scales and opacities without a finite logarithm or logit.
+    splat.quaternions[100..150].fill([0.; 4]);
+    splat.log_scales[0][1] = f32::NEG_INFINITY;
+    splat.opacity_logits[..2].copy_from_slice(&[f32::INFINITY, f32::NEG_INFINITY]);
+    let gaussians = Gaussians::from_splat(&splat);
+    assert_eq!([0, 1].map(|index| gaussians.opacities.double_value(&[0, index])), [1., 0.]);
+    assert_eq!(gaussians.scales.double_value(&[0, 0, 1]), 0.);
+    let made = gaussians.to_splat(origin).unwrap();
+    assert_eq!(made.len(), 250);
+    assert_says(&made.warnings[0], &["50 of 300 Gaussians are left out", "length 0"]);
+    assert!(made.log_scales[0][1].is_finite() && made.opacity_logits.iter().all(|logit| logit.is_finite()));
+    let two = gaussians.map(|tensor| tch::Tensor::cat(&[tensor, tensor], 0));
+    assert_says(&two.to_splat(origin).unwrap_err().to_string(), &["a splat holds one scene, found 2"]);
+}
+
+/// Returns a camera at the origin that looks along z, 64×64.
+fn camera() -> Camera {
+    let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 32. };
+    Camera { intrinsics, c2w: glam::DMat4::IDENTITY, width: 64, height: 64 }
+}
+
+fn psnr_of_pictures(a: &Splat, b: &Splat, camera: Camera) -> f64 {
+    let seen = |splat: &Splat| render_views(&Gaussians::from_splat(splat), &[camera]).unwrap().remove(0).rgb;
+    globalsplat::eval::psnr(&seen(a), &seen(b))
+}
+
+/// Renders from all sides are the same after a round trip: a wrong sign, order or axis would show from some side.
+#[test]
+fn pictures_are_the_same_from_other_sides() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut splat = random_splat(400, 3, 7);
+    splat.sh.as_flattened_mut().iter_mut().for_each(|coefficient| *coefficient *= 0.5);
+    for ending in ENDINGS {
+        let degree = if ending == "splat" { 0 } else { 3 };
+        let original = splat.with_sh_degree(degree);
+        let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &original)).unwrap();
+        for side in 0..6 {
+            let turn = glam::DMat4::from_rotation_y(f64::from(side)) * glam::DMat4::from_rotation_x(0.4);
+            let centre = glam::DMat4::from_translation([0., 0., 6.].into());
+            let c2w = centre * turn * glam::DMat4::from_translation([0., 0., -8.].into());
+            let psnr = psnr_of_pictures(&original, &copy, Camera { c2w, ..camera() });
+            assert!(psnr > 27., "{ending} from side {side}: {psnr} dB");
+        }
+    }
+}
+
+#[test]
+fn endings_that_are_unknown() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
+    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is absent")] {
+        let to = folder.path().join(name);
+        let all = [told, "expected .ply, .compressed.ply, .spz or .splat"];
+        assert_says(&refuse(&["convert", arg(&splat), arg(&to)]), &all);
+        std::fs::copy(&splat, &to).unwrap();
+        assert_says(&refuse(&["convert", arg(&to), arg(&splat)]), &all);
+        std::fs::remove_file(&to).unwrap();
+    }
+    let (_kept, room) = room();
+    let out = folder.path().join("made.sog");
+    let refine = ["refine", "--scene", arg(&room), "--steps", "1", "--out", arg(&out)];
+    assert_says(&refuse(&refine), &["the ending is .sog"]);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing was written");
+}
+
+/// `convert` reports both files and the loss, measured on an orbit or from a capture's cameras.
+#[test]
+fn convert_tells_what_is_lost() {
+    let (folder, room) = room();
+    let ground_truth = room.join("truth.ply");
+    let convert = |to: &str, more: &[&str]| -> Value {
+        let to = folder.path().join(to);
+        let told = succeed(&[&["convert", arg(&ground_truth), arg(&to), "--json"], more].concat());
+        serde_json::from_str(&told).unwrap()
+    };
+    let same = convert("a.ply", &[]);
+    assert_eq!(same["from"]["gaussians"], same["to"]["gaussians"]);
+    assert_eq!(same["same_pixels"], true, "{same}");
+    assert_eq!(std::fs::read(&ground_truth).unwrap(), std::fs::read(folder.path().join("a.ply")).unwrap());
+    let small = convert("a.spz", &["--scene", arg(&room)]);
+    assert_eq!((small["views"].as_u64(), small["same_pixels"].as_bool()), (Some(9), Some(false)));
+    assert!(small["psnr"].as_f64().unwrap() > 30., "{small}");
+    assert_eq!(small["to"]["bytes"], std::fs::metadata(folder.path().join("a.spz")).unwrap().len());
+    assert!(small["to"]["bytes"].as_u64() < small["from"]["bytes"].as_u64());
+    for degree in ["0", "3"] {
+        let told = convert("b.compressed.ply", &["--sh-degree", degree]);
+        assert_eq!(told["to"]["sh_degree"].to_string(), degree);
+        assert_eq!(told["views"], 8);
+    }
+    let told = succeed(&["convert", arg(&ground_truth), arg(&folder.path().join("c.splat"))]);
+    assert!(told.contains("Gaussians, SH degree 0, ") && told.contains("dB between renders"), "{told}");
+    let out = folder.path().join("d.ply");
+    let higher =
+        crate::common::program::globalsplat(&["convert", arg(&ground_truth), arg(&out), "--sh-degree", "4"]);
+    assert_eq!(higher.status.code(), Some(2));
+}
+
+/// Coefficients beyond SPZ's range are clamped without a capture; with a capture the others are fitted to its cameras.
+#[test]
+fn convert_keeps_what_a_capture_sees() {
+    let (folder, room) = room();
+    let strong = folder.path().join("strong.ply");
+    let mut splat = read_splat(&room.join("truth.ply")).unwrap().with_sh_degree(3);
+    let mut random = Random::new(3);
+    for of_one in splat.sh.chunks_exact_mut(16) {
+        of_one[1..].iter_mut().for_each(|colour| *colour = random.symmetric().map(|number: f32| 3. * number));
+    }
+    write_splat(&strong, &splat).unwrap();
+    let cameras = globalsplat::data::open_capture(&room).unwrap().cameras();
+    for (ending, gain, always) in [
+        ("spz", 6., &[][..]),
+        ("splat", 0.5, &[]),
+        ("ply", 6., &["--for-viewers"]),
+        ("spz", 6., &["--for-viewers"]),
+    ] {
+        let psnr = |options: &[&str]| {
+            let to = folder.path().join(format!("a.{ending}"));
+            succeed(&[&["convert", arg(&strong), arg(&to)], options, always].concat());
+            let copy = read_splat(&to).unwrap();
+            if !always.is_empty() {
+                let largest = |numbers: &[[f32; 3]]| {
+                    numbers.as_flattened().iter().fold(0f32, |largest, number| largest.max(number.abs()))
+                };
+                let beyond = (0..copy.len()).map(|index| {
+                    let (dc, rest) = copy.sh_of(index).split_at(1);
+                    [largest(dc) * 0.28209479 - 0.5, largest(rest) - 1.]
+                });
+                // SPZ's quantization step is 0.03.
+                let beyond = beyond.fold([0f32; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
+                assert!(
+                    beyond.iter().all(|&beyond| beyond < 0.02),
+                    "{ending}: {beyond:?} beyond what viewers hold"
+                );
+            }
+            globalsplat::eval::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
+        };
+        let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
+        assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
+    }
+    // A message appears only without a capture.
+    let (out, own) = (folder.path().join("b.spz"), folder.path().join("b.ply"));
+    let said = |more: &[&str]| {
+        let done =
+            crate::common::program::globalsplat(&[&["convert", arg(&strong), arg(&out)], more].concat());
+        String::from_utf8(done.stderr).unwrap()
+    };
+    assert!(said(&[]).contains("beyond what the format holds"), "{}", said(&[]));
+    assert!(said(&["--for-viewers"]).contains("beyond what viewers hold"), "{}", said(&["--for-viewers"]));
+    assert_eq!(said(&["--scene", arg(&room)]), "");
+    for to in [&out, &own] {
+        let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
+        succeed(&[&refine[..], &[arg(to)]].concat());
+    }
+    let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap());
+    let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
+    let cut = fit_splat(&out, &large, &ShLimits::up_to(3), &[]).unwrap();
+    let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
+    assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
+}
+
+/// Returns standard error and standard output of a command that succeeds.
+fn said(arguments: &[&str]) -> (String, String) {
+    let done = crate::common::program::globalsplat(arguments);
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    let (stdout, stderr) = (text(done.stdout), text(done.stderr));
+    assert!(done.status.success(), "{arguments:?}: {stderr}");
+    (stderr, stdout)
+}
+
+/// Gaussians without a rotation are counted by every command that reads a splat.
+#[test]
+fn gaussians_without_a_rotation_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    // Files of other programs: values that underflow, in a PLY; the middle of the byte range in a .splat.
+    let mut columns = small_gaussians();
+    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
+    let ply = folder.path().join("zero.ply");
+    write_ply(&ply, &columns, &[]);
+    let dot_splat = written(folder.path(), "zero.splat", &random_splat(3, 0, 1));
+    let mut bytes = std::fs::read(&dot_splat).unwrap();
+    bytes[32 + 28..64].fill(128);
+    std::fs::write(&dot_splat, bytes).unwrap();
+    for path in [&ply, &dot_splat] {
+        let line = "1 of 3 Gaussians are left out, whose rotations have length 0\n";
+        let expected = format!("{}: {line}", path.display());
+        let to = folder.path().join("b.spz");
+        assert!(said(&["convert", arg(path), arg(&to)]).0.starts_with(&expected));
+        assert_eq!(said(&["inspect", arg(path)]).0, expected);
+        let views = folder.path().join("views.png");
+        let render = ["render", "--splat", arg(path), "--orbit", "--frames", "1", "--size", "16x16", "--out"];
+        assert_eq!(said(&[&render[..], &[arg(&views)]].concat()).0, expected);
+    }
+}
+
+/// `convert` removes Gaussians with invalid values, and counts them; other commands refuse the file and name it.
+#[test]
+fn convert_repairs_what_others_refuse() {
+    let (folder, room) = room();
+    let mut cases = files_with_invalid_values(folder.path());
+    // SPZ's oldest version has half-precision floats.
+    let head = [b"NGSP", &[1, 0, 0, 0, 3, 0, 0, 0, 0, 12, 0, 0][..]].concat();
+    let halves = [0x3c00u16, 0x3c00, 0x4400, 0x3c00, 0x7e00, 0x4400, 0xbc00, 0x3c00, 0x4400];
+    let rest = [vec![200; 3], vec![128; 9], vec![130; 9], vec![128; 9]].concat();
+    let spz = folder.path().join("half.spz");
+    let mut encoder = flate2::write::GzEncoder::new(vec![], flate2::Compression::default());
+    encoder.write_all(&[head, halves.map(u16::to_le_bytes).concat(), rest].concat()).unwrap();
+    std::fs::write(&spz, encoder.finish().unwrap()).unwrap();
+    cases.push((spz, "the position", "position"));
+    for (index, (path, field, property)) in cases.iter().enumerate() {
+        let (picture, out) = (folder.path().join("orbit.png"), folder.path().join("refined.ply"));
+        let render = ["render", "--splat", arg(path), "--orbit", "--out", arg(&picture)];
+        let refine = ["refine", "--splat", arg(path), "--scene", arg(&room), "--out", arg(&out)];
+        let eval = ["eval", "--splat", arg(path), "--scene", arg(&room)];
+        let commands = [&["inspect", arg(path)][..], &render, &refine, &eval];
+        for arguments in &commands[..if index == 0 { 4 } else { 1 }] {
+            assert_says(&refuse(arguments), &[field, "`globalsplat convert` leaves out"]);
+        }
+        for ending in &ENDINGS[if index == 0 { 0..4 } else { index % 4..index % 4 + 1 }] {
+            let to = folder.path().join(format!("repaired.{ending}"));
+            let (warnings, _) = said(&["convert", arg(path), arg(&to)]);
+            let expected = format!(
+                "{}: 1 of 3 Gaussians are left out, whose numbers aren't finite or are out of range: {property}",
+                path.display()
+            );
+            assert_eq!(warnings.lines().next(), Some(&*expected), "{ending}");
+            assert_eq!(read_splat(&to).unwrap().len(), 2, "{ending}");
+        }
+    }
+    let none = write_changed_ply(folder.path(), "none.ply", |columns| {
+        columns.iter_mut().for_each(|(_, values)| *values = [f64::NAN; 3]);
+    });
+    let to = folder.path().join("none.spz");
+    assert_says(
+        &refuse(&["convert", arg(&none), arg(&to)]),
+        &["the number of Gaussians is 3, none of which"],
+    );
+}
+
+/// 2DGS has no third scale: its Gaussians are flat, in every format, down to each format's smallest scale.
+#[test]
+fn surfels_are_flat() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| *name != "scale_2");
+    let surfels = folder.path().join("surfels.ply");
+    write_ply(&surfels, &columns, &[]);
+    let splat = read_splat(&surfels).unwrap();
+    assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
+    let third =
+        |splat: &Splat| (0..splat.len()).map(|index| f64::from(splat.scale(index)[2])).fold(0., f64::max);
+    assert!(third(&splat) > 0. && third(&splat) <= 1.1e-30, "{}", third(&splat));
+    // From the side only the rasterizer's blur is visible: a smaller scale makes no difference.
+    let mut thinnest = splat.clone();
+    thinnest.log_scales.iter_mut().for_each(|log_scale| log_scale[2] = f32::NEG_INFINITY);
+    assert!(psnr_of_pictures(&splat, &thinnest, camera()) > 90.);
+    for (ending, flat) in [("ply", 1.1e-30), ("compressed.ply", 2.1e-9), ("spz", 4.6e-5), ("splat", 1.1e-30)]
+    {
+        let to = folder.path().join(format!("a.{ending}"));
+        let (warnings, _) = said(&["convert", arg(&surfels), arg(&to)]);
+        assert_eq!(warnings.lines().count(), 1, "{warnings}");
+        let copy = read_splat(&to).unwrap();
+        assert!(third(&copy) <= flat, "{ending}: {}", third(&copy));
+        let psnr = psnr_of_pictures(&splat, &copy, camera());
+        assert!(psnr > 35., "{ending}: {psnr} dB");
+    }
+}

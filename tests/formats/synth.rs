@@ -1,0 +1,303 @@
+//! Videos of synthetic scenes are reproducible, consistent with their cameras, and usable like any other data.
+
+use crate::common::program::{arg, refuse, succeed, tiny_config};
+use glam::{DMat3, DVec3};
+use globalsplat::data::{Capture, Dataset, SceneGroup, Split, SyntheticDataset, load_all_views, load_views};
+use globalsplat::scene::{Camera, ImageSize};
+use globalsplat::synth::{Video, VideoSettings};
+use npyz::NpyFile;
+use std::fs::File;
+use std::path::Path;
+
+fn settings(frames: usize, side: u32) -> VideoSettings {
+    VideoSettings { frames, size: ImageSize { height: side, width: side }, pictures: vec![] }
+}
+
+/// A seed determines the bytes, whatever the number of threads; another seed gives others.
+#[test]
+fn a_seed_makes_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = |name: &str, threads: &str, seed: &str| {
+        let out = folder.path().join(name);
+        let done = std::process::Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+            .args([
+                "synth",
+                "--out",
+                arg(&out),
+                "--scenes",
+                "3",
+                "--frames",
+                "3",
+                "--size",
+                "24",
+                "--seed",
+                seed,
+            ])
+            .env("RAYON_NUM_THREADS", threads)
+            .output()
+            .unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        std::fs::read(out.join("000000.torch")).unwrap()
+    };
+    let one = bytes("one", "1", "5");
+    assert!(one == bytes("three", "3", "5"), "threads change the bytes");
+    assert!(one != bytes("other", "1", "6"), "another seed is another world");
+}
+
+#[test]
+fn where_it_was_stopped_the_same_command_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("worlds");
+    let (chunk, indices) =
+        (out.join("000000.torch"), ["index.json", "evaluation_index.json"].map(|n| out.join(n)));
+    let synth = |[scenes, frames, size, seed]: [&'static str; 4]| {
+        let settings = ["--scenes", scenes, "--frames", frames, "--size", size, "--seed", seed, "--depth"];
+        [&["synth", "--out", arg(&out)][..], &settings].concat()
+    };
+    let arguments = synth(["2", "3", "24", "0"]);
+    succeed(&arguments);
+    let read = || indices.each_ref().map(|index| std::fs::read(index).unwrap());
+    let (before, depth) = (read(), out.join("depth/0_000001.npy"));
+    let (bytes, depths) = (std::fs::read(&chunk).unwrap(), std::fs::read(&depth).unwrap());
+
+    // Simulates a process that was stopped before it wrote the index, and a lost file.
+    for lost in indices.iter().chain([&depth]) {
+        std::fs::remove_file(lost).unwrap();
+    }
+    let written = || chunk.metadata().unwrap().modified().unwrap();
+    let when = written();
+    succeed(&arguments);
+    assert_eq!(read(), before);
+    assert!(std::fs::read(&chunk).unwrap() == bytes && std::fs::read(&depth).unwrap() == depths);
+    assert_eq!(written(), when, "made anew");
+    // The existing files are of other scenes, or of other photos of them.
+    std::fs::remove_file(&indices[0]).unwrap();
+    for other in [["1", "3", "24", "0"], ["2", "4", "24", "0"], ["2", "3", "25", "0"], ["2", "3", "24", "1"]]
+    {
+        let error = refuse(&synth(other));
+        assert!(error.contains("000000.torch: the output is a chunk already"), "{other:?}: {error}");
+    }
+    assert!(std::fs::read(&chunk).unwrap() == bytes, "lost");
+}
+
+/// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.
+fn seen(from: &Camera, to: &Camera, x: f64, y: f64, depth: f64) -> (f64, f64, f64) {
+    let k = from.intrinsics;
+    let point = from.c2w.transform_point3(depth * DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.));
+    let there = to.c2w.inverse().transform_point3(point);
+    let k = to.intrinsics;
+    (k.fx * there.x / there.z + k.cx, k.fy * there.y / there.z + k.cy, there.z)
+}
+
+/// A view warped into another by its depths and both poses agrees with it, where both see the same.
+#[test]
+fn depths_and_poses_carry_one_view_into_the_next() {
+    const SIDE: u32 = 96;
+    let mut compared = 0;
+    for index in 0..6 {
+        let video = Video::new(11, index, &settings(24, SIDE));
+        // Near enough that little of what one view sees is occluded in the other.
+        let frames = [6, 12];
+        let [from, to] = frames.map(|i| &video.cameras()[i]);
+        let (photos, depths) = (frames.map(|i| video.photo(i)), frames.map(|i| video.depth(i)));
+        let (mut differences, mut unmoved, mut apart) = (vec![], vec![], vec![]);
+        for (i, &depth) in depths[0].iter().enumerate().filter(|(_, depth)| depth.is_finite()) {
+            let (column, row) = (i as u32 % SIDE, i as u32 / SIDE);
+            let (x, y, far) = seen(from, to, f64::from(column) + 0.5, f64::from(row) + 0.5, f64::from(depth));
+            if !(0. ..f64::from(SIDE)).contains(&x) || !(0. ..f64::from(SIDE)).contains(&y) || far <= 0. {
+                continue;
+            }
+            let there = (y as u32 * SIDE + x as u32) as usize;
+            apart.push((f64::from(depths[1][there]) / far - 1.).abs());
+            // A different depth: the point is occluded.
+            if *apart.last().unwrap() > 0.05 {
+                continue;
+            }
+            let difference = |a: [u8; 3], b: [u8; 3]| {
+                a.iter().zip(b).map(|(&a, b)| (i32::from(a) - i32::from(b)).abs()).max().unwrap()
+            };
+            let here = photos[0].get_pixel(column, row).0;
+            differences.push(difference(here, photos[1].get_pixel(x as u32, y as u32).0));
+            unmoved.push(difference(here, photos[1].get_pixel(column, row).0));
+        }
+        if apart.len() < 1000 {
+            continue;
+        }
+        compared += 1;
+        apart.sort_by(f64::total_cmp);
+        let (half, most) = (apart[apart.len() / 2], apart[apart.len() * 7 / 10]);
+        assert!(half < 0.008 && most < 0.02, "video {index}: depths are {half} apart for half of the pixels");
+        let mean = |of: &[i32]| of.iter().map(|&x| f64::from(x)).sum::<f64>() / of.len() as f64;
+        let (moved, unmoved) = (mean(&differences), mean(&unmoved));
+        assert!(
+            moved < 30. && moved < 0.6 * unmoved,
+            "video {index}: {moved} of 255 apart, {unmoved} if not carried"
+        );
+    }
+    assert!(compared >= 4, "{compared} videos");
+}
+
+#[test]
+fn cameras_are_in_free_space_and_move() {
+    for index in 0..8 {
+        let video = Video::new(2, index, &settings(12, 16));
+        let near = video.depth(6).into_iter().fold(f32::INFINITY, f32::min);
+        assert!(near > 0.02, "video {index}: something {near} m before the camera");
+        let centres = [0, 11].map(|i| video.cameras()[i].c2w.w_axis.truncate());
+        assert!(centres[0].distance(centres[1]) > 0.01, "video {index} doesn't move");
+        assert!(centres[0].distance(centres[1]) < 12., "video {index} leaves");
+    }
+}
+
+/// Some videos go around an object, as people photograph objects: all cameras look at nearly the same point, by more than 45
+/// degrees from one another.
+#[test]
+fn things_are_looked_at_from_around() {
+    let is_around = |index| {
+        let cameras = Video::new(5, index, &settings(5, 16)).cameras().to_vec();
+        let rays: Vec<(DVec3, DVec3)> =
+            cameras.iter().map(|c| (c.c2w.w_axis.truncate(), c.c2w.z_axis.truncate())).collect();
+        let turn = rays.iter().map(|ray| ray.1.angle_between(rays[0].1)).fold(0., f64::max);
+        // The point that is nearest to all rays from c along d solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) c.
+        let across = |d: DVec3| DMat3::IDENTITY - DMat3::from_cols(d.x * d, d.y * d, d.z * d);
+        let sum = rays.iter().fold(DMat3::ZERO, |sum, &(_, d)| sum + across(d));
+        let point = sum.inverse() * rays.iter().map(|&(c, d)| across(d) * c).sum::<DVec3>();
+        let near = |&(c, d): &(DVec3, DVec3)| {
+            let (away, past) = (point - c, across(d) * (point - c));
+            away.dot(d) > 0. && past.length() < 0.15 * away.length()
+        };
+        turn > 0.8 && rays.iter().all(near)
+    };
+    let around = (0..40).filter(|&index| is_around(index)).count();
+    assert!((6..=20).contains(&around), "{around} of 40 videos");
+}
+
+/// Written videos are a dataset, with an evaluation index; videos generated on the fly have the same scenes.
+#[test]
+fn videos_are_data_like_any_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, sheet) = (folder.path().join("worlds"), folder.path().join("sheet.png"));
+    succeed(&[
+        "synth",
+        "--out",
+        arg(&out),
+        "--scenes",
+        "2",
+        "--first",
+        "7",
+        "--seed",
+        "3",
+        "--frames",
+        "9",
+        "--size",
+        "24",
+        "--depth",
+        "--sheet",
+        arg(&sheet),
+    ]);
+    assert!(image::open(&sheet).unwrap().width() > 8 * 24);
+    let depths = NpyFile::new(File::open(out.join("depth/3_000008.npy")).unwrap()).unwrap();
+    assert_eq!(depths.shape(), [9, 24, 24]);
+    let video = Video::new(3, 8, &settings(9, 24));
+    let expected: Vec<f32> = (0..9).flat_map(|view| video.depth(view)).collect();
+    assert_eq!(depths.into_vec::<f32>().unwrap(), expected);
+    let told = succeed(&["inspect", arg(&out), "--json"]);
+    assert!(told.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{told}");
+    let weights = folder.path().join("weights.safetensors");
+    succeed(&["export", "--config", arg(&tiny_config(folder.path(), &out)), "--out", arg(&weights)]);
+    let index = out.join("evaluation_index.json");
+    let name = "synth:seed=3,first=7,scenes=2,frames=9,size=24";
+    let scores = ["of the written", "of the named"].map(|scores| folder.path().join(scores));
+    for (data, scores) in [arg(&out), name].into_iter().zip(&scores) {
+        succeed(&[
+            "eval",
+            "--weights",
+            arg(&weights),
+            "--data",
+            data,
+            "--index",
+            arg(&index),
+            "--out",
+            arg(scores),
+        ]);
+        assert_eq!(
+            std::fs::read_dir(scores.join("scenes")).unwrap().count(),
+            4,
+            "scores and a picture of each scene"
+        );
+    }
+
+    let written = Dataset::open(&out, Split::Test).unwrap();
+    let named = Dataset::open(Path::new(name), Split::Train).unwrap();
+    assert_eq!(written.scenes(), 2);
+    let keys = |data: &Dataset| data.groups().iter().flat_map(|g| g.keys.clone()).collect::<Vec<_>>();
+    assert_eq!(keys(&written), keys(&named));
+    let views = |data: &Dataset| {
+        let key = &keys(data)[1];
+        let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
+        load_all_views(&group.open().unwrap().capture(key).unwrap(), None).unwrap()
+    };
+    for (a, b) in views(&written).iter().zip(&views(&named)) {
+        assert!((a.camera.c2w - b.camera.c2w).abs_diff_eq(glam::DMat4::ZERO, 1e-5));
+        // The written photos are JPEGs of high quality.
+        let apart = (&a.image - &b.image).abs().mean(tch::Kind::Double).double_value(&[]);
+        assert!(apart < 0.02, "{apart}");
+    }
+}
+
+/// A user's images are visible in some of the scenes, both in written videos and in those generated on the fly.
+#[test]
+fn pictures_that_a_user_names_are_seen() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, pictures) = (folder.path().join("worlds"), folder.path().join("pictures"));
+    std::fs::create_dir(&pictures).unwrap();
+    image::RgbImage::from_pixel(8, 8, image::Rgb([255, 0, 255])).save(pictures.join("pink.png")).unwrap();
+    let size = ["--scenes", "8", "--frames", "3", "--size", "24"];
+    succeed(&[&["synth", "--out", arg(&out), "--pictures", arg(&pictures)][..], &size].concat());
+    let named = |more: &str| format!("synth:scenes=8,frames=3,size=24{more}");
+    // Returns the number of pink pixels in the first view of each scene.
+    let pink = |data: &Path| -> Vec<f64> {
+        let data = Dataset::open(data, Split::Test).unwrap();
+        let first = |capture: Capture| {
+            let view = load_views(&capture, &[0], None).unwrap().remove(0);
+            let channel = |index| -> tch::Tensor { view.image.select(0, index) };
+            let excess = channel(0).minimum(&channel(2)) - channel(1) * 2.;
+            excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as f64
+        };
+        let of_group = |group: &SceneGroup| {
+            let open = group.open().unwrap();
+            group.keys.iter().map(|key| first(open.capture(key).unwrap())).collect::<Vec<_>>()
+        };
+        data.groups().iter().flat_map(of_group).collect()
+    };
+    let plain = pink(named("").as_ref());
+    let (written, named) = (pink(&out), pink(named(&format!(",pictures={}", arg(&pictures))).as_ref()));
+    let more = named.iter().zip(&plain).filter(|(with, without)| **with > *without + 5.).count();
+    assert!(more >= 2, "{named:?}, {plain:?} without");
+    assert!(written.iter().zip(&named).all(|(a, b)| (a - b).abs() < 20.), "{written:?} {named:?}");
+}
+
+#[test]
+fn names_of_made_up_videos_are_checked() {
+    let named = |name: &str| SyntheticDataset::named(Path::new(name));
+    assert!(named("captures/synth").unwrap().is_none());
+    assert_eq!(named("synth:scenes=3").unwrap().unwrap().keys(), ["0_000000", "0_000001", "0_000002"]);
+    assert_eq!(named("synth:seed=4,scenes=1,first=9").unwrap().unwrap().keys(), ["4_000009"]);
+    for (name, found) in [
+        ("synth:", r#"a field is "", expected synth:seed=S,scenes=N"#),
+        ("synth:scenes=1,", r#"a field is "", expected"#),
+        ("synth:seed=1", "scenes is missing, expected"),
+        ("synth:scenes=9000000", "scenes is 9000000, expected 1 to 1000000"),
+        ("synth:scenes=some", r#"scenes is "some", expected"#),
+        ("synth:scenes", r#"scenes is "", expected"#),
+        ("synth:scenes=1,scenes=2", "scenes is there twice"),
+        ("synth:scenes=1,colour=red", r#"a field is "colour", expected"#),
+        ("synth:scenes=1,size=8", "size is 8, expected 16 to 8192"),
+        ("synth:scenes=1,frames=2", "frames is 2, expected 3 to 10000"),
+        ("synth:scenes=1,pictures=nowhere", "nowhere can't be read"),
+        ("synth:scenes=1,pictures=", "pictures is nothing, expected"),
+    ] {
+        let error = named(name).unwrap_err().to_string();
+        assert!(error.contains(found), "{name}: {error}");
+    }
+}

@@ -1,0 +1,320 @@
+//! Units and origins of captures don't matter: renders are the same in millimetres and kilometres, at the origin and in UTM
+//! coordinates, and bit-identical if the unit changes by a power of two (spec 2.5).
+
+use crate::common::program::{arg, globalsplat, refuse, room, succeed};
+use crate::common::{captures, skip};
+use glam::{DMat3, DMat4, DVec3};
+use globalsplat::data::{open_capture, write_cameras_json};
+use globalsplat::eval::psnr;
+use globalsplat::io::{
+    Splat, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
+};
+use globalsplat::render::{SplatRenderer, transform};
+use globalsplat::scene::{Camera, Gaussians, LocalFrame, Similarity};
+use serde_json::{Value, json};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Scales and origins, among them kilometres, UTM and ECEF coordinates.
+const PLACES: [(f64, [f64; 3]); 7] = [
+    (1e-6, [0.; 3]),
+    (1e-3, [0.; 3]),
+    (37., [-4., 3., 5.]),
+    (1e6, [0.; 3]),
+    (1., [448_265.12, 5_411_920.65, 135.4]),
+    (1e3, [1e8, -1e8, 1e8]),
+    (1., [-1e8, 3e7, 7e6]),
+];
+
+/// Returns the similarity transform of such a scale and origin.
+fn to_place((scale, offset): (f64, [f64; 3])) -> Similarity {
+    Similarity { rotation: DMat3::IDENTITY, translation: DVec3::from_array(offset), scale }
+}
+
+/// Writes the capture at `from`, transformed by `to`, to `folder`.
+fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
+    let capture = open_capture(from).unwrap();
+    let names: Vec<String> = capture.names().map(String::from).collect();
+    let moved = |camera: Camera| {
+        let centre = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
+        let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), centre);
+        Camera { c2w, ..camera }
+    };
+    for name in &names {
+        fs::create_dir_all(folder.join(name).parent().unwrap()).unwrap();
+        fs::copy(from.join(name), folder.join(name)).unwrap();
+    }
+    let cameras: Vec<Camera> = capture.cameras().into_iter().map(moved).collect();
+    write_cameras_json(&folder.join("cameras.json"), &names, &cameras).unwrap();
+}
+
+/// Returns `splat` transformed by `to`, to match a capture transformed by `to`. Its origin is the translation.
+fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
+    let about_origin = Similarity { translation: DVec3::ZERO, ..*to };
+    transform(&Gaussians::from_splat(splat), &about_origin).to_splat(to.translation).unwrap()
+}
+
+fn told(arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeed(arguments)).expect("JSON")
+}
+
+/// Returns the PNGs of `folder`, sorted by name.
+fn pictures(folder: &Path) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    assert!(!files.is_empty());
+    files
+}
+
+/// Returns the minimum PSNR of the images of folder `a` compared with those of `b`.
+fn least_psnr(a: &Path, b: &Path) -> f64 {
+    let image = |path: &Path| tensor_from_rgb(&read_image(path).unwrap());
+    let both = pictures(a).into_iter().zip(pictures(b));
+    both.map(|(a, b)| psnr(&image(&a), &image(&b))).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn a_splat_looks_the_same_in_any_unit_and_place() {
+    let (folder, room) = room();
+    let ground_truth = room.join("truth.ply");
+    let of = |name: &str| folder.path().join(name);
+    // Renders from the capture's cameras, along a smooth path through them and on orbits, with the scores and the loss of
+    // `convert`.
+    let looked_at = |splat: &Path, scene: &Path, name: &str| -> (PathBuf, f64, f64) {
+        let (pictures, copy) = (of(name), of("copy.compressed.ply"));
+        let (splat, scene) = (arg(splat), arg(scene));
+        succeed(&["render", "--splat", splat, "--scene", scene, "--depth", "--out", arg(&pictures)]);
+        for (name, cameras) in [
+            ("around", &["--orbit"][..]),
+            ("amid", &["--orbit", "--scene", scene]),
+            ("path", &["--path", scene]),
+        ] {
+            let out = pictures.join(format!("{name}.png"));
+            let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
+            succeed(&[&["render"], cameras, &others].concat());
+        }
+        let scores = told(&["eval", "--splat", splat, "--scene", scene, "--json"]);
+        let loss = told(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
+        (pictures, scores["psnr"].as_f64().unwrap(), loss["psnr"].as_f64().unwrap())
+    };
+    let (plain, plain_psnr, plain_loss) = looked_at(&ground_truth, &room, "plain");
+    let read = read_splat(&ground_truth).unwrap();
+    for place in PLACES {
+        let to = to_place(place);
+        let (scene, splat) = (of("scene"), of("a.ply"));
+        write_moved(&room, &scene, &to);
+        write_local_splat(&splat, &moved_splat(&read, &to)).unwrap();
+        assert_eq!(origin_file(&splat).is_file(), to.translation != DVec3::ZERO);
+        let (pictures, psnr, loss) = looked_at(&splat, &scene, "pictures");
+        let least = least_psnr(&plain, &pictures);
+        assert!(least >= 60., "{place:?}: {least:.2} dB");
+        assert!((psnr - plain_psnr).abs() < 0.05, "{place:?}: {psnr:.2} instead of {plain_psnr:.2} dB");
+        assert!((loss - plain_loss).abs() < 1., "{place:?}: {loss:.2} instead of {plain_loss:.2} dB");
+        fs::remove_dir_all(&scene).unwrap();
+        fs::remove_dir_all(&pictures).unwrap();
+    }
+}
+
+/// A reconstruction and its file are bit-identical up to the exponent.
+#[test]
+fn powers_of_two_change_no_bit() {
+    let (folder, room) = room();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
+    let of = |name: &str| folder.path().join(name);
+    let made = |scene: &Path, name: &str| {
+        // This format stores linear scales.
+        let (out, pictures) = (of(&format!("{name}.splat")), of(&format!("{name}.png")));
+        succeed(&["reconstruct", "--scene", arg(scene), "--views", "3", "--out", arg(&out)]);
+        succeed(&[
+            "render",
+            "--splat",
+            arg(&out),
+            "--scene",
+            arg(scene),
+            "--depth",
+            "--alpha",
+            "--out",
+            arg(&pictures),
+        ]);
+        (Gaussians::from_splat(&read_splat(&out).unwrap()), fs::read(&pictures).unwrap())
+    };
+    let (plain, pictures) = made(&room, "plain");
+    let cameras = open_capture(&room).unwrap().cameras();
+    let seen = SplatRenderer::from_splat(&ground_truth).render(&cameras).unwrap();
+    for exponent in [-20, -3, 5, 20] {
+        let factor = f64::from(exponent).exp2();
+        let scene = of(&format!("scene{exponent}"));
+        let to = to_place((factor, [0.; 3]));
+        write_moved(&room, &scene, &to);
+        let (gaussians, same) = made(&scene, "scaled");
+        assert!(gaussians.means.equal(&(&plain.means * factor)), "2^{exponent}");
+        assert!(gaussians.scales.equal(&(&plain.scales * factor)), "2^{exponent}");
+        assert!(gaussians.quaternions.equal(&plain.quaternions) && gaussians.sh.equal(&plain.sh));
+        assert!(pictures == same, "2^{exponent}");
+        let cameras = open_capture(&scene).unwrap().cameras();
+        let scaled = SplatRenderer::from_splat(&moved_splat(&ground_truth, &to)).render(&cameras).unwrap();
+        for (a, b) in seen.iter().zip(&scaled) {
+            assert!(a.rgb.equal(&b.rgb) && a.alpha.equal(&b.alpha), "2^{exponent}");
+            assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");
+        }
+    }
+}
+
+/// A page has a local origin, and a unit that suits a browser's precision and the page's step sizes.
+#[test]
+fn a_page_is_the_same_in_any_unit_and_place() {
+    if told(&["doctor", "--json"])["viewer"] != true {
+        skip("npm", "this program was built without the viewer");
+        return;
+    }
+    let (folder, room) = room();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
+    let of = |name: &str| folder.path().join(name);
+    let contents = |splat: &Path, scene: &Path| -> Value {
+        let page = of("page.html");
+        succeed(&["render", "--splat", arg(splat), "--scene", arg(scene), "--html", arg(&page)]);
+        let text = fs::read_to_string(page).unwrap();
+        let (_, json) = text.split_once("<script id=\"scene\" type=\"application/json\">").unwrap();
+        serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
+    };
+    let plain = contents(&room.join("truth.ply"), &room);
+    for place in PLACES {
+        let to = to_place(place);
+        let (scene, splat) = (of("scene"), of("a.ply"));
+        write_moved(&room, &scene, &to);
+        write_local_splat(&splat, &moved_splat(&ground_truth, &to)).unwrap();
+        let other = contents(&splat, &scene);
+        for (path, least) in [("/distance", 1e-4), ("/frustum", 1e-4)] {
+            let number = |value: &Value| value.pointer(path).unwrap().as_f64().unwrap();
+            assert!((number(&plain) / number(&other) - 1.).abs() < least, "{path}: {place:?}");
+        }
+        for (a, b) in plain["path"].as_array().unwrap().iter().zip(other["path"].as_array().unwrap()) {
+            let numbers = |pose: &Value| -> Vec<f64> { serde_json::from_value(pose.clone()).unwrap() };
+            for (a, b) in numbers(a).iter().zip(numbers(b)) {
+                assert!((a - b).abs() < 1e-3, "{place:?}: {a} {b}");
+            }
+        }
+    }
+}
+
+/// Far from the origin, the loss in float32 is reported, and a local origin avoids it in all commands that read the splat.
+#[test]
+fn a_local_origin_keeps_the_detail() {
+    let (folder, room) = room();
+    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
+    let of = |name: &str| folder.path().join(name);
+    let to = to_place(PLACES[4]);
+    let offset = to.translation;
+    let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
+    write_moved(&room, &scene, &to);
+    write_local_splat(&local, &moved_splat(&ground_truth, &to)).unwrap();
+    let psnr = |splat: &Path| {
+        told(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
+    };
+
+    let output = globalsplat(&["convert", arg(&local), arg(&world), "--scene", arg(&scene), "--json"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && said.lines().count() == 1, "{said}");
+    for part in ["world.ply", "5.412e6 units", "every 0.5 units", "--local-origin"] {
+        assert!(said.contains(part), "{said}");
+    }
+    assert!(!origin_file(&world).exists());
+    assert!(psnr(&local) > psnr(&world) + 10., "{} {}", psnr(&local), psnr(&world));
+
+    // Relative to the capture's centre, in every format; an older splat's origin is replaced.
+    for ending in ["ply", "compressed.ply", "spz", "splat"] {
+        let copy = of(&format!("copy.{ending}"));
+        let convert = ["convert", arg(&local), arg(&copy), "--scene", arg(&scene)];
+        let output = globalsplat(&[&convert[..], &["--local-origin"]].concat());
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+        let centre = LocalFrame::from_cameras(&open_capture(&scene).unwrap().cameras()).origin;
+        let written: Value = serde_json::from_slice(&fs::read(origin_file(&copy)).unwrap()).unwrap();
+        assert_eq!(written, json!({"origin": centre.to_array()}));
+        assert!(psnr(&copy) > psnr(&local).min(45.) - 12., "{ending}: {}", psnr(&copy));
+        let inspected = told(&["inspect", arg(&copy), "--json"]);
+        assert_eq!(inspected["local_origin"], json!(centre.to_array()));
+        assert!((inspected["x"][1].as_f64().unwrap() - offset.x).abs() < 5., "{inspected}");
+        succeed(&convert);
+        assert!(!origin_file(&copy).exists(), "{ending}");
+    }
+
+    // Without a capture, a splat keeps its origin, and one without an origin gets its own centre.
+    let copy = of("kept.ply");
+    succeed(&["convert", arg(&local), arg(&copy), "--local-origin"]);
+    assert_eq!(read_splat(&copy).unwrap().origin, offset);
+    succeed(&["convert", arg(&world), arg(&copy), "--local-origin"]);
+    assert!(read_splat(&copy).unwrap().origin.distance(offset) < 10.);
+
+    // A file name that is too long for the origin's file is refused before the work.
+    let long = of(&format!("{}.ply", "x".repeat(240)));
+    let said = refuse(&["convert", arg(&local), arg(&long), "--local-origin"]);
+    assert!(said.contains(".origin.json can't be written"), "{said}");
+
+    // A copy without its origin file still opens, at another position.
+    let lone = of("lone.ply");
+    fs::copy(&local, &lone).unwrap();
+    assert_eq!(read_splat(&lone).unwrap().origin, DVec3::ZERO);
+    // Writing by the library in world coordinates removes the origin file.
+    write_splat(&local, &read_splat(&local).unwrap()).unwrap();
+    assert!(!origin_file(&local).exists() && read_splat(&local).unwrap().origin == DVec3::ZERO);
+}
+
+#[test]
+fn origins_that_are_none_are_refused() {
+    let (folder, room) = room();
+    let splat = room.join("truth.ply");
+    let refused = |bad: &str, command: &[&str]| {
+        fs::write(origin_file(&splat), bad).unwrap();
+        let said = refuse(command);
+        for part in ["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"] {
+            assert!(said.contains(part), "{bad}: {said}");
+        }
+    };
+    for bad in [
+        "",
+        "[1, 2, 3]",
+        "{}",
+        "{\"origin\": [1, 2]}",
+        "{\"origin\": [1, 2, 1e999]}",
+        "{\"origin\": [1, \"2\", 3]}",
+    ] {
+        refused(bad, &["inspect", arg(&splat)]);
+    }
+    let (out, page, scene) = (folder.path().join("out.ply"), folder.path().join("out.html"), arg(&room));
+    for command in [
+        &["render", "--splat", arg(&splat), "--scene", scene, "--out", arg(folder.path())][..],
+        &["render", "--splat", arg(&splat), "--scene", scene, "--html", arg(&page)],
+        &["eval", "--splat", arg(&splat), "--scene", scene],
+        &["convert", arg(&splat), arg(&out)],
+        &["refine", "--splat", arg(&splat), "--scene", scene, "--steps", "1", "--out", arg(&out)],
+    ] {
+        refused("{\"origin\": null}", command);
+    }
+}
+
+/// A real capture gets the same scores in kilometres and in UTM coordinates.
+#[test]
+fn real_captures_score_the_same_anywhere() {
+    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let of = |name: &str| folder.path().join(name);
+    let score = |scene: &Path, name: &str| {
+        let splat = of(name);
+        succeed(&["reconstruct", "--scene", arg(scene), "--out", arg(&splat), "--local-origin"]);
+        let pictures = of(&format!("{name}.pictures"));
+        succeed(&["render", "--splat", arg(&splat), "--scene", arg(scene), "--out", arg(&pictures)]);
+        pictures
+    };
+    let plain = score(&capture, "plain.ply");
+    // Synthetic rooms have walls whose Gaussians are equally far from a camera, in an order that rotations change; photos have
+    // none.
+    let turned = Similarity { rotation: DMat3::from_rotation_y(0.9), ..to_place(PLACES[2]) };
+    for place in [to_place(PLACES[0]), to_place(PLACES[5]), turned] {
+        let scene = of("scene");
+        write_moved(&capture, &scene, &place);
+        let other = score(&scene, "moved.ply");
+        let least = least_psnr(&plain, &other);
+        assert!(least >= 60., "{place:?}: {least:.2} dB");
+        fs::remove_dir_all(&scene).unwrap();
+    }
+}

@@ -1,0 +1,16 @@
+//! Tests of the library alone: the model, the splat op, losses and loading against golden tensors and twins; the architecture and citations.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod architecture;
+mod citations;
+mod fuzz_seeds;
+mod golden_loss;
+mod golden_model;
+mod golden_scene;
+mod loader;
+mod model;
+mod perceptual;
+mod published;
+mod splat;

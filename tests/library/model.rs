@@ -1,0 +1,328 @@
+//! The model's parameters, variants and image sizes.
+
+use globalsplat::config::Config;
+use globalsplat::model::{GlobalSplat, Memory, ModelConfig, Precision, Stage, Streams};
+use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, save_model};
+use std::collections::BTreeMap;
+use tch::{Device, Kind, Tensor, nn};
+
+fn build(config: &ModelConfig) -> (nn::VarStore, GlobalSplat) {
+    let vs = nn::VarStore::new(Device::Cpu);
+    let model = GlobalSplat::new(&vs.root(), config).expect("a valid configuration");
+    (vs, model)
+}
+
+fn small() -> ModelConfig {
+    ModelConfig {
+        latents: 12,
+        width: 32,
+        rgb_width: 24,
+        ray_width: 16,
+        rounds: 2,
+        heads: 4,
+        ..Default::default()
+    }
+}
+
+/// Returns `views` images of noise from cameras in a row.
+fn inputs(views: i64, height: i64, width: i64) -> [Tensor; 3] {
+    let options = (Kind::Float, Device::Cpu);
+    let images = Tensor::rand([1, views, 3, height, width], options);
+    let c2w = Tensor::eye(4, options).repeat([1, views, 1, 1]);
+    c2w.select(3, 3).select(2, 0).copy_(&Tensor::linspace(-0.5, 0.5, views, options).unsqueeze(0));
+    let (w, h) = (width as f32, height as f32);
+    let intrinsics = Tensor::from_slice(&[w, 0., w / 2., 0., w, h / 2., 0., 0., 1.]).view([3, 3]);
+    [images, c2w, intrinsics.repeat([1, views, 1, 1])]
+}
+
+#[test]
+fn the_main_model_has_the_published_names_and_shapes() {
+    let Some(golden) = crate::common::golden() else { return };
+    let table = golden.join("../spec/state_dict_16k.tsv");
+    let Ok(table) = std::fs::read_to_string(&table) else {
+        crate::common::skip("the published names", &format!("{} is not there", table.display()));
+        return;
+    };
+    let expected: BTreeMap<String, Vec<i64>> = table
+        .lines()
+        .map(|line| {
+            let (name, shape) = line.split_once('\t').expect("name and shape");
+            (name.to_string(), shape.split(',').map(|s| s.parse().expect("a size")).collect())
+        })
+        .collect();
+    let (vs, _) = build(&ModelConfig::default());
+    let ours: BTreeMap<String, Vec<i64>> =
+        vs.variables().into_iter().map(|(name, t)| (name, t.size())).collect();
+    assert_eq!(expected.len(), 454);
+    assert_eq!(ours, expected);
+}
+
+#[test]
+fn the_main_model_has_84_million_trained_parameters() {
+    let (vs, _) = build(&ModelConfig::default());
+    let trained: usize = vs.trainable_variables().iter().map(Tensor::numel).sum();
+    assert_eq!(trained, 84_321_120);
+}
+
+#[test]
+fn the_single_stream_has_90_million_parameters() {
+    let config = ModelConfig { streams: Streams::Single, width: 776, ..Default::default() };
+    let (vs, _) = build(&config);
+    let trained: usize = vs.trainable_variables().iter().map(Tensor::numel).sum();
+    let off = trained as f64 / 90e6 - 1.;
+    assert!(off.abs() <= 0.01, "{trained} parameters");
+    assert!(vs.variables().keys().all(|name| !name.contains("tex") && !name.contains("pair_adapters")));
+}
+
+#[test]
+fn plucker_only_has_no_camera_code() {
+    let (vs, _) = build(&ModelConfig { camera_code: false, ..small() });
+    assert!(vs.variables().keys().all(|name| !name.starts_with("view_pe")));
+}
+
+#[test]
+fn every_variant_decodes_as_many_gaussians_as_it_says() {
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let variants = [
+        (small(), 3, 12 * 8),
+        (small(), 4, 12 * 16),
+        (ModelConfig { candidates: 2, ..small() }, 0, 12),
+        (ModelConfig { streams: Streams::Single, ..small() }, 3, 12 * 8),
+        (ModelConfig { camera_code: false, ..small() }, 3, 12 * 8),
+        (ModelConfig { sh_degree: 0, ..small() }, 1, 12 * 2),
+        (ModelConfig { latents: 48, ..small() }, 3, 48 * 8), // more tokens than dimensions
+    ];
+    for (config, stage, count) in variants {
+        let (_vs, model) = build(&config);
+        for mix in [0., 0.3, 1.] {
+            let decoded = model.forward(&images, &c2w, &intrinsics, Stage { index: stage, mix });
+            let g = &decoded.gaussians;
+            assert_eq!(g.means.size(), [1, count, 3], "{config:?}");
+            assert_eq!(g.sh.size(), [1, count, config.sh_bases(), 3]);
+            for t in [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh] {
+                assert_eq!(t.isfinite().all().int64_value(&[]), 1);
+            }
+            let norms = g.quaternions.norm_scalaropt_dim(2, [-1i64], false);
+            assert!((norms - 1.).abs().max().double_value(&[]) < 1e-5);
+            assert!(g.quaternions.select(-1, 0).min().double_value(&[]) >= 0.);
+        }
+    }
+}
+
+#[test]
+fn the_number_of_gaussians_does_not_depend_on_the_number_of_views() {
+    let (_vs, model) = build(&small());
+    for views in [2, 5] {
+        let [images, c2w, intrinsics] = inputs(views, 16, 16);
+        let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+        assert_eq!(decoded.gaussians.count(), 12 * 8);
+    }
+}
+
+#[test]
+fn a_transition_starts_where_the_stage_before_ended() {
+    // At λ = 0 every parent occurs twice, its optical depth split between the two.
+    let (_vs, model) = build(&small());
+    let [images, c2w, intrinsics] = inputs(2, 16, 16);
+    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics));
+    let after = model.decode(&encoded, Stage { index: 2, mix: 0. }).gaussians;
+    let before = model.decode(&encoded, Stage { index: 1, mix: 1. }).gaussians;
+    let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 1, None);
+    assert!(crate::common::largest_error(&after.means, &twice(&before.means)) < 1e-6);
+    assert!(crate::common::largest_error(&after.sh, &twice(&before.sh)) < 1e-6);
+    let ratio = after.scales / twice(&before.scales);
+    assert!((ratio - 0.5f64.cbrt()).abs().max().double_value(&[]) < 1e-6);
+}
+
+#[test]
+fn bf16_is_float32_but_for_its_rounding() {
+    for streams in [Streams::Dual, Streams::Single] {
+        let (vs, mut model) = build(&ModelConfig { streams, ..small() });
+        let mut random = crate::common::Random::new(3);
+        // In the order of names: the map's own order differs between processes, and so would every weight.
+        for (name, variable) in &mut vs.variables().into_iter().collect::<BTreeMap<_, _>>() {
+            // Large values, so that every layer matters: LayerScale is initialized to a thousandth.
+            let is_norm = name.ends_with(".weight") && variable.dim() == 1;
+            let value = random.symmetric(&variable.size()) * 0.3 + if is_norm { 1. } else { 0. };
+            tch::no_grad(|| variable.copy_(&value));
+        }
+        let [_, c2w, intrinsics] = inputs(3, 16, 24);
+        let images = random.uniform(&[1, 3, 3, 16, 24]).to_kind(Kind::Float);
+        let mut run = |precision| {
+            model.set_precision(precision);
+            let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+            let g = decoded.gaussians.map(Tensor::shallow_clone);
+            vs.trainable_variables().iter_mut().for_each(|variable| variable.zero_grad());
+            (g.means.square().sum(Kind::Float) + g.sh.square().sum(Kind::Float)).backward();
+            let gradients = vs.trainable_variables().into_iter().map(|variable| variable.grad());
+            let gradient: Vec<Tensor> =
+                gradients.filter(Tensor::defined).map(|gradient| gradient.flatten(0, -1)).collect();
+            (g, Tensor::cat(&gradient, 0))
+        };
+        let (exact, exact_gradient) = run(Precision::F32);
+        let (rounded, rounded_gradient) = run(Precision::Bf16);
+        let pairs = [
+            ("means", &rounded.means, &exact.means),
+            ("scales", &rounded.scales, &exact.scales),
+            ("quaternions", &rounded.quaternions, &exact.quaternions),
+            ("opacities", &rounded.opacities, &exact.opacities),
+            ("sh", &rounded.sh, &exact.sh),
+            ("gradient", &rounded_gradient, &exact_gradient),
+        ];
+        for (name, rounded, exact) in pairs {
+            assert_eq!(rounded.kind(), Kind::Float, "{name}");
+            let error = crate::common::relative_error(rounded, exact);
+            assert!((1e-5..2e-2).contains(&error), "{streams:?}, {name}: relative error {error:.1e}");
+        }
+    }
+}
+
+#[test]
+fn weights_of_a_file_in_bf16_are_kept_in_it() {
+    let config = Config { model: ModelConfig { streams: Streams::Dual, ..small() }, ..Default::default() };
+    let (vs, _) = build(&config.model);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let stage = config.curriculum.final_stage();
+    save_model(&path, &vs, &config, stage, ModelDtype::BF16).unwrap();
+    let load = |precision| ModelFile::open(&path, &[]).unwrap().load(Device::Cpu, precision).unwrap();
+
+    let mut cast = load(Precision::F32);
+    cast.model.set_precision(Precision::Bf16);
+    let kept = load(Precision::Bf16);
+    let bytes = |loaded: &LoadedModel, kind: Kind| -> usize {
+        let variables = loaded.vs.variables().into_values().filter(|t| t.kind() == kind);
+        variables.map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum()
+    };
+    assert_eq!(bytes(&cast, Kind::BFloat16), 0);
+    assert!(bytes(&kept, Kind::BFloat16) > 0);
+    assert_eq!(bytes(&kept, Kind::Float) + 2 * bytes(&kept, Kind::BFloat16), bytes(&cast, Kind::Float));
+
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let [cast, kept] = [&cast, &kept]
+        .map(|loaded| tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians));
+    assert!(cast.means.equal(&kept.means) && cast.scales.equal(&kept.scales) && cast.sh.equal(&kept.sh));
+    assert!(cast.quaternions.equal(&kept.quaternions) && cast.opacities.equal(&kept.opacities));
+}
+
+/// Returns the resident bytes of the process that are mapped from `file`, as Linux counts them.
+#[cfg(target_os = "linux")]
+fn resident(file: &std::path::Path) -> u64 {
+    let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
+    let name = file.canonicalize().unwrap().display().to_string();
+    let (mut is_of_file, mut kilobytes) = (false, 0);
+    for line in maps.lines() {
+        let first = line.split_whitespace().next().unwrap_or_default();
+        if first.contains('-') {
+            // A line with a range of addresses, and the mapped file at its end.
+            is_of_file = line.ends_with(&name);
+        } else if first == "Rss:" && is_of_file {
+            kilobytes += line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap();
+        }
+    }
+    1000 * kilobytes
+}
+
+#[test]
+fn weights_that_lie_in_their_file_are_those_that_are_copied() {
+    let model = ModelConfig { width: 64, heads: 4, ..small() };
+    let config = Config { model, ..Default::default() };
+    let (vs, _) = build(&config.model);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let stage = config.curriculum.final_stage();
+    for (dtype, precision) in [(ModelDtype::F32, Precision::F32), (ModelDtype::BF16, Precision::Bf16)] {
+        save_model(&path, &vs, &config, stage, dtype).unwrap();
+        let open = || ModelFile::open(&path, &[]).unwrap();
+        let copied = open().load(Device::Cpu, precision).unwrap();
+        let lies = open().load_mmap(Device::Cpu, precision).unwrap();
+        let mapped = lies.mapped.expect("a mapped file");
+        assert!(copied.mapped.is_none());
+        let [images, c2w, intrinsics] = inputs(3, 16, 24);
+        let same = |loaded: &LoadedModel| {
+            let of = |loaded: &LoadedModel| {
+                tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians)
+            };
+            let (a, b) = (of(&copied), of(loaded));
+            // The memory alignment of a tensor may affect the order of summation.
+            let pairs = [(&a.means, &b.means), (&a.opacities, &b.opacities), (&a.sh, &b.sh)];
+            pairs.iter().all(|(a, b)| crate::common::relative_error(b, a) < 1e-5)
+        };
+        assert!(same(&lies), "{dtype:?}");
+        #[cfg(target_os = "linux")]
+        {
+            let bytes = std::fs::metadata(&path).unwrap().len();
+            let used = resident(&path);
+            mapped.release_pages();
+            let left = resident(&path);
+            assert!(2 * used > bytes && 8 * left < bytes, "{dtype:?}: {used} of {bytes} bytes, then {left}");
+        }
+        assert!(same(&lies), "{dtype:?}: read again");
+        // Pages that are written to become private copies.
+        let before = std::fs::read(&path).unwrap();
+        tch::no_grad(|| lies.vs.variables().values().for_each(|t| drop(t.shallow_clone().fill_(1.))));
+        assert!(!same(&lies) && std::fs::read(&path).unwrap() == before);
+        mapped.release_pages();
+    }
+}
+
+#[test]
+fn initial_weights_are_as_specified() {
+    tch::manual_seed(0);
+    let (vs, _) = build(&ModelConfig { rounds: 1, ..Default::default() });
+    let variables = vs.variables();
+    let std = |name: &str| variables[name].std(false).double_value(&[]);
+    let near =
+        |value: f64, expected: f64| assert!((value / expected - 1.).abs() < 0.05, "{value} for {expected}");
+    near(std("slot_encoder.geo_rounds.0.lat_q.weight"), 0.02);
+    near(std("slot_encoder.mem_regs"), 0.02);
+    near(std("scene_tokens"), 0.02);
+    near(std("gaussian_decoder.geo_pos_readout.weight"), 1e-2);
+    near(std("gaussian_decoder.sh_readout.weight"), 1e-3);
+    near(std("rgb_patch_embeds.1.weight"), 1. / (3f64 * 192.).sqrt()); // uniform ±1/√192
+    near(variables["slot_encoder.geo_rounds.0.attn_ls.gamma"].mean(Kind::Float).double_value(&[]), 1e-3);
+    near(variables["slot_encoder.geo_rounds.0.tower.1.ls2.gamma"].mean(Kind::Float).double_value(&[]), 1e-2);
+    for name in ["slot_encoder.geo_rounds.0.lat_q.bias", "gaussian_decoder.gate_readout.bias"] {
+        assert_eq!(variables[name].abs().max().double_value(&[]), 0.);
+    }
+    // M ≤ d: orthogonal rows of length 0.02.
+    let (vs, _) = build(&small());
+    let tokens = &vs.variables()["scene_tokens"];
+    let gram = tokens.matmul(&tokens.tr()) / (0.02 * 0.02);
+    assert!(crate::common::largest_error(&gram, &Tensor::eye(12, (Kind::Float, Device::Cpu))) < 1e-5);
+}
+
+#[test]
+fn configurations_that_do_not_fit_are_refused() {
+    let refused = [
+        (ModelConfig { width: 30, heads: 4, ..small() }, "model.width is 30"),
+        (ModelConfig { candidates: 6, ..small() }, "model.candidates is 6"),
+        (ModelConfig { sh_degree: 4, ..small() }, "model.sh_degree is 4"),
+        (ModelConfig { patch_size: 0, ..small() }, "model.patch_size is 0"),
+    ];
+    for (config, message) in refused {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let error = GlobalSplat::new(&vs.root(), &config).expect_err("a refusal").to_string();
+        assert!(error.starts_with(message), "{error}");
+    }
+    assert!(small().check_image(20, 16).unwrap_err().to_string().contains("height is 20"));
+}
+
+#[test]
+fn a_memory_that_nobody_follows_is_kept_as_products_take_it() {
+    let (_vs, mut model) = build(&small());
+    model.set_precision(Precision::Bf16);
+    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let followed = model.memory(&images, &c2w, &intrinsics);
+    let of = |memory: &Memory| [&memory.tokens, &memory.common].map(|t| (t.requires_grad(), t.kind()));
+    assert_eq!(of(&followed), [(true, Kind::Float), (false, Kind::Float)]);
+    let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics));
+    assert_eq!(of(&kept), [(false, Kind::BFloat16), (false, Kind::Float)]);
+    // Without gradients, the common part is estimated from some of the views, one view at a time: products of other shapes
+    // differ in float32's last digits. The remaining difference is rounding to bfloat16.
+    let whole = |memory: &Memory| memory.tokens.to_kind(Kind::Double) + &memory.common;
+    let off = (whole(&kept) - whole(&followed)).abs();
+    let rounding =
+        kept.tokens.to_kind(Kind::Double).abs() * 2f64.powi(-8) + whole(&followed).abs().max() * 1e-6;
+    assert_eq!(off.le_tensor(&rounding).all().int64_value(&[]), 1);
+}

@@ -1,0 +1,114 @@
+//! L_perc in bf16, which training offers as an option.
+
+use crate::common::Random;
+use globalsplat::data::{Holdout, open_capture};
+use globalsplat::io::find_pretrained;
+use globalsplat::loss::{LossConfig, LpipsNetwork, PerceptualKind, PerceptualLoss};
+use globalsplat::model::Precision;
+use globalsplat::reconstruct::load_context;
+use std::path::Path;
+use tch::{Device, Kind, Tensor};
+
+const SIDE: u32 = 96;
+/// Amplitudes of noise on images, for a PSNR of about 14, 20, 26 and 34 dB.
+const NOISES: [f64; 4] = [0.4, 0.2, 0.1, 0.04];
+
+/// VGG-19's convolutions: their indices in torchvision's file, and output channels.
+const LAYERS: [(i64, i64); 14] = [
+    (0, 64),
+    (2, 64),
+    (5, 128),
+    (7, 128),
+    (10, 256),
+    (12, 256),
+    (14, 256),
+    (16, 256),
+    (19, 512),
+    (21, 512),
+    (23, 512),
+    (25, 512),
+    (28, 512),
+    (30, 512),
+];
+
+/// Loads the network in both precisions.
+fn both(perceptual: PerceptualKind, weights: &Path) -> [PerceptualLoss; 2] {
+    let perceptual_weights = weights.display().to_string();
+    let config = LossConfig { perceptual, perceptual_weights, ..Default::default() };
+    [Precision::F32, Precision::Bf16].map(|precision| {
+        let loaded = PerceptualLoss::load(&config, [SIDE, SIDE].into(), Device::Cpu).expect("weights");
+        loaded.expect("a network").with_precision(precision)
+    })
+}
+
+/// Returns an image of random noise in blocks of several sizes, [1, 1, 3, SIDE, SIDE].
+fn made_up(random: &mut Random) -> Tensor {
+    let side = i64::from(SIDE);
+    let blocks = [4, 12, 32, side].map(|count| {
+        let coarse = random.uniform(&[1, 3, count, count]).to_kind(Kind::Float);
+        coarse.upsample_nearest2d([side, side], None, None)
+    });
+    (blocks.into_iter().reduce(|sum, block| sum + block).expect("four") / 4.).unsqueeze(0)
+}
+
+/// Asserts that loss and gradient in bf16 are near those in float32, for images at several distances from `ground_truth`: the smaller
+/// the difference, the larger the relative rounding error.
+fn assert_near(networks: &[PerceptualLoss; 2], ground_truth: &Tensor, name: &str, random: &mut Random) {
+    for noise in NOISES {
+        let noise = random.symmetric(&ground_truth.size()).to_kind(Kind::Float) * noise;
+        let [exact, rounded] = networks.each_ref().map(|network| {
+            let picture = (ground_truth + &noise).clamp(0., 1.).set_requires_grad(true);
+            let loss = network.loss(&picture, ground_truth);
+            loss.backward();
+            (loss.double_value(&[]), picture.grad().flatten(0, -1).to_kind(Kind::Double))
+        });
+        let off = (rounded.0 / exact.0 - 1.).abs();
+        let cosine = rounded.1.dot(&exact.1) / (rounded.1.norm() * exact.1.norm());
+        let cosine = cosine.double_value(&[]);
+        println!("{name}: loss {:.4}, off by {off:.1e}, cosine of the gradients {cosine:.4}", exact.0);
+        assert!(off > 0. && off <= 1e-2, "{name}: off by {off:.1e}");
+        assert!((0.98..0.99999).contains(&cosine), "{name}: cosine of the gradients {cosine:.5}");
+    }
+}
+
+#[test]
+fn vgg19_in_bf16_is_float32_s() {
+    let mut random = Random::new(7);
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("vgg19.safetensors");
+    let (mut inputs, mut weights) = (3, vec![]);
+    for (number, outputs) in LAYERS {
+        let bound = (6. / (9. * inputs as f64)).sqrt();
+        let kernel = random.symmetric(&[outputs, inputs, 3, 3]) * bound;
+        weights.push((format!("features.{number}.weight"), kernel.to_kind(Kind::Float)));
+        weights
+            .push((format!("features.{number}.bias"), Tensor::zeros([outputs], (Kind::Float, Device::Cpu))));
+        inputs = outputs;
+    }
+    Tensor::write_safetensors(&weights, &file).expect("weights");
+    let networks = both(PerceptualKind::Vgg19, &file);
+    let ground_truth = made_up(&mut random);
+    assert_near(&networks, &ground_truth, "vgg19", &mut random);
+}
+
+#[test]
+fn lpips_in_bf16_is_float32_s() {
+    if !crate::common::has_lpips() {
+        return;
+    }
+    let mut random = Random::new(8);
+    let mut ground_truths = vec![("made up", made_up(&mut random))];
+    if let Some(captures) = crate::common::captures() {
+        let capture = open_capture(&captures[0]).expect("a capture");
+        let views = load_context(&capture, Holdout::None, Some(2), [SIDE, SIDE].into()).expect("views");
+        ground_truths.push(("a photo", views[0].image.to_kind(Kind::Float).unsqueeze(0).unsqueeze(0)));
+    }
+    for (kind, network) in
+        [(PerceptualKind::LpipsVgg, LpipsNetwork::Vgg16), (PerceptualKind::LpipsAlex, LpipsNetwork::AlexNet)]
+    {
+        let networks = both(kind, &find_pretrained(network.file_name()).expect("weights"));
+        for (what, ground_truth) in &ground_truths {
+            assert_near(&networks, ground_truth, &format!("{}, {what}", network.metric()), &mut random);
+        }
+    }
+}

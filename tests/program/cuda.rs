@@ -1,0 +1,143 @@
+//! GPU kernels, as far as they can be tested without a GPU.
+
+use crate::common::{again, skip};
+use globalsplat::render::cuda::{Driver, Form, Nvrtc, cache_folder, prepare, usage};
+use std::path::Path;
+use std::process::Command;
+
+/// Oldest and newest supported GPU architectures.
+const OLDEST: i32 = 75;
+const NEWEST: i32 = 120;
+/// Shared memory in bytes that every GPU grants a block, registers per block, and threads of the largest block.
+const SHARED: u32 = 48 << 10;
+const REGISTERS: u32 = 64 << 10;
+const BLOCK: u32 = 256;
+
+fn nvrtc() -> Option<Nvrtc> {
+    Nvrtc::find().map_err(|why| skip("NVRTC", &why)).ok()
+}
+
+#[test]
+fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
+    let Some(nvrtc) = nvrtc() else { return };
+    let promised: Vec<i32> =
+        nvrtc.architectures.iter().copied().filter(|of| (OLDEST..=NEWEST).contains(of)).collect();
+    assert!(promised.contains(&OLDEST) && promised.contains(&NEWEST), "{promised:?}");
+    for architecture in promised {
+        let compiled = nvrtc.compile(architecture, Form::Cubin).unwrap();
+        assert!(compiled.image.starts_with(b"\x7fELF"), "{architecture}");
+        let kernels = usage(&compiled.log);
+        assert_eq!(kernels.len(), 12, "{}", compiled.log);
+        for kernel in kernels {
+            assert!(kernel.spills == 0 && kernel.shared <= SHARED, "{architecture}: {kernel:?}");
+            // Kernels with blocks of 128 threads may use all registers.
+            let threads = if kernel.name.contains("project") { BLOCK / 2 } else { BLOCK };
+            assert!(
+                kernel.registers > 0 && kernel.registers * threads <= REGISTERS,
+                "{architecture}: {kernel:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_splat_s_sums_take_eleven_shuffles() {
+    let Some(nvrtc) = nvrtc() else { return };
+    let ptx = nvrtc.compile(90, Form::Ptx).unwrap().image;
+    let ptx = String::from_utf8_lossy(&ptx);
+    let kernel = ptx.split(".entry ").find(|text| text.starts_with("gs_blend_backward")).expect("a kernel");
+    assert_eq!(kernel.matches("shfl.sync.bfly").count(), 11);
+}
+
+#[test]
+fn newer_gpus_get_what_their_driver_compiles_and_older_ones_a_sentence() {
+    let Some(nvrtc) = nvrtc() else { return };
+    let newest = *nvrtc.architectures.last().unwrap();
+    assert_eq!(nvrtc.target(newest), Ok((newest, Form::Cubin)));
+    assert_eq!(nvrtc.target(newest + 10), Ok((newest, Form::Ptx)));
+    let ptx = nvrtc.compile(newest, Form::Ptx).unwrap().image;
+    assert!(ptx.ends_with(&[0]) && String::from_utf8_lossy(&ptx).contains(".entry gs_blend"));
+    let refused = nvrtc.target(nvrtc.architectures[0] - 1).unwrap_err();
+    assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
+}
+
+/// Returns a folder with a fake driver, which loaders find by LD_LIBRARY_PATH. Beside it is a toolkit's stub, which only
+/// linkers use.
+fn fake_driver() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let stub = folder.path().join("stub.c");
+    std::fs::write(&stub, "int cuInit(unsigned flags) { return 34; }").expect("a file");
+    let compiler = std::env::var("CXX").unwrap_or("c++".into());
+    for (source, library) in
+        [(Path::new("tests/common/fake_driver.c"), "libcuda.so.1"), (&stub, "libcuda.so")]
+    {
+        let compiled = Command::new(&compiler)
+            .args(["-x", "c", "-shared", "-fPIC", "-o"])
+            .args([&folder.path().join(library), source])
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .status()
+            .expect("the compiler that this was built with");
+        assert!(compiled.success());
+    }
+    folder
+}
+
+#[test]
+fn kernels_are_compiled_once() {
+    if nvrtc().is_none() {
+        return;
+    }
+    // The driver is looked up once per process: this test runs itself again with a fake one.
+    const EXPECTED: &str = "GLOBALSPLAT_TEST_EXPECTED";
+    if let Some(expected) = std::env::var_os(EXPECTED) {
+        let driver = Driver::find().unwrap();
+        let gpu = &driver.gpus[0];
+        assert_eq!((driver.version, gpu.name.as_str(), gpu.architecture), (13000, "Imaginary", 90));
+        assert_eq!((gpu.memory, gpu.multiprocessors), (8 << 30, 132));
+        let prepared = prepare(0).unwrap();
+        assert_eq!((prepared.architecture, prepared.was_kept), (90, expected == "kept"));
+        let file = prepared.file.expect("a place for it");
+        assert!(file.starts_with(cache_folder().unwrap()) && file.is_file());
+        assert!(prepare(1).unwrap_err().contains("1 GPUs"));
+        return;
+    }
+    let (driver, cache) = (fake_driver(), tempfile::tempdir().expect("a temporary folder"));
+    let run = |expected: &str| {
+        let variables = [
+            ("LD_LIBRARY_PATH", driver.path()),
+            ("XDG_CACHE_HOME", cache.path()),
+            (EXPECTED, Path::new(expected)),
+        ];
+        assert!(again("cuda::kernels_are_compiled_once", &variables).0, "{expected}");
+    };
+    run("compiled");
+    run("kept");
+    let kept = cache.path().join("globalsplat").read_dir().unwrap().next().unwrap().unwrap().path();
+    let image = std::fs::read(&kept).unwrap();
+    std::fs::write(&kept, &image[..image.len() / 2]).unwrap();
+    run("compiled");
+    assert_eq!(std::fs::read(&kept).unwrap(), image);
+}
+
+#[test]
+fn doctor_says_what_is_missing() {
+    let driver = fake_driver();
+    let doctor = |error: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
+            .arg("doctor")
+            .envs([("LD_LIBRARY_PATH", driver.path()), ("XDG_CACHE_HOME", driver.path())])
+            .env("GLOBALSPLAT_FAKE_DRIVER", error)
+            .output()
+            .expect("a program that starts");
+        assert!(output.status.success());
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let found = doctor("");
+    assert!(
+        found.contains("CUDA 13.0") && found.contains("Imaginary, compute capability 9.0, 8.6 GB"),
+        "{found}"
+    );
+    assert!(found.contains("this libtorch can't use it"), "{found}");
+    assert!(doctor("no device").contains("it reports no GPU"));
+    assert!(doctor("mismatch").contains("unsupported display driver"));
+}

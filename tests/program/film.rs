@@ -1,0 +1,482 @@
+//! Videos and camera paths: what players decode, the sources of cameras, and cleanup after failures.
+
+use crate::common::browser::Browser;
+use crate::common::formats::{Format, rewrite};
+use crate::common::program::{arg, command, refuse, room, succeed};
+use crate::common::skip;
+use base64::Engine;
+use glam::{DMat4, DVec4};
+use globalsplat::data::{open_capture, read_camera_path, write_cameras_json};
+use globalsplat::io::find_ffmpeg;
+use globalsplat::scene::{Camera, pose_to_rows};
+use serde_json::{Value, json};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// Returns `true` if there is an ffmpeg that writes MP4s; otherwise, skips the test.
+fn has_ffmpeg() -> bool {
+    find_ffmpeg().map_err(|why| skip("ffmpeg", &why)).is_ok()
+}
+
+/// Returns the arguments that render `splat` to `out`, followed by `more`.
+fn render<'a>(splat: &'a Path, out: &'a Path, more: &[&'a str]) -> Vec<&'a str> {
+    [&["render", "--splat", arg(splat), "--out", arg(out)][..], more].concat()
+}
+
+/// Returns the images in `folder`, sorted by name.
+fn pictures(folder: &Path) -> Vec<image::RgbImage> {
+    let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    files.iter().map(|file| image::open(file).unwrap().into_rgb8()).collect()
+}
+
+/// Returns the PSNR of two images in dB, from bytes.
+fn psnr(a: &[u8], b: &[u8]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let square = |(&a, &b): (&u8, &u8)| (f64::from(a) - f64::from(b)).powi(2);
+    let error = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
+    10. * (255f64.powi(2) / error.max(1e-9)).log10()
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+/// Returns the description of a video's stream by ffprobe.
+fn probed(film: &Path) -> Value {
+    let output = Command::new("ffprobe")
+        .args(["-v", "error", "-count_frames", "-show_streams", "-of", "json", arg(film)])
+        .output()
+        .unwrap();
+    let mut told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["streams"].as_array().unwrap().len(), 1, "pictures alone");
+    told["streams"][0].take()
+}
+
+#[test]
+fn an_mp4_shows_what_the_pictures_show() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let (folder, room) = room();
+    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.mp4"));
+    let cameras = ["--scene", arg(&room), "--size", "384x256"];
+    succeed(&render(&splat, &film, &[&cameras[..], &["--depth", "--fps", "25"]].concat()));
+    let found = probed(&film);
+    for (key, expected) in [
+        ("codec_name", "h264"),
+        ("pix_fmt", "yuv420p"),
+        ("r_frame_rate", "25/1"),
+        ("nb_read_frames", "9"),
+        ("color_space", "bt709"),
+        ("color_range", "tv"),
+    ] {
+        assert_eq!(found[key], expected, "{key}: {found}");
+    }
+    // Colour and depth side by side, with a gap.
+    assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(2 * 384 + 4), Some(256)));
+    let bytes = fs::read(&film).unwrap();
+    let at = |name: &[u8]| bytes.windows(4).position(|four| four == name).unwrap();
+    assert!(at(b"moov") < at(b"mdat"), "a page would have to load all of it first");
+
+    // Another program decodes the video, and its frames are compared with PNGs from the same cameras.
+    let decoded = Command::new("ffmpeg")
+        .args(["-v", "error", "-i", arg(&film), "-sws_flags", "accurate_rnd+full_chroma_int+bicubic"])
+        .args(["-f", "rawvideo", "-pix_fmt", "rgb24", "-"])
+        .output()
+        .unwrap()
+        .stdout;
+    let frames: Vec<&[u8]> = decoded.chunks(3 * 772 * 256).collect();
+    assert_eq!(frames.len(), 9);
+    let views = folder.path().join("views");
+    succeed(&render(&splat, &views, &[&cameras[..], &["--depth"]].concat()));
+    let parts = pictures(&views);
+    for (i, (frame, parts)) in frames.iter().zip(parts.chunks(2)).enumerate() {
+        let mut picture = image::RgbImage::from_pixel(772, 256, image::Rgb([255; 3]));
+        // Sorted by name: 000.png, then 000_depth.png.
+        image::imageops::replace(&mut picture, &parts[0], 0, 0);
+        image::imageops::replace(&mut picture, &parts[1], 388, 0);
+        let likeness = psnr(frame, &picture);
+        println!("frame {i}: {likeness:.1} dB");
+        assert!(likeness > 33., "frame {i} of the film is {likeness} dB like its picture");
+    }
+
+    // An odd side is cropped by one line, and nothing else.
+    let odd = folder.path().join("odd.mp4");
+    succeed(&render(&splat, &odd, &["--scene", arg(&room), "--size", "33x41"]));
+    let found = probed(&odd);
+    assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(32), Some(40)));
+    assert!(names(folder.path()).iter().all(|name| !name.contains("partial")));
+}
+
+#[test]
+fn a_browser_plays_an_mp4_from_disk() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let Some(mut browser) = Browser::start() else { return };
+    let (folder, room) = room();
+    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.mp4"));
+    let cameras = ["--scene", arg(&room), "--size", "384x256"];
+    succeed(&render(&splat, &film, &cameras));
+    let views = folder.path().join("views");
+    succeed(&render(&splat, &views, &cameras));
+    let page = folder.path().join("page.html");
+    let text = "<!doctype html><body style='margin:0'><canvas width=384 height=256 style='display:block'></canvas>\
+        <video src=film.mp4 muted></video>";
+    fs::write(&page, text).unwrap();
+    browser.open(&page);
+    let told = browser.evaluate(
+        "new Promise((done, failed) => {
+            const v = document.querySelector('video');
+            const tell = () => done([v.readyState, v.duration, v.videoWidth, v.videoHeight]);
+            v.readyState > 1 ? tell() : (v.onloadeddata = tell, v.onerror = () => failed(v.error.message));
+        })",
+    );
+    assert!(told[0].as_i64() >= Some(2), "{told}");
+    // Nine frames at 20 frames per second.
+    assert!((told[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{told}");
+    assert_eq!((told[2].as_i64(), told[3].as_i64()), (Some(384), Some(256)));
+    for (i, picture) in pictures(&views).iter().enumerate().step_by(4) {
+        // Seek to the middle of the frame.
+        browser.evaluate(&format!(
+            "new Promise((done) => {{
+                const v = document.querySelector('video');
+                v.onseeked = done;
+                v.currentTime = {};
+            }})",
+            (i as f64 + 0.5) / 20.
+        ));
+        // When the event fires, a canvas may still get the previous frame.
+        let mut look = || {
+            browser.evaluate(
+                "new Promise((done) => {
+                    document.querySelector('canvas').getContext('2d').drawImage(document.querySelector('video'), 0, 0);
+                    requestAnimationFrame(() => requestAnimationFrame(done));
+                })",
+            );
+            // A page from disk may not read the pixels of a video; a screenshot shows them all the same.
+            let clip = json!({"x": 0, "y": 0, "width": 384, "height": 256, "scale": 1});
+            let shot = browser.call("Page.captureScreenshot", json!({"format": "png", "clip": clip}));
+            let png =
+                base64::engine::general_purpose::STANDARD.decode(shot["data"].as_str().unwrap()).unwrap();
+            psnr(&image::load_from_memory(&png).unwrap().into_rgb8(), picture)
+        };
+        let likeness = (0..20).map(|_| look()).find(|&likeness| likeness > 28.).unwrap_or_else(&mut look);
+        println!("frame {i}: {likeness:.1} dB");
+        assert!(likeness > 28., "the browser's frame {i} is {likeness} dB like its picture");
+    }
+    let ended = browser.evaluate(
+        "new Promise((done, failed) => {
+            const v = document.querySelector('video');
+            v.onended = () => done(v.currentTime);
+            v.currentTime = 0;
+            v.play().catch(failed);
+        })",
+    );
+    assert!((ended.as_f64().unwrap() - 0.45).abs() < 0.05, "{ended}");
+    assert!(browser.errors().is_empty(), "{:?}", browser.errors());
+}
+
+/// Returns a folder with this script as `ffmpeg`, for use as the path; the script itself finds the system's tools.
+fn with_ffmpeg(script: &str) -> TempDir {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("ffmpeg");
+    fs::write(&file, format!("#!/bin/sh\nPATH=/usr/bin:/bin\n{script}\n")).unwrap();
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o755)).unwrap();
+    folder
+}
+
+/// Returns the error message and the exit code of a video that can't be written with `path`, and asserts that no file is left.
+fn no_film(path: &Path, splat: &Path) -> (String, Option<i32>) {
+    let out = tempfile::tempdir().unwrap();
+    let film = out.path().join("film.mp4");
+    let output =
+        command(&render(splat, &film, &["--orbit", "--frames", "9"])).env("PATH", path).output().unwrap();
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(told.lines().count(), 1, "{told}");
+    assert_eq!(names(out.path()), [""; 0], "{told}");
+    (told, output.status.code())
+}
+
+#[test]
+fn an_mp4_without_an_encoder_is_refused_before_anything_is_read() {
+    let nothing = tempfile::tempdir().unwrap();
+    let absent = Path::new("no_such_splat.ply");
+    let (told, code) = no_film(nothing.path(), absent);
+    assert_eq!(code, Some(2));
+    for part in ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"] {
+        assert!(told.contains(part), "{part}: {told}");
+    }
+    let other = with_ffmpeg("echo ' V....D mpeg4  MPEG-4 part 2'");
+    let (told, code) = no_film(other.path(), absent);
+    assert!(code == Some(2) && told.contains("lacks libx264") && told.contains(".gif"), "{told}");
+    // A GIF needs no ffmpeg.
+    let (folder, room) = room();
+    let film = folder.path().join("film.gif");
+    let splat = room.join("truth.ply");
+    let arguments = render(&splat, &film, &["--orbit", "--frames", "2", "--size", "16x16"]);
+    assert!(command(&arguments).env("PATH", nothing.path()).status().unwrap().success());
+}
+
+#[test]
+fn an_encoder_that_fails_is_quoted_and_leaves_nothing() {
+    const KNOWS: &str =
+        "case $* in *-encoders*) echo libx264; exit;; esac; for out; do :; done; echo begun > \"$out\"";
+    let (_folder, room) = room();
+    for (script, told) in [
+        ("head -c 9 > /dev/null; echo 'the disk is full' >&2; exit 1", "ffmpeg failed: the disk is full"),
+        ("cat > /dev/null; echo 'no trailer' >&2; exit 1", "ffmpeg failed: no trailer"),
+        ("cat > /dev/null; kill -9 $$", "ffmpeg failed (signal: 9"),
+        ("exit 0", "ffmpeg ended early"),
+    ] {
+        let ffmpeg = with_ffmpeg(&format!("{KNOWS}; {script}"));
+        let (sentence, code) = no_film(ffmpeg.path(), &room.join("truth.ply"));
+        assert!(code == Some(1) && sentence.contains(told), "{script}: {sentence}");
+    }
+}
+
+#[test]
+fn ctrl_c_leaves_no_half_film() {
+    let (_folder, room) = room();
+    let splat = room.join("truth.ply");
+    for ending in ["gif", "mp4"] {
+        if ending == "mp4" && !has_ffmpeg() {
+            return;
+        }
+        let out = tempfile::tempdir().unwrap();
+        let film = out.path().join(format!("film.{ending}"));
+        let mut program =
+            command(&render(&splat, &film, &["--orbit", "--frames", "100000", "--size", "64x64"]))
+                .stderr(Stdio::piped())
+                .spawn()
+                .unwrap();
+        // Frames are written as they are rendered.
+        let partial = out.path().join(format!(".film.{ending}.globalsplat-partial"));
+        let deadline = Instant::now() + Duration::from_secs(60);
+        let written = || fs::metadata(&partial).is_ok_and(|file| ending == "mp4" || file.len() > 100_000);
+        while !written() {
+            assert!(Instant::now() < deadline && program.try_wait().unwrap().is_none(), "nothing is written");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        assert_eq!(unsafe { libc::kill(program.id() as i32, libc::SIGINT) }, 0);
+        let output = program.wait_with_output().unwrap();
+        let told = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{told}");
+        assert!(told.contains("stopped after") && told.contains("of 100000 views"), "{told}");
+        assert_eq!(names(out.path()), [""; 0]);
+    }
+}
+
+#[test]
+fn a_gif_lasts_as_long_as_it_should() {
+    let (folder, room) = room();
+    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.gif"));
+    let orbit = ["--orbit", "--frames", "12", "--size", "20x16", "--alpha"];
+    succeed(&render(&splat, &film, &[&orbit[..], &["--fps", "24"]].concat()));
+    let mut decoder = gif::DecodeOptions::new().read_info(fs::File::open(&film).unwrap()).unwrap();
+    assert_eq!((decoder.width(), decoder.height()), (44, 16));
+    let mut delays = vec![];
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        delays.push(frame.delay);
+    }
+    // Half a second in total, although 1/24 s is not a whole number of hundredths.
+    assert_eq!((delays.len(), delays.iter().sum::<u16>()), (12, 50), "{delays:?}");
+
+    let told = refuse(&render(&splat, &film, &[&orbit[..], &["--fps", "60"]].concat()));
+    assert!(told.contains("frames per second is 60, expected 1 to 50 in a .gif"), "{told}");
+    let views = folder.path().join("views");
+    let told = refuse(&render(&splat, &views, &[&orbit[..], &["--fps", "24"]].concat()));
+    assert!(told.contains("--fps is for films") && !views.exists(), "{told}");
+}
+
+#[test]
+fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
+    let (folder, room) = room();
+    let splat = room.join("truth.ply");
+    let [views, smooth, along] = ["views", "smooth", "along"].map(|name| folder.path().join(name));
+    succeed(&render(&splat, &views, &["--scene", arg(&room)]));
+    succeed(&render(&splat, &smooth, &["--scene", arg(&room), "--frames", "25"]));
+    succeed(&render(&splat, &along, &["--path", arg(&room), "--frames", "25"]));
+    let (views, path) = (pictures(&views), pictures(&smooth));
+    assert_eq!((views.len(), path.len()), (9, 25));
+    assert_eq!(path, pictures(&along));
+    assert!(psnr(&views[0], &path[0]) > 50. && psnr(&views[8], &path[24]) > 50.);
+    // The path passes every view, and its frames resemble their neighbours more than the views do.
+    for (i, view) in views.iter().enumerate() {
+        let nearest = path.iter().map(|frame| psnr(view, frame)).fold(0., f64::max);
+        println!("view {i}: {nearest:.1} dB");
+        assert!(nearest > 25., "view {i} is passed at {nearest} dB");
+    }
+    let mean = |pictures: &[image::RgbImage]| {
+        pictures.windows(2).map(|pair| psnr(&pair[0], &pair[1])).sum::<f64>() / (pictures.len() - 1) as f64
+    };
+    assert!(mean(&path) > mean(&views) + 3., "{} {}", mean(&path), mean(&views));
+}
+
+#[test]
+fn all_pictures_have_one_scale_of_depth() {
+    let (folder, room) = room();
+    let splat = room.join("truth.ply");
+    // Same position, eight times the focal length: the centre has the same depth in both.
+    let mut wide = open_capture(&room).unwrap().cameras()[8];
+    (wide.intrinsics.cx, wide.intrinsics.cy) = (20., 20.);
+    let mut long = wide;
+    (long.intrinsics.fx, long.intrinsics.fy) = (8. * wide.intrinsics.fx, 8. * wide.intrinsics.fy);
+    let (path, out) = (folder.path().join("zoom.json"), folder.path().join("views"));
+    write_cameras_json(&path, &[String::new(), String::new()], &[wide, long]).unwrap();
+    succeed(&render(&splat, &out, &["--path", arg(&path), "--depth", "--size", "320x320"]));
+    let [_, wide, _, long] = <[_; 4]>::try_from(pictures(&out)).unwrap();
+    // The centre of the one, enlarged, equals the other.
+    let middle = image::imageops::crop_imm(&wide, 140, 140, 40, 40).to_image();
+    let middle = image::imageops::resize(&middle, 320, 320, image::imageops::FilterType::Triangle);
+    let likeness = psnr(&middle, &long);
+    println!("{likeness:.1} dB");
+    assert!(likeness > 30., "colours of the same depths are {likeness} dB alike");
+}
+
+fn assert_same(path: &Path, expected: &[Camera], tolerance: f64) {
+    let found = read_camera_path(path, None).unwrap_or_else(|e| panic!("{e}")).cameras;
+    assert_eq!(found.len(), expected.len(), "{}", path.display());
+    for (a, b) in found.iter().zip(expected) {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        let both = a.intrinsics.to_rows().into_iter().zip(b.intrinsics.to_rows());
+        both.for_each(|(a, b)| assert!((a - b).abs() < 40. * tolerance, "{}: {a} {b}", path.display()));
+        assert!(a.c2w.abs_diff_eq(b.c2w, tolerance), "{}: {} {}", path.display(), a.c2w, b.c2w);
+    }
+}
+
+#[test]
+fn a_path_takes_every_format_and_needs_no_photos() {
+    let (folder, original) = room();
+    let cameras = open_capture(&original).unwrap().cameras();
+    let chunks = folder.path().join("chunks");
+    succeed(&["pack", arg(&original), "--out", arg(&chunks)]);
+    let chunk = names(&chunks).into_iter().find(|name| name.ends_with(".torch")).unwrap();
+    assert_same(&chunks.join(format!("{chunk}#room_000")), &cameras, 1e-5);
+    for format in [None, Some(Format::Transforms), Some(Format::ColmapText), Some(Format::ColmapBinary)] {
+        let (_folder, room) = room();
+        if let Some(format) = format {
+            rewrite(&room, format);
+        }
+        fs::remove_dir_all(room.join("images")).unwrap();
+        assert!(open_capture(&room).is_err(), "the photos are gone");
+        assert_same(&room, &cameras, 1e-9);
+        // A file of cameras may have any name.
+        for file in ["cameras.json", "transforms.json"].map(|name| room.join(name)) {
+            if file.exists() {
+                assert_same(&file, &cameras, 1e-9);
+                let renamed = room.join("my path.json");
+                fs::rename(&file, &renamed).unwrap();
+                assert_same(&renamed, &cameras, 1e-9);
+                let row = room.join("row.png");
+                succeed(&render(&room.join("truth.ply"), &row, &["--path", arg(&renamed)]));
+                assert_eq!(image::image_dimensions(&row).unwrap(), (9 * 40 + 8 * 4, 40));
+            }
+        }
+    }
+}
+
+#[test]
+fn photos_that_would_tell_their_size_and_are_gone_are_asked_for() {
+    let (_folder, room) = room();
+    rewrite(&room, Format::Transforms);
+    let file = room.join("transforms.json");
+    let mut json: Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
+    json.as_object_mut().unwrap().retain(|key, _| key != "w" && key != "h");
+    fs::write(&file, json.to_string()).unwrap();
+    let cameras = open_capture(&room).unwrap().cameras();
+    assert_same(&room, &cameras, 1e-9);
+    fs::remove_dir_all(room.join("images")).unwrap();
+    let (splat, out) = (room.join("truth.ply"), room.join("row.png"));
+    let told = refuse(&render(&splat, &out, &["--path", arg(&room)]));
+    assert!(told.contains("the size of frame 0 is absent") && told.contains("--size"), "{told}");
+    let found = read_camera_path(&room, Some([40, 40].into())).unwrap().cameras;
+    assert_eq!((found[0].width, found[0].intrinsics), (40, cameras[0].intrinsics));
+    succeed(&render(&splat, &out, &["--path", arg(&room), "--size", "40x40"]));
+}
+
+/// Returns a camera path as nerfstudio's viewer writes it.
+fn of_viewer(cameras: &[Camera]) -> Value {
+    let frames = cameras.iter().map(|camera| {
+        let opengl = camera.c2w * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.));
+        let fov = 2. * (f64::from(camera.height) / 2. / camera.intrinsics.fy).atan().to_degrees();
+        json!({"camera_to_world": pose_to_rows(&opengl), "fov": fov, "aspect": 1.5})
+    });
+    json!({
+        "camera_type": "perspective", "render_height": cameras[0].height, "render_width": cameras[0].width,
+        "camera_path": frames.collect::<Vec<_>>(), "fps": 24, "seconds": 4, "is_cycle": false, "keyframes": [],
+    })
+}
+
+#[test]
+fn a_path_of_nerfstudio_s_viewer_is_flown() {
+    let (folder, room) = room();
+    let mut cameras = open_capture(&room).unwrap().cameras();
+    for camera in &mut cameras {
+        // Such a path stores only square pixels and a principal point in the middle.
+        camera.width = 60;
+        camera.intrinsics.fx = camera.intrinsics.fy;
+        (camera.intrinsics.cx, camera.intrinsics.cy) = (30., 20.);
+    }
+    let file = folder.path().join("2026-01-01.json");
+    fs::write(&file, of_viewer(&cameras).to_string()).unwrap();
+    assert_same(&file, &cameras, 1e-9);
+    assert_eq!(read_camera_path(&file, None).unwrap().frames_per_second, Some(24));
+    let film = folder.path().join("film.gif");
+    succeed(&render(&room.join("truth.ply"), &film, &["--path", arg(&file), "--frames", "12"]));
+    let mut decoder = gif::DecodeOptions::new().read_info(fs::File::open(&film).unwrap()).unwrap();
+    let mut lasts = 0;
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        lasts += frame.delay;
+    }
+    assert_eq!(lasts, 50);
+
+    type Change = fn(&mut Value);
+    let changes: [(Change, &[&str]); 12] = [
+        (|json| json["camera_type"] = json!("fisheye"), &["camera_type is \"fisheye\"", "perspective"]),
+        (|json| json["render_height"] = json!(0), &["render_height is 0", "a number of pixels"]),
+        (|json| json["render_width"] = json!(20.5), &["render_width is 20.5", "a number of pixels"]),
+        (|json| drop(json.as_object_mut().unwrap().remove("render_width")), &["render_width is absent"]),
+        (|json| json["camera_path"] = json!([]), &["camera_path is a list of 0", "a list of cameras"]),
+        (|json| json["camera_path"] = json!("x"), &["camera_path is \"x\"", "a list of cameras"]),
+        (|json| json["camera_path"][3]["fov"] = json!(180), &["fov of camera 3 is 180", "between 0 and 180"]),
+        (|json| json["camera_path"][1]["fov"] = Value::Null, &["fov of camera 1 is null", "degrees"]),
+        (
+            |json| json["camera_path"][2]["camera_to_world"] = json!([1., 0.]),
+            &["camera_to_world of camera 2 is a list of 2", "16 numbers"],
+        ),
+        (
+            |json| json["camera_path"][2]["camera_to_world"][0] = json!(3.),
+            &["camera_to_world of camera 2 is a matrix that isn't rigid", "a rotation"],
+        ),
+        (|json| json["fps"] = json!(0), &["fps is 0", "1 to 120"]),
+        (|json| json["fps"] = json!("fast"), &["fps is \"fast\"", "1 to 120"]),
+    ];
+    let out = folder.path().join("refused.gif");
+    for (change, parts) in changes {
+        let mut json = of_viewer(&cameras);
+        change(&mut json);
+        fs::write(&file, json.to_string()).unwrap();
+        let told = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
+        for part in ["2026-01-01.json"].iter().chain(parts) {
+            assert!(told.contains(part), "{part}: {told}");
+        }
+    }
+    assert!(!out.exists());
+    // Files that are no camera paths.
+    for (text, part) in [
+        ("{", "not a description of cameras"),
+        ("{\"frames\": 3}", "frames is 3"),
+        ("{\"frames\": []}", "number of views is 0, expected one or more"),
+    ] {
+        fs::write(&file, text).unwrap();
+        let told = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
+        assert!(told.contains(part), "{text}: {told}");
+    }
+}

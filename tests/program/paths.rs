@@ -1,0 +1,150 @@
+//! Every command works in a folder whose name isn't UTF-8, and its JSON contains the name as text.
+#![cfg(target_os = "linux")]
+
+use crate::common::program::{TINY_CONFIG, command};
+use serde_json::{Value, json};
+use std::ffi::{OsStr, OsString};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::os::unix::ffi::OsStrExt;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+/// Name of a folder in Latin-1, and its lossy conversion to text.
+const NAME: &[u8] = b"caf\xe9";
+const SHOWN: &str = "caf\u{fffd}";
+
+struct Folder(PathBuf);
+
+impl Folder {
+    fn path(&self, name: &str) -> OsString {
+        self.0.join(name).into()
+    }
+
+    /// Returns the program's command with this as current folder; arguments that begin with @ are files there.
+    fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = command(&[]);
+        command.args(arguments.iter().map(|argument| match argument.strip_prefix('@') {
+            Some(name) => self.path(name),
+            None => argument.into(),
+        }));
+        // Without networks for LPIPS, without a browser, and with temporary files here as well.
+        command
+            .current_dir(&self.0)
+            .env("ROOMS", self.path("rooms"))
+            .env("GLOBALSPLAT_WEIGHTS", &self.0)
+            .env("TMPDIR", &self.0)
+            .env("PATH", "");
+        command
+    }
+
+    /// Returns the standard output of a command that must succeed.
+    fn succeed(&self, arguments: &[&str]) -> String {
+        let done = self.command(arguments).output().expect("a program");
+        assert!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
+        String::from_utf8(done.stdout).expect("text")
+    }
+
+    /// Returns the JSON object that the command prints, and asserts that the values of `keys` are paths.
+    fn json(&self, arguments: &[&str], keys: &[&str]) -> Value {
+        let told: Value =
+            serde_json::from_str(&self.succeed(&[arguments, &["--json"]].concat())).expect("JSON");
+        for key in keys {
+            let path = told.pointer(key).and_then(Value::as_str).unwrap_or_else(|| panic!("{key} of {told}"));
+            assert!(path.contains(SHOWN), "{arguments:?}: {key} is {path}");
+        }
+        told
+    }
+}
+
+#[test]
+fn names_that_are_not_utf_8() {
+    let outside = tempfile::tempdir().expect("a folder");
+    let folder = Folder(outside.path().join(OsStr::from_bytes(NAME)));
+    std::fs::create_dir(&folder.0).expect("a folder");
+    let write = |name: &str, text: &str| std::fs::write(folder.0.join(name), text).expect("a file");
+
+    let size = ["--frames", "9", "--size", "40"];
+    let rooms = [&["synth", "--gaussians", "--out", "@rooms", "--scenes", "2"], &size[..]].concat();
+    folder.json(&rooms, &["/captures/0", "/captures/1"]);
+    let videos =
+        ["synth", "--out", "@videos", "--frames", "9", "--size", "64", "--depth", "--sheet", "@s.png"];
+    folder.json(&videos, &["/out", "/index", "/depth", "/sheet"]);
+    let pack = |out: &str| folder.succeed(&["pack", "@rooms", "--out", out, "--json"]);
+    assert!(pack("@chunks").contains(SHOWN));
+    assert!(!pack("chunks_too").contains(SHOWN), "a path as it was given");
+
+    write("tiny.toml", &TINY_CONFIG.replace("[data]", "[data]\ncaptures = [\"${ROOMS}/room_000\"]"));
+    folder.json(&["train", "--config", "@tiny.toml", "--out", "@run"], &["/checkpoint", "/curves"]);
+    watch(&folder);
+    folder.json(&["export", "--run", "@run", "--out", "@tiny.safetensors"], &["/weights"]);
+    folder.json(&["import", "--from", "@tiny.safetensors", "--out", "@imported.safetensors"], &["/weights"]);
+
+    for path in [
+        "@rooms/room_000",
+        "@videos/000000.torch",
+        "@chunks/000000.torch#room_001",
+        "@tiny.safetensors",
+        "@rooms/room_000/truth.ply",
+    ] {
+        folder.json(&["inspect", path], &[]);
+    }
+    std::fs::remove_file(folder.0.join("chunks_too/000000.torch")).expect("a chunk");
+    folder.json(&["inspect", "@chunks_too"], &["/absent_chunks/0"]);
+
+    let room = ["--scene", "@rooms/room_000"];
+    let model = ["reconstruct", "--weights", "@tiny.safetensors", "--out", "@made.ply"];
+    folder.json(&[&model[..], &room].concat(), &["/splat", "/weights"]);
+    let splat = ["--splat", "@rooms/room_000/truth.ply"];
+    let refine = ["refine", "--steps", "1", "--sheet", "@sheet.png", "--out", "@refined.spz"];
+    folder.json(&[&refine[..], &splat, &room].concat(), &["/splat"]);
+    folder.json(&["convert", "@refined.spz", "@refined.splat"], &["/from/splat", "/to/splat"]);
+    for (out, orbit) in [("@views", false), ("@orbit.png", true), ("@orbit.gif", true)] {
+        let frames: &[&str] = if orbit { &["--orbit", "--frames", "3"] } else { &[] };
+        folder.json(&[&["render", "--out", out], frames, &splat, &room].concat(), &["/files/0"]);
+    }
+    folder.json(&[&["bench", "raster", "--repeats", "1"], &splat[..], &room].concat(), &[]);
+
+    folder.json(&[&["eval", "--sheet", "@scores.png"], &splat[..], &room].concat(), &[]);
+    write("index.json", &json!({"room_001": {"context": [0, 2], "target": [1, 3]}}).to_string());
+    std::fs::create_dir(folder.0.join("splats")).expect("a folder");
+    std::fs::copy(folder.0.join("rooms/room_001/truth.ply"), folder.0.join("splats/room_001.ply"))
+        .expect("a copy");
+    let eval =
+        ["eval", "--splat", "@splats", "--data", "@rooms", "--index", "@index.json", "--out", "@scored"];
+    folder.json(&eval, &["/report", "/evaluations/0/folder"]);
+    folder.json(&["report", "@scored", "--out", "@report.html"], &["/out", "/evaluations/0/folder"]);
+    folder.json(&["doctor"], &[]);
+
+    let has_viewer = folder.json(&["doctor"], &[])["viewer"] == true;
+    if !has_viewer {
+        return crate::common::skip("the page's viewer", "the program was built without it");
+    }
+    let page = [&["render", "--html", "@room.html"], &splat[..], &room].concat();
+    folder.json(&page, &["/page"]);
+    folder.json(&[&["view", "@rooms/room_000/truth.ply"], &room[..]].concat(), &["/page"]);
+}
+
+/// Checks what `watch` prints about the run, and what it serves.
+fn watch(folder: &Folder) {
+    let mut watch =
+        folder.command(&["watch", "@run", "--json"]).stdout(Stdio::piped()).spawn().expect("a program");
+    let mut line = String::new();
+    BufReader::new(watch.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
+    let answer = served_state(&line);
+    let _ = (watch.kill(), watch.wait());
+    assert!(line.contains(SHOWN), "{line}");
+    let answer = answer.expect("an answer");
+    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains(SHOWN), "{answer}");
+}
+
+/// Returns the response to a request for `/state` to the server whose URL is in `line`.
+fn served_state(line: &str) -> Option<String> {
+    let told: Value = serde_json::from_str(line).ok()?;
+    let host = told["url"].as_str()?.strip_prefix("http://")?.trim_end_matches('/');
+    let mut stream = TcpStream::connect(host).ok()?;
+    write!(stream, "GET /state HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").ok()?;
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).ok()?;
+    Some(answer)
+}

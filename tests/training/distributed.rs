@@ -1,0 +1,755 @@
+//! Distributed processes: they compute what one process computes, and they survive failures.
+#![cfg(target_os = "linux")]
+
+use crate::common::largest_error;
+use crate::common::program::{arg, command, rooms, succeed, text, tiny_config, tiny_weights, train};
+use crate::common::skip;
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::net::TcpListener;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// Timeout for everything that normally takes seconds.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Serializes the tests: each uses all cores of a small machine.
+fn turn() -> Option<MutexGuard<'static, ()>> {
+    static TURN: Mutex<()> = Mutex::new(());
+    if !globalsplat_csrc::ranks::has_gloo() {
+        skip(
+            "Gloo",
+            "the program was built without Gloo; install libgloo-dev, touch csrc/build.rs and build again",
+        );
+        return None;
+    }
+    Some(TURN.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// Returns the `torchrun` of the virtual environment that `make venv` creates, or the one that `TORCHRUN` names.
+fn torchrun() -> Option<PathBuf> {
+    let named = std::env::var_os("TORCHRUN").map(PathBuf::from);
+    let path = named.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/torchrun"));
+    if path.is_file() {
+        return Some(path);
+    }
+    skip("torchrun", &format!("{} is not there; run make venv, or set TORCHRUN", path.display()));
+    None
+}
+
+/// Started processes, and the folder with their output. Dropping this ends them and their children.
+struct Started {
+    processes: Vec<Child>,
+    folder: TempDir,
+}
+
+/// Result of a process.
+struct Ended {
+    code: Option<i32>,
+    out: String,
+    err: String,
+}
+
+impl Started {
+    fn start(commands: Vec<Command>) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str, i: usize| File::create(folder.path().join(format!("{name}{i}"))).unwrap();
+        let start = |(i, mut command): (usize, Command)| {
+            let (out, err) = (file("out", i), file("err", i));
+            command.stdin(Stdio::null()).stdout(out).stderr(err).spawn().unwrap()
+        };
+        Started { processes: commands.into_iter().enumerate().map(start).collect(), folder }
+    }
+
+    /// Starts `count` ranks by torchrun with `options`.
+    fn by_torchrun(torchrun: &Path, count: usize, options: &[&str], arguments: &[&str]) -> Self {
+        let mut command = Command::new(torchrun);
+        command.args(["--standalone", "--no-python", &format!("--nproc-per-node={count}")]).args(options);
+        command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments).env("OMP_NUM_THREADS", "1");
+        Started::start(vec![command])
+    }
+
+    /// Starts one rank on each of two simulated machines, by torchruns that rendezvous; each torchrun may restart its ranks
+    /// once.
+    fn by_two_torchruns(torchrun: &Path, arguments: &[&str]) -> Self {
+        let port = free_port();
+        let machine = || {
+            let mut command = Command::new(torchrun);
+            command.args(["--no-python", "--nnodes=2", "--nproc-per-node=1", "--max-restarts=1"]);
+            command.args(["--rdzv-backend=c10d", "--rdzv-id=test", "--local-addr=127.0.0.1"]);
+            command.arg(format!("--rdzv-endpoint=127.0.0.1:{port}"));
+            // The same setting as in scripts/slurm_train.sh.
+            command.env("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1").env("OMP_NUM_THREADS", "1");
+            command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments);
+            command
+        };
+        Started::start(vec![machine(), machine()])
+    }
+
+    /// Starts `count` ranks with only the environment variables that every launcher sets.
+    fn by_environment(count: usize, arguments: &[&str]) -> Self {
+        Started::by_environment_of(&vec![arguments.to_vec(); count])
+    }
+
+    /// Starts one rank per list of arguments.
+    fn by_environment_of(arguments: &[Vec<&str>]) -> Self {
+        let (port, count) = (free_port(), arguments.len());
+        let rank = |rank: usize| {
+            let mut command = command(&arguments[rank]);
+            for (name, value) in [("WORLD_SIZE", count), ("RANK", rank), ("MASTER_PORT", port.into())] {
+                command.env(name, value.to_string());
+            }
+            command.env("LOCAL_RANK", rank.to_string()).env("LOCAL_WORLD_SIZE", count.to_string());
+            command.env("MASTER_ADDR", "127.0.0.1");
+            command
+        };
+        Started::start((0..count).map(rank).collect())
+    }
+
+    fn told(&self, file: &str) -> String {
+        String::from_utf8_lossy(&fs::read(self.folder.path().join(file)).unwrap()).into_owned()
+    }
+
+    /// Polls `find` until it returns a value, while all processes are still running.
+    fn wait_for<T>(&mut self, what: &str, mut find: impl FnMut() -> Option<T>) -> T {
+        let begun = Instant::now();
+        loop {
+            if let Some(found) = find() {
+                return found;
+            }
+            let ended = self.processes.iter_mut().any(|process| process.try_wait().unwrap().is_some());
+            assert!(!ended && begun.elapsed() < PATIENCE, "{what} never came: {}", self.told("err0"));
+            sleep(Duration::from_micros(200));
+        }
+    }
+
+    /// Waits until all processes have ended.
+    fn end(mut self) -> Vec<Ended> {
+        let begun = Instant::now();
+        let ended = |i: usize, process: &mut Child| loop {
+            if let Some(status) = process.try_wait().unwrap() {
+                break status.code();
+            }
+            let err = || fs::read_to_string(self.folder.path().join(format!("err{i}"))).unwrap();
+            assert!(begun.elapsed() < PATIENCE, "process {i} doesn't end: {}", err());
+            sleep(Duration::from_millis(5));
+        };
+        let codes: Vec<_> =
+            self.processes.iter_mut().enumerate().map(|(i, process)| ended(i, process)).collect();
+        let ended = |(i, code)| Ended {
+            code,
+            out: self.told(&format!("out{i}")),
+            err: self.told(&format!("err{i}")),
+        };
+        codes.into_iter().enumerate().map(ended).collect()
+    }
+
+    /// Waits for the child of a torchrun that has rank `rank` after the given number of `restarts`.
+    fn rank(&mut self, rank: usize, restarts: usize) -> u32 {
+        let torchruns: Vec<u32> = self.processes.iter().map(Child::id).collect();
+        let variables = [format!("RANK={rank}"), format!("TORCHELASTIC_RESTART_COUNT={restarts}")];
+        let is_it = |child: &u32| {
+            let environment = fs::read(format!("/proc/{child}/environ")).unwrap_or_default();
+            let set: BTreeSet<&[u8]> = environment.split(|byte| *byte == 0).collect();
+            variables.iter().all(|variable| set.contains(variable.as_bytes()))
+        };
+        self.wait_for("a rank", || torchruns.iter().flat_map(|&of| children(of)).find(is_it))
+    }
+}
+
+impl Drop for Started {
+    fn drop(&mut self) {
+        for process in &mut self.processes {
+            if let Ok(None) = process.try_wait() {
+                let children = children(process.id());
+                let _ = process.kill();
+                let _ = process.wait();
+                children.into_iter().for_each(|child| signal(child, libc::SIGKILL));
+            }
+        }
+    }
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+/// Returns the state and the parent of a process.
+fn state(process: u32) -> Option<(char, u32)> {
+    let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
+    // The process name, in brackets, may contain anything.
+    let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
+    Some((fields.next()?.parse().ok()?, fields.next()?.parse().ok()?))
+}
+
+fn children(process: u32) -> Vec<u32> {
+    let all =
+        fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+    all.filter(|&other| state(other).is_some_and(|(_, parent)| parent == process)).collect()
+}
+
+fn signal(process: u32, signal: libc::c_int) {
+    // SAFETY: sends a signal to a process that this test started and nobody has waited for, or to none.
+    unsafe { libc::kill(process as i32, signal) };
+}
+
+/// Suspends a process, so that its state can be examined.
+fn hold(process: u32) {
+    signal(process, libc::SIGSTOP);
+    while state(process).is_some_and(|(state, _)| state != 'T') {
+        sleep(Duration::from_micros(100));
+    }
+}
+
+/// Returns the output of `count` ranks that succeed; all but the first print nothing.
+#[track_caller]
+fn succeed_together(count: usize, arguments: &[&str]) -> String {
+    let mut ended = Started::by_environment(count, arguments).end();
+    let err: Vec<&str> = ended.iter().map(|of| of.err.as_str()).collect();
+    for (rank, of) in ended.iter().enumerate() {
+        assert_eq!(of.code, Some(0), "rank {rank}: {err:?}");
+        assert!(rank == 0 || (of.out.is_empty() && of.err.is_empty()), "rank {rank}: {}{}", of.out, of.err);
+    }
+    ended.swap_remove(0).out
+}
+
+/// Returns the program's own error messages among all lines that torchrun prints.
+fn sentences(err: &str) -> Vec<&str> {
+    let told = err.lines().filter_map(|line| line.strip_prefix("globalsplat: "));
+    // Exclude the progress line that is printed every half minute.
+    told.filter(|line| !(line.starts_with(|c: char| c.is_ascii_digit()) && line.contains(" steps"))).collect()
+}
+
+/// Returns a folder of rooms, and a configuration that trains on them.
+fn data(scenes: u32) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let captures = folder.path().join("captures");
+    rooms(&captures, scenes, 9, 40);
+    let config = tiny_config(folder.path(), &captures);
+    (folder, config)
+}
+
+/// Returns the lines of metrics.jsonl about steps, and those about validations.
+fn metrics(run: &Path) -> (Vec<Value>, Vec<Value>) {
+    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+    // The last line may be incomplete.
+    let lines = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let (validations, steps) = lines.partition(|line| line["validation"].is_object());
+    (steps, validations)
+}
+
+fn numbers(lines: &[Value]) -> Vec<u64> {
+    lines.iter().map(|line| line["step"].as_u64().unwrap()).collect()
+}
+
+/// Returns the number of steps before each checkpoint.
+fn checkpoints(run: &Path) -> Vec<u64> {
+    let paths = globalsplat::train::list_checkpoints(run).unwrap();
+    paths.iter().map(|path| arg(path).rsplit_once('-').unwrap().1.parse().unwrap()).collect()
+}
+
+fn weights(file: &Path) -> Vec<(String, tch::Tensor)> {
+    let mut all: Vec<_> = globalsplat::io::read_weights(file).unwrap().tensors.into_iter().collect();
+    all.sort_by(|a, b| a.0.cmp(&b.0));
+    all
+}
+
+fn last_weights(run: &Path) -> Vec<(String, tch::Tensor)> {
+    weights(&globalsplat::train::latest_checkpoint(run).unwrap().join("model.safetensors"))
+}
+
+fn distance(a: &[(String, tch::Tensor)], b: &[(String, tch::Tensor)]) -> f64 {
+    assert!(a.len() > 10 && a.len() == b.len());
+    let errors = a.iter().zip(b).map(|((name, x), (other, y))| {
+        assert_eq!(name, other);
+        largest_error(x, y)
+    });
+    errors.fold(0., f64::max)
+}
+
+#[track_caller]
+fn assert_close(a: &Value, b: &Value, tolerance: f64) {
+    let (x, y) = (a.as_f64().unwrap(), b.as_f64().unwrap());
+    assert!((x - y).abs() <= tolerance * y.abs(), "{x} {y}");
+}
+
+/// Asserts that the steps of both runs agree up to the order of summation.
+#[track_caller]
+fn assert_same_steps(a: &Path, b: &Path) {
+    let (a, b) = (metrics(a).0, metrics(b).0);
+    assert_eq!(numbers(&a), numbers(&b));
+    for (a, b) in a.iter().zip(&b) {
+        for field in ["loss", "psnr", "gradient_norm", "learning_rate"] {
+            assert_close(&a[field], &b[field], 1e-5);
+        }
+    }
+}
+
+/// Asserts that both runs ended bit-identically.
+#[track_caller]
+fn assert_same_bits(a: &Path, b: &Path) {
+    let [a, b] = [a, b].map(|run| globalsplat::train::latest_checkpoint(run).unwrap());
+    assert_eq!(a.file_name(), b.file_name());
+    for file in ["model.safetensors", "optimizer.safetensors", "state.json"] {
+        assert!(fs::read(a.join(file)).unwrap() == fs::read(b.join(file)).unwrap(), "{file}");
+    }
+}
+
+#[test]
+fn ranks_train_like_one() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(5);
+    let of = |name: &str| folder.path().join(name);
+    let [one, two] = ["one", "two"].map(of);
+    // At a higher learning rate, AdamW amplifies gradients that are little more than rounding errors.
+    let settings = |batch| ["train.steps=12", "train.validate_every=5", "train.learning_rate=2e-4", batch];
+    succeed(&text(&train(&config, &one, &settings("train.batch_size=2"))));
+    let arguments = train(&config, &two, &settings("train.batch_size=1"));
+    let ended = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments)).end().remove(0);
+    assert_eq!(ended.code, Some(0), "{}", ended.err);
+    assert!(
+        ended.out.matches("trained in ").count() == 1 && sentences(&ended.err).is_empty(),
+        "{}",
+        ended.out
+    );
+
+    assert_same_steps(&two, &one);
+    let [of_one, of_two] = [&one, &two].map(|run| metrics(run).1);
+    assert_eq!((numbers(&of_one), numbers(&of_two)), (vec![4, 9, 11], vec![4, 9, 11]));
+    for (a, b) in of_one.iter().zip(&of_two) {
+        let [a, b] = [a, b].map(|line| &line["validation"]);
+        assert_eq!((a["scenes"].as_u64(), b["scenes"].as_u64()), (Some(5), Some(5)));
+        assert_close(&a["psnr"], &b["psnr"], 1e-4);
+        assert_close(&a["ssim"], &b["ssim"], 1e-4);
+    }
+    let fresh = weights(&tiny_weights(folder.path(), &folder.path().join("captures")));
+    let (moved, apart) =
+        (distance(&last_weights(&one), &fresh), distance(&last_weights(&one), &last_weights(&two)));
+    assert!(moved > 1e-3 && apart < 1e-5, "moved by {moved}, {apart} from each other");
+}
+
+#[test]
+fn a_run_goes_on_with_another_number_of_ranks() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(5);
+    let [one, many] = ["one", "many"].map(|name| folder.path().join(name));
+    let settings = |batch| ["train.steps=24", "train.checkpoint_every=100", batch];
+    succeed(&text(&train(&config, &one, &settings("train.batch_size=6"))));
+
+    let arguments = train(&config, &many, &settings("train.batch_size=3"));
+    let mut started = Started::by_environment(2, &text(&arguments));
+    started.wait_for("a step", || (metrics(&many).0.len() >= 4).then_some(()));
+    // A stop request to any rank stops all.
+    signal(started.processes[1].id(), libc::SIGTERM);
+    let ended = started.end();
+    assert_eq!((ended[0].code, ended[1].code), (Some(1), Some(0)), "{}", ended[1].err);
+    let [sentence] = sentences(&ended[0].err)[..] else { panic!("one sentence: {}", ended[0].err) };
+    assert!(sentence.starts_with("stopped; ") && sentence.contains("the same command resumes"), "{sentence}");
+    let done = metrics(&many).0.len();
+    assert!((4..24).contains(&done) && checkpoints(&many) == [done as u64], "{done} steps");
+
+    succeed_together(3, &text(&train(&config, &many, &settings("train.batch_size=2"))));
+    assert_same_steps(&many, &one);
+}
+
+#[test]
+fn ranks_that_die_are_survived_to_the_same_bits() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(8);
+    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
+    let settings = ["train.steps=40", "train.checkpoint_every=2", "train.validate_every=10"];
+    succeed_together(2, &text(&train(&config, &whole, &settings)));
+
+    let arguments = train(&config, &run, &settings);
+    let mut started = Started::by_torchrun(&torchrun, 2, &["--max-restarts=3"], &text(&arguments));
+    // Kill a rank within a step.
+    started.wait_for("a step", || (metrics(&run).0.len() >= 5).then_some(()));
+    let second = started.rank(1, 0);
+    signal(second, libc::SIGKILL);
+    // Kill a rank within a save. A suspended process doesn't finish the save before it is killed.
+    let first = started.rank(0, 1);
+    loop {
+        started.wait_for("a save", || unfinished_save(&run));
+        hold(first);
+        if unfinished_save(&run).is_some() {
+            break signal(first, libc::SIGKILL);
+        }
+        signal(first, libc::SIGCONT);
+    }
+    // Kill a rank within a validation: its checkpoint exists, but its score never appears, however long the first rank runs.
+    let second = started.rank(1, 2);
+    let unfinished_validation = || {
+        let ((steps, validations), saved) = (metrics(&run), checkpoints(&run).pop());
+        let done = steps.len() as u64;
+        let due = done > 0 && done.is_multiple_of(10) && saved == Some(done);
+        (due && !numbers(&validations).contains(&(done - 1))).then_some(())
+    };
+    loop {
+        started.wait_for("a validation", unfinished_validation);
+        hold(second);
+        sleep(Duration::from_millis(300));
+        if unfinished_validation().is_some() {
+            break signal(second, libc::SIGKILL);
+        }
+        signal(second, libc::SIGCONT);
+    }
+    let ended = started.end().remove(0);
+    assert_eq!(ended.code, Some(0), "{}", ended.err);
+    let told = sentences(&ended.err);
+    let is_lost = |told: &&str| {
+        told.contains("distributed communication failed") && told.contains("restart the processes")
+    };
+    assert!(told.len() == 3 && told.iter().all(is_lost), "one sentence for each: {told:?}");
+
+    assert_same_bits(&run, &whole);
+    assert_same_steps(&run, &whole);
+    let (steps, validations) = metrics(&run);
+    assert_eq!(numbers(&steps), (0..40).collect::<Vec<_>>(), "every step once");
+    assert_eq!(numbers(&validations), [9, 19, 29, 39]);
+    let [a, b] = [&run, &whole].map(|run| fs::read(run.join("best/state.json")).unwrap());
+    assert!(a == b, "the best checkpoint, by the same score");
+    assert_eq!(
+        fs::read_dir(run.join("checkpoints")).unwrap().count(),
+        2,
+        "what the kills left is cleared away"
+    );
+}
+
+#[test]
+fn ranks_of_two_machines_are_started_again() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(4);
+    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
+    let settings = ["train.steps=30", "train.checkpoint_every=4"];
+    succeed_together(2, &text(&train(&config, &whole, &settings)));
+    let mut started = Started::by_two_torchruns(&torchrun, &text(&train(&config, &run, &settings)));
+    started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
+    // Killing the first rank, which hosts the store, restarts everything.
+    let first = started.rank(0, 0);
+    signal(first, libc::SIGKILL);
+    for (machine, ended) in started.end().into_iter().enumerate() {
+        assert_eq!(ended.code, Some(0), "machine {machine}: {}", ended.err);
+    }
+    assert_same_bits(&run, &whole);
+    assert_eq!(numbers(&metrics(&run).0), (0..30).collect::<Vec<_>>(), "every step once");
+}
+
+/// Returns `Some` while a checkpoint is being written that is newer than all complete ones.
+fn unfinished_save(run: &Path) -> Option<()> {
+    let entries = fs::read_dir(run.join("checkpoints")).ok()?;
+    let names = entries.filter_map(|entry| Some(entry.ok()?.file_name().to_str()?.to_string()));
+    let partial = names.filter_map(|name| {
+        name.strip_prefix(".step-")?.strip_suffix(".globalsplat-partial")?.parse::<u64>().ok()
+    });
+    (partial.max()? > checkpoints(run).pop().unwrap_or(0)).then_some(())
+}
+
+#[test]
+fn a_rank_that_dies_ends_all_with_one_sentence() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(4);
+    let run = folder.path().join("run");
+    let arguments = train(&config, &run, &["train.steps=40", "train.checkpoint_every=4"]);
+    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
+    started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
+    let begun = Instant::now();
+    let second = started.rank(1, 0);
+    signal(second, libc::SIGKILL);
+    let ended = started.end().remove(0);
+    assert!(begun.elapsed() < PATIENCE && ended.code != Some(0), "{:?}", ended.code);
+    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
+    let expected =
+        ["distributed communication failed (", "); restart the processes to resume from the last checkpoint"];
+    assert!(expected.iter().all(|part| sentence.contains(part)), "{sentence}");
+
+    // One process resumes a run of two.
+    let saved = checkpoints(&run).pop().unwrap();
+    assert!((8..40).contains(&saved), "{saved}");
+    succeed(&text(&arguments));
+    assert_eq!(numbers(&metrics(&run).0), (0..40).collect::<Vec<_>>());
+    let state = fs::read(globalsplat::train::latest_checkpoint(&run).unwrap().join("state.json")).unwrap();
+    let state: Value = serde_json::from_slice(&state).unwrap();
+    assert_eq!(state["samples"].as_u64(), Some(2 * saved + (40 - saved)));
+}
+
+#[test]
+fn a_rank_that_hangs_ends_all_with_one_sentence() {
+    let Some(turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(2);
+    let run = folder.path().join("run");
+    let arguments = train(&config, &run, &["train.steps=1000000", "train.checkpoint_every=100000"]);
+    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
+    started.wait_for("a step", || (metrics(&run).0.len() > 2).then_some(()));
+    let [first, second] = [0, 1].map(|rank| started.rank(rank, 0));
+    let begun = Instant::now();
+    hold(second);
+    // All processes are blocked: other tests may run.
+    drop(turn);
+    while state(first).is_some_and(|(state, _)| state != 'Z') {
+        assert!(begun.elapsed() < PATIENCE, "the first rank still waits");
+        sleep(Duration::from_millis(20));
+    }
+    assert_eq!(sentences(&started.told("err0")), ["rank 1 of 2 gave no sign of life for 25 seconds"]);
+    // torchrun would wait for it half a minute longer.
+    signal(second, libc::SIGKILL);
+    let ended = started.end().remove(0);
+    assert_ne!(ended.code, Some(0));
+    assert_eq!(sentences(&ended.err).len(), 1, "{}", ended.err);
+}
+
+#[test]
+fn ranks_load_ahead_from_step_to_step() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(2);
+    let run = folder.path().join("run");
+    let arguments = train(&config, &run, &["train.steps=1000000", "train.checkpoint_every=100000"]);
+    let mut started = Started::by_environment(2, &text(&arguments));
+    let ranks: Vec<u32> = started.processes.iter().map(Child::id).collect();
+    let mut loaders_after = |steps: usize| {
+        started.wait_for("a step", || (metrics(&run).0.len() >= steps).then_some(()));
+        ranks.iter().map(|&rank| threads(rank, "loader-")).collect::<Vec<_>>()
+    };
+    let (before, after) = (loaders_after(2), loaders_after(8));
+    assert!(before.iter().all(|threads| !threads.is_empty()) && before == after, "{before:?} {after:?}");
+}
+
+/// Returns the threads of a process whose names begin with `name`.
+fn threads(process: u32, name: &str) -> Vec<String> {
+    let threads = fs::read_dir(format!("/proc/{process}/task")).unwrap().map(|entry| entry.unwrap().path());
+    let is_called =
+        |thread: &PathBuf| fs::read_to_string(thread.join("comm")).is_ok_and(|of| of.starts_with(name));
+    threads.filter(is_called).map(|thread| arg(&thread).to_string()).collect()
+}
+
+#[test]
+fn ranks_that_are_asked_to_stop_save_first() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let (folder, config) = data(4);
+    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
+    let settings = ["train.steps=100", "train.checkpoint_every=100"];
+    succeed_together(2, &text(&train(&config, &whole, &settings)));
+    let arguments = train(&config, &run, &settings);
+    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
+    started.wait_for("a step", || (metrics(&run).0.len() > 5).then_some(()));
+    signal(started.processes[0].id(), libc::SIGTERM);
+    let ended = started.end().remove(0);
+    assert_ne!(ended.code, Some(0));
+    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
+    let done = metrics(&run).0.len();
+    let saved = format!("stopped; {}/checkpoints/step-{done:08} is complete", arg(&run));
+    assert!(sentence.starts_with(&saved) && sentence.ends_with("the same command resumes"), "{sentence}");
+    assert!(done < 100 && checkpoints(&run) == [done as u64]);
+    succeed_together(2, &text(&arguments));
+    assert_same_bits(&run, &whole);
+}
+
+#[test]
+fn a_mistake_is_told_once() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(2);
+    let run = folder.path().join("run");
+    let arguments = |setting: &str| train(&config, &run, &[setting]);
+    let mistakes = [
+        ("train.steps=\"x\"", "train.steps=\"x\": "),
+        ("train.stepz=3", "unknown field `stepz`"),
+        ("data.captures=[\"nowhere\"]", "nowhere"),
+        // Only the first rank detects this one.
+        ("train.keep_checkpoints=3", "config.toml that no run wrote"),
+    ];
+    fs::create_dir(&run).unwrap();
+    fs::write(run.join("config.toml"), "").unwrap();
+    for (setting, expected) in mistakes {
+        let ended = Started::by_environment(2, &text(&arguments(setting))).end();
+        assert!(ended.iter().all(|of| of.code != Some(0) && of.out.is_empty()), "{setting}");
+        let err: String = ended.iter().map(|of| of.err.as_str()).collect();
+        let [sentence] = sentences(&err)[..] else { panic!("{setting}: one sentence: {err}") };
+        assert!(sentence.contains(expected) && !sentence.contains("communication failed"), "{sentence}");
+    }
+}
+
+#[test]
+fn ranks_that_train_something_else_are_refused() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(2);
+    let (_more, more) = data(3);
+    let run = folder.path().join("run");
+    let mut shards = train(&config, &run, &[]);
+    shards.push("--shard-optimizer".into());
+    let others = [
+        (train(&config, &run, &["train.seed=5"]), "configuration isn't the first one's: train.seed 0 → 5"),
+        (train(&config, &run, &["data.flip=true"]), "data.flip false → true"),
+        (shards, "--shard-optimizer false → true"),
+        (train(&more, &run, &[]), "this rank's training scenes aren't the first one's: 3 of 3"),
+    ];
+    let first = train(&config, &run, &[]);
+    for (other, expected) in others {
+        let ended = Started::by_environment_of(&[text(&first), text(&other)]).end();
+        assert!(ended.iter().all(|of| of.code != Some(0)), "{expected}");
+        let err: String = ended.iter().map(|of| of.err.as_str()).collect();
+        let [sentence] = sentences(&err)[..] else { panic!("{expected}: one sentence: {err}") };
+        assert!(sentence.starts_with("rank 1 of 2: ") && sentence.contains(expected), "{sentence}");
+    }
+}
+
+#[test]
+fn work_that_is_not_shared_out_is_refused_once() {
+    let Some(_turn) = turn() else { return };
+    let Some(torchrun) = torchrun() else { return };
+    let ended = Started::by_torchrun(&torchrun, 2, &[], &["inspect", "x"]).end().remove(0);
+    assert_ne!(ended.code, Some(0));
+    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
+    let expected = "this is work for one process, and torchrun started 2: expected train,";
+    assert!(sentence.starts_with(expected), "{sentence}");
+}
+
+/// Returns the result of an evaluation, without times and memory.
+fn evaluation(out: &Path) -> (Value, Vec<String>) {
+    let mut scores: Value = serde_json::from_slice(&fs::read(out.join("scores.json")).unwrap()).unwrap();
+    for scene in scores["scenes"].as_array_mut().unwrap() {
+        for measured in ["forward_seconds", "warm_up", "peak_memory_bytes"] {
+            scene.as_object_mut().unwrap().remove(measured);
+        }
+    }
+    for measured in ["forward_seconds", "timed_scenes", "peak_memory_bytes"] {
+        scores["efficiency"].as_object_mut().unwrap().remove(measured).expect(measured);
+    }
+    let csv = fs::read_to_string(out.join("scores.csv")).unwrap();
+    // The last column contains times.
+    (scores, csv.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect())
+}
+
+#[test]
+fn ranks_evaluate_like_one() {
+    let Some(_turn) = turn() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let of = |name: &str| folder.path().join(name);
+    let (captures, index) = (of("captures"), of("re10k_3v.json"));
+    rooms(&captures, 5, 5, 40);
+    let names: Vec<String> = (0..5).map(|room| format!("room_{room:03}")).collect();
+    let frames = names.iter().map(|name| (name.clone(), json!({"context": [0, 2, 4], "target": [1, 3]})));
+    fs::write(&index, Value::Object(frames.collect()).to_string()).unwrap();
+    let weights = tiny_weights(folder.path(), &captures);
+    let arguments = |out: &Path| {
+        let all =
+            ["eval", "--weights", arg(&weights), "--data", arg(&captures), "--index", arg(&index), "--out"];
+        all.into_iter().chain([arg(out)]).map(String::from).collect::<Vec<_>>()
+    };
+    let (one, many) = (of("one"), of("many"));
+    succeed(&text(&arguments(&one)));
+    let out = succeed_together(3, &text(&arguments(&many)));
+    assert!(out.contains("5 of 5 scenes") && out.matches("report.html").count() == 1, "{out}");
+    assert!(many.join("report.html").is_file());
+    let (scores, csv) = evaluation(&many);
+    assert_eq!((&scores, &csv), (&evaluation(&one).0, &evaluation(&one).1));
+    let scored: Vec<&str> =
+        scores["scenes"].as_array().unwrap().iter().map(|s| s["scene"].as_str().unwrap()).collect();
+    assert!(scored == names && csv.len() == 1 + 5 * 2, "{scored:?}");
+
+    // Stopped evaluations resume, and a scene that fails is reported once.
+    let photo = captures.join("room_003/images/003.png");
+    fs::write(&photo, "no photo").unwrap();
+    for out in [&one, &many] {
+        fs::remove_file(out.join("scenes/room_003.json")).unwrap();
+        fs::remove_file(out.join("scenes/room_004.json")).unwrap();
+    }
+    assert_eq!(command(&text(&arguments(&one))).output().unwrap().status.code(), Some(1));
+    let ended = Started::by_environment(2, &text(&arguments(&many))).end();
+    let err: String = ended.iter().map(|of| of.err.as_str()).collect();
+    assert!(ended[0].code == Some(1) && err.matches("room_003: ").count() == 1, "{err}");
+    assert_eq!(sentences(&err), ["1 scenes could not be scored, the means are of the others"]);
+    let (scores, csv) = evaluation(&many);
+    assert_eq!((&scores, &csv), (&evaluation(&one).0, &evaluation(&one).1));
+    assert_eq!(scores["failures"][0]["scene"], "room_003");
+}
+
+#[test]
+fn bad_data_are_told_of_whichever_rank_finds_them() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(6);
+    // Truncate the photos of the scene of sample 1, the second rank's first.
+    for entry in fs::read_dir(folder.path().join("captures/room_003/images")).unwrap() {
+        let photo = entry.unwrap().path();
+        let bytes = fs::read(&photo).unwrap();
+        fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
+    }
+    // One step in which every rank loads one sample, at most two ahead: no rank finds an error in another's sample.
+    let settings = |share, batch| ["train.steps=1", "data.prefetch=1", "data.threads=1", share, batch];
+    let arguments = |run: &str, share, batch| {
+        let mut arguments = train(&config, &folder.path().join(run), &settings(share, batch));
+        arguments.push("--json".into());
+        arguments
+    };
+    let refused = arguments("refused", "data.max_bad_share=0", "train.batch_size=1");
+    let ended = Started::by_environment(2, &text(&refused)).end();
+    let err: String = ended.iter().map(|of| of.err.as_str()).collect();
+    let [sentence] = sentences(&err)[..] else { panic!("one sentence: {err}") };
+    assert!(
+        sentence.starts_with("rank 1 of 2: 1 of 6 scenes were skipped: 1 with broken images"),
+        "{sentence}"
+    );
+
+    let told = |output: &str| -> Value { serde_json::from_str(output).unwrap() };
+    let one = told(&succeed(&text(&arguments("one", "data.max_bad_share=0.5", "train.batch_size=2"))));
+    let two =
+        told(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch_size=1"))));
+    assert_eq!(two["skipped_scenes"], one["skipped_scenes"]);
+    assert_eq!(two["skipped_scenes"]["with_broken_images"], 1);
+    // Its held-out views are not scored, either.
+    let judged = |told: &Value| -> Vec<Value> {
+        told["held_out"]["scenes"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|scene| scene["ours"]["scene"].clone())
+            .collect()
+    };
+    assert_eq!((judged(&two), judged(&two).len()), (judged(&one), 5));
+}
+
+/// The script for Slurm trains, with a fake Slurm of one node, this machine, which starts two processes.
+#[test]
+fn slurm_s_script_trains() {
+    let (Some(_turn), Some(torchrun)) = (turn(), torchrun()) else { return };
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/slurm_train.sh");
+    assert!(Command::new("bash").args(["-n", arg(&script)]).status().unwrap().success());
+    let (folder, config) = data(1);
+    let run = folder.path().join("run");
+    let tools = folder.path().join("bin");
+    fs::create_dir(&tools).unwrap();
+    for (name, does) in
+        [("scontrol", "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1"), ("srun", "exec \"$@\"")]
+    {
+        let tool = tools.join(name);
+        fs::write(&tool, format!("#!/bin/sh\n{does}\n")).unwrap();
+        fs::set_permissions(&tool, fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    // The folder from which the job is submitted contains the program.
+    let checkout = folder.path().join("checkout");
+    fs::create_dir_all(checkout.join("target/release")).unwrap();
+    symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();
+    let path = format!("{}:{}", tools.display(), std::env::var("PATH").unwrap());
+    let mut job = Command::new(&script);
+    job.args([&config, &run]).args(["--set", "train.steps=2"]).env("PATH", path).env("OMP_NUM_THREADS", "1");
+    for (name, value) in
+        [("JOB_ID", "4321"), ("JOB_NODELIST", "here"), ("NNODES", "1"), ("SUBMIT_DIR", arg(&checkout))]
+    {
+        job.env(format!("SLURM_{name}"), value);
+    }
+    job.env("PROCESSES", "2").env("DEVICE", "cpu").env("TORCHRUN", torchrun);
+    let ended = Started::start(vec![job]).end().remove(0);
+    assert_eq!(ended.code, Some(0), "{}", ended.err);
+    assert!(ended.err.contains("2 processes train together"), "{}", ended.err);
+    assert_eq!(checkpoints(&run).last(), Some(&2));
+}

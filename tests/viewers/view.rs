@@ -1,0 +1,378 @@
+//! The interactive page shows the scene in a browser without network access, and reacts to touch and keys.
+#![cfg(unix)]
+
+use crate::common::browser::{Browser, Screenshots};
+use crate::common::program::{arg, command, refuse, room, succeed};
+use crate::common::{captures, skip};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use globalsplat::data::{load_views, open_capture};
+use globalsplat::eval::psnr;
+use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb};
+use globalsplat::render::render_views;
+use globalsplat::scene::{Gaussians, ImageSize};
+use serde_json::{Value, json};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use tch::{Kind, Tensor};
+
+const SIDE: u32 = 512;
+/// Minimum PSNR between the page's image and our own render, in dB.
+const LEAST: f64 = 25.;
+
+/// Returns `true` if the program contains the viewer; otherwise, skips the test.
+fn has_viewer() -> bool {
+    let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
+    if !found {
+        skip(
+            "the page's viewer",
+            "web/ isn't bundled; install Node.js 20 or newer with npm and run make build",
+        );
+    }
+    found
+}
+
+/// Page in a browser whose window is as large as the square photos, without animations.
+struct Shown {
+    browser: Browser,
+    folder: tempfile::TempDir,
+}
+
+impl Shown {
+    fn open(page: &Path) -> Option<Self> {
+        let mut browser = Browser::start()?;
+        let size = json!({"width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false});
+        browser.call("Emulation.setDeviceMetricsOverride", size);
+        let still = json!({"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]});
+        browser.call("Emulation.setEmulatedMedia", still);
+        browser.open(page);
+        let mut shown = Shown { browser, folder: tempfile::tempdir().expect("a folder") };
+        shown.wait_for("document.body.dataset.state !== 'loading'");
+        assert_eq!(
+            shown.value("document.body.dataset.state"),
+            "ready",
+            "{}",
+            shown.value("document.body.innerText")
+        );
+        Some(shown)
+    }
+
+    fn value(&mut self, expression: &str) -> Value {
+        self.browser.evaluate(expression)
+    }
+
+    #[track_caller]
+    fn wait_for(&mut self, condition: &str) {
+        let begun = Instant::now();
+        while self.value(condition) != true {
+            assert!(begun.elapsed() < Duration::from_secs(60), "{condition} never came true");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// Returns the image of the page, without controls, after all changes have finished.
+    fn picture(&mut self) -> Tensor {
+        self.wait_for("(({ stage, walk }) => !walk.jump && !stage.isDirty && !stage.spark.sorting && !stage.spark.sortDirty)(page)");
+        // The last frame must have reached the screen.
+        self.value("new Promise((done) => setTimeout(done, 500))");
+        self.key("KeyH");
+        let picture = self.screen();
+        self.key("KeyH");
+        picture
+    }
+
+    fn screen(&mut self) -> Tensor {
+        let png = self.browser.call("Page.captureScreenshot", json!({"format": "png"}));
+        let file = self.folder.path().join("picture.png");
+        std::fs::write(&file, STANDARD.decode(png["data"].as_str().unwrap()).unwrap()).unwrap();
+        tensor_from_rgb(&read_image(&file).unwrap())
+    }
+
+    /// Presses a key briefly.
+    fn key(&mut self, code: &str) {
+        self.key_for(code, Duration::ZERO);
+    }
+
+    fn key_for(&mut self, code: &str, time: Duration) {
+        for kind in ["keyDown", "keyUp"] {
+            let key =
+                json!({"type": kind, "code": code, "key": code.trim_start_matches("Key").to_lowercase()});
+            self.browser.call("Input.dispatchKeyEvent", key);
+            if kind == "keyDown" {
+                std::thread::sleep(time);
+            }
+        }
+    }
+
+    /// Drags one finger across the touch screen.
+    fn draw(&mut self, from: (f64, f64), to: (f64, f64)) {
+        self.browser.call("Emulation.setTouchEmulationEnabled", json!({"enabled": true}));
+        for step in 0..=8 {
+            let share = f64::from(step) / 8.;
+            let (x, y) = (from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1));
+            let kind = if step == 0 { "touchStart" } else { "touchMove" };
+            self.browser
+                .call("Input.dispatchTouchEvent", json!({"type": kind, "touchPoints": [{"x": x, "y": y}]}));
+            std::thread::sleep(Duration::from_millis(30));
+        }
+        self.browser.call("Input.dispatchTouchEvent", json!({"type": "touchEnd", "touchPoints": []}));
+    }
+
+    fn click(&mut self, selector: &str) {
+        self.value(&format!("document.querySelector({selector:?}).click()"));
+    }
+
+    /// Returns the position and the quaternion of the page's camera.
+    fn place(&mut self) -> Vec<f64> {
+        let place = "[...page.stage.camera.position.toArray(), ...page.stage.camera.quaternion.toArray()]";
+        serde_json::from_value(self.value(place)).unwrap()
+    }
+}
+
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Returns our own render from a capture's camera, and the photo, as large as the page.
+fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
+    let size = ImageSize { width: SIDE, height: SIDE };
+    let view = load_views(&open_capture(capture).unwrap(), &[index], Some(size)).unwrap().remove(0);
+    let own =
+        render_views(&Gaussians::from_splat(&read_splat(splat).unwrap()), &[view.camera]).unwrap().remove(0);
+    (own.rgb.clamp(0., 1.), view.image)
+}
+
+/// Returns the mean distance of an image's pixels from the nearest depth colour.
+fn from_depth_colours(picture: &Tensor) -> f64 {
+    let pixels = picture.flatten(1, 2).transpose(0, 1).contiguous();
+    let distances = Tensor::cdist(&pixels, &Tensor::from_slice2(&depth_colours()), 2., None::<i64>);
+    distances.amin([1i64].as_slice(), false).mean(Kind::Double).double_value(&[])
+}
+
+#[test]
+fn a_page_shows_the_scene_and_can_be_walked_in() {
+    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
+    if !has_viewer() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("page.html");
+    let splat = capture.join("reference.ply");
+    succeed(&["render", "--splat", arg(&splat), "--scene", arg(&capture), "--html", arg(&page)]);
+    let Some(mut shown) = Shown::open(&page) else { return };
+    let screenshots = Screenshots::create();
+
+    // The view from the first camera matches our own render.
+    let (own, photo) = expected(&capture, &splat, 0);
+    let picture = shown.picture();
+    screenshots.save("page-first", &picture);
+    println!("the first camera: {:.2} dB", psnr(&picture, &own));
+    assert!(psnr(&picture, &own) >= LEAST, "{:.2} dB", psnr(&picture, &own));
+    assert_eq!(shown.value("page.walk.at"), 0);
+    let count = open_capture(&capture).unwrap().len();
+    assert_eq!(shown.value("document.querySelectorAll('#strip img').length"), count);
+
+    // The slider overlays the photo.
+    shown.value("share.value = 1, share.dispatchEvent(new Event('input'))");
+    shown.value("document.getElementById('photo').decode()");
+    let hide = |how: &str| {
+        format!(
+            "document.querySelectorAll('header, footer, #share').forEach((of) => of.style.visibility = '{how}')"
+        )
+    };
+    shown.value(&hide("hidden"));
+    let over = shown.screen();
+    shown.value(&hide("visible"));
+    screenshots.save("page-photo", &over);
+    assert!(psnr(&over, &photo) > psnr(&picture, &photo) + 1., "{:.2} dB", psnr(&over, &photo));
+    assert!(psnr(&over, &photo) > 28., "{:.2} dB", psnr(&over, &photo));
+    shown.value("share.value = 0, share.dispatchEvent(new Event('input'))");
+
+    // Jump by the photo strip, and by keys.
+    shown.click("#strip button:nth-child(4)");
+    let jumped = shown.picture();
+    let (own, _) = expected(&capture, &splat, 3);
+    println!("the fourth camera: {:.2} dB", psnr(&jumped, &own));
+    assert!(
+        psnr(&jumped, &own) >= LEAST && shown.value("page.walk.at") == 3,
+        "{:.2} dB",
+        psnr(&jumped, &own)
+    );
+    shown.key("Comma");
+    shown.wait_for("page.walk.at === 2");
+    assert_eq!(shown.value("[...strip.children].findIndex((of) => of.hasAttribute('aria-current'))"), 2);
+    // Holding the key for many frames jumps to the first photo and nowhere else.
+    shown.key_for("Home", Duration::from_millis(500));
+    shown.wait_for("page.walk.at === 0");
+
+    // Depth is shown in the depth colours, centres as points.
+    shown.key("Digit2");
+    let depth = shown.picture();
+    screenshots.save("page-depth", &depth);
+    assert_eq!(shown.value("document.querySelector('[aria-pressed=true]').id"), "depth");
+    let [of_depth, of_photo] = [&depth, &picture].map(from_depth_colours);
+    println!("{of_depth:.3} from the colours of depth, in colour {of_photo:.3}");
+    assert!(of_depth < 0.05 && of_photo > 0.15, "{of_depth} {of_photo}");
+    shown.click("#centres");
+    let centres = shown.picture();
+    screenshots.save("page-centres", &centres);
+    let black = centres.lt(0.05).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+    assert!((0.5..0.99).contains(&black), "{black} of the points' picture is black");
+    shown.click("#colour");
+    shown.key("Home");
+    shown.wait_for("page.walk.at === 0");
+
+    // Walking by keys and turning by touch leave the photo.
+    let at_photo = shown.place();
+    shown.key_for("KeyS", Duration::from_millis(700));
+    shown.wait_for("page.walk.at === null");
+    let walked = shown.place();
+    assert!(distance(&at_photo[..3], &walked[..3]) > 0.01 && distance(&at_photo[3..], &walked[3..]) < 1e-3);
+    assert_eq!(shown.value("compare.hidden"), true);
+    // From behind, the camera is visible.
+    let before = shown.picture();
+    shown.key("KeyC");
+    let cameras = shown.picture();
+    screenshots.save("page-cameras", &cameras);
+    assert!(psnr(&cameras, &before) < 40., "{:.2} dB: no camera is to be seen", psnr(&cameras, &before));
+    shown.key("KeyC");
+    shown.draw((200., 200.), (300., 210.));
+    let turned = shown.place();
+    assert!(distance(&walked[3..], &turned[3..]) > 0.01, "{walked:?} {turned:?}");
+
+    // The path plays until it is stopped, or at its end.
+    shown.key("Space");
+    shown.wait_for("page.walk.along > 0.05");
+    assert_eq!(shown.value("page.walk.isPlaying && document.getElementById('play').textContent"), "Pause");
+    shown.key("Space");
+    shown.wait_for("!page.walk.isPlaying");
+    shown.value("along.value = 1, along.dispatchEvent(new Event('input'))");
+    shown.key("Slash");
+    assert_eq!(shown.value("document.getElementById('help').open"), true);
+
+    let errors = shown.browser.errors();
+    assert!(errors.is_empty(), "{errors:?}");
+    let asked: Vec<&str> = shown.browser.requests();
+    assert!(asked.iter().all(|url| url.starts_with("file://") || url.starts_with("blob:")), "{asked:?}");
+    let pages = asked.iter().filter(|url| url.starts_with("file://")).count();
+    assert_eq!(pages, 1, "{asked:?}");
+}
+
+/// Writes a program `xdg-open` that records the path it is asked to open, and returns its folder.
+fn opener(folder: &Path) -> PathBuf {
+    let bin = folder.join("bin");
+    std::fs::create_dir_all(&bin).unwrap();
+    let program = bin.join("xdg-open");
+    std::fs::write(&program, format!("#!/bin/sh\nprintf %s \"$1\" > {:?}\n", folder.join("opened"))).unwrap();
+    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+    bin
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn view_opens_a_page_of_a_splat_alone() {
+    if !has_viewer() {
+        return;
+    }
+    let (folder, room) = room();
+    // Names are escaped as text.
+    let splat = folder.path().join("a <b>room&.ply");
+    std::fs::copy(room.join("truth.ply"), &splat).unwrap();
+    let path = format!("{}:/usr/bin:/bin", opener(folder.path()).display());
+    let done =
+        command(&["view", arg(&splat)]).env("PATH", path).env("TMPDIR", folder.path()).output().unwrap();
+    assert!(done.status.success() && done.stderr.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));
+    let page = PathBuf::from(String::from_utf8(done.stdout).unwrap().trim_end());
+    let begun = Instant::now();
+    let opened = loop {
+        if let Some(opened) =
+            std::fs::read_to_string(folder.path().join("opened")).ok().filter(|o| !o.is_empty())
+        {
+            break opened;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(20), "nothing was opened");
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    assert_eq!(Path::new(&opened), page);
+    assert_eq!(page.parent().unwrap(), folder.path());
+
+    let Some(mut shown) = Shown::open(&page) else { return };
+    assert_eq!(shown.value("document.querySelector('h1').textContent"), "a <b>room&");
+    assert_eq!(shown.value("document.title"), "a <b>room&");
+    let seen = shown.picture().gt(0.1).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+    assert!(seen > 0.05, "{seen} of the picture is not black");
+    assert_eq!(shown.value("compare.hidden"), true);
+    assert!(shown.browser.errors().is_empty(), "{:?}", shown.browser.errors());
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn without_a_browser_view_says_where_the_page_is() {
+    if !has_viewer() {
+        return;
+    }
+    let (folder, room) = room();
+    let empty = folder.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    let splat = room.join("truth.ply");
+    let done = command(&["view", arg(&splat), "--scene", arg(&room), "--json"])
+        .env("PATH", &empty)
+        .env("TMPDIR", folder.path())
+        .output()
+        .unwrap();
+    assert!(done.status.success());
+    let told: Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert_eq!(told["opened"], false);
+    assert!(Path::new(told["page"].as_str().unwrap()).is_file());
+    let err = String::from_utf8(done.stderr).unwrap();
+    assert!(err.starts_with("no browser could be started (") && err.lines().count() == 1, "{err}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn pages_are_for_their_owner_and_go_with_the_next() {
+    if !has_viewer() {
+        return;
+    }
+    let (folder, room) = room();
+    let (empty, temporary) = (folder.path().join("empty"), folder.path().join("temporary"));
+    std::fs::create_dir(&empty).unwrap();
+    std::fs::create_dir(&temporary).unwrap();
+    let other = temporary.join("page.html");
+    std::fs::write(&other, "somebody's").unwrap();
+    let splat = room.join("truth.ply");
+    let mut before: Option<PathBuf> = None;
+    for _ in 0..2 {
+        let done = command(&["view", arg(&splat), "--scene", arg(&room), "--json"])
+            .env("PATH", &empty)
+            .env("TMPDIR", &temporary)
+            .output()
+            .unwrap();
+        assert!(done.status.success());
+        let told: Value = serde_json::from_slice(&done.stdout).unwrap();
+        let page = PathBuf::from(told["page"].as_str().unwrap());
+        assert_eq!(std::fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
+        assert_eq!(std::fs::read_dir(&temporary).unwrap().count(), 2, "the page, and what isn't ours");
+        assert!(before.is_none_or(|before| !before.exists()));
+        before = Some(page);
+    }
+    assert!(other.exists());
+}
+
+#[test]
+fn bad_requests_are_refused() {
+    if !has_viewer() {
+        return;
+    }
+    let (folder, room) = room();
+    let nowhere = folder.path().join("nowhere.ply");
+    let refusal = refuse(&["view", arg(&nowhere)]);
+    assert!(refusal.contains("nowhere.ply"), "{refusal}");
+    let splat = room.join("truth.ply");
+    // The page's path is a folder.
+    let page = folder.path().join("page.html");
+    std::fs::create_dir(&page).unwrap();
+    let refusal = refuse(&["render", "--splat", arg(&splat), "--scene", arg(&room), "--html", arg(&page)]);
+    assert!(refusal.contains(arg(&page)), "{refusal}");
+}

@@ -1,0 +1,141 @@
+//! Our splats in third-party viewers: renders by Spark and Babylon.js, two independent public viewers, in a browser. A test
+//! that fails keeps the images.
+
+use crate::common::browser::{Browser, Screenshots};
+use crate::common::program::{arg, succeed};
+use crate::common::{captures, skip};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use globalsplat::data::open_capture;
+use globalsplat::eval::psnr;
+use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb};
+use globalsplat::render::render_views;
+use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use tch::{Kind, Tensor};
+
+const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
+/// Minimum PSNR between a viewer's image and our own render, in dB.
+const LEAST: f64 = 25.;
+
+/// Returns the pages with the viewers, by their names.
+fn viewers(folder: &Path) -> Option<Vec<(&'static str, PathBuf)>> {
+    let npm = Path::new(env!("CARGO_MANIFEST_DIR")).join("parity/npm");
+    let bundler = npm.join("node_modules/.bin/esbuild");
+    if !bundler.exists() {
+        skip(
+            "other viewers",
+            "parity/npm has no packages; install Node.js 20 or newer with npm and run make venv",
+        );
+        return None;
+    }
+    let page = |name| {
+        let (script, page) = (folder.join(format!("{name}.js")), folder.join(format!("{name}.html")));
+        let bundled = Command::new(&bundler)
+            .args(["--bundle", "--format=iife", "--log-level=error"])
+            .args([format!("--outfile={}", script.display()), format!("viewers/{name}.js")])
+            .current_dir(&npm)
+            .status();
+        assert!(bundled.expect("esbuild").success());
+        let text = format!("<!doctype html><meta charset=utf-8><body><script src={name}.js></script>");
+        std::fs::write(&page, text).expect("a page");
+        (name, page)
+    };
+    Some(["spark", "babylon"].map(page).into())
+}
+
+/// Returns the first camera of a capture, for an image of [`SIZE`].
+fn first_camera(capture: &Path) -> Camera {
+    let camera = open_capture(capture).unwrap().cameras()[0];
+    let factor = f64::from(SIZE.width) / f64::from(camera.width);
+    let k = camera.intrinsics;
+    let intrinsics =
+        Intrinsics { fx: k.fx * factor, fy: k.fy * factor, cx: k.cx * factor, cy: k.cy * factor };
+    Camera { intrinsics, width: SIZE.width, height: SIZE.height, ..camera }
+}
+
+/// Shows a splat in a viewer; returns the viewer's report, and its image [3, H, W].
+fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Value, Tensor) {
+    browser.open(page);
+    let c2w: Vec<f64> = (0..12).map(|i| camera.c2w.col(i % 4)[i / 4]).collect();
+    let k = camera.intrinsics;
+    let angle = 2. * (f64::from(camera.height) / 2. / k.fy).atan();
+    let (width, height) = (camera.width, camera.height);
+    let camera = json!({
+        "c2w": c2w, "angle": angle, "aspect": k.fy / k.fx, "width": width, "height": height,
+    });
+    let bytes = STANDARD.encode(std::fs::read(file).unwrap());
+    let ending = file.extension().unwrap().to_str().unwrap();
+    let told = browser.evaluate(&format!(
+        "show(Uint8Array.from(atob({bytes:?}), (letter) => letter.charCodeAt(0)), {ending:?}, {camera})"
+    ));
+    assert!(browser.errors().is_empty(), "{:?}", browser.errors());
+    let png = told["png"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let picture = folder.path().join("picture.png");
+    std::fs::write(&picture, STANDARD.decode(png).unwrap()).unwrap();
+    (told, tensor_from_rgb(&read_image(&picture).unwrap()))
+}
+
+/// Returns the corners of the bounding box of the means.
+fn bounds(splat: &Splat) -> [Vec<f64>; 2] {
+    let means = Gaussians::from_splat(splat).means.view([-1, 3]).to_kind(Kind::Double);
+    [means.amin([0i64].as_slice(), false), means.amax([0i64].as_slice(), false)]
+        .map(|corner| Vec::try_from(corner).unwrap())
+}
+
+fn numbers(list: &Value) -> Vec<f64> {
+    list.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn public_viewers_show_our_splats_as_we_do() {
+    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let Some(viewers) = viewers(folder.path()) else { return };
+    let Some(mut browser) = Browser::start() else { return };
+    let of = |name: &str| folder.path().join(name);
+    let published = capture.join("reference.ply");
+    // The embedded model's reconstruction, unchanged; and the published splat, whose colours are far beyond the range of a
+    // byte, converted by `convert --for-viewers`.
+    succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.ply"))]);
+    succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.spz"))]);
+    for ending in ["ply", "spz"] {
+        let to = of(&format!("published.{ending}"));
+        succeed(&["convert", arg(&published), arg(&to), "--for-viewers", "--scene", arg(&capture)]);
+    }
+    let screenshots = Screenshots::create();
+    let camera = first_camera(&capture);
+    let files = [
+        ("made", of("made.ply"), of("made.ply"), LEAST),
+        ("made", of("made.ply"), of("made.spz"), LEAST),
+        ("published", published.clone(), of("published.ply"), LEAST),
+        ("published", published.clone(), of("published.spz"), LEAST),
+        // The viewers clamp its colours, each in its own way, so its PSNR is only printed.
+        ("as it is", published.clone(), published, 0.),
+    ];
+    for (name, original, file, least) in files {
+        let splat = read_splat(&original).unwrap();
+        let own =
+            render_views(&Gaussians::from_splat(&splat), &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
+        screenshots.save(&format!("{name}-own"), &own);
+        let ending = file.extension().unwrap().to_str().unwrap();
+        for (viewer, page) in &viewers {
+            let what = format!("{name}, .{ending}, in {viewer}");
+            let (told, picture) = show(&mut browser, page, &file, &camera);
+            screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);
+            assert_eq!(told["count"].as_i64(), Some(splat.len() as i64), "{what}");
+            for (corner, own) in ["low", "high"].iter().zip(bounds(&splat)) {
+                // Spark stores means in half precision.
+                for (a, b) in numbers(&told[*corner]).iter().zip(own) {
+                    assert!((a - b).abs() <= 1e-3 * b.abs(), "{what}: {corner} {a}, {b}");
+                }
+            }
+            let psnr = psnr(&picture, &own);
+            println!("{what}: {psnr:.2} dB");
+            assert!(psnr >= least, "{what}: {psnr:.2} dB");
+        }
+    }
+}
