@@ -20,7 +20,7 @@
 //! op alone.
 //!
 //! Modules, from the highest level to the lowest; each uses only those after it in this list, and [`scene`]:
-//! [`eval`] computes metrics, [`train`] trains, [`refine`] optimizes a splat per scene, [`reconstruct`] turns photos into
+//! [`refine`] optimizes a splat per scene, [`eval`] computes metrics, [`train`] trains, [`reconstruct`] turns photos into
 //! splats, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the losses, [`data`]
 //! reads captures, [`synth`] generates synthetic scenes, [`io`] reads and writes files, [`ranks`] connects the processes of
 //! distributed training, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] the camera maths.

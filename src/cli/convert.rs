@@ -1,4 +1,4 @@
-use super::{cameras::orbit_around_gaussians, open_capture, print_json, splat_out, warn};
+use super::{open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
@@ -6,6 +6,7 @@ use globalsplat::eval::psnr_between;
 use globalsplat::io::{
     InputFiles, ShLimits, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
 };
+use globalsplat::render::orbit_around_gaussians;
 use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, splat_frame};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};

@@ -9,12 +9,10 @@ use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::{
     Baselines, CaptureScores, ContactSheet, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex,
-    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, write_csv,
-    write_evaluation, write_report,
+    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, weights_fingerprint,
+    write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{
-    InputFiles, WeightsFile, check_writable_dir, check_writable_png, checksum, weights_files,
-};
+use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png, weights_files};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{HighResMode, Input, LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
@@ -290,15 +288,13 @@ impl Eval {
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
     }
 
-    /// Returns a string that identifies what is evaluated: for weights their file name and a checksum of all their files.
+    /// Returns a string that identifies what is evaluated: for weights [`weights_fingerprint`].
     /// Splats and images are compared scene by scene, so for them it is the path of their folder.
     fn fingerprint(&self) -> Result<String> {
         let Some(weights) = &self.weights else {
             return Ok(self.path().canonicalize()?.display().to_string());
         };
-        let weights = WeightsFile::open(weights)?;
-        let name = weights.path().file_name().unwrap_or_default();
-        Ok(format!("{} {:08x}", name.display(), checksum(weights.files())?))
+        Ok(weights_fingerprint(weights)?)
     }
 
     fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {

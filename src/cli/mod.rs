@@ -9,7 +9,6 @@ mod bench_common;
 mod bench_model;
 mod bench_refine;
 mod bench_train;
-mod cameras;
 mod convert;
 mod device;
 mod doctor;
@@ -19,6 +18,7 @@ mod import;
 mod inspect;
 mod memory;
 mod model;
+mod option_names;
 #[cfg(target_os = "linux")]
 mod oversubscription;
 mod pack;
@@ -42,6 +42,7 @@ use globalsplat::Error;
 use globalsplat::data::Capture;
 use globalsplat::error::panic_message;
 use globalsplat::scene::ImageSize;
+use option_names::name_options;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic;
 use std::path::Path;
@@ -151,7 +152,7 @@ pub fn main() -> ExitCode {
     let code = match result {
         Ok(Ok(())) => DONE,
         Ok(Err(error)) => {
-            let message = error.to_string();
+            let message = name_options(&error.to_string());
             // An error of the lower crates is one of the library's.
             let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
             let error = error.or_else(|other| other.downcast::<Error>()).ok();

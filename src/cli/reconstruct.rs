@@ -1,5 +1,5 @@
 use super::memory::keep_during;
-use super::refine::{DEFAULT_GAUSSIANS, From, Refine, SpaceName};
+use super::refine::{InitialFile, RefineJob, parse_time};
 use super::{check_views, device, model, open_capture, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
@@ -10,6 +10,7 @@ use globalsplat::error::Error;
 use globalsplat::eval::process_age;
 use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
 use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, reconstruct};
+use globalsplat::refine::RefineOptions;
 use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
@@ -63,37 +64,21 @@ pub struct Reconstruct {
 }
 
 impl Reconstruct {
-    /// Returns the `refine` command that reconstructs the same splat and then optimizes its Gaussians for `seconds`.
-    fn refined(self, seconds: f64) -> Refine {
-        Refine {
-            splat: None,
-            from: Some(From::Weights),
-            weights: self.weights,
-            space: SpaceName::Gaussians,
-            scene: self.scene,
-            out: self.out,
-            local_origin: self.local_origin,
-            gaussians: DEFAULT_GAUSSIANS,
-            seconds,
-            steps: None,
-            seed: 0,
-            holdout: self.holdout,
-            views: self.views,
-            size: None,
-            correct_poses: false,
-            correct_exposures: false,
-            sheet: None,
-            lpips: false,
-            set: vec![],
-            device: self.device,
-            json: self.json,
-        }
+    /// Reconstructs the same splat and then optimizes its Gaussians for `seconds`.
+    fn run_refined(self, seconds: f64) -> Result<()> {
+        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
+        let budget = parse_time(seconds)?;
+        let device = device::parse(&self.device)?;
+        let options = RefineOptions { budget, holdout, views: self.views, device, ..Default::default() };
+        let initial = InitialFile::Model(self.weights);
+        let Reconstruct { scene, out, local_origin, json, .. } = self;
+        RefineJob { scene, out, initial, options, local_origin, sheet: None, lpips: false, json }.run()
     }
 
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
         if let Some(seconds) = self.refine {
-            return self.refined(seconds).run();
+            return self.run_refined(seconds);
         }
         let device = device::parse(&self.device)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;

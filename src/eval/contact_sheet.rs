@@ -1,8 +1,10 @@
 //! Contact sheets for visual inspection: ground truth, render and depth side by side.
 
+use crate::data::View;
 use crate::error::Result;
 use crate::io::{Mosaic, colourize_depth, enlarge, shrink, subsample};
-use crate::render::RenderedView;
+use crate::render::{RenderedView, render_views};
+use crate::scene::Gaussians;
 use std::path::Path;
 use tch::Tensor;
 
@@ -17,6 +19,18 @@ impl ContactSheet {
     /// Creates a sheet for `views` rows.
     pub fn new(views: usize) -> Self {
         ContactSheet(Mosaic::column(views))
+    }
+
+    /// Renders `views` of Gaussians, and creates a sheet with a row for each.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn render(gaussians: &Gaussians, views: &[View]) -> Result<Self> {
+        let mut sheet = ContactSheet::new(views.len());
+        for view in views {
+            sheet.add(&view.image, &render_views(gaussians, &[view.camera])?[0].to_host())?;
+        }
+        Ok(sheet)
     }
 
     /// Adds the row of a view: the photo `ground_truth` `[3, H, W]`, and what was rendered from its camera.

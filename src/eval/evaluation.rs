@@ -4,7 +4,21 @@ use super::scores::CaptureScores;
 use crate::reconstruct::Input;
 use serde::{Deserialize, Serialize};
 
-/// Scores of one method (a model, given splats or given images) on the scenes of one index.
+/// Scores of one method (a model, given splats or given images) on the scenes of one index. [`DatasetEvaluation`](super::DatasetEvaluation)
+/// computes them.
+///
+/// ```no_run
+/// use globalsplat::eval::read_evaluation;
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let evaluation = read_evaluation("results/re10k".as_ref())?;
+/// println!("{} on {}: {:.2} dB", evaluation.method, evaluation.dataset, evaluation.summary.psnr);
+/// for scene in &evaluation.scenes {
+///     println!("{}: {:.2} dB", scene.scores.scene, scene.scores.psnr);
+/// }
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Evaluation {
     /// Name of the method's row in tables.

@@ -54,7 +54,12 @@ impl Journal {
         if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
         {
             let found = format!("a folder with a {name} that no evaluation wrote");
-            return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
+            return Err(Error::input(
+                out,
+                "the output",
+                found,
+                "a folder of its own (choose another output folder)",
+            ));
         }
         let journal = Journal::of(out);
         std::fs::create_dir_all(&journal.scenes).map_err(Error::write(&journal.scenes))?;
@@ -70,7 +75,7 @@ impl Journal {
             return match serde_json::from_slice::<Identity>(&text) {
                 Ok(found) if found == *identity => Ok(journal),
                 Ok(found) => {
-                    let expected = format!("{} (choose another --out)", wanted(identity));
+                    let expected = format!("{} (choose another output folder)", wanted(identity));
                     Err(Error::input(&file, "the evaluation", format!("of {}", wanted(&found)), expected))
                 }
                 Err(e) => Err(Error::input(

@@ -43,4 +43,4 @@ pub use scene::EvalScene;
 pub use score_views::score_views;
 pub use scores::{Baselines, CaptureScores, ViewScore, score};
 pub use scores_file::{REPORT, TABLE, comparison_path, read_evaluation, write_csv, write_evaluation};
-pub use sweep::DatasetEvaluation;
+pub use sweep::{DatasetEvaluation, weights_fingerprint};

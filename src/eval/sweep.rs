@@ -12,7 +12,7 @@ use super::scene::SceneLoader;
 use super::scores_file::comparison_path;
 use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::error::{Error, Result};
-use crate::io::write_jpeg;
+use crate::io::{WeightsFile, checksum, write_jpeg};
 use crate::ranks::Group;
 use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
@@ -23,6 +23,50 @@ use std::sync::mpsc::sync_channel;
 use tch::{Device, Tensor};
 
 /// Evaluation of a method over a dataset.
+///
+/// ```no_run
+/// use globalsplat::data::{Dataset, Split};
+/// use globalsplat::eval::{
+///     DatasetEvaluation, EvaluationIndex, Method, Perceptual, machine, weights_fingerprint, write_evaluation, write_report,
+/// };
+/// use globalsplat::ranks::Group;
+/// use globalsplat::reconstruct::load_model;
+/// use std::path::Path;
+/// use tch::Device;
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let (weights, root, out) = (Path::new("model.safetensors"), Path::new("re10k"), Path::new("results"));
+/// let device = Device::Cpu;
+/// let model = load_model(weights, device)?;
+/// let dataset = Dataset::open(root, Split::Test)?;
+/// let index = EvaluationIndex::read("re10k_24v.json".as_ref())?;
+/// let evaluation = DatasetEvaluation {
+///     method: Method::Model((&model).into()),
+///     name: "GlobalSplat".into(),
+///     fingerprint: weights_fingerprint(weights)?,
+///     dataset: &dataset,
+///     root,
+///     dataset_name: DatasetEvaluation::dataset_name(None, root, &index)?,
+///     index: &index,
+///     picture_size: model.config.data.image_size,
+///     machine: machine(device)?,
+///     device,
+///     out,
+///     group: &Group::alone(),
+/// }
+/// .run(
+///     || Perceptual::find(device),
+///     |done, total| {
+///         println!("{done} of {total} scenes");
+///         // `false` would stop; the next evaluation into the same folder resumes.
+///         true
+///     },
+/// )?;
+/// write_evaluation(out, &evaluation)?;
+/// write_report(&out.join("report.html"), &[(out.to_owned(), evaluation)])?;
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct DatasetEvaluation<'a> {
     /// Method under evaluation. For splats and images, this is the folder that holds those of every scene.
@@ -49,6 +93,17 @@ pub struct DatasetEvaluation<'a> {
     pub out: &'a Path,
     /// Group of processes that divide the scenes among themselves. All of them have access to `out`.
     pub group: &'a Group,
+}
+
+/// Returns a string that identifies the model in the file `weights`, for [`DatasetEvaluation::fingerprint`]: the file's name and a checksum
+/// of all its files.
+///
+/// # Errors
+/// Fails if a file can't be read.
+pub fn weights_fingerprint(weights: &Path) -> Result<String> {
+    let weights = WeightsFile::open(weights)?;
+    let name = weights.path().file_name().unwrap_or_default();
+    Ok(format!("{} {:08x}", name.display(), checksum(weights.files())?))
 }
 
 /// Results of a rank for its share of the scenes.
@@ -86,7 +141,7 @@ impl DatasetEvaluation<'_> {
                 format!("{ours} by its name and {theirs} by that of {}", root.display())
             }
         };
-        Err(Error::input(&index.file, "the data set", found, "a single one, as --dataset names"))
+        Err(Error::input(&index.file, "the data set", found, "a single one, or its name"))
     }
 
     /// Scores the scenes that the index and the dataset have in common. `observe` is called with the number of finished scenes and the
@@ -379,7 +434,7 @@ mod tests {
         ] {
             let error = name(root, index).unwrap_err().to_string();
             assert!(error.contains(&format!("{index}: the data set is {found}")), "{error}");
-            assert!(error.ends_with("expected a single one, as --dataset names"), "{error}");
+            assert!(error.ends_with("expected a single one, or its name"), "{error}");
         }
     }
 }

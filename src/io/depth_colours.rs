@@ -1,5 +1,8 @@
 //! Colours for depth that people can compare: equal steps look equally large.
 
+use crate::error::Result;
+use crate::render::SplatRenderer;
+use crate::scene::{Camera, ImageSize};
 use tch::{Kind, Tensor};
 
 /// Minimum opacity at which depth is valid.
@@ -38,6 +41,24 @@ impl DepthScale {
         let values = values.slice(0, None, None, 1 + values.size()[0] / ENOUGH);
         let bound = |q: f64| values.quantile_scalar(q, None::<i64>, false, "linear").double_value(&[]);
         DepthScale { far: bound(0.02), near: bound(0.98) }
+    }
+
+    /// Estimates the scale for renders of a splat from `cameras` by a few small renders, so that it is known before the first image.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn estimate(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<Self> {
+        const FEW: usize = 12;
+        const SMALL: u32 = 128;
+        let small = |camera: &Camera| {
+            let by = (camera.width.max(camera.height)).div_ceil(SMALL);
+            camera
+                .with_size(ImageSize { width: camera.width.div_ceil(by), height: camera.height.div_ceil(by) })
+        };
+        let count = cameras.len().min(FEW);
+        let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
+        let rendered = renderer.render(&spread.collect::<Vec<_>>())?;
+        Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
     }
 
     /// Converts depth [H, W] to colours [3, H, W]: near is bright, far is dark, linear in inverse depth. Where little is visible (`alpha`),

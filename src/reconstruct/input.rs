@@ -64,10 +64,10 @@ impl Input {
         let longest = u64::from(phase) * u64::from(side.max(trained.width));
         if phase == 0 || phase * side != height || longest > MOST.into() {
             let [twice, thrice] = [2, 3].map(|times| u64::from(side) * times);
-            return Err(Error::request(format!(
-                "--views-at is {height}, expected a multiple of the {side} pixels that the model sees, with sides of {MOST} at \
-                 most: {side}, {twice}, {thrice}, …"
-            )));
+            let expected = format!(
+                "a multiple of the {side} pixels that the model sees, with sides of {MOST} at most: {side}, {twice}, {thrice}, …"
+            );
+            return Err(Error::setting("the height of the photos", height, expected));
         }
         Ok(if phase == 1 { Input::PLAIN } else { Input { phase, views_as } })
     }
@@ -132,7 +132,9 @@ mod tests {
         for height in [0, 16, 48, 97, 12_288, u32::MAX] {
             let error = Input::at(height, HighResMode::Polyphase, trained).unwrap_err().to_string();
             assert!(
-                error.starts_with(&format!("--views-at is {height}, expected a multiple of the 32")),
+                error.starts_with(&format!(
+                    "the height of the photos is {height}, expected a multiple of the 32"
+                )),
                 "{error}"
             );
             assert!(error.ends_with("32, 64, 96, …"), "{error}");

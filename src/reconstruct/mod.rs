@@ -102,6 +102,23 @@ impl Reconstruction {
 /// # Errors
 /// Fails with fewer than two photos, with images whose sides aren't multiples of the model's patch size, or if rendering to the photos'
 /// cameras fails.
+///
+/// ```no_run
+/// use globalsplat::data::{Holdout, open_capture};
+/// use globalsplat::io::write_splat;
+/// use globalsplat::reconstruct::{load_context, load_model, reconstruct};
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let model = load_model("model.safetensors".as_ref(), tch::Device::Cpu)?;
+/// let capture = open_capture("captures/room".as_ref())?;
+/// // As many photos as the model was configured for, resized to the size of its images.
+/// let data = &model.config.data;
+/// let photos = load_context(&capture, Holdout::None, Some(data.context_views), data.image_size)?;
+/// let reconstruction = reconstruct(&model, &photos, &[])?;
+/// write_splat("room.ply".as_ref(), &reconstruction.to_splat()?)?;
+/// # Ok(())
+/// # }
+/// ```
 pub fn reconstruct<'a>(
     model: impl Into<Model<'a>>,
     photos: &[View],

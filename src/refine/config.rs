@@ -109,7 +109,7 @@ impl RefineConfig {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
         let mut table = toml::Table::try_from(&defaults).expect("plain numbers");
         for assignment in overrides {
-            let refused = |why: &str| Error::request(format!("--set {assignment}: {why}"));
+            let refused = |why: &str| Error::request(format!("override {assignment}: {why}"));
             let set: toml::Table = assignment.parse().map_err(|_| refused("expected KEY=VALUE"))?;
             if set.len() != 1 {
                 return Err(refused("expected KEY=VALUE"));
@@ -162,7 +162,7 @@ impl RefineConfig {
     }
 
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
-    fn from_splat() -> Self {
+    pub fn from_splat() -> Self {
         RefineConfig { resolution_schedule: vec![], opacity: 0., ..Default::default() }
     }
 
@@ -208,7 +208,7 @@ mod tests {
             ("view=3", "unknown field"),
         ] {
             let message = with(assignment).expect_err(assignment).to_string();
-            assert!(message.starts_with(&format!("--set {assignment}: ")), "{message}");
+            assert!(message.starts_with(&format!("override {assignment}: ")), "{message}");
             assert!(message.contains(expected), "{message}");
         }
         assert_eq!(with("resolution_schedule=[]").unwrap().levels(), 1);

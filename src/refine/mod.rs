@@ -1,11 +1,12 @@
 //! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians. It optimizes each
 //! Gaussian by itself, or all of them through the tokens that a model decodes them from. Without a splat, refinement starts from the depths
-//! on which the photos agree.
+//! on which the photos agree. [`RefineSession`] does all of it, from a capture to a splat and its scores.
 
 mod begin;
 mod config;
 mod corrections;
 mod gaussian_params;
+mod options;
 mod patches;
 mod photos;
 mod relocate;
@@ -17,9 +18,10 @@ mod view_selection;
 pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
+pub use options::{Budget, RefineOptions, SpaceKind};
 pub use patches::{PatchScores, Patches};
 pub use photos::{MIN_SIDE, Photos, load_photos};
-pub use session::{EvalPoint, Initial, RefineEvent, RefineOptions, RefineResult, RefineSession, SpaceKind};
+pub use session::{EvalPoint, Initial, RefineEvent, RefineResult, RefineSession};
 pub use space::{GaussianSpace, Space, TokenSpace};
 
 use crate::data::View;
@@ -33,15 +35,6 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::time::{Duration, Instant};
 use tch::{Kind, Tensor};
-
-/// Budget of an optimization.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Budget {
-    /// Number of steps. The same number of steps gives bit-identical results.
-    Steps(u64),
-    /// Wall-clock time, including all other work.
-    Time(Duration),
-}
 
 /// State of the optimization after a step.
 pub struct RefineStep<'a> {

@@ -2,21 +2,23 @@
 //! few pixels during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
 use super::begin::gaussians_from_photos;
-use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
+use super::options::{Budget, RefineOptions, SpaceKind};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
 use super::space::{GaussianSpace, Space, TokenSpace};
-use super::{Budget, Task, refine, scene_depth};
+use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, points_of};
 use crate::error::{Error, Result};
+use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
+use crate::io::Splat;
 use crate::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
 use crate::render::transform;
-use crate::scene::{Camera, Gaussians, ImageSize, LocalFrame, RawGaussians, Similarity};
-use glam::{DMat4, DVec3};
+use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians, Similarity};
+use glam::DMat4;
 use serde::Serialize;
 use std::time::{Duration, Instant};
-use tch::{Device, Tensor};
+use tch::Tensor;
 
 /// Fraction of the time or steps for the tokens if Gaussians are optimized afterwards.
 const TOKENS_SHARE: f64 = 0.2;
@@ -28,64 +30,37 @@ const MAX_START_SHARE: f64 = 0.5;
 const FEW_PHOTOS: usize = 2;
 /// Maximum fraction of the time for scores during the optimization.
 const MAX_SCORING_SHARE: f64 = 0.03;
+/// Maximum fraction of the time for scoring whole held-out views before the optimization, and again for scoring them after it.
+const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
+/// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
+const WRITING_TIME: Duration = Duration::from_millis(200);
+const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
+/// Maximum number of photos that LPIPS compares if no views are held out.
+const LPIPS_PHOTOS: usize = 8;
 /// Fractions of a phase at which the held-out views are scored.
 const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
-
-/// Parameter space of the optimization.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SpaceKind {
-    /// Individual Gaussians.
-    Gaussians,
-    /// Tokens from which a model decodes the Gaussians.
-    Tokens,
-    /// Tokens first, then Gaussians.
-    Both,
-}
-
-/// Options of a session.
-#[derive(Debug, Clone)]
-pub struct RefineOptions {
-    /// Hyperparameters.
-    pub config: RefineConfig,
-    /// Parameter space of the optimization.
-    pub space: SpaceKind,
-    /// Number of steps, or time. A time counts from the clock that the session is given, and includes reading photos and the start.
-    pub budget: Budget,
-    /// Number of Gaussians if the initial splat doesn't determine it.
-    pub gaussians: usize,
-    /// Seed of the random numbers.
-    pub seed: u64,
-    /// Learns corrections of the camera poses if `true`.
-    pub correct_poses: bool,
-    /// Learns the exposure of each photo relative to the others if `true`.
-    pub correct_exposures: bool,
-    /// Size to which photos are cropped and resized. If it is `None`, they keep their shape, and large ones are downscaled.
-    pub size: Option<ImageSize>,
-    /// Device of the depth estimation and the optimization.
-    pub device: Device,
-}
 
 /// Source of the initial Gaussians.
 #[derive(Debug, Clone, Copy)]
 pub enum Initial<'a> {
     /// Pixels of the photos, at depths on which the photos agree.
     Photos,
-    /// Splat in the capture's world, with means relative to an origin.
-    Splat(&'a Gaussians, DVec3),
-    /// Reconstruction of the photos by a model.
-    Model {
-        /// Model that reconstructs the photos.
-        loaded: &'a LoadedModel,
-        /// Maximum number of photos that the model sees; if it is `None`, the number in its configuration.
-        views: Option<usize>,
-    },
+    /// Splat in the capture's world.
+    Splat(&'a Splat),
+    /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
+    Model(&'a LoadedModel),
 }
 
 /// Progress event of a session.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum RefineEvent {
-    /// Photos are being read; the value is the number read so far.
-    Loading(usize),
+pub enum RefineEvent<'a> {
+    /// Photos are being read.
+    Loading {
+        /// Number of photos read so far.
+        done: usize,
+        /// Number of photos to read, including those of the held-out views.
+        count: usize,
+    },
     /// Depths are being computed; the value is the number of photos that are done.
     Starting(usize),
     /// A step of the optimization is done.
@@ -95,6 +70,11 @@ pub enum RefineEvent {
         /// Most recent PSNR on patches of the held-out views, in dB.
         psnr: Option<f64>,
     },
+    /// Whole views are being scored; the value is the number of views that are done.
+    Scoring(usize),
+    /// Warning to print, a sentence: photos that were left out, missing depth information, or too little time. The callback's answer to it
+    /// is ignored.
+    Warning(&'a str),
 }
 
 /// Scores of the held-out views at one time during the optimization.
@@ -112,7 +92,11 @@ pub struct EvalPoint {
 /// Result of a session.
 #[derive(Debug)]
 pub struct RefineResult {
-    /// Gaussians in the session's frame, on its device.
+    /// Splat in the capture's world. If it is a splat that the session started from, it is unchanged.
+    pub splat: Splat,
+    /// Initial Gaussians in the session's frame, on its device.
+    pub initial: Gaussians,
+    /// Final Gaussians in the session's frame, on its device.
     pub gaussians: Gaussians,
     /// `true` if these are the initial Gaussians, which matched the photos better than the optimized ones.
     pub is_initial: bool,
@@ -126,16 +110,52 @@ pub struct RefineResult {
     pub shown: [PatchScores; 2],
     /// Scores on patches of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
+    /// Scores of the initial Gaussians on whole held-out views; `None` if there are none, or if the callback ended the scoring.
+    /// [`RefineSession::score_held_out`] also scores the final Gaussians.
+    pub held_out_before: Option<CaptureScores>,
 }
 
 /// Initial state of the optimization.
 enum Start<'a> {
-    Gaussians(RawGaussians),
+    Photos(RawGaussians),
+    Splat(&'a Splat, RawGaussians),
     Model(&'a LoadedModel, Box<Reconstruction>),
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
 /// [`RefineSession::load`], then [`RefineSession::start`], then [`RefineSession::run`].
+///
+/// ```no_run
+/// use globalsplat::data::{Holdout, open_capture};
+/// use globalsplat::io::write_splat;
+/// use globalsplat::refine::{Budget, Initial, RefineEvent, RefineOptions, RefineSession};
+/// use std::time::Duration;
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let capture = open_capture("captures/room".as_ref())?;
+/// let options = RefineOptions {
+///     budget: Budget::Time(Duration::from_secs(30)),
+///     holdout: Holdout::Every { every: 8, first: 0 },
+///     ..Default::default()
+/// };
+/// let mut session = RefineSession::load(&capture, &options, |event| {
+///     match event {
+///         RefineEvent::Warning(line) => eprintln!("{line}"),
+///         RefineEvent::Optimizing { steps, .. } => println!("{steps} steps"),
+///         _ => {}
+///     }
+///     // `false` would end the work early.
+///     true
+/// })?;
+/// session.start(Initial::Photos)?;
+/// let result = session.run()?;
+/// write_splat("room.ply".as_ref(), &result.splat)?;
+/// if let Some([before, after]) = session.score_held_out(&result)? {
+///     println!("held-out views: {:.2} dB before, {:.2} dB after", before.psnr, after.psnr);
+/// }
+/// # Ok(())
+/// # }
+/// ```
 pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
@@ -146,9 +166,10 @@ pub struct RefineSession<'a> {
     photos: Vec<View>,
     held_out: Vec<View>,
     patches_held_out: Patches,
+    /// Held-out views that there is time to score as a whole.
+    scored: Vec<View>,
     start: Option<(Start<'a>, Gaussians, f64)>,
     near_duplicates: usize,
-    warnings: Vec<String>,
     reserve: Duration,
     scoring: Duration,
     last_scoring: Duration,
@@ -157,22 +178,23 @@ pub struct RefineSession<'a> {
 }
 
 impl<'a> RefineSession<'a> {
-    /// Reads the photos `shown` and `held_out`. `clock` is the start of the time budget. `watch` receives progress events and ends the work
-    /// if it returns `false`.
+    /// Chooses the photos and the held-out views of the capture, and reads them. `watch` receives progress events and ends the work if it
+    /// returns `false`.
     ///
     /// # Errors
-    /// Fails like [`load_photos`], and if `watch` ends the work before all photos are read.
+    /// Fails if an option is out of range, like [`load_photos`], and if `watch` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
-        shown: &[usize],
-        held_out: &[usize],
         options: &'a RefineOptions,
-        clock: Instant,
         mut watch: impl FnMut(RefineEvent) -> bool + 'a,
     ) -> Result<Self> {
-        let mut go_on = |done: usize| watch(RefineEvent::Loading(done));
-        let mut photos = load_photos(capture, shown, options.size, &mut go_on)?;
-        let mut held_out = load_photos(capture, held_out, options.size, |done| go_on(photos.len() + done))?;
+        let clock = options.started.unwrap_or_else(Instant::now);
+        options.check()?;
+        let [shown, held_out] = options.chosen_views(capture);
+        let count = shown.len() + held_out.len();
+        let mut go_on = |done: usize| watch(RefineEvent::Loading { done, count });
+        let mut photos = load_photos(capture, &shown, options.size, &mut go_on)?;
+        let mut held_out = load_photos(capture, &held_out, options.size, |done| go_on(photos.len() + done))?;
         let frame = LocalFrame::from_cameras(&capture.cameras());
         for view in photos.iter_mut().chain(&mut held_out) {
             view.camera = frame.camera_to_local(&view.camera);
@@ -187,21 +209,15 @@ impl<'a> RefineSession<'a> {
             patches_held_out: Patches::of(&held_out),
             photos,
             held_out,
+            scored: vec![],
             start: None,
             near_duplicates: 0,
-            warnings: vec![],
             reserve: Duration::ZERO,
             scoring: Duration::ZERO,
             last_scoring: Duration::ZERO,
             steps: 0,
             curve: vec![],
         })
-    }
-
-    /// Transforms Gaussians from the session's frame to the capture's unit and axes. Returns them with means relative to an origin, and
-    /// this origin in the capture's world.
-    pub fn to_world(&self, gaussians: &Gaussians) -> (Gaussians, DVec3) {
-        (gaussians.to_world_units(&self.frame), self.frame.origin)
     }
 
     /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
@@ -214,9 +230,9 @@ impl<'a> RefineSession<'a> {
         &self.held_out
     }
 
-    /// Returns warnings to print, one sentence each: photos that were left out, and missing depth information.
-    pub fn warnings(&self) -> &[String] {
-        &self.warnings
+    /// Returns the views that represent the splat's quality, in the session's frame: the held-out views if there are any, else the photos.
+    fn judged_views(&self) -> &[View] {
+        if self.held_out.is_empty() { &self.photos } else { &self.held_out }
     }
 
     /// Returns the number of photos that were left out as near duplicates.
@@ -224,19 +240,23 @@ impl<'a> RefineSession<'a> {
         self.near_duplicates
     }
 
-    /// Returns a warning if reading the photos and the start left little or no time for the optimization.
-    pub fn late_start_warning(&self) -> Option<String> {
-        let Budget::Time(time) = self.options.budget else { return None };
-        let gone = self.clock.elapsed();
-        (gone + self.reserve + MIN_TIME.min(time) > time).then(|| {
-            let (time, gone) = (time.as_secs_f64(), gone.as_secs_f64());
-            format!("{time:.0} s are too short here: reading the photos and beginning took {gone:.1} s; it ends as soon as it can")
-        })
+    /// Reserves a further part of the time budget for work after the optimization. Writing the splat and scoring the held-out views are
+    /// provided for already.
+    pub fn reserve(&mut self, time: Duration) {
+        self.reserve += time;
     }
 
-    /// Reserves part of the time budget for the work after the optimization.
-    pub fn reserve(&mut self, time: Duration) {
-        self.reserve = time;
+    /// Reserves the time of [`RefineSession::contact_sheet`], estimated by rendering one row of `gaussians`.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn reserve_for_contact_sheet(&mut self, gaussians: &Gaussians) -> Result<()> {
+        let views = self.judged_views();
+        let begun = Instant::now();
+        let _ = ContactSheet::render(gaussians, &views[..1])?;
+        let time = begun.elapsed() * views.len() as u32;
+        self.reserve(time);
+        Ok(())
     }
 
     /// Creates the initial Gaussians, and returns them in the session's frame on its device. Near duplicates are removed from the photos.
@@ -244,15 +264,22 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `watch` ends the work before there are Gaussians.
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
+        let mut warnings = vec![];
+        if self.options.space != SpaceKind::Gaussians && !matches!(initial, Initial::Model(_)) {
+            return Err(Error::request(
+                "tokens are optimized only if a model reconstructs the initial splat",
+            ));
+        }
         let start = match initial {
-            Initial::Splat(gaussians, origin) => {
-                let local = gaussians.to_local(&self.frame, origin);
-                Start::Gaussians(RawGaussians::of(&local.to_device(self.options.device)))
+            Initial::Splat(splat) => {
+                let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
+                Start::Splat(splat, RawGaussians::of(&local.to_device(self.options.device)))
             }
-            Initial::Model { loaded, views } => {
+            Initial::Model(loaded) => {
                 let data = &loaded.config.data;
                 let all: Vec<usize> = (0..self.photos.len()).collect();
-                let context = spread_over_path(&self.cameras(), &all, views.unwrap_or(data.context_views))
+                let count = self.options.views.unwrap_or(data.context_views);
+                let context = spread_over_path(&self.cameras(), &all, count)
                     .into_iter()
                     .map(|index| self.photos[index].fitted(data.image_size))
                     .collect::<Result<Vec<_>>>()?;
@@ -265,22 +292,23 @@ impl<'a> RefineSession<'a> {
                 }
                 if self.are_in_one_place() {
                     let line = "the photos were all taken from one place, and tell no depth: all that they show is put at one distance";
-                    self.warnings.push(format!("{}: {line}", self.capture.name));
+                    warnings.push(format!("{}: {line}", self.capture.name));
                 }
-                Start::Gaussians(self.gaussians_from_photos(None)?.ok_or_else(stopped)?)
+                Start::Photos(self.gaussians_from_photos(None)?.ok_or_else(stopped)?)
             }
         };
         let gaussians = match &start {
-            Start::Gaussians(raw) => raw.activate(),
+            Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(_, reconstruction) => reconstruction.in_world().to_device(self.options.device),
         };
         let depth = scene_depth(&gaussians, &self.photos)?;
-        self.leave_out_near_duplicates(depth);
+        warnings.extend(self.leave_out_near_duplicates(depth));
+        warnings.iter().for_each(|line| self.warn(line));
         self.start = Some((start, gaussians.map(Tensor::shallow_clone), depth));
         Ok(gaussians)
     }
 
-    /// Optimizes the result of [`RefineSession::start`], and scores patches of the photos before and after.
+    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores patches of the photos before and after.
     ///
     /// # Errors
     /// Fails if rendering fails.
@@ -289,6 +317,14 @@ impl<'a> RefineSession<'a> {
     /// Panics if [`RefineSession::start`] was not called before.
     pub fn run(&mut self) -> Result<RefineResult> {
         let (start, initial, depth) = self.start.take().expect("a start");
+        self.scored = self.affordable_views(&initial)?;
+        let scoring = Instant::now();
+        let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
+        let count = initial.count().max(self.options.gaussians as i64);
+        self.reserve(scoring.elapsed() + WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32);
+        if let Some(line) = self.late_start_warning() {
+            self.warn(&line);
+        }
         let patches = Patches::of(&self.photos);
         let before = patches.score(&initial)?.expect("photos");
         if matches!(start, Start::Model(..)) {
@@ -305,14 +341,107 @@ impl<'a> RefineSession<'a> {
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let asked = self.options.correct_poses || self.options.correct_exposures;
         let corrections = if asked && !is_initial { learned.told(&self.photos) } else { vec![] };
+        let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
+        let splat = match start {
+            Start::Splat(splat, _) if is_initial => Splat { warnings: vec![], ..splat.clone() },
+            _ => gaussians.to_world_units(&self.frame).to_splat(self.frame.origin)?,
+        };
         Ok(RefineResult {
-            gaussians: if is_initial { initial } else { gaussians },
+            splat,
+            initial,
+            gaussians,
             is_initial,
             corrections,
             steps: self.steps,
             seconds: [begun, ended],
             shown: if is_initial { [before; 2] } else { [before, after] },
             curve: std::mem::take(&mut self.curve),
+            held_out_before,
+        })
+    }
+
+    /// Scores a result on whole held-out views: those that [`RefineSession::run`] scored before the optimization. With a time budget there
+    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `watch` ended the
+    /// scoring.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn score_held_out(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
+        let before = result.held_out_before.clone();
+        let after = if result.is_initial {
+            before.clone()
+        } else {
+            self.score_whole(&result.gaussians, &self.scored_views(), None)?
+        };
+        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+    }
+
+    /// Scores the initial and the final Gaussians by LPIPS, with the networks whose weights are installed: on all held-out views, or on a
+    /// few photos if no views are held out. Returns `None` if `watch` ends the scoring.
+    ///
+    /// # Errors
+    /// Fails if rendering fails, or if a file of weights is invalid.
+    pub fn score_lpips(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
+        let perceptual = Perceptual::find(result.initial.means.device())?;
+        let count = if self.held_out.is_empty() { LPIPS_PHOTOS } else { self.held_out.len() };
+        let views: Vec<View> = self.judged_views().iter().take(count).map(View::shallow_clone).collect();
+        let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
+        let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
+        if let Some(line) = after.as_ref().and_then(|after| perceptual.why_absent(after)) {
+            self.warn(&line);
+        }
+        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+    }
+
+    /// Renders the held-out views, or else the photos, beside their photos: a row per view.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn contact_sheet(&self, result: &RefineResult) -> Result<ContactSheet> {
+        ContactSheet::render(&result.gaussians, self.judged_views())
+    }
+
+    /// Returns an evenly spaced subset of the held-out views that can be scored within [`MAX_WHOLE_SCORING_SHARE`] of a time budget.
+    fn affordable_views(&mut self, gaussians: &Gaussians) -> Result<Vec<View>> {
+        let every = match self.options.budget {
+            Budget::Time(time) if !self.held_out.is_empty() => {
+                let begun = Instant::now();
+                self.score_whole(gaussians, &[self.held_out[0].shallow_clone()], None)?;
+                let all = begun.elapsed() * self.held_out.len() as u32;
+                all.div_duration_f64(time.mul_f64(MAX_WHOLE_SCORING_SHARE)).ceil().max(1.) as usize
+            }
+            _ => 1,
+        };
+        Ok(self.held_out.iter().step_by(every).map(View::shallow_clone).collect())
+    }
+
+    fn scored_views(&self) -> Vec<View> {
+        self.scored.iter().map(View::shallow_clone).collect()
+    }
+
+    /// Scores Gaussians on whole views. Returns `None` if there are no views, or if `watch` ends the scoring.
+    fn score_whole(
+        &mut self,
+        gaussians: &Gaussians,
+        views: &[View],
+        perceptual: Option<&Perceptual>,
+    ) -> Result<Option<CaptureScores>> {
+        let go_on = |done| (self.watch)(RefineEvent::Scoring(done));
+        let scores = score_views(&self.capture.name, gaussians, views, perceptual, go_on)?;
+        Ok(scores.filter(|scores| scores.views.len() == views.len()))
+    }
+
+    fn warn(&mut self, line: &str) {
+        let _ = (self.watch)(RefineEvent::Warning(line));
+    }
+
+    /// Returns a warning if reading the photos and the start left little or no time for the optimization.
+    fn late_start_warning(&self) -> Option<String> {
+        let Budget::Time(time) = self.options.budget else { return None };
+        let gone = self.clock.elapsed();
+        (gone + self.reserve + MIN_TIME.min(time) > time).then(|| {
+            let (time, gone) = (time.as_secs_f64(), gone.as_secs_f64());
+            format!("{time:.0} s are too short here: reading the photos and beginning took {gone:.1} s; it ends as soon as it can")
         })
     }
 
@@ -325,10 +454,11 @@ impl<'a> RefineSession<'a> {
         self.photos.iter().all(|view| centre(view) == centre(&self.photos[0]))
     }
 
-    fn leave_out_near_duplicates(&mut self, depth: f64) {
+    /// Removes near duplicates from the photos. Returns a warning that names them, if there are any.
+    fn leave_out_near_duplicates(&mut self, depth: f64) -> Option<String> {
         let keep = distinct(&self.photos, depth);
         if keep.len() == self.photos.len() {
-            return;
+            return None;
         }
         let mut is_kept = vec![false; self.photos.len()];
         keep.iter().for_each(|&index| is_kept[index] = true);
@@ -339,11 +469,11 @@ impl<'a> RefineSession<'a> {
         }
         self.near_duplicates = left_out.len();
         let (count, all) = (left_out.len(), left_out.len() + self.photos.len());
-        self.warnings.push(format!(
+        Some(format!(
             "{}: {count} of {all} photos are nearly equal to others, and left out: {}",
             self.capture.name,
             names(&left_out)
-        ));
+        ))
     }
 
     /// Creates the requested number of Gaussians on the session's device, and keeps those of the `known` Gaussians that don't contradict
@@ -381,7 +511,7 @@ impl<'a> RefineSession<'a> {
             SpaceKind::Both => TOKENS_SHARE,
         };
         let (raw, depth, done) = match start {
-            Start::Gaussians(raw) => (raw.shallow_clone(), depth, 0.),
+            Start::Photos(raw) | Start::Splat(_, raw) => (raw.shallow_clone(), depth, 0.),
             Start::Model(loaded, reconstruction) => {
                 let gaussians = if end > 0. {
                     self.optimize_tokens(loaded, reconstruction, depth, end)?

@@ -3,11 +3,13 @@
 pub mod cpu;
 pub mod cuda;
 mod harmonics;
+mod orbit;
 mod transform;
 mod views;
 
 use crate::ffi::take_outputs;
 pub use harmonics::fit_harmonics;
+pub use orbit::orbit_around_gaussians;
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};
 

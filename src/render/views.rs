@@ -31,6 +31,24 @@ impl RenderedView {
 ///
 /// # Errors
 /// Fails like [`render`].
+///
+/// ```no_run
+/// use globalsplat::data::open_capture;
+/// use globalsplat::io::{read_splat, write_png};
+/// use globalsplat::render::render_views;
+/// use globalsplat::scene::LocalFrame;
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let splat = read_splat("room.ply".as_ref())?;
+/// let cameras = open_capture("captures/room".as_ref())?.cameras();
+/// // The local frame of the cameras has a suitable unit.
+/// let frame = LocalFrame::from_cameras(&cameras);
+/// let gaussians = splat.gaussians.to_local(&frame, splat.origin);
+/// let rendered = render_views(&gaussians, &[frame.camera_to_local(&cameras[0])])?;
+/// write_png("room.png".as_ref(), &rendered[0].rgb)?;
+/// # Ok(())
+/// # }
+/// ```
 pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<RenderedView>> {
     cameras
         .iter()
@@ -77,6 +95,20 @@ impl SplatRenderer {
     /// Returns the frame that the splat is rendered in.
     pub fn frame(&self) -> LocalFrame {
         self.frame
+    }
+
+    /// Returns the median rendered depth of the middle one of `cameras`, over the pixels with an alpha of at least 0.5; if there are none, the
+    /// splat's typical distance.
+    ///
+    /// # Errors
+    /// Fails like [`render`].
+    ///
+    /// # Panics
+    /// Panics if there are no cameras.
+    pub fn median_depth(&self, cameras: &[Camera]) -> Result<f64> {
+        let rendered = self.render(&cameras[cameras.len() / 2..][..1])?.remove(0);
+        let seen = rendered.depth.masked_select(&rendered.alpha.ge(0.5));
+        Ok(if seen.numel() == 0 { self.frame.typical_distance() } else { seen.median().double_value(&[]) })
     }
 
     /// Renders the splat from each camera; cameras may differ in size. The images are on the host, whatever the device. Depth is in world

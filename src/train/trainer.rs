@@ -27,6 +27,29 @@ use tch::{Device, Kind, Tensor, nn, no_grad};
 pub(crate) const COMMUNICATION: &str = "communication";
 
 /// Model, optimizer and data of a run.
+///
+/// ```no_run
+/// use globalsplat::config::Config;
+/// use globalsplat::data::TrainingScenes;
+/// use globalsplat::train::{Event, Resume, Trainer, run};
+/// use std::sync::Arc;
+///
+/// # fn main() -> globalsplat::Result<()> {
+/// let config = Config::read("configs/tiny.toml".as_ref(), &["train.steps=100".into()])?;
+/// let scenes = Arc::new(TrainingScenes::find(&config.data.capture_paths()?)?);
+/// let mut trainer = Trainer::new(&config, scenes, tch::Device::Cpu)?;
+/// // The folder gets the checkpoints and the logs; training resumes from its newest checkpoint.
+/// let outcome = run(&mut trainer, "runs/tiny".as_ref(), &Resume::Auto, None, |event| {
+///     if let Event::Step { report, .. } = event {
+///         println!("step {}: {:.2} dB", report.step, report.psnr());
+///     }
+///     // `false` would save a checkpoint and stop.
+///     true
+/// })?;
+/// println!("{}", outcome.checkpoint.display());
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct Trainer {
     pub(super) config: Config,
@@ -368,7 +391,7 @@ impl Trainer {
             !["data.captures ", "data.validation "].iter().any(|key| change.starts_with(key))
         });
         if shards != own.2 {
-            changed.push(format!("--shard-optimizer {shards} → {}", own.2));
+            changed.push(format!("shards_optimizer {shards} → {}", own.2));
         }
         if !changed.is_empty() {
             let changed = changed.join(", ");

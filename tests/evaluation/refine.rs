@@ -8,8 +8,7 @@ use glam::DVec3;
 use globalsplat::data::{load_all_views, open_capture, points_of};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::refine::{
-    Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession, SpaceKind,
-    gaussians_from_photos,
+    Budget, Initial, RefineEvent, RefineOptions, RefineSession, gaussians_from_photos,
 };
 use globalsplat::scene::Gaussians;
 use serde_json::Value;
@@ -178,23 +177,11 @@ fn photos_from_one_place_are_shown_at_one_distance() {
 fn work_that_is_ended_early_keeps_what_there_is() {
     let (_folder, room) = room();
     let capture = open_capture(&room).unwrap();
-    let options = RefineOptions {
-        config: RefineConfig::default(),
-        space: SpaceKind::Gaussians,
-        budget: Budget::Steps(1_000_000),
-        gaussians: 300,
-        seed: 0,
-        correct_poses: false,
-        correct_exposures: false,
-        size: None,
-        device: tch::Device::Cpu,
-    };
-    let all: Vec<usize> = (0..capture.len()).collect();
+    let options =
+        RefineOptions { budget: Budget::Steps(1_000_000), gaussians: 300, ..RefineOptions::default() };
     // Returns the number of steps done if the work stops at the first event of a kind.
     let steps = |ends: fn(&RefineEvent) -> bool| {
-        let now = std::time::Instant::now();
-        let mut session =
-            RefineSession::load(&capture, &all, &[], &options, now, move |event| !ends(&event))?;
+        let mut session = RefineSession::load(&capture, &options, move |event| !ends(&event))?;
         session.start(Initial::Photos)?;
         let result = session.run()?;
         assert_eq!(result.gaussians.count(), 300);
@@ -202,7 +189,7 @@ fn work_that_is_ended_early_keeps_what_there_is() {
         Ok::<u64, globalsplat::Error>(result.steps)
     };
     for nothing_yet in [
-        |event: &RefineEvent| matches!(event, RefineEvent::Loading(_)),
+        |event: &RefineEvent| matches!(event, RefineEvent::Loading { .. }),
         |event: &RefineEvent| *event == RefineEvent::Starting(0),
     ] {
         let why = steps(nothing_yet).unwrap_err().to_string();

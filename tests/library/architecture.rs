@@ -8,9 +8,9 @@ const LAYERS: [&str; 17] = [
     "cli",
     "parity",
     "bench",
+    "refine",
     "eval",
     "train",
-    "refine",
     "reconstruct",
     "config",
     "optim",
@@ -80,6 +80,26 @@ fn every_module_is_in_the_diagram_and_on_the_page() {
         let line = line.unwrap_or_else(|| panic!("{module} is not in its place in CONTRIBUTING.md"));
         below = &below[line + 1..];
     }
+}
+
+/// The library has no command line: what it says names its own arguments, and `src/cli/option_names.rs` names the options.
+#[test]
+fn the_library_names_no_options() {
+    let mut options = vec![];
+    for (module, source) in sources() {
+        if module.first().is_some_and(|layer| ["cli", "parity", "bench"].contains(&layer.as_str())) {
+            continue;
+        }
+        for (at, _) in source.text.match_indices("--") {
+            let (before, after) = (&source.text[..at], &source.text[at + 2..]);
+            // Variables of style sheets begin with two dashes, too.
+            if after.starts_with(|c: char| c.is_ascii_lowercase()) && !before.ends_with("var(") {
+                let option: String = after.chars().take_while(|&c| c.is_alphanumeric() || c == '-').collect();
+                options.push(format!("{}: --{option}", module.join("::")));
+            }
+        }
+    }
+    assert!(options.is_empty(), "{options:?}");
 }
 
 #[test]

@@ -116,7 +116,7 @@ impl Render {
         let (gaussians, origin) = self.gaussians(capture.as_ref())?;
         let renderer = SplatRenderer::from_gaussians(&gaussians, origin);
         let shots = self.shots((&gaussians, origin), &renderer, capture.as_ref())?;
-        let scale = if self.depth { Some(depth_scale(&renderer, &shots.cameras)?) } else { None };
+        let scale = if self.depth { Some(DepthScale::estimate(&renderer, &shots.cameras)?) } else { None };
 
         let stop = stop_flag()?;
         let mut inputs = self.inputs(capture.as_ref());
@@ -210,18 +210,4 @@ impl Render {
             ImageSize { width: largest(|camera| camera.width), height: largest(|camera| camera.height) };
         tiled_size(size, 1 + u32::from(self.depth) + u32::from(self.alpha))
     }
-}
-
-/// Returns the depth scale for all images, estimated from a few small renders, so that it is known before the first image.
-fn depth_scale(renderer: &SplatRenderer, cameras: &[Camera]) -> Result<DepthScale> {
-    const FEW: usize = 12;
-    const SMALL: u32 = 128;
-    let small = |camera: &Camera| {
-        let by = (camera.width.max(camera.height)).div_ceil(SMALL);
-        camera.with_size(ImageSize { width: camera.width.div_ceil(by), height: camera.height.div_ceil(by) })
-    };
-    let count = cameras.len().min(FEW);
-    let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
-    let rendered = renderer.render(&spread.collect::<Vec<_>>())?;
-    Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
 }

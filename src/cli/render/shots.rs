@@ -1,12 +1,11 @@
 //! Cameras of `render`.
 
-use super::super::cameras::{median_depth, orbit_around_gaussians};
 use crate::cli::warn;
 use anyhow::Result;
 use glam::DVec3;
 use globalsplat::data::{CameraPath, Capture, read_camera_path};
 use globalsplat::io::InputFiles;
-use globalsplat::render::SplatRenderer;
+use globalsplat::render::{SplatRenderer, orbit_around_gaussians};
 use globalsplat::scene::{Camera, Gaussians, ImageSize, orbit_around_cameras, smooth_path};
 use std::path::Path;
 
@@ -52,7 +51,7 @@ impl Shots {
         renderer: &SplatRenderer,
     ) -> Result<Self> {
         let cameras = resized(capture.cameras(), size);
-        let distance = median_depth(renderer, &cameras)?;
+        let distance = renderer.median_depth(&cameras)?;
         let orbit = orbit_around_cameras(&cameras, distance, frames.unwrap_or(DEFAULT_FRAMES))?;
         Ok(Shots::numbered(orbit))
     }
@@ -101,5 +100,5 @@ fn resized(cameras: Vec<Camera>, size: Option<ImageSize>) -> Vec<Camera> {
 }
 
 fn smoothed(cameras: &[Camera], frames: usize, renderer: &SplatRenderer) -> Result<Vec<Camera>> {
-    Ok(smooth_path(cameras, median_depth(renderer, cameras)?, frames)?)
+    Ok(smooth_path(cameras, renderer.median_depth(cameras)?, frames)?)
 }

@@ -1,13 +1,12 @@
 //! Data about the scene that is embedded in a page.
 
-use super::super::cameras::{median_depth, orbit_around_gaussians};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use globalsplat::data::{Capture, load_views};
 use globalsplat::io::{encode_photo, rgb_from_tensor};
-use globalsplat::render::{DEFAULT_EPS2D, SplatRenderer};
+use globalsplat::render::{DEFAULT_EPS2D, SplatRenderer, orbit_around_gaussians};
 use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
@@ -83,7 +82,7 @@ impl Contents {
                 (named.collect(), orbit)
             }
         };
-        let distance = median_depth(&SplatRenderer::from_gaussians(gaussians, DVec3::ZERO), &all)?;
+        let distance = SplatRenderer::from_gaussians(gaussians, DVec3::ZERO).median_depth(&all)?;
         let path = match capture {
             Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MOST_FRAMES))?,
             None => [&all[..], &all[..1]].concat(),

@@ -139,12 +139,7 @@ impl WatchedRun {
     pub fn open(run: &Path) -> Result<Self> {
         if !RunLock::was_taken(run) && !run.join(METRICS_FILE).is_file() {
             let found = if run.exists() { "a folder without metrics.jsonl" } else { "absent" };
-            return Err(Error::input(
-                run,
-                "the run",
-                found,
-                "a folder that `globalsplat train --out` writes",
-            ));
+            return Err(Error::input(run, "the run", found, "a folder that `globalsplat train` writes"));
         }
         let lines = NewLines::new(&run.join(METRICS_FILE));
         let mut watched =

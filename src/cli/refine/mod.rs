@@ -1,0 +1,183 @@
+//! The command `refine`: its arguments, and the work that `reconstruct --refine` shares with it.
+
+mod job;
+mod report;
+
+pub use job::{InitialFile, RefineJob};
+
+use super::{check_views, device, parse_size};
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use globalsplat::data::Holdout;
+use globalsplat::error::Error;
+use globalsplat::refine::{Budget, MIN_SIDE, RefineConfig, RefineOptions, SpaceKind};
+use globalsplat::scene::ImageSize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Maximum of `--seconds`: a year.
+const MAX_SECONDS: f64 = 365. * 24. * 3600.;
+
+/// Optimize a splat on the photos of its scene, or create one from the photos alone.
+///
+/// The Gaussians, whose number stays fixed, are optimized until their renders match the photos. Without --splat they are
+/// initialized where the depths of several photos agree; neither weights nor a GPU are needed. Ctrl-C ends the optimization
+/// early and writes the current splat.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
+    globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
+    globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
+pub struct Refine {
+    /// Initial splat, in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
+    splat: Option<PathBuf>,
+    /// Initialization without --splat: from the photos alone, or from a model's reconstruction
+    #[arg(long, value_enum, conflicts_with = "splat")]
+    from: Option<From>,
+    /// Weights of the initial model, as `globalsplat export` writes them; by default the weights embedded in this program
+    #[arg(long, value_name = "FILE", conflicts_with = "splat")]
+    weights: Option<PathBuf>,
+    /// Optimized parameters: Gaussians, the tokens that a model decodes them from, or both: first tokens, then Gaussians
+    #[arg(long, value_enum, default_value_t = SpaceName::Gaussians, conflicts_with = "splat")]
+    space: SpaceName,
+    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    #[arg(long, value_name = "PATH")]
+    scene: PathBuf,
+    /// Output splat: .ply, .compressed.ply, .spz or .splat
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
+    /// world's origin, as in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    local_origin: bool,
+    /// Number of Gaussians, not allowed with --splat; a model's reconstruction may have more
+    #[arg(long, value_name = "N", default_value_t = RefineOptions::default().gaussians as u32, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    gaussians: u32,
+    /// Total time in seconds, from the start of the program to its end
+    #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
+    seconds: f64,
+    /// Number of steps, instead of a time: the same steps and seed give the same bytes
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    /// Seed of the random numbers
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    seed: u64,
+    /// Views to hold out and score: every:N, every:N+K, or none for only the capture's own test split
+    #[arg(long, value_name = "WHICH", default_value = "none")]
+    holdout: String,
+    /// Maximum number of the other views, spread along the camera path
+    #[arg(long, value_name = "N")]
+    views: Option<usize>,
+    /// Crop and resize photos to this size; by default they keep their aspect ratio, with at most 512 pixels along the longer
+    /// side
+    #[arg(long, value_name = "WxH")]
+    size: Option<String>,
+    /// Also optimize a correction of each camera's pose
+    #[arg(long)]
+    correct_poses: bool,
+    /// Also optimize a correction of each photo's exposure and white balance
+    #[arg(long)]
+    correct_exposures: bool,
+    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
+    #[arg(long, value_name = "FILE.png")]
+    sheet: Option<PathBuf>,
+    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
+    #[arg(long)]
+    lpips: bool,
+    /// Override a setting of the method, as in views=4; docs/refine.md lists them
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Device of the optimization: cpu, cuda or cuda:N
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: String,
+    /// Print the result as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Initialization of the optimization.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum From {
+    /// Pixels at which the depths of the photos agree
+    Nothing,
+    /// A model's reconstruction, and pixels for the Gaussians that it lacks to --gaussians
+    Weights,
+}
+
+/// Parameters that are optimized.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum SpaceName {
+    /// Each Gaussian by itself
+    Gaussians,
+    /// Tokens of a model
+    Tokens,
+    /// Tokens first, then Gaussians
+    Both,
+}
+
+impl Refine {
+    pub fn run(self) -> Result<()> {
+        check_views(self.views)?;
+        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
+        let options = self.options(holdout)?;
+        let needs_model = self.needs_model()?;
+        if self.space == SpaceName::Tokens && (self.correct_poses || self.correct_exposures) {
+            let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
+            return Err(Error::request(why).into());
+        }
+        let initial = match self.splat {
+            Some(splat) => InitialFile::Splat(splat),
+            None if needs_model => InitialFile::Model(self.weights),
+            None => InitialFile::Photos,
+        };
+        let Refine { scene, out, sheet, local_origin, lpips, json, .. } = self;
+        RefineJob { scene, out, initial, options, local_origin, sheet, lpips, json }.run()
+    }
+
+    fn needs_model(&self) -> Result<bool> {
+        let needs_model = self.weights.is_some() || self.space != SpaceName::Gaussians;
+        if self.from == Some(From::Nothing) && needs_model {
+            let why = "--from nothing has neither weights nor tokens; --from weights has";
+            return Err(Error::request(why).into());
+        }
+        Ok(needs_model || self.from == Some(From::Weights))
+    }
+
+    fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
+        let size = self.size.as_deref().map(parse_size).transpose()?;
+        if let Some(ImageSize { width, height }) = size
+            && width.min(height) < MIN_SIDE
+        {
+            let why = format!("--size {width}x{height}: expected {MIN_SIDE} pixels or more along each side");
+            return Err(Error::request(why).into());
+        }
+        let time = parse_time(self.seconds)?;
+        Ok(RefineOptions {
+            config: RefineConfig::with(&self.set, self.splat.is_some())?,
+            space: match self.space {
+                SpaceName::Gaussians => SpaceKind::Gaussians,
+                SpaceName::Tokens => SpaceKind::Tokens,
+                SpaceName::Both => SpaceKind::Both,
+            },
+            budget: self.steps.map_or(time, Budget::Steps),
+            gaussians: self.gaussians as usize,
+            seed: self.seed,
+            holdout,
+            views: self.views,
+            correct_poses: self.correct_poses,
+            correct_exposures: self.correct_exposures,
+            size,
+            device: device::parse(&self.device)?,
+            ..RefineOptions::default()
+        })
+    }
+}
+
+/// Checks a time in seconds and returns it as a budget.
+pub fn parse_time(seconds: f64) -> Result<Budget> {
+    if !(seconds > 0. && seconds <= MAX_SECONDS) {
+        let why = format!("--seconds is {seconds}, expected more than 0, up to a year");
+        return Err(Error::request(why).into());
+    }
+    Ok(Budget::Time(Duration::from_secs_f64(seconds)))
+}
