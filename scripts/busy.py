@@ -31,7 +31,7 @@ def main() -> int:
     options = parser.parse_args()
     rates = {}
     with tempfile.TemporaryDirectory() as folder:
-        synth = ["synth", "--gaussians", "--out", folder, "--scenes", "2", "--frames", "12", "--size", "256"]
+        synth = ["synth", "--out", folder, "--scenes", "2", "--frames", "12", "--size", "256"]
         subprocess.run([options.binary[0], *synth], check=True, stdout=subprocess.DEVNULL)
         bench = ["bench", "train", "--config", "configs/first_light.toml", "--batch", "2", "--json"]
         bench += ["--steps", str(options.steps), "--set", f'data.captures=["{folder}"]']

@@ -82,7 +82,7 @@ def main() -> int:
     captures, run, config = options.out / "captures", options.out / "run", options.out / "soak.toml"
     options.out.mkdir(parents=True, exist_ok=True)
     if not captures.exists():
-        synth = ["synth", "--gaussians", "--out", captures, "--scenes", "2", "--frames", "9", "--size", "40"]
+        synth = ["synth", "--out", captures, "--scenes", "2", "--frames", "9", "--size", "40"]
         subprocess.run([options.binary, *synth], check=True, stdout=subprocess.DEVNULL)
     config.write_text(CONFIG.format(captures=captures.resolve(), steps=options.steps))
 

@@ -198,10 +198,6 @@ class Tree:
 # The operations.
 
 
-def whole_room(name):
-    return name.split("/")[0]
-
-
 def whole_checkpoint(name):
     return name.rsplit("/", 1)[0] if name.startswith(("checkpoints/", "best/")) else name
 
@@ -346,6 +342,14 @@ class Bench:
         return Done(code, "" if into else told.read_text(), said.read_text(), calls)
 
 
+def make_rooms(folder, scenes, frames, size):
+    """Writes captures of synthetic rooms with their splats."""
+    program = REPOSITORY / "target/release/examples/make_rooms"
+    if not program.exists():
+        sys.exit(f"{program} is missing: run cargo build --release --examples")
+    subprocess.run([program, folder, *map(str, (scenes, frames, size))], check=True)
+
+
 def operations(bench, only):
     """Yields the operations, on synthetic scenes and weights that the program creates, with the configuration of
     tests/common/program.rs."""
@@ -353,7 +357,7 @@ def operations(bench, only):
     source = (REPOSITORY / "tests/common/program.rs").read_text()
     config = re.search(r'TINY_CONFIG: &str = r#"(.*?)"#', source, re.DOTALL)[1]
     rooms, room = inputs / "rooms", inputs / "rooms/room_000"
-    bench.make("synth", "--gaussians", "--out", rooms, "--scenes", 2, "--frames", 9, "--size", 40)
+    make_rooms(rooms, 2, 9, 40)
     tiny, weights = inputs / "tiny.toml", inputs / "tiny.safetensors"
     config = config.replace("[data]", f"[data]\ncaptures = [{json.dumps(str(room))}]")
     tiny.write_text(config + "validate_every = 2\n")
@@ -401,7 +405,7 @@ def operations(bench, only):
 
     def packed():
         # Scenes of more than a megabyte each, so that each chunk has one scene.
-        bench.make("synth", "--gaussians", "--out", inputs / "large", "--scenes", 2, "--frames", 9, "--size", 256)
+        make_rooms(inputs / "large", 2, 9, 256)
         command = ["pack", inputs / "large", "--out", out, "--chunk-size", 1, "--json"]
         # Existing chunks are never replaced, so start from the state of an interrupted run.
         bench.make(*command)
@@ -409,16 +413,11 @@ def operations(bench, only):
         (out / "index.json").unlink()
         return Operation(bench, "pack", command, once=True).take()
 
-    def synthesized():
-        bench.make("synth", "--gaussians", "--out", out, "--frames", 4, "--size", 16, "--seed", 7)
-        command = ["synth", "--gaussians", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--json"]
-        return Operation(bench, "synth", command, whole_room).take()
-
     def filmed():
         more = ["--depth", "--sheet", out / "sheet.png"]
         command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, *more, "--json"]
         # Older files, without the index that marks the folder as complete.
-        return Operation(bench, "synth, videos", command, once=True).age(drop=["000000.torch", "index.json"])
+        return Operation(bench, "synth", command, once=True).age(drop=["000000.torch", "index.json"])
 
     def converted():
         shutil.copy(splat, out / "room.ply")
@@ -457,8 +456,7 @@ def operations(bench, only):
         "eval --data": aged("eval --data", [*sweep, out], keep=scored),
         "report": aged("report", report),
         "pack": packed,
-        "synth": synthesized,
-        "synth, videos": filmed,
+        "synth": filmed,
     }
     for name, make in made.items():
         if not only or name in only:

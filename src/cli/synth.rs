@@ -2,7 +2,7 @@ use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::Error;
-use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures, write_room};
+use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
     InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy,
@@ -57,9 +57,6 @@ pub struct Synth {
     /// Also write an overview image, a row per video
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
-    /// Write captures of a small room made of Gaussians instead, with its splat beside them
-    #[arg(long, conflicts_with_all = ["first", "pictures", "depth", "sheet"])]
-    gaussians: bool,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -73,14 +70,6 @@ impl Synth {
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
-        if self.gaussians { self.write_rooms() } else { self.write_videos() }
-    }
-
-    fn image_size(&self) -> ImageSize {
-        ImageSize { height: self.size as u32, width: self.size as u32 }
-    }
-
-    fn write_videos(&self) -> Result<()> {
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
         check_writable_dir(&self.out)?;
         let mut inputs = InputFiles::default();
@@ -88,7 +77,8 @@ impl Synth {
         on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
         inputs.check_folder(&self.out)?;
         self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
-        let settings = VideoSettings { frames: self.frames as usize, size: self.image_size(), pictures };
+        let size = ImageSize { height: self.size as u32, width: self.size as u32 };
+        let settings = VideoSettings { frames: self.frames as usize, size, pictures };
         let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
         let depths = self.out.join("depth");
@@ -166,26 +156,6 @@ impl Synth {
     fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {
         let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
         write_npy(file, &[self.frames, self.size, self.size], &depths)
-    }
-
-    fn write_rooms(&self) -> Result<()> {
-        check_writable_dir(&self.out)?;
-        let bar = progress::bar(self.scenes, "scenes");
-        let mut captures = vec![];
-        for scene in 0..self.scenes {
-            let path = self.out.join(format!("room_{scene:03}"));
-            let seed = self.seed.wrapping_mul(1_000_003).wrapping_add(scene);
-            write_room(&path, seed, self.frames as usize, self.image_size())?;
-            captures.push(path.to_string_lossy().into_owned());
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        if self.json {
-            print_json(&json!({ "captures": captures }));
-        } else {
-            println!("{}: {} captures of {} photos", self.out.display(), captures.len(), self.frames);
-        }
-        Ok(())
     }
 }
 

@@ -6,11 +6,9 @@ mod batch;
 mod chunk_writer;
 mod config;
 mod dataset;
-mod gaussian_room;
 mod jitter;
 mod loading;
 mod polyphase;
-mod room;
 mod view;
 
 pub(crate) use batch::cameras_at;
@@ -25,7 +23,6 @@ pub use globalsplat_capture::{
 pub use globalsplat_synth::{SyntheticDataset, read_pictures};
 pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};
 pub use polyphase::polyphase;
-pub use room::write_room;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};
 
 // Exchanged between processes.

@@ -287,14 +287,13 @@ fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Ve
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::{open_capture, write_room};
+    use crate::data::SyntheticDataset;
+    use globalsplat_synth::VideoSettings;
 
     #[test]
     fn the_model_sees_as_many_views_as_in_training() {
-        let folder = tempfile::tempdir().unwrap();
-        let room = folder.path().join("room");
-        write_room(&room, 0, 12, [16, 16].into()).unwrap();
-        let capture = open_capture(&room).unwrap();
+        let settings = VideoSettings { frames: 12, size: [16, 16].into(), pictures: vec![] };
+        let capture = SyntheticDataset::new(0, 0, 1, settings).capture(0).unwrap();
         let config = DataConfig {
             image_size: [16, 16].into(),
             context_views: 4,
@@ -307,7 +306,7 @@ mod tests {
         // The context views are chosen among views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
         let context = names(&context);
         assert_eq!((context.len(), target.len()), (4, 4));
-        assert_eq!((context[0].as_str(), context[3].as_str()), ("images/000.png", "images/011.png"));
-        assert_eq!(names(&target)[3], "images/010.png");
+        assert_eq!((context[0].as_str(), context[3].as_str()), ("000000", "000011"));
+        assert_eq!(names(&target)[3], "000010");
     }
 }

@@ -40,7 +40,7 @@ pub use weights::{Weights, write_checkpoint, write_weights};
 pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
 
 pub(crate) use globalsplat_files::{
-    AppendFile, expand_path, lock_parent, read_text, recover_dirs, remove_dir, replace_dir, write_json,
+    AppendFile, expand_path, read_text, recover_dirs, remove_dir, replace_dir, write_json,
 };
 
 pub(crate) use event_file::EventFile;

@@ -3,6 +3,7 @@
 
 pub mod browser;
 pub mod program;
+pub mod room;
 
 pub use globalsplat_test_kit::formats;
 pub use globalsplat_test_kit::{again, captures, fox, golden, skip};

@@ -81,9 +81,7 @@ pub fn arg(path: &Path) -> &str {
 
 /// Writes the rooms `room_000`, … to `folder`, each with `frames` photos of `size` × `size`.
 pub fn rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
-    let [scenes, frames, size] = [scenes, frames, size].map(|number| number.to_string());
-    let numbers = ["--scenes", &scenes, "--frames", &frames, "--size", &size];
-    succeed(&[&["synth", "--gaussians", "--out", arg(folder)][..], &numbers].concat());
+    super::room::write_rooms(folder, scenes, frames, size).expect("rooms");
 }
 
 /// Returns a capture of nine 40×40 photos of a procedural room, with `ground_truth.ply` beside them; every caller gets its own copy.

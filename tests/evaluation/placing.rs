@@ -1,7 +1,8 @@
 //! A scene is normalized to several scales and positions, and the splat that matches the photos best is kept (spec 9.9).
 
 use crate::common::program::{arg, refuse, succeed, tiny_config};
-use globalsplat::data::{Holdout, View, open_capture, write_room};
+use crate::common::room::write_room;
+use globalsplat::data::{Holdout, View, open_capture};
 use globalsplat::loss::{mse, psnr_of_mse};
 use globalsplat::reconstruct::{LoadedModel, Reconstruction, bundled_model, load_context, reconstruct};
 use globalsplat::render::render_views;

@@ -2,7 +2,7 @@
 
 use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
 use crate::common::program::{arg, refuse, succeed};
-use globalsplat::data::write_room;
+use crate::common::room::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
 use image::RgbImage;
 use serde_json::Value;

@@ -2,7 +2,7 @@
 #![cfg(unix)]
 
 use crate::common::program::{arg, refuse, room, succeed, text, tiny_config, train};
-use globalsplat::data::write_room;
+use crate::common::room::write_room;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -31,31 +31,6 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         }
     }
     files
-}
-
-#[test]
-fn synth_replaces_its_own_rooms_alone() {
-    for name in ["notes.txt", "images/mine.jpg", "images/7.png", "images/old/notes.txt"] {
-        let (folder, room) = room();
-        let file = put(room.join(name));
-        let before = contents(&room);
-        let error =
-            refuse(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
-        assert!(error.contains("room_000: the output is a folder with"), "{error}");
-        assert_kept(&file);
-        assert_eq!(contents(&room), before);
-    }
-    let (folder, capture) = room();
-    std::fs::remove_file(capture.join("truth.ply")).unwrap();
-    let before = contents(&capture);
-    let error =
-        refuse(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
-    assert!(error.contains("a capture without truth.ply"), "{error}");
-    assert_eq!(contents(&capture), before);
-
-    let (folder, room) = room();
-    succeed(&["synth", "--gaussians", "--out", arg(folder.path()), "--frames", "3", "--size", "24"]);
-    assert_eq!(contents(&room).len(), 2 + 3);
 }
 
 #[test]

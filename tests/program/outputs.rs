@@ -314,13 +314,12 @@ fn two_processes_may_write_the_same() {
     let [room, splat, weights] = [&files.room, &files.splat, &files.weights].map(|path| arg(path));
     let out = files.at("out");
     fs::create_dir(&out).unwrap();
-    let [ply, film, views, worlds] = ["room.ply", "film.gif", "views", "worlds"].map(|name| out.join(name));
+    let [ply, film, views] = ["room.ply", "film.gif", "views"].map(|name| out.join(name));
     let orbit = ["--orbit", "--frames", "12", "--size", "48x48"];
     for request in [
         vec!["reconstruct", "--weights", weights, "--scene", room, "--out", arg(&ply)],
         [&["render", "--splat", splat, "--out", arg(&film)][..], &orbit].concat(),
         [&["render", "--splat", splat, "--out", arg(&views)][..], &orbit].concat(),
-        vec!["synth", "--gaussians", "--scenes", "3", "--frames", "3", "--size", "16", "--out", arg(&worlds)],
     ] {
         for _ in 0..3 {
             let begun: Vec<_> = (0..4).map(|_| command(&request).spawn().unwrap()).collect();
@@ -335,9 +334,6 @@ fn two_processes_may_write_the_same() {
         );
     }
     read_splat(&ply).unwrap();
-    for scene in 0..3 {
-        assert_eq!(names(&worlds.join(format!("room_{scene:03}"))), ["cameras.json", "images", "truth.ply"]);
-    }
 }
 
 #[test]

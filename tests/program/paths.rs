@@ -2,6 +2,7 @@
 #![cfg(target_os = "linux")]
 
 use crate::common::program::{TINY_CONFIG, command};
+use crate::common::room::write_rooms;
 use serde_json::{Value, json};
 use std::ffi::{OsStr, OsString};
 use std::io::{BufRead, BufReader, Read, Write};
@@ -64,9 +65,7 @@ fn names_that_are_not_utf_8() {
     std::fs::create_dir(&folder.0).expect("a folder");
     let write = |name: &str, text: &str| std::fs::write(folder.0.join(name), text).expect("a file");
 
-    let size = ["--frames", "9", "--size", "40"];
-    let rooms = [&["synth", "--gaussians", "--out", "@rooms", "--scenes", "2"], &size[..]].concat();
-    folder.json(&rooms, &["/captures/0", "/captures/1"]);
+    write_rooms(&folder.0.join("rooms"), 2, 9, 40).expect("rooms");
     let videos =
         ["synth", "--out", "@videos", "--frames", "9", "--size", "64", "--depth", "--sheet", "@s.png"];
     folder.json(&videos, &["/out", "/index", "/depth", "/sheet"]);

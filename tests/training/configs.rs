@@ -1,8 +1,8 @@
 //! Every configuration in `configs/` and the embedded model.
 
+use crate::common::room::write_room;
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
-use globalsplat::data::write_room;
 use globalsplat::io::read_weights;
 use globalsplat::loss::Term;
 use globalsplat::model::{GlobalSplat, Streams};

@@ -527,7 +527,7 @@ fn scenes_of_training_among_those_held_out_are_told() {
     };
     assert!(said(folder.path()).contains("room_000 of data.validation is also a training scene"));
     let other = folder.path().join("other");
-    globalsplat::data::write_room(&other, 9, 5, [40, 40].into()).unwrap();
+    crate::common::room::write_room(&other, 9, 5, [40, 40].into()).unwrap();
     assert_eq!(said(&other).matches("trained on").count(), 0);
 }
 

@@ -1,31 +1,51 @@
-//! A small room made of Gaussians, and a camera path through it. The splat of this scene is known exactly, which allows testing
-//! everything without photos.
+//! Captures of a small room made of Gaussians. The splat of this scene is known exactly, which allows testing everything without photos.
 
-use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics, SH_C0};
 use glam::{DMat4, DQuat, DVec3};
+use globalsplat::data::write_cameras_json;
+use globalsplat::io::{write_png, write_splat};
+use globalsplat::render::render_views;
+use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use std::path::Path;
 use tch::{Kind, Tensor};
+
+/// Spherical harmonic of degree 0.
+const SH_C0: f64 = 0.28209479177387814;
 
 /// Distance between the Gaussians of a surface, in metres.
 const SPACING: f64 = 0.06;
 
-/// A room and a camera path through it.
-#[derive(Debug)]
-pub struct Room {
-    /// Gaussians of the room's surfaces.
-    pub gaussians: Gaussians,
-    /// Cameras that photos are rendered from.
-    pub cameras: Vec<Camera>,
+/// Writes a capture of the room of `seed` at `path`: `cameras.json`, `frames` photos of `size` in `images`, and the splat, `truth.ply`.
+///
+/// # Errors
+/// Returns an error if a file can't be written.
+pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> globalsplat::Result<()> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let gaussians = surfaces(&mut random);
+    let cameras = walk(&mut random, frames, size);
+    let names: Vec<String> = (0..frames).map(|i| format!("images/{i:03}.png")).collect();
+    std::fs::create_dir_all(path.join("images")).map_err(globalsplat::Error::write(path))?;
+    for (name, view) in names.iter().zip(render_views(&gaussians, &cameras)?) {
+        write_png(&path.join(name), &view.rgb)?;
+    }
+    write_splat(&path.join("truth.ply"), &gaussians.to_splat(DVec3::ZERO)?)?;
+    Ok(write_cameras_json(&path.join("cameras.json"), &names, &cameras)?)
 }
 
-impl Room {
-    /// Creates the room of `seed` with `frames` cameras for images of `size`.
-    pub fn new(seed: u64, frames: usize, size: ImageSize) -> Self {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let gaussians = surfaces(&mut random);
-        Room { gaussians, cameras: walk(&mut random, frames, size) }
-    }
+/// Writes the rooms `room_000`, … to `folder`, each with `frames` photos of `size` × `size`.
+///
+/// # Errors
+/// Returns an error if a file can't be written.
+pub fn write_rooms(folder: &Path, scenes: u32, frames: u32, size: u32) -> globalsplat::Result<()> {
+    (0..scenes).try_for_each(|scene| {
+        write_room(
+            &folder.join(format!("room_{scene:03}")),
+            scene.into(),
+            frames as usize,
+            [size, size].into(),
+        )
+    })
 }
 
 /// Returns cameras on a path to the right with a slight turn, looking into the room.
