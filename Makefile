@@ -47,15 +47,24 @@ gpu-bundle: build
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
 
-# The checks for the edit loop: formatting, lints, and the library's unit tests.
+# The checks for the edit loop: formatting, lints, the crates without libtorch, and the library's unit tests.
 .PHONY: quick
-quick: check-format check-lints
+quick: check-crates check-format check-lints
 	$(CARGO) test --release --locked --lib
 
-CHECKS := check-format check-lints check-library check-docs check-tests
+CHECKS := check-crates check-format check-lints check-library check-docs check-tests
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity
-$(CHECKS): venv
+$(filter-out check-crates,$(CHECKS)): venv
+
+# Tests the crates that need neither libtorch nor Python. They run without LIBTORCH, so that none comes to need it.
+CRATES := $(addprefix -p globalsplat-,files torch-file capture splat-file synth)
+check-crates:
+	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
+# Packages these crates as for crates.io, and builds each package by itself.
+.PHONY: check-packages
+check-packages:
+	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
 
 check-format:
 	$(CARGO) fmt --all --check
@@ -67,7 +76,7 @@ check-library:
 check-docs:
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --no-deps
 check-tests:
-	$(CARGO) test --release --locked --no-fail-fast
+	$(CARGO) test --release --locked --no-fail-fast -p globalsplat -p globalsplat-csrc
 
 # Compares every module, loss and kernel with plain PyTorch, and verifies that the comparison detects wrong results (--self-test). Then
 # repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU.

@@ -18,6 +18,7 @@ use tch::Device;
 
 /// Measure the speed of the program's parts on this machine.
 #[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat bench raster\n  globalsplat bench model")]
 pub struct Bench {
     #[command(subcommand)]
     part: Part,

@@ -251,3 +251,30 @@ fn say_shrunk(path: &Path, by: i64) {
         );
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn every_command_has_examples_and_json() {
+        let mut program = Cli::command();
+        program.build();
+        for command in
+            program.get_subcommands().filter(|command| !command.is_hide_set() && command.get_name() != "help")
+        {
+            let name = command.get_name();
+            let help = command.clone().render_long_help().to_string();
+            assert!(help.contains("Example"), "{name} has no example");
+            let leaves: Vec<_> = match command.has_subcommands() {
+                true => command.get_subcommands().filter(|command| command.get_name() != "help").collect(),
+                false => vec![command],
+            };
+            for leaf in leaves {
+                let has_json = leaf.get_arguments().any(|argument| argument.get_id() == "json");
+                assert!(has_json, "{name} {} has no --json", leaf.get_name());
+            }
+        }
+    }
+}

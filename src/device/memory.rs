@@ -78,20 +78,3 @@ pub fn peak_memory_bytes() -> u64 {
     let unit = if cfg!(target_os = "macos") { 1 } else { 1024 };
     usage.ru_maxrss as u64 * unit
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    #[cfg(target_os = "linux")]
-    fn a_peak_is_forgotten() {
-        const BYTES: usize = 300_000_000;
-        drop(std::hint::black_box(vec![1u8; BYTES]));
-        let with = peak_memory_bytes();
-        forget_peak_memory(Device::Cpu);
-        // Other tests allocate memory at the same time, but less.
-        assert!(peak_memory_bytes() + (BYTES as u64) / 2 < with);
-        assert_eq!(device_memory_bytes(Device::Cpu), None);
-    }
-}
