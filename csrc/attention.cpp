@@ -11,7 +11,7 @@
 #include "globalsplat-csrc/src/attention.rs.h"
 #include "kernels/attend.h"
 #include "kernels/rows.h"
-#include "room.h"
+#include "memory_check.h"
 #include "threads.h"
 
 namespace globalsplat {
@@ -58,7 +58,7 @@ void done() { at::native::cpublas::brgemm_release(true); }
 
 // Returns the product functions. To be called once per op, because there may be no memory for their code.
 raster::Bf16Products products() {
-  expect_room_for_code(0);
+  ensure_memory_for_code(0);
   return {multiply, done};
 }
 
@@ -96,17 +96,17 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
-    const Tensor &q = t[0], &k = t[1], &v = t[2], &out = t[3], slope = with_whole_rows(g[0]);
+    const Tensor &q = t[0], &k = t[1], &v = t[2], &out = t[3], grad_out = with_whole_rows(g[0]);
     const auto like = [](const Tensor& of) { return at::empty(of.sizes(), of.options()); };
     const Tensor dq = like(q), dk = like(k), dv = like(v);
     const raster::AttentionShape shape = shape_of(q, k, ctx->saved_data["heads"].toInt());
     const float* const sums = t[4].const_data_ptr<float>();
     if (is_bf16(q))
       raster::attend_backward_bf16(
-          shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(slope),
+          shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(grad_out),
           {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, products(), threads());
     else
-      raster::attend_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(slope),
+      raster::attend_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(grad_out),
                               {written<float>(dq), written<float>(dk), written<float>(dv)}, threads());
     return {dq, dk, dv, Tensor()};
   }
@@ -114,7 +114,7 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
 
 }  // namespace
 
-bool attention_takes(int64_t width, bool is_bf16) {
+bool supports_attention(int64_t width, bool is_bf16) {
   const bool fits = width > 0 && width % (is_bf16 ? 8 : 4) == 0 && width <= raster::kAttentionWidth;
   return fits && (!is_bf16 || has_bf16_products());
 }
@@ -126,7 +126,7 @@ size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t h
   for (const Tensor* t : {&q, &k, &v})
     TORCH_CHECK(t->device().is_cpu() && t->scalar_type() == (bf16 ? at::kBFloat16 : at::kFloat) && t->dim() == 3,
                 "queries, keys and values must be float32 on the CPU, or all of them bfloat16, of shape [B, n, d]");
-  TORCH_CHECK(heads > 0 && q.size(2) % heads == 0 && attention_takes(q.size(2) / heads, bf16), "queries of shape ", q.sizes(),
+  TORCH_CHECK(heads > 0 && q.size(2) % heads == 0 && supports_attention(q.size(2) / heads, bf16), "queries of shape ", q.sizes(),
               " have ", heads, " heads, expected a width of each that is a multiple of 4, of bfloat16 of 8, at most ",
               raster::kAttentionWidth);
   TORCH_CHECK(k.sizes() == v.sizes() && k.size(0) == q.size(0) && k.size(2) == q.size(2) && k.size(1) > 0, "queries have shape ",

@@ -8,7 +8,7 @@ namespace globalsplat {
 
 // Returns true if attention() supports heads of this width: with float32, or with bfloat16 if bf16 products are available. Throws if the
 // memory for this test can't be allocated.
-bool attention_takes(int64_t width, bool is_bf16);
+bool supports_attention(int64_t width, bool is_bf16);
 
 // Computes softmax(q kᵀ / √(d/h)) v over h adjacent heads (kernels/attention.h). q is [B, n, d], k and v are [B, m, d] with m at least 1,
 // float32 or bfloat16 on the CPU, with any strides; arguments are addresses of live tensors. Returns the address of a new contiguous tensor

@@ -44,16 +44,16 @@ struct Projected {
 };
 
 // State other than tensors that a backend's splat() passes to its splat_backward().
-struct Kept {
-  virtual ~Kept() = default;
+struct SavedState {
+  virtual ~SavedState() = default;
 };
 
 // Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. Backward functions
 // return gradients of all five Gaussian tensors, and of w2c if `of_cameras` is set.
 struct Backend {
   at::DeviceType device;
-  RenderOutput (*splat)(const Inputs&, std::unique_ptr<const Kept>& kept);
-  Gradients (*splat_backward)(const Inputs&, const RenderOutput& drawn, const RenderOutput& gradients, const Kept&, bool of_cameras);
+  RenderOutput (*splat)(const Inputs&, std::unique_ptr<const SavedState>& saved);
+  Gradients (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, bool of_cameras);
   Projected (*project)(const Inputs&);
   Gradients (*project_backward)(const Inputs&, const Projected& gradients, bool of_cameras);
 };

@@ -18,7 +18,7 @@ const BRIDGES: [&str; 13] = [
     "src/processor.rs",
     "src/ranks.rs",
     "src/render.rs",
-    "src/room.rs",
+    "src/memory_check.rs",
     "src/tensor_memory.rs",
 ];
 

@@ -18,19 +18,19 @@ c10::Device by_number(int32_t gpu) { return {c10::kCUDA, static_cast<c10::Device
 }  // namespace
 
 // Only events of the backend's default kind record times.
-Mark::Mark(int32_t gpu) : event_(c10::kCUDA, c10::EventFlag::BACKEND_DEFAULT) { event_.record(driver().getStream(by_number(gpu))); }
+CudaEvent::CudaEvent(int32_t gpu) : event_(c10::kCUDA, c10::EventFlag::BACKEND_DEFAULT) { event_.record(driver().getStream(by_number(gpu))); }
 
-double Mark::since(const Mark& earlier) const {
+double CudaEvent::since(const CudaEvent& earlier) const {
   earlier.event_.synchronize();
   event_.synchronize();
   return earlier.event_.elapsedTime(event_);
 }
 
-std::unique_ptr<Mark> mark(int32_t gpu) { return std::make_unique<Mark>(gpu); }
+std::unique_ptr<CudaEvent> record_event(int32_t gpu) { return std::make_unique<CudaEvent>(gpu); }
 
 Copies::Copies(std::vector<at::Tensor> tensors, c10::Event done) : tensors_(std::move(tensors)), done_(std::move(done)) {}
 
-void Copies::hand_over(rust::Slice<size_t> out) const {
+void Copies::take_tensors(rust::Slice<size_t> out) const {
   TORCH_CHECK(out.size() == tensors_.size(), "there are ", tensors_.size(), " copies, and places for ", out.size());
   const c10::Stream current = driver().getStream(tensors_.at(0).device());
   done_.block(current);
@@ -69,8 +69,8 @@ uint64_t peak_bytes(int32_t gpu) {
   return uint64_t(stats.allocated_bytes[size_t(c10::CachingAllocator::StatType::AGGREGATE)].peak);
 }
 
-void forget_peak_bytes(int32_t gpu) { at::getDeviceAllocator(c10::kCUDA)->resetPeakStats(by_number(gpu).index()); }
+void reset_peak_bytes(int32_t gpu) { at::getDeviceAllocator(c10::kCUDA)->resetPeakStats(by_number(gpu).index()); }
 
-void leave_out_tf32() { at::globalContext().setAllowTF32CuDNN(false); }
+void disable_tf32() { at::globalContext().setAllowTF32CuDNN(false); }
 
 }  // namespace globalsplat

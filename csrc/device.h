@@ -16,18 +16,18 @@
 namespace globalsplat {
 
 // Event that records when a GPU has completed the work enqueued in its current stream so far.
-class Mark {
+class CudaEvent {
  public:
-  explicit Mark(int32_t gpu);
+  explicit CudaEvent(int32_t gpu);
 
   // Returns the milliseconds since `earlier`. Waits until the GPU has reached both events.
-  double since(const Mark& earlier) const;
+  double since(const CudaEvent& earlier) const;
 
  private:
   c10::Event event_;
 };
 
-std::unique_ptr<Mark> mark(int32_t gpu);
+std::unique_ptr<CudaEvent> record_event(int32_t gpu);
 
 // New tensors on a GPU, and the event after which they hold the copied data.
 class Copies {
@@ -36,7 +36,7 @@ class Copies {
 
   // Passes the tensors to the caller, once and in order. Work that is enqueued in the GPU's current stream from now on waits for the
   // copies; the host doesn't.
-  void hand_over(rust::Slice<size_t> out) const;
+  void take_tensors(rust::Slice<size_t> out) const;
 
  private:
   std::vector<at::Tensor> tensors_;
@@ -64,10 +64,10 @@ void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out
 
 // Returns the peak of the bytes that tensors take on a GPU since the start of the program or the last reset; the second function resets it.
 uint64_t peak_bytes(int32_t gpu);
-void forget_peak_bytes(int32_t gpu);
+void reset_peak_bytes(int32_t gpu);
 
 // Disables TF32 in CUDA's float32 convolutions, which by default round factors to TF32's 11 bits. Matrix products don't use TF32 by
 // default.
-void leave_out_tf32();
+void disable_tf32();
 
 }  // namespace globalsplat

@@ -59,16 +59,16 @@ struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
     return {picture.data_ptr<T>(), photo.data_ptr<T>(), picture.numel() / (height * width), int(width), int(height)};
   }
 
-  static Tensor forward(AutogradContext* ctx, Tensor picture, Tensor photo, double absolute, double similar, bool differentiable) {
+  static Tensor forward(AutogradContext* ctx, Tensor picture, Tensor photo, double l1_weight, double ssim_weight, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(picture) : Tensor();
     if (const auto device = cuda::kernel_device(picture)) {
       const cuda::Parts parts =
-          cuda::photometric(*device, job_of<float>(picture, photo), absolute, similar, data_or_null<float>(gradient));
+          cuda::photometric(*device, job_of<float>(picture, photo), l1_weight, ssim_weight, data_or_null<float>(gradient));
       return with_gradient(ctx, sum_of(parts, picture), gradient);
     }
     const double value = by_type(picture, [&](auto number) {
       using T = decltype(number);
-      return raster::photometric<T>(job_of<T>(picture, photo), absolute, similar, data_or_null<T>(gradient), threads());
+      return raster::photometric<T>(job_of<T>(picture, photo), l1_weight, ssim_weight, data_or_null<T>(gradient), threads());
     });
     return with_gradient(ctx, scalar(value, picture), gradient);
   }
@@ -120,12 +120,12 @@ void run(const Tensor& first, const Tensor& second, rust::Slice<size_t> out, Num
 
 }  // namespace
 
-void photometric(size_t picture_address, size_t photo_address, double absolute, double similar, rust::Slice<size_t> out) {
+void photometric(size_t picture_address, size_t photo_address, double l1_weight, double ssim_weight, rust::Slice<size_t> out) {
   const Tensor &picture = borrowed(picture_address), &photo = borrowed(photo_address);
   TORCH_CHECK(picture.sizes() == photo.sizes(), "the picture has shape ", picture.sizes(), " and the photo ", photo.sizes());
   TORCH_CHECK(picture.dim() >= 2 && picture.size(-1) >= raster::kWindow && picture.size(-2) >= raster::kWindow && picture.numel() > 0,
               "the picture has shape ", picture.sizes(), ", expected [.., H, W] with H and W of ", raster::kWindow, " or more");
-  run<PhotometricFunction>(picture, photo, out, absolute, similar);
+  run<PhotometricFunction>(picture, photo, out, l1_weight, ssim_weight);
 }
 
 void depth_smoothness(size_t depths_address, size_t photos_address, double factor, rust::Slice<size_t> out) {
@@ -144,7 +144,7 @@ void adam(const AdamArguments& of) {
   for (const Tensor* t : {&value, &gradient, &first, &second})
     TORCH_CHECK(t->device().is_cpu() && t->is_contiguous() && t->sizes() == value.sizes() &&
                     t->scalar_type() == value.scalar_type() && (t->scalar_type() == at::kFloat || t->scalar_type() == at::kDouble),
-                "a number, its gradient and its moments must be alike, on the CPU and contiguous");
+                "a parameter, its gradient and its moments must have one shape and type, be contiguous, and be on the CPU");
   by_type(value, [&](auto number) {
     using T = decltype(number);
     const raster::AdamNumbers<T> numbers{value.data_ptr<T>(), gradient.data_ptr<T>(), first.data_ptr<T>(), second.data_ptr<T>()};

@@ -14,7 +14,7 @@
 
 #include "globalsplat-csrc/src/linear.rs.h"
 #include "processor.h"
-#include "room.h"
+#include "memory_check.h"
 
 namespace globalsplat {
 namespace {
@@ -67,8 +67,8 @@ Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Ten
 }
 
 // Throws std::bad_alloc unless there is memory for a product: for the result, and for a copy of the weights in oneDNN's layout.
-void expect_room_for(const Tensor& xs, const Tensor& weights) {
-  expect_room_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
+void ensure_memory_for_product(const Tensor& xs, const Tensor& weights) {
+  ensure_memory_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
 }
 
 // Calls task(0) to task(count - 1), distributed over libtorch's threads. On such a thread, oneDNN and MKL use only that thread.
@@ -112,7 +112,7 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
   static Tensor forward(AutogradContext* ctx, Tensor xs, Tensor weights, std::optional<Tensor> bias) {
     ctx->save_for_backward({xs, weights});
     ctx->saved_data["has_bias"] = bias.has_value();
-    expect_room_for(xs, weights);
+    ensure_memory_for_product(xs, weights);
     return multiply_in_blocks(xs, weights, bias);
   }
 
@@ -121,7 +121,7 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
     const Tensor &xs = kept[0], &weights = kept[1], g = gradients[0].contiguous();
     Tensor d_xs, d_weights, d_bias;
     if (ctx->needs_input_grad(0)) {
-      expect_room_for(g, weights.t());
+      ensure_memory_for_product(g, weights.t());
       d_xs = multiply(g, weights.t(), {});
     }
     if (ctx->needs_input_grad(1)) {
@@ -130,7 +130,7 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
       for (int64_t first = 0; first < g.size(0); first += at_once) {
         const int64_t rows = std::min(at_once, g.size(0) - first);
         const Tensor g_part = g.narrow(0, first, rows).t(), xs_part = xs.narrow(0, first, rows).t();
-        expect_room_for(g_part, xs_part);
+        ensure_memory_for_product(g_part, xs_part);
         const Tensor part = multiply(g_part, xs_part, {});
         d_weights = d_weights.defined() ? d_weights.add_(part) : part;
       }

@@ -36,7 +36,7 @@ void leave(const at::RecordFunction& function, at::ObserverContext*) {
 
 }  // namespace
 
-void note_ops(bool outermost) {
+void start_recording_ops(bool outermost) {
   noted.clear();
   only_outermost = outermost;
   within = 0;
@@ -44,7 +44,7 @@ void note_ops(bool outermost) {
   callback = at::addThreadLocalCallback(noting);
 }
 
-rust::Vec<rust::String> noted_ops() {
+rust::Vec<rust::String> stop_recording_ops() {
   at::removeCallback(callback);
   return std::exchange(noted, {});
 }

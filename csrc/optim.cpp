@@ -53,7 +53,7 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
       const Tensor& t = (*list)[k];
       TORCH_CHECK(t.sizes() == x[k].sizes() && t.is_contiguous() && t.device() == x[0].device() &&
                       t.scalar_type() == x[0].scalar_type(),
-                  "parameters, their gradients and their moments must be alike, contiguous, and all of one type on one device");
+                  "parameters, their gradients and their moments must have equal shapes, be contiguous, and have one type and one device");
     }
   }
   const at::NoGradGuard no_grad;
@@ -70,7 +70,7 @@ void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients,
   for (size_t k = 0; k < x.size(); ++k) {
     for (const Tensor* t : {&x[k], &g[k], &m[k]})
       TORCH_CHECK(t->device().is_cpu() && t->is_contiguous() && t->scalar_type() == at::kFloat && t->sizes() == x[k].sizes(),
-                  "a matrix, its gradient and the running mean of it must be alike, float32 on the CPU, and contiguous");
+                  "a matrix, its gradient and the running mean of it must have one shape, be float32, contiguous, and on the CPU");
     TORCH_CHECK(x[k].dim() == 2 && x[k].numel() > 0 && of.parts > 0 && x[k].size(0) % of.parts == 0, "a matrix has shape ", x[k].sizes(),
                 ", expected two sizes, the first a multiple of ", of.parts);
     const int64_t rows = x[k].size(0) / of.parts, columns = x[k].size(1);

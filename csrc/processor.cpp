@@ -36,16 +36,16 @@ SimdLimit limit_libraries() {
 // Set before main(), when no library has chosen a kernel yet and there are no other threads.
 const SimdLimit limit = limit_libraries();
 
-Bf16 found() {
-  if (limit != SimdLimit::None) return Bf16::None;
+Bf16Support found() {
+  if (limit != SimdLimit::None) return Bf16Support::None;
   const auto capabilities = at::cpu::get_cpu_capabilities();
   const auto has = [&](const char* name) {
     const auto found = capabilities.find(name);
     return found != capabilities.end() && found->second.isBool() && found->second.toBool();
   };
   // The operating system may refuse tile instructions that the processor has.
-  if (has("amx_bf16") && at::cpu::init_amx()) return Bf16::Tiles;
-  return has("avx512_bf16") ? Bf16::Vectors : Bf16::None;
+  if (has("amx_bf16") && at::cpu::init_amx()) return Bf16Support::Tiles;
+  return has("avx512_bf16") ? Bf16Support::Vectors : Bf16Support::None;
 }
 
 }  // namespace
@@ -54,8 +54,8 @@ SimdLimit simd_limit() { return limit; }
 
 rust::String libtorch_simd_level() { return at::get_cpu_capability(); }
 
-Bf16 bf16_of_cpu() {
-  static const Bf16 known = found();
+Bf16Support bf16_of_cpu() {
+  static const Bf16Support known = found();
   return known;
 }
 

@@ -7,7 +7,7 @@
 
 namespace globalsplat {
 
-enum class Bf16 : uint8_t;
+enum class Bf16Support : uint8_t;
 
 // Instruction sets that GLOBALSPLAT_SIMD allows, for our own kernels and for those of libtorch, oneDNN and MKL: `avx2` hides AVX-512 and
 // bf16, `portable` hides AVX2 as well.
@@ -16,7 +16,7 @@ SimdLimit simd_limit();
 
 // Returns the CPU's bf16 instructions, as libtorch sees them; without any, bf16 products are slower than float32 products. None if
 // GLOBALSPLAT_SIMD hides them.
-Bf16 bf16_of_cpu();
+Bf16Support bf16_of_cpu();
 
 // Returns true if the current GPU has bf16 instructions.
 bool gpu_has_bf16();

@@ -60,7 +60,7 @@ std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust:
 
 bool has_gloo() { return GLOBALSPLAT_GLOO; }
 
-std::unique_ptr<Group> gloo([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank, [[maybe_unused]] int32_t ranks,
+std::unique_ptr<ProcessGroup> gloo([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank, [[maybe_unused]] int32_t ranks,
                             [[maybe_unused]] int64_t seconds) {
 #if GLOBALSPLAT_GLOO
   using c10d::ProcessGroupGloo;
@@ -70,21 +70,21 @@ std::unique_ptr<Group> gloo([[maybe_unused]] const Store& store, [[maybe_unused]
   const bool named = interface && *interface;
   options->devices.push_back(named ? ProcessGroupGloo::createDeviceForInterface(interface) : ProcessGroupGloo::createDefaultDevice());
   auto inner = c10::make_intrusive<c10d::PrefixStore>("gloo", store.inner());
-  return std::make_unique<Group>(c10::make_intrusive<ProcessGroupGloo>(std::move(inner), rank, ranks, std::move(options)));
+  return std::make_unique<ProcessGroup>(c10::make_intrusive<ProcessGroupGloo>(std::move(inner), rank, ranks, std::move(options)));
 #else
   throw std::runtime_error("built without Gloo");
 #endif
 }
 
-Group::Group(Ranks ranks) : ranks_(std::move(ranks)) {}
+ProcessGroup::ProcessGroup(Ranks ranks) : ranks_(std::move(ranks)) {}
 
-void Group::all_reduce(size_t tensor) const {
+void ProcessGroup::all_reduce(size_t tensor) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> tensors{borrowed_tensor(tensor)};
   start_one_at_a_time([&] { return ranks_->allreduce(tensors); })->wait();
 }
 
-void Group::broadcast(size_t tensor, int32_t from) const {
+void ProcessGroup::broadcast(size_t tensor, int32_t from) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> tensors{borrowed_tensor(tensor).detach()};
   c10d::BroadcastOptions options;
@@ -92,7 +92,7 @@ void Group::broadcast(size_t tensor, int32_t from) const {
   start_one_at_a_time([&] { return ranks_->broadcast(tensors, options); })->wait();
 }
 
-void Group::all_gather(size_t tensor, rust::Slice<size_t> out) const {
+void ProcessGroup::all_gather(size_t tensor, rust::Slice<size_t> out) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> inputs{borrowed_tensor(tensor).contiguous()};
   auto sizes = inputs[0].sizes().vec();
@@ -221,7 +221,7 @@ size_t Buckets::finish() const {
   return gradients;
 }
 
-std::unique_ptr<Buckets> buckets(const Group& group, rust::Slice<const size_t> parameters, int64_t bytes) {
+std::unique_ptr<Buckets> buckets(const ProcessGroup& group, rust::Slice<const size_t> parameters, int64_t bytes) {
   std::vector<at::Tensor> tensors;
   for (const size_t address : parameters) tensors.push_back(borrowed_tensor(address));
   return std::make_unique<Buckets>(group.ranks(), std::move(tensors), bytes);

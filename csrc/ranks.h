@@ -44,9 +44,9 @@ bool has_gloo();
 bool has_nccl();
 
 // Process group of all ranks. They must call the same functions in the same order, with tensors of the same shape, type and kind of device.
-class Group {
+class ProcessGroup {
  public:
-  explicit Group(Ranks ranks);
+  explicit ProcessGroup(Ranks ranks);
 
   // Replaces a tensor by its sum over all ranks. Work on a GPU is enqueued, not waited for.
   void all_reduce(size_t tensor) const;
@@ -66,9 +66,9 @@ class Group {
 };
 
 // Creates a group for CPU tensors. Collectives that take longer than `seconds` fail.
-std::unique_ptr<Group> gloo(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
+std::unique_ptr<ProcessGroup> gloo(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 // Creates a group for GPU tensors. libtorch's CUDA library must have been loaded. Collectives that take longer than `seconds` fail.
-std::unique_ptr<Group> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
+std::unique_ptr<ProcessGroup> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 
 // Gradients of a step, summed over all ranks in buckets. A bucket is sent as soon as the backward pass has computed all of its gradients
 // and the previous bucket has been sent, so the order is the same on all ranks.
@@ -90,6 +90,6 @@ class Buckets {
   std::shared_ptr<State> state_;
 };
 
-std::unique_ptr<Buckets> buckets(const Group& group, rust::Slice<const size_t> parameters, int64_t bytes);
+std::unique_ptr<Buckets> buckets(const ProcessGroup& group, rust::Slice<const size_t> parameters, int64_t bytes);
 
 }  // namespace globalsplat

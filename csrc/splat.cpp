@@ -60,9 +60,9 @@ tensor_list gradients_of(const Gradients& gradients) {
 
 Tensor contiguous(const Tensor& t) { return t.defined() ? t.contiguous() : t; }
 
-struct KeptHolder : torch::CustomClassHolder {
-  explicit KeptHolder(std::unique_ptr<const Kept> k) : kept(std::move(k)) {}
-  std::unique_ptr<const Kept> kept;
+struct SavedStateHolder : torch::CustomClassHolder {
+  explicit SavedStateHolder(std::unique_ptr<const SavedState> k) : saved(std::move(k)) {}
+  std::unique_ptr<const SavedState> saved;
 };
 
 // ---- the two ops ----
@@ -71,19 +71,19 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
   static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
                              Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
-    std::unique_ptr<const Kept> kept;
-    const RenderOutput drawn = backend_of(means).splat(in, kept);
-    save(ctx, in, {drawn.rgb, drawn.alpha, drawn.depth});
-    ctx->saved_data["kept"] = c10::IValue::make_capsule(c10::make_intrusive<KeptHolder>(std::move(kept)));
-    return {drawn.rgb, drawn.alpha, drawn.depth};
+    std::unique_ptr<const SavedState> saved;
+    const RenderOutput outputs = backend_of(means).splat(in, saved);
+    save(ctx, in, {outputs.rgb, outputs.alpha, outputs.depth});
+    ctx->saved_data["kept"] = c10::IValue::make_capsule(c10::make_intrusive<SavedStateHolder>(std::move(saved)));
+    return {outputs.rgb, outputs.alpha, outputs.depth};
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
-    const auto holder = c10::static_intrusive_pointer_cast<KeptHolder>(ctx->saved_data["kept"].toCapsule());
+    const auto holder = c10::static_intrusive_pointer_cast<SavedStateHolder>(ctx->saved_data["kept"].toCapsule());
     return gradients_of(backend_of(t[0])
                             .splat_backward(saved_inputs(ctx, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
-                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->kept,
+                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->saved,
                                             ctx->needs_input_grad(kW2c)));
   }
 };
@@ -92,10 +92,10 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
   static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
                              Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
-    const Projected seen = backend_of(means).project(in);
+    const Projected projected = backend_of(means).project(in);
     save(ctx, in);
-    ctx->mark_non_differentiable({seen.visible});
-    return {seen.visible, seen.mean2d, seen.conic, seen.depth, seen.colour};
+    ctx->mark_non_differentiable({projected.visible});
+    return {projected.visible, projected.mean2d, projected.conic, projected.depth, projected.colour};
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
@@ -136,7 +136,7 @@ void sh_basis(const std::array<double, 3>& direction, rust::Slice<double> out) {
 
 rust::String libtorch_version() { return TORCH_VERSION; }
 
-void leave_out_stack_traces() {
+void disable_stack_traces() {
   const auto nothing = std::make_shared<const c10::PrecomputedLazyValue<std::string>>(std::string());
   c10::SetStackTraceFetcher([nothing]() -> c10::Backtrace { return nothing; });
 }

@@ -30,6 +30,6 @@ rust::String libtorch_version();
 
 // Makes libtorch's errors carry no stack trace from now on. A stack trace allocates memory without handling failures, and it is captured
 // and formatted for every error.
-void leave_out_stack_traces();
+void disable_stack_traces();
 
 }  // namespace globalsplat

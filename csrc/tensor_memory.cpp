@@ -29,9 +29,9 @@ thread_local std::unique_ptr<Counting> counting;
 
 }  // namespace
 
-void count_tensor_bytes() { counting = std::make_unique<Counting>(); }
+void start_counting_tensor_bytes() { counting = std::make_unique<Counting>(); }
 
-uint64_t most_tensor_bytes() {
+uint64_t stop_counting_tensor_bytes() {
   const int64_t most = counting->counter->most;
   counting.reset();
   return uint64_t(most);

@@ -6,9 +6,9 @@
 namespace globalsplat {
 
 // Begins counting the bytes that this thread allocates and frees for CPU tensors.
-void count_tensor_bytes();
+void start_counting_tensor_bytes();
 
 // Ends counting and returns the peak.
-uint64_t most_tensor_bytes();
+uint64_t stop_counting_tensor_bytes();
 
 }  // namespace globalsplat

@@ -13,7 +13,7 @@
 #include "optim.cpp"
 #include "processor.cpp"
 #include "ranks.cpp"
-#include "room.cpp"
+#include "memory_check.cpp"
 #include "splat.cpp"
 #include "tensor_memory.cpp"
 #include "threads.cpp"

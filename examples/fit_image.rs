@@ -100,5 +100,5 @@ fn groups(gaussians: &RawGaussians) -> Vec<ParameterGroup> {
         learning_rate: learning_rate(name),
         weight_decay: 0.,
     };
-    gaussians.named().map(group).into()
+    gaussians.named_parameters().map(group).into()
 }

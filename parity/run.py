@@ -20,7 +20,7 @@ from pathlib import Path
 from harness.areas import CASES
 from harness.document import document
 from harness.exchange import ProgramError, program
-from harness.hold import hold
+from harness.runner import run_cases
 from harness.table import as_json, self_test_report, table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -88,7 +88,7 @@ def main(argv=None):
     answerer = program(options.binary, options.device)
     try:
         for seed in range(options.seed, options.seed + options.repeat):
-            results += hold(names, seed, answerer, options.self_test, progress, options.device != "cpu")
+            results += run_cases(names, seed, answerer, options.self_test, progress, options.device != "cpu")
     except ProgramError as error:
         progress("")
         print(error, file=sys.stderr)
@@ -100,7 +100,7 @@ def main(argv=None):
     print(f"{len(results)} draws, {failed} failed, {time.perf_counter() - started:.0f} s")
     undetected = 0
     if options.self_test:
-        undetected = sum(len(result.blind) for result in results)
+        undetected = sum(len(result.missed) for result in results)
         print(self_test_report(results))
     if options.markdown:
         options.markdown.write_text(document(results, command(options), options.device), encoding="utf-8")

@@ -39,7 +39,7 @@ namespace {
 
 using raster::parallel_for;
 
-constexpr unsigned kPatience = 120;  // timeout in seconds, much longer than any check takes
+constexpr unsigned kTimeoutSeconds = 120;  // timeout in seconds, much longer than any check takes
 
 std::string now;  // name of the running check
 
@@ -54,10 +54,10 @@ void expect(bool holds, const char* what) {
 
 void begin(std::string what) {
   now = std::move(what);
-  alarm(kPatience);
+  alarm(kTimeoutSeconds);
 }
 
-void out_of_patience(int) {
+void on_timeout(int) {
   const auto say = [](const char* text, size_t length) { return write(2, text, length) == ssize_t(length); };
   const char end[] = ": never ends\n";
   _exit(say("FOUND: ", 7) && say(now.data(), now.size()) && say(end, sizeof end - 1) ? 1 : 2);
@@ -86,8 +86,8 @@ class Render {
     for (size_t k = 0; k < views_.size(); ++k) {
       pictures_.push_back({std::vector<T>(3 * pixels, unwritten), std::vector<T>(pixels, unwritten),
                            std::vector<T>(pixels, unwritten)});
-      asked_.push_back(pictures_.back());
-      for (auto* plane : {&asked_.back().rgb, &asked_.back().alpha, &asked_.back().depth})
+      output_gradients_.push_back(pictures_.back());
+      for (auto* plane : {&output_gradients_.back().rgb, &output_gradients_.back().alpha, &output_gradients_.back().depth})
         for (T& value : *plane) value = T(random.uniform(-1, 1));
     }
   }
@@ -103,7 +103,7 @@ class Render {
       out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data()});
     raster::StageTimes times;
     cameras_.assign(views_.size(), {});
-    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(asked_), out, cameras_.data(), times);
+    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(output_gradients_), out, cameras_.data(), times);
   }
 
   void drop() { frame_.reset(); }
@@ -140,7 +140,7 @@ class Render {
   raster::Settings settings_;
   std::vector<raster::Gaussians<T>> scenes_;
   std::vector<raster::View<T>> views_;
-  std::vector<Planes> pictures_, asked_;  // asked_: gradients of the loss
+  std::vector<Planes> pictures_, output_gradients_;  // output_gradients_: gradients of the loss
   std::vector<raster::CameraGradient<T>> cameras_;
   std::vector<Arrays<T>> gradients_;
   std::unique_ptr<raster::Frame<T>> frame_;
@@ -209,9 +209,9 @@ int64_t fits(const std::vector<int>& thread_counts) {
     const size_t all = size_t(planes * height * width);
     const std::vector<T> pictures = numbers(all), photos = numbers(all);
     const raster::FitJob<T> job{pictures.data(), photos.data(), planes, width, height};
-    for (const double similar : {0.0, -0.2})
+    for (const double ssim_weight : {0.0, -0.2})
       expect_the_same("a fit", all, [&](T* gradient, int threads) {
-        return raster::photometric<T>(job, 0.8, similar, gradient, threads);
+        return raster::photometric<T>(job, 0.8, ssim_weight, gradient, threads);
       });
   }
   for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
@@ -294,9 +294,9 @@ int64_t matrices(const std::vector<int>& thread_counts) {
   for (const raster::MuonMatrix& matrix : all) {
     begin("a step of Muon on " + std::to_string(matrix.rows) + " × " + std::to_string(matrix.columns));
     const std::vector<double> expected = after_muon(step, matrix);
-    const size_t bytes = sizeof(float) * size_t(raster::muon_room(matrix.rows, matrix.columns));
-    const std::unique_ptr<float, decltype(&std::free)> room(static_cast<float*>(std::aligned_alloc(64, bytes)), std::free);
-    raster::kernels().muon(step, matrix, room.get());
+    const size_t bytes = sizeof(float) * size_t(raster::muon_scratch_size(matrix.rows, matrix.columns));
+    const std::unique_ptr<float, decltype(&std::free)> scratch(static_cast<float*>(std::aligned_alloc(64, bytes)), std::free);
+    raster::kernels().muon(step, matrix, scratch.get());
     for (size_t k = 0; k < expected.size(); ++k)
       expect(std::abs(matrix.value[k] - expected[k]) < 1e-5, "a step of Muon goes elsewhere");
   }
@@ -347,7 +347,7 @@ int64_t attentions(const std::vector<int>& thread_counts) {
                                               {1, 2, 50, 800, 64},
                                               {1, 1, 9, 20, raster::kAttentionWidth}}) {
     const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
-    const std::vector<float> q = numbers(shape.scenes * in), slope = numbers(shape.scenes * in);
+    const std::vector<float> q = numbers(shape.scenes * in), grad_out = numbers(shape.scenes * in);
     const std::vector<float> k = numbers(shape.scenes * seen), v = numbers(shape.scenes * seen);
     const auto attended = [&](int threads) {
       begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(threads) +
@@ -357,20 +357,20 @@ int64_t attentions(const std::vector<int>& thread_counts) {
       std::vector<float> out = unwritten(q.size()), log_sums = unwritten(size_t(shape.scenes * shape.heads * shape.queries));
       raster::attend(shape, inputs, {out.data(), in, row}, log_sums.data(), threads);
       std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
-      raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {slope.data(), in, row},
+      raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
                               {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, threads);
       for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
       if (shape.width % 8 != 0) return out;
 
       using Halves = std::vector<raster::Bf16>;
-      const Halves q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v), slope_cut = cut_to_bf16(slope);
+      const Halves q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v), grad_out_cut = cut_to_bf16(grad_out);
       const auto unwritten_cut = [&](size_t n) { return Halves(n, raster::Bf16(threads)); };
       const raster::AttentionInputs<raster::Bf16> cut{{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}};
       const raster::Bf16Products products = {multiply_bf16, [] {}};
       Halves out_cut = unwritten_cut(q.size()), dq_cut = unwritten_cut(q.size());
       Halves dk_cut = unwritten_cut(k.size()), dv_cut = unwritten_cut(v.size());
       raster::attend_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), products, threads);
-      raster::attend_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {slope_cut.data(), in, row},
+      raster::attend_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {grad_out_cut.data(), in, row},
                                    {{dq_cut.data(), in, row}, {dk_cut.data(), seen, row}, {dv_cut.data(), seen, row}}, products,
                                    threads);
       out.insert(out.end(), log_sums.begin(), log_sums.end());
@@ -525,7 +525,7 @@ int64_t threads(bool is_short) {
     } catch (const std::runtime_error&) {
       caught = true;
     }
-    expect(caught, "the caller doesn't hear of it");
+    expect(caught, "the exception doesn't reach the caller");
     sum = 0;
     parallel_for(4, 100, add);
     expect(sum == 4950, "the next call doesn't do its work");
@@ -541,7 +541,7 @@ int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
   Render<T> one = expected(scene), render(scene, threads);
   meet(threads);
   for (int64_t n = 0;; ++n) {
-    alarm(kPatience);
+    alarm(kTimeoutSeconds);
     const int64_t before = blocks();
     bool caught = false;
     refuse_memory(n, all_after);
@@ -553,7 +553,7 @@ int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
     }
     const int64_t refused = allow_memory();
     render.drop();
-    expect(caught == (refused > 0), "the caller doesn't hear of it");
+    expect(caught == (refused > 0), "the exception doesn't reach the caller");
     expect(blocks() == before, "memory is lost");
     if (!caught) {
       expect(n > 0, "nothing asks for memory");
@@ -642,7 +642,7 @@ int main(int count, char** arguments) {
                {"memory", checks::memory},
                {"orders", checks::orders},
                {"children", checks::children}};
-  signal(SIGALRM, checks::out_of_patience);
+  signal(SIGALRM, checks::on_timeout);
   const std::string check = count > 1 ? arguments[1] : "";
   if (check == "simd") {
     try {
@@ -656,7 +656,7 @@ int main(int count, char** arguments) {
     std::printf("%d\n", cuda::emulated::barriers());
     return 0;
   }
-  if (count == 4) cuda::emulated::leave_out_barrier(std::atoi(arguments[3]));
+  if (count == 4) cuda::emulated::skip_barrier(std::atoi(arguments[3]));
   for (const auto& one : known)
     if (check == one.name && (count == 3 || count == 4)) {
       std::printf("%lld\n", static_cast<long long>(one.run(std::strcmp(arguments[2], "short") == 0)));

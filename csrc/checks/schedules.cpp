@@ -16,7 +16,7 @@ namespace {
 using Numbers = std::vector<float>;
 
 // Outputs of a render, for all scenes and views consecutively.
-struct Left {
+struct RenderResult {
   Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c;
   std::vector<Numbers*> all() { return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c}; }
   static constexpr size_t kPictures = 3;  // number of images, which come first
@@ -25,7 +25,7 @@ struct Left {
 void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
 
 // Returns gradients with respect to the images.
-Numbers asked(Random& random, size_t count) {
+Numbers random_gradients(Random& random, size_t count) {
   Numbers numbers;
   for (const double value : random.uniform(count, -1, 1)) numbers.push_back(float(value));
   return numbers;
@@ -33,7 +33,7 @@ Numbers asked(Random& random, size_t count) {
 
 size_t count_of(const Scene<float>& scene) { return scene.gaussians.empty() ? 0 : scene.gaussians[0].opacities.size(); }
 
-Left emptied(const Scene<float>& scene) {
+RenderResult emptied(const Scene<float>& scene) {
   const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
   const size_t count = count_of(scene) * scene.gaussians.size();
   const auto empty = [](size_t numbers) { return Numbers(numbers, std::nanf("")); };
@@ -41,7 +41,7 @@ Left emptied(const Scene<float>& scene) {
           empty(count), empty(size_t(scene.bases) * 3 * count), empty(16 * scene.views.size())};
 }
 
-Left by_kernels(const Scene<float>& scene, uint64_t seed) {
+RenderResult by_kernels(const Scene<float>& scene, uint64_t seed) {
   Numbers means, scales, quaternions, opacities, sh, w2c, intrinsics;
   for (const Arrays<float>& g : scene.gaussians) {
     append(means, g.means);
@@ -61,56 +61,56 @@ Left by_kernels(const Scene<float>& scene, uint64_t seed) {
   }
   Random random(9);
   const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
-  const Numbers g_rgb = asked(random, 3 * pixels), g_alpha = asked(random, pixels), g_depth = asked(random, pixels);
+  const Numbers g_rgb = random_gradients(random, 3 * pixels), g_alpha = random_gradients(random, pixels), g_depth = random_gradients(random, pixels);
 
   const int64_t scenes = int64_t(scene.gaussians.size());
   const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(),
                                    int64_t(count_of(scene)), scene.bases},
                                   w2c.data(), intrinsics.data(), scenes,
                                   scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height, 0.05};
-  Left left = emptied(scene);
+  RenderResult result = emptied(scene);
   const cuda::emulated::Emulator device(seed);
-  const cuda::Frame frame(device, arguments, {left.rgb.data(), left.alpha.data(), left.depth.data()});
-  frame.backward(device, arguments, {left.rgb.data(), left.alpha.data(), left.depth.data()},
+  const cuda::Frame frame(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()});
+  frame.backward(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()},
                  {g_rgb.data(), g_alpha.data(), g_depth.data()},
-                 {left.means.data(), left.scales.data(), left.quaternions.data(), left.opacities.data(), left.sh.data()},
-                 left.w2c.data());
-  return left;
+                 {result.means.data(), result.scales.data(), result.quaternions.data(), result.opacities.data(), result.sh.data()},
+                 result.w2c.data());
+  return result;
 }
 
-Left by_cpu(const Scene<float>& scene) {
+RenderResult by_cpu(const Scene<float>& scene) {
   const size_t pixels = size_t(scene.width) * size_t(scene.height), views = scene.views.size(), count = count_of(scene);
   Random random(9);
-  const Numbers g_rgb = asked(random, 3 * pixels * views), g_alpha = asked(random, pixels * views);
-  const Numbers g_depth = asked(random, pixels * views);
-  Left left = emptied(scene);
+  const Numbers g_rgb = random_gradients(random, 3 * pixels * views), g_alpha = random_gradients(random, pixels * views);
+  const Numbers g_depth = random_gradients(random, pixels * views);
+  RenderResult result = emptied(scene);
   std::vector<raster::Gaussians<float>> gaussians;
   std::vector<raster::GaussianGradients<float>> out;
   for (size_t b = 0; b < scene.gaussians.size(); ++b) {
     const Arrays<float>& g = scene.gaussians[b];
     gaussians.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), int64_t(count),
                          scene.bases});
-    out.push_back({left.means.data() + 3 * count * b, left.scales.data() + 3 * count * b, left.quaternions.data() + 4 * count * b,
-                   left.opacities.data() + count * b, left.sh.data() + size_t(scene.bases) * 3 * count * b});
+    out.push_back({result.means.data() + 3 * count * b, result.scales.data() + 3 * count * b, result.quaternions.data() + 4 * count * b,
+                   result.opacities.data() + count * b, result.sh.data() + size_t(scene.bases) * 3 * count * b});
   }
-  std::vector<raster::RenderOutput<float>> drawn;
+  std::vector<raster::RenderOutput<float>> outputs;
   std::vector<raster::RenderOutput<const float>> pictures, gradients;
   for (size_t k = 0; k < views; ++k) {
-    drawn.push_back({left.rgb.data() + 3 * pixels * k, left.alpha.data() + pixels * k, left.depth.data() + pixels * k});
-    pictures.push_back({drawn[k].rgb, drawn[k].alpha, drawn[k].depth});
+    outputs.push_back({result.rgb.data() + 3 * pixels * k, result.alpha.data() + pixels * k, result.depth.data() + pixels * k});
+    pictures.push_back({outputs[k].rgb, outputs[k].alpha, outputs[k].depth});
     gradients.push_back({g_rgb.data() + 3 * pixels * k, g_alpha.data() + pixels * k, g_depth.data() + pixels * k});
   }
   raster::StageTimes times;
   std::vector<raster::CameraGradient<float>> cameras(views);
-  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, {scene.width, scene.height, 0.05, 2}, drawn, times);
+  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, {scene.width, scene.height, 0.05, 2}, outputs, times);
   frame->backward(gaussians, pictures, gradients, out, cameras.data(), times);
   for (size_t k = 0; k < views; ++k)
     for (int number = 0; number < 16; ++number) {
       const int row = number / 4, column = number % 4;
-      left.w2c[16 * k + size_t(number)] =
+      result.w2c[16 * k + size_t(number)] =
           row == 3 ? 0 : cameras[k].numbers[column < 3 ? 3 * row + column : 9 + row];
     }
-  return left;
+  return result;
 }
 
 bool same(const Numbers& a, const Numbers& b) {
@@ -134,19 +134,19 @@ double distance(const Numbers& a, const Numbers& b) {
 std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds) {
   const char* const names[] = {"colours", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
                                "spherical harmonics", "cameras"};
-  Left cpu = by_cpu(scene), first = by_kernels(scene, seeds[0]);
+  RenderResult cpu = by_cpu(scene), first = by_kernels(scene, seeds[0]);
   // Infinite values and NaN spread to pixels nearby: on the CPU within a block, here within two.
   const bool is_strange = scene.name.rfind("strange", 0) == 0;
   double slope = 0;
-  for (size_t k = Left::kPictures; k < cpu.all().size(); ++k) slope = std::max(slope, largest(*cpu.all()[k]));
+  for (size_t k = RenderResult::kPictures; k < cpu.all().size(); ++k) slope = std::max(slope, largest(*cpu.all()[k]));
   for (size_t k = 0; k < first.all().size() && !is_strange; ++k) {
     const Numbers &ours = *first.all()[k], &theirs = *cpu.all()[k];
     // Some gradients, such as that of a sphere's rotation, are differences of larger values that cancel.
-    const double off = distance(ours, theirs), most = k < Left::kPictures ? 0 : 1e-3 * largest(theirs) + 1e-5 * slope;
+    const double off = distance(ours, theirs), most = k < RenderResult::kPictures ? 0 : 1e-3 * largest(theirs) + 1e-5 * slope;
     if (!(off <= most)) return std::string(names[k]) + " differ from the CPU's by " + std::to_string(off);
   }
   for (size_t n = 1; n < seeds.size(); ++n) {
-    Left other = by_kernels(scene, seeds[n]);
+    RenderResult other = by_kernels(scene, seeds[n]);
     for (size_t k = 0; k < first.all().size(); ++k)
       if (!same(*first.all()[k], *other.all()[k]))
         return std::string(names[k]) + " change with the order of threads, seed " + std::to_string(seeds[n]);
@@ -210,11 +210,11 @@ std::string fits_differ(const std::vector<uint64_t>& seeds) {
     return {};
   };
   for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {2, 27, 43}, {3, 12, 75}})
-    for (const auto& [absolute, similar] : {std::array<double, 2>{0.8, 0}, {0, 1}, {0.8, -0.2}}) {
+    for (const auto& [l1_weight, ssim_weight] : {std::array<double, 2>{0.8, 0}, {0, 1}, {0.8, -0.2}}) {
       const size_t all = size_t(planes * height * width);
       const Numbers pictures = numbers(all), photos = numbers(all);
       const raster::FitJob<float> job{pictures.data(), photos.data(), planes, width, height};
-      const double a = absolute, s = similar;
+      const double a = l1_weight, s = ssim_weight;
       const std::string found = difference(
           all, [&](float* gradient) { return raster::photometric<float>(job, a, s, gradient, 1); },
           [&](const cuda::Device& device, float* gradient) { return cuda::photometric(device, job, a, s, gradient); });

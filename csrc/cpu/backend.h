@@ -8,8 +8,8 @@ namespace globalsplat::cpu {
 extern const Backend backend;
 
 // splat.cpp
-RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept);
-Gradients splat_backward(const Inputs& in, const RenderOutput& drawn, const RenderOutput& gradients, const Kept& kept, bool of_cameras);
+RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved);
+Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved, bool of_cameras);
 
 // projection.cpp
 Projected project(const Inputs& in);

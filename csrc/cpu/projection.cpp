@@ -13,13 +13,13 @@ namespace {
 
 // Cameras of each scene, and the splat of every Gaussian in each of them.
 template <class T>
-struct Seen {
+struct ProjectedScenes {
   std::vector<raster::Gaussians<T>> scenes;
   int64_t cameras;
   std::vector<raster::Lens<T>> lenses;             // [scenes · cameras]
   std::vector<std::vector<raster::Splat<T>>> splats;  // [scenes · cameras][N]
 
-  explicit Seen(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
+  explicit ProjectedScenes(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
     std::vector<raster::Splat<T>*> places;
     for (const auto& view : views_of<T>(in)) {
       lenses.push_back(raster::lens_of(view.camera, int(in.width), int(in.height), in.eps2d));
@@ -54,7 +54,7 @@ Projected project_as(const Inputs& in) {
   const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
     std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
   };
-  Seen<T>(in).for_each_visible([&](size_t, int64_t at, const raster::Splat<T>& s) {
+  ProjectedScenes<T>(in).for_each_visible([&](size_t, int64_t at, const raster::Splat<T>& s) {
     // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
     const T two_ln2 = T(2 / raster::kLog2E);
     out.visible.data_ptr<int64_t>()[at] = 1;
@@ -68,12 +68,12 @@ Projected project_as(const Inputs& in) {
 
 template <class T>
 Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool of_cameras) {
-  const Seen<T> seen(in);
+  const ProjectedScenes<T> projected(in);
   // One record per visible Gaussian: the sums over pixels that project_backward() converts to exactly these gradients.
-  const size_t views = seen.splats.size(), count = size_t(in.count());
+  const size_t views = projected.splats.size(), count = size_t(in.count());
   std::vector<std::vector<raster::SplatGradient<T>>> records(views);
   std::vector<std::vector<uint32_t>> first(views, std::vector<uint32_t>(count + 1, 0));
-  seen.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
+  projected.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
     const T *d_mean = gradients.mean2d.data_ptr<T>() + 2 * at, *d_conic = gradients.conic.data_ptr<T>() + 3 * at;
     const T* d_colour = gradients.colour.data_ptr<T>() + 3 * at;
     // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two
@@ -100,10 +100,10 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool
   Gradients out{empty_like(in.gaussians), {}};
   const auto places = gradients_of<T>(out.gaussians);
   std::vector<raster::CameraGradient<T>> cameras(of_cameras ? views : 0);
-  for (size_t b = 0; b < seen.scenes.size(); ++b) {
-    const int64_t view = int64_t(b) * seen.cameras;
-    raster::kernels().of<T>().project_backward(seen.scenes[b], 0, int64_t(count), seen.lenses.data() + view,
-                                               seen.cameras, of_views.data() + view, places[b],
+  for (size_t b = 0; b < projected.scenes.size(); ++b) {
+    const int64_t view = int64_t(b) * projected.cameras;
+    raster::kernels().of<T>().project_backward(projected.scenes[b], 0, int64_t(count), projected.lenses.data() + view,
+                                               projected.cameras, of_views.data() + view, places[b],
                                                of_cameras ? cameras.data() + view : nullptr);
   }
   if (of_cameras) out.w2c = w2c_gradient(in, cameras);

@@ -20,8 +20,8 @@ namespace {
 thread_local raster::StageTimes last_times;
 
 template <class T>
-struct KeptFrame : Kept {
-  explicit KeptFrame(std::unique_ptr<raster::Frame<T>> f) : frame(std::move(f)) {}
+struct SavedFrame : SavedState {
+  explicit SavedFrame(std::unique_ptr<raster::Frame<T>> f) : frame(std::move(f)) {}
   std::unique_ptr<raster::Frame<T>> frame;
 };
 
@@ -49,23 +49,23 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, rast
 
 }  // namespace
 
-RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
   return by_type(in, [&](auto number) {
     using T = decltype(number);
     RenderOutput out;
-    kept = std::make_unique<KeptFrame<T>>(draw<T>(in, out, last_times));
+    saved = std::make_unique<SavedFrame<T>>(draw<T>(in, out, last_times));
     return out;
   });
 }
 
-Gradients splat_backward(const Inputs& in, const RenderOutput& drawn, const RenderOutput& gradients, const Kept& kept,
+Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved,
                          bool of_cameras) {
   return by_type(in, [&](auto number) {
     using T = decltype(number);
     Gradients out{empty_like(in.gaussians), {}};
     std::vector<raster::CameraGradient<T>> cameras(of_cameras ? size_t(in.scenes() * in.cameras()) : 0);
-    static_cast<const KeptFrame<T>&>(kept).frame->backward(
-        scenes_of<T>(in), pictures_of<const T>(drawn), pictures_of<const T>(gradients), gradients_of<T>(out.gaussians),
+    static_cast<const SavedFrame<T>&>(saved).frame->backward(
+        scenes_of<T>(in), pictures_of<const T>(outputs), pictures_of<const T>(gradients), gradients_of<T>(out.gaussians),
         of_cameras ? cameras.data() : nullptr, last_times);
     if (of_cameras) out.w2c = w2c_gradient(in, cameras);
     return out;
@@ -84,7 +84,7 @@ StageTimes stage_times() {
 PairCounts count_pairs(const SplatArguments& of) {
   const Arguments a = borrowed(of);
   a.check();
-  TORCH_CHECK(a.means.scalar_type() != at::kDouble, "pairs are counted as float32 sees them");
+  TORCH_CHECK(a.means.scalar_type() != at::kDouble, "pairs can be counted for float32 Gaussians only");
   RenderOutput pictures;
   raster::StageTimes times;
   const raster::PairCounts counts = cpu::draw<float>(a.on(at::kCPU), pictures, times)->count();

@@ -80,11 +80,11 @@ __global__ void gs_blend_backward(Call, const Splat<float>* splats, const TileEn
                                   SplatGradient<float>* records);
 __global__ void gs_project_backward(Call, Gaussians<float>, const Lens<float>* lenses, const Splat<float>* splats,
                                     const SplatGradient<float>* records, const uint32_t* first,
-                                    GaussianGradients<float> out, CameraGradient<float>* asked);
+                                    GaussianGradients<float> out, CameraGradient<float>* camera_gradients);
 __global__ void gs_ssim(FitPlanes, double each, float* slopes, double* parts);
-__global__ void gs_fit_gradient(FitPlanes, const float* slopes, double absolute, float similar, float* gradient, double* parts);
+__global__ void gs_fit_gradient(FitPlanes, const float* slopes, double l1_weight, float ssim_weight, float* gradient, double* parts);
 __global__ void gs_unevenness(DepthJob<float>, double each, float* gradient, double* parts);
-__global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* asked, float* w2c);
+__global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* camera_gradients, float* w2c);
 }
 
 }  // namespace globalsplat::cuda

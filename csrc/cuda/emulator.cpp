@@ -100,7 +100,7 @@ Block& block() {
   return *own;
 }
 
-int left_out = -1;  // the barrier that all threads skip
+int skipped_barrier = -1;  // the barrier that all threads skip
 
 // Fills uninitialized memory with values that differ every time and are often NaN.
 void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
@@ -187,13 +187,13 @@ Index block_size() { return block().size; }
 Index grid_size() { return block().grid; }
 
 void meet_in_block(int place) {
-  if (place == left_out) return;
+  if (place == skipped_barrier) return;
   meet(block().waiting, int(block().size.x));
   GS_TSAN(__tsan_acquire(&block().waiting));
 }
 
 void meet_in_warp(int place) {
-  if (place == left_out) return;
+  if (place == skipped_barrier) return;
   Warp& warp = own_warp();
   warp.place = -1;
   meet(warp.waiting, 32);
@@ -229,7 +229,7 @@ void* shared_memory(size_t bytes) {
   return memory;
 }
 
-void leave_out_barrier(int place) { left_out = place; }
+void skip_barrier(int place) { skipped_barrier = place; }
 
 Memory Emulator::allocate(size_t bytes) const {
   if (bytes == 0) return Memory();  // as for an empty tensor

@@ -15,7 +15,7 @@ FitPlanes planes_of(const raster::FitJob<float>& job) {
 
 // Throws if there are more blocks than a launch may have.
 Blocks blocks_of(int64_t count) {
-  if (count > std::numeric_limits<int32_t>::max()) throw std::length_error("a GPU compares at most 2 billion tiles of pictures in one go");
+  if (count > std::numeric_limits<int32_t>::max()) throw std::length_error("a call compares at most 2 billion tiles of images");
   return {count};
 }
 
@@ -25,17 +25,17 @@ Blocks tiles_of(int64_t planes, int columns, int rows) {
 
 }  // namespace
 
-Parts photometric(const Device& device, const raster::FitJob<float>& job, double absolute, double similar, float* gradient) {
+Parts photometric(const Device& device, const raster::FitJob<float>& job, double l1_weight, double ssim_weight, float* gradient) {
   const FitPlanes planes = planes_of(job);
   const int columns = job.width - raster::kWindow + 1, rows = job.height - raster::kWindow + 1;
   const int64_t windows = int64_t(columns) * rows * job.planes, pixels = int64_t(job.width) * job.height * job.planes;
-  const double each_window = similar / double(windows), each_pixel = absolute / double(pixels);
-  const Blocks of_windows = similar != 0 ? tiles_of(job.planes, columns, rows) : Blocks{0};
-  const Blocks of_pixels = absolute != 0 || gradient != nullptr ? tiles_of(job.planes, job.width, job.height) : Blocks{0};
+  const double each_window = ssim_weight / double(windows), each_pixel = l1_weight / double(pixels);
+  const Blocks of_windows = ssim_weight != 0 ? tiles_of(job.planes, columns, rows) : Blocks{0};
+  const Blocks of_pixels = l1_weight != 0 || gradient != nullptr ? tiles_of(job.planes, job.width, job.height) : Blocks{0};
   const int64_t count = of_windows.x + of_pixels.x;
   const Memory numbers = device.allocate(size_t(count) * sizeof(double));
   const Memory slopes =
-      similar != 0 && gradient != nullptr ? device.allocate(size_t(3 * windows) * sizeof(float)) : Memory();
+      ssim_weight != 0 && gradient != nullptr ? device.allocate(size_t(3 * windows) * sizeof(float)) : Memory();
   auto* const of_block = static_cast<double*>(numbers.get());
   auto* const of_window = static_cast<float*>(slopes.get());
   GS_LAUNCH(device, gs_ssim, of_windows, kFitThreads, planes, each_window, of_window, of_block);

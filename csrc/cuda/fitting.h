@@ -13,7 +13,7 @@ struct Parts {
 };
 
 // Compute raster::photometric() and raster::depth_smoothness(); addresses are in the device's memory.
-Parts photometric(const Device&, const raster::FitJob<float>&, double absolute, double similar, float* gradient);
+Parts photometric(const Device&, const raster::FitJob<float>&, double l1_weight, double ssim_weight, float* gradient);
 Parts depth_smoothness(const Device&, const raster::DepthJob<float>&, double factor, float* gradient);
 
 }  // namespace globalsplat::cuda

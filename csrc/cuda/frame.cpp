@@ -13,7 +13,7 @@ T* as(const Memory& memory) {
 }
 
 template <class T>
-Memory room_for(const Device& device, int64_t count) {
+Memory allocate_array(const Device& device, int64_t count) {
   return device.allocate(size_t(count) * sizeof(T));
 }
 
@@ -27,7 +27,7 @@ Call call_of(const Arguments& of) {
   const int columns = parts(of.width, raster::kTile), rows = parts(of.height, raster::kTile);
   constexpr int64_t most = std::numeric_limits<int32_t>::max();
   if (views > kMostRows || views * of.gaussians.count > most || views * columns * rows > most)
-    throw std::length_error("a GPU draws at most 65535 views, and 2 billion tiles and splats of all views, in one go");
+    throw std::length_error("a call renders at most 65535 views, and at most 2 billion tiles or splats over all views");
   return {int(views), int(of.cameras), int(of.gaussians.count), of.gaussians.bases, {of.width, of.height, columns, rows}};
 }
 
@@ -36,11 +36,11 @@ int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.gr
 
 }  // namespace
 
-Seen::Seen(const Device& device, const Arguments& of, bool counts_tiles)
+ProjectedScenes::ProjectedScenes(const Device& device, const Arguments& of, bool counts_tiles)
     : call(call_of(of)),
-      lenses(room_for<Lens<float>>(device, call.views)),
-      splats(room_for<Splat<float>>(device, int64_t(call.views) * call.count)),
-      tile_counts(counts_tiles ? room_for<uint32_t>(device, places_of_tiles(call)) : Memory()) {
+      lenses(allocate_array<Lens<float>>(device, call.views)),
+      splats(allocate_array<Splat<float>>(device, int64_t(call.views) * call.count)),
+      tile_counts(counts_tiles ? allocate_array<uint32_t>(device, places_of_tiles(call)) : Memory()) {
   const int64_t threads = counts_tiles ? std::max<int64_t>(call.views, places_of_tiles(call)) : call.views;
   GS_LAUNCH(device, gs_lenses, for_each(threads, kWarp), kWarp, call, float(of.eps2d), of.w2c, of.intrinsics,
             as<Lens<float>>(lenses), as<uint32_t>(tile_counts));
@@ -48,30 +48,30 @@ Seen::Seen(const Device& device, const Arguments& of, bool counts_tiles)
             as<Lens<float>>(lenses), as<Splat<float>>(splats));
 }
 
-void Seen::backward(const Device& device, const Arguments& of, const SplatGradient<float>* records, const uint32_t* first,
+void ProjectedScenes::backward(const Device& device, const Arguments& of, const SplatGradient<float>* records, const uint32_t* first,
                     const GaussianGradients<float>& out, float* w2c) const {
   const int warps = parts(call.count, kWarp);
-  const Memory asked = w2c == nullptr ? Memory() : room_for<CameraGradient<float>>(device, int64_t(call.views) * warps);
+  const Memory camera_gradients = w2c == nullptr ? Memory() : allocate_array<CameraGradient<float>>(device, int64_t(call.views) * warps);
   // With several cameras, all warps of a block process the same Gaussians.
   const int gaussians = call.cameras > 1 ? kWarp : kGaussianThreads;
   GS_LAUNCH(device, gs_project_backward, for_each(call.count, gaussians, of.scenes), kGaussianThreads, call, of.gaussians,
-            as<Lens<float>>(lenses), as<Splat<float>>(splats), records, first, out, as<CameraGradient<float>>(asked));
+            as<Lens<float>>(lenses), as<Splat<float>>(splats), records, first, out, as<CameraGradient<float>>(camera_gradients));
   if (w2c != nullptr)
     GS_LAUNCH(device, gs_sum_cameras, for_each(int64_t(call.views) * 16 * kWarp, kGaussianThreads), kGaussianThreads, call.views,
-              warps, as<CameraGradient<float>>(asked), w2c);
+              warps, as<CameraGradient<float>>(camera_gradients), w2c);
 }
 
-Frame::Frame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : seen_(device, of, true), count_(0) {
-  const Call& call = seen_.call;
+Frame::Frame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : projected_(device, of, true), count_(0) {
+  const Call& call = projected_.call;
   const int64_t splats = int64_t(call.views) * call.count, places = places_of_tiles(call);
   const int64_t groups = parts(call.count, kWarp) * int64_t(call.views);
   const Blocks blocks = for_each(call.count, kGaussianThreads, call.views);
 
-  const Memory group_pairs = room_for<uint32_t>(device, groups), pairs_before = room_for<uint32_t>(device, groups);
-  const Memory total = room_for<uint64_t>(device, 1);
-  uint32_t* const tile_counts = as<uint32_t>(seen_.tile_counts);
-  tile_start_ = room_for<uint32_t>(device, places);
-  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(group_pairs),
+  const Memory group_pairs = allocate_array<uint32_t>(device, groups), pairs_before = allocate_array<uint32_t>(device, groups);
+  const Memory total = allocate_array<uint64_t>(device, 1);
+  uint32_t* const tile_counts = as<uint32_t>(projected_.tile_counts);
+  tile_start_ = allocate_array<uint32_t>(device, places);
+  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(projected_.splats), as<uint32_t>(group_pairs),
             tile_counts + 1, nullptr, nullptr, nullptr);
   // The prefix sum for a tile is stored one index after the tile's own, where it grows to that of the next tile.
   GS_LAUNCH(device, gs_scan, for_each(std::max(groups, places), kScanThreads * kScanItems, 2), kScanThreads,
@@ -81,31 +81,31 @@ Frame::Frame(const Device& device, const Arguments& of, const RenderOutput<float
   const uint64_t count = device.read(as<uint64_t>(total));
   // The margin lets indices run past the last pair by a few batches.
   if (count > std::numeric_limits<uint32_t>::max() - 1024)
-    throw std::length_error("more than 4 billion (Gaussian, tile) pairs in one go");
+    throw std::length_error("more than 4 billion (Gaussian, tile) pairs in one call");
   count_ = uint32_t(count);
-  seen_.tile_counts.reset();
+  projected_.tile_counts.reset();
 
-  first_ = room_for<uint32_t>(device, splats + 1);
-  entries_ = room_for<TileEntry>(device, count_);
-  const Memory keys = room_for<uint64_t>(device, count_), spare = room_for<uint64_t>(device, count_);
-  const Memory pairs = room_for<TileEntry>(device, count_);
-  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(seen_.splats), as<uint32_t>(pairs_before),
+  first_ = allocate_array<uint32_t>(device, splats + 1);
+  entries_ = allocate_array<TileEntry>(device, count_);
+  const Memory keys = allocate_array<uint64_t>(device, count_), spare = allocate_array<uint64_t>(device, count_);
+  const Memory pairs = allocate_array<TileEntry>(device, count_);
+  GS_LAUNCH(device, gs_cover, blocks, kGaussianThreads, call, as<Splat<float>>(projected_.splats), as<uint32_t>(pairs_before),
             as<uint32_t>(tile_start_) + 1, as<uint32_t>(first_), as<uint64_t>(keys), as<TileEntry>(pairs));
   const Blocks tiles{call.grid.tiles(), call.views};
   GS_LAUNCH(device, gs_sort_lists, tiles, kSortThreads, call, as<uint32_t>(tile_start_), as<uint64_t>(keys),
             as<uint64_t>(spare), as<TileEntry>(pairs), as<TileEntry>(entries_));
-  GS_LAUNCH(device, gs_blend, tiles, kTileThreads, call, as<Splat<float>>(seen_.splats), as<TileEntry>(entries_),
+  GS_LAUNCH(device, gs_blend, tiles, kTileThreads, call, as<Splat<float>>(projected_.splats), as<TileEntry>(entries_),
             as<uint32_t>(tile_start_), out);
 }
 
 void Frame::backward(const Device& device, const Arguments& of, const RenderOutput<const float>& pictures,
                      const RenderOutput<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const {
-  const Call& call = seen_.call;
-  const Memory records = room_for<SplatGradient<float>>(device, count_);
+  const Call& call = projected_.call;
+  const Memory records = allocate_array<SplatGradient<float>>(device, count_);
   GS_LAUNCH(device, gs_blend_backward, (Blocks{call.grid.tiles(), call.views}), kTileThreads, call,
-            as<Splat<float>>(seen_.splats), as<TileEntry>(entries_), as<uint32_t>(tile_start_), pictures, gradients,
+            as<Splat<float>>(projected_.splats), as<TileEntry>(entries_), as<uint32_t>(tile_start_), pictures, gradients,
             as<SplatGradient<float>>(records));
-  seen_.backward(device, of, as<SplatGradient<float>>(records), as<uint32_t>(first_), out, w2c);
+  projected_.backward(device, of, as<SplatGradient<float>>(records), as<uint32_t>(first_), out, w2c);
 }
 
 }  // namespace globalsplat::cuda

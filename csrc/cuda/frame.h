@@ -16,9 +16,9 @@ struct Arguments {
 };
 
 // All Gaussians projected into every view.
-struct Seen {
+struct ProjectedScenes {
   // Projects the Gaussians. `counts_tiles` requests memory for counts of tiles.
-  Seen(const Device&, const Arguments&, bool counts_tiles = false);
+  ProjectedScenes(const Device&, const Arguments&, bool counts_tiles = false);
 
   // Computes every gradient of every Gaussian, and of w2c if it isn't null. The records of Gaussian i in a view are first[view·N + i] …
   // first[view·N + i + 1] − 1.
@@ -37,12 +37,12 @@ class Frame {
   // Renders every view.
   Frame(const Device&, const Arguments&, const RenderOutput<float>& out);
 
-  // Computes gradients as Seen::backward() does. All arguments except `gradients`, `out` and `w2c` must be those of the forward pass.
+  // Computes gradients as ProjectedScenes::backward() does. All arguments except `gradients`, `out` and `w2c` must be those of the forward pass.
   void backward(const Device&, const Arguments&, const RenderOutput<const float>& pictures,
                 const RenderOutput<const float>& gradients, const GaussianGradients<float>& out, float* w2c) const;
 
  private:
-  Seen seen_;
+  ProjectedScenes projected_;
   uint32_t count_;     // number of (splat, tile) pairs
   Memory first_;       // uint32_t[views · N + 1]: index of each splat's first record
   Memory entries_;     // TileEntry[count]: all tiles' lists, one after the other

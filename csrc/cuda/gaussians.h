@@ -65,7 +65,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
 }
 
 // Computes the gradients of Gaussians, with one row of blocks per scene. The records of Gaussian i in a view are first[view·N + i] …
-// first[view·N + i + 1] − 1. If `asked` isn't null, it receives the gradients of the views' cameras from the Gaussians of every warp:
+// first[view·N + i + 1] − 1. If `camera_gradients` isn't null, it receives the gradients of the views' cameras from the Gaussians of every warp:
 // [views, warps of a view].
 //
 // With several cameras, the warps of a block process the same Gaussians and divide the cameras among themselves; their sums are added in
@@ -74,7 +74,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
 __global__ void __launch_bounds__(kGaussianThreads, 4)
     gs_project_backward(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, const Splat<float>* splats,
                         const SplatGradient<float>* records, const uint32_t* first, GaussianGradients<float> out,
-                        CameraGradient<float>* asked) {
+                        CameraGradient<float>* camera_gradients) {
   constexpr int kWarps = kGaussianThreads / kWarp, kRow = 3 * raster::kMaxBases + 1;  // odd, which avoids bank conflicts
   constexpr int kSums = 14;
   struct Shared {
@@ -128,13 +128,13 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
             [&](int n, float x, float y) { sums_of_sh[n] = raster::lane::add_product(x, y, ever ? sums_of_sh[n] : 0); }, d_r);
         raster::lane::load_shapes(scene, i, i + 1, group);
         raster::lane::project_group(group, lens, projection);
-        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, asked != nullptr, of_camera);
+        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, camera_gradients != nullptr, of_camera);
         ever = true;
       }
-      if (asked != nullptr) {
+      if (camera_gradients != nullptr) {
         const Fold<raster::kCameraNumbers, kWarp> fold;
         const float number = fold(of_camera);
-        if (fold.which >= 0 && begin < call.count) asked[(view + k) * groups + begin / kWarp].numbers[fold.which] = number;
+        if (fold.which >= 0 && begin < call.count) camera_gradients[(view + k) * groups + begin / kWarp].numbers[fold.which] = number;
       }
     }
     if (!ever)
@@ -181,14 +181,14 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
 }
 
 // Computes the gradient of one element of w2c per warp, summed over the gradients from all warps.
-__global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* asked, float* w2c) {
+__global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* camera_gradients, float* w2c) {
   const int64_t number = (int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / kWarp;
   if (number >= int64_t(views) * 16) return;
   const int64_t view = number / 16, row = number % 16 / 4, column = number % 4;
   double sum = 0;
   if (row < 3)
     for (int64_t k = lane(); k < warps; k += kWarp)
-      sum += asked[view * warps + k].numbers[column < 3 ? 3 * row + column : 9 + row];
+      sum += camera_gradients[view * warps + k].numbers[column < 3 ? 3 * row + column : 9 + row];
   for (int step = kWarp / 2; step > 0; step /= 2) sum += __shfl_xor_sync(kAll, sum, step);
   if (lane() == 0) w2c[number] = float(sum);
 }

@@ -73,10 +73,10 @@ __global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each
   if (threadIdx.x == 0) parts[blockIdx.x] = each * total;
 }
 
-// Computes Σ |x − y| of a tile of pixels times `absolute`, and its gradient plus `similar` times that of Σ SSIM, from all windows' slopes
+// Computes Σ |x − y| of a tile of pixels times `l1_weight`, and its gradient plus `ssim_weight` times that of Σ SSIM, from all windows' slopes
 // if they aren't null. `gradient`, [planes, H, W], may be null.
 __global__ void __launch_bounds__(kFitThreads)
-    gs_fit_gradient(FitPlanes of, const float* slopes, double absolute, float similar, float* gradient, double* parts) {
+    gs_fit_gradient(FitPlanes of, const float* slopes, double l1_weight, float ssim_weight, float* gradient, double* parts) {
   const int columns = of.width - raster::kWindow + 1, last = of.height - raster::kWindow;
   const FitTile tile(of.width, of.height);
   const int64_t pixels = int64_t(of.width) * of.height, windows = int64_t(columns) * (last + 1);
@@ -102,17 +102,17 @@ __global__ void __launch_bounds__(kFitThreads)
     const float x = of.pictures[at], y = of.photos[at];
     sum += raster::lane::magnitude(x - y);
     if (gradient == nullptr) continue;
-    float slope = raster::lane::gradient_of_difference<float>(x, y, float(absolute));
+    float slope = raster::lane::gradient_of_difference<float>(x, y, float(l1_weight));
     if (slopes != nullptr) {
       raster::lane::WindowSlopes<float> along = {};
       for (int n = 0; n < raster::kWindow; ++n)
         for (int j = 0; j < 3; ++j) along[j] = raster::lane::add_product(of.window[n], sums[j][row][column + n], along[j]);
-      slope = raster::lane::add_gradient_of_similarity<float>(x, y, similar, along, slope);
+      slope = raster::lane::add_gradient_of_similarity<float>(x, y, ssim_weight, along, slope);
     }
     gradient[at] = slope;
   }
   const double total = block_sum(sum);
-  if (threadIdx.x == 0) parts[blockIdx.x] = absolute * total;
+  if (threadIdx.x == 0) parts[blockIdx.x] = l1_weight * total;
 }
 
 // Computes the unevenness of the pairs of one pixel per thread with the pixels to the right and below, times `each`; and the gradient from

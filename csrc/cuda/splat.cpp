@@ -50,34 +50,34 @@ GaussianGradients<float> places_of(const globalsplat::Gaussians& g) {
 
 float* place_of_cameras(const Gradients& g) { return g.w2c.defined() ? data<float>(g.w2c) : nullptr; }
 
-struct KeptFrame : Kept {
-  KeptFrame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : frame(device, of, out) {}
+struct SavedFrame : SavedState {
+  SavedFrame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : frame(device, of, out) {}
   Frame frame;
 };
 
-globalsplat::RenderOutput splat(const Inputs& in, std::unique_ptr<const Kept>& kept) {
+globalsplat::RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
   const auto device = kernel_device(in.gaussians.means);
   const auto options = in.gaussians.means.options();
   const Tensor rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   const globalsplat::RenderOutput out{rgb, alpha, at::empty_like(alpha)};
-  kept = std::make_unique<KeptFrame>(*device, arguments_of(in), places_of<float>(out));
+  saved = std::make_unique<SavedFrame>(*device, arguments_of(in), places_of<float>(out));
   return out;
 }
 
-Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& drawn, const globalsplat::RenderOutput& gradients,
-                         const Kept& kept, bool of_cameras) {
+Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& outputs, const globalsplat::RenderOutput& gradients,
+                         const SavedState& saved, bool of_cameras) {
   const auto device = kernel_device(in.gaussians.means);
   const Gradients out = empty_gradients(in, of_cameras);
-  static_cast<const KeptFrame&>(kept).frame.backward(*device, arguments_of(in), places_of<const float>(drawn),
+  static_cast<const SavedFrame&>(saved).frame.backward(*device, arguments_of(in), places_of<const float>(outputs),
                                                      places_of<const float>(gradients), places_of(out.gaussians),
                                                      place_of_cameras(out));
   return out;
 }
 
-// Returns the fields of the splats in Splat's order, each [B, C, N]. They are valid as long as `seen`.
-std::vector<Tensor> numbers_of(const Seen& seen, const Inputs& in) {
-  return tensor_of(seen.splats.get(), {in.scenes(), in.cameras(), in.count(), 16}, in.gaussians.means.options()).unbind(-1);
+// Returns the fields of the splats in Splat's order, each [B, C, N]. They are valid as long as `projected`.
+std::vector<Tensor> numbers_of(const ProjectedScenes& projected, const Inputs& in) {
+  return tensor_of(projected.splats.get(), {in.scenes(), in.cameras(), in.count(), 16}, in.gaussians.means.options()).unbind(-1);
 }
 constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // indices of fields
 constexpr double kTwoLn2 = 2 / raster::kLog2E;
@@ -85,8 +85,8 @@ constexpr double kTwoLn2 = 2 / raster::kLog2E;
 // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
 Projected project(const Inputs& in) {
   const auto device = kernel_device(in.gaussians.means);
-  const Seen seen(*device, arguments_of(in));
-  const std::vector<Tensor> s = numbers_of(seen, in);
+  const ProjectedScenes projected(*device, arguments_of(in));
+  const std::vector<Tensor> s = numbers_of(projected, in);
   const Tensor &a = s[kA], &b = s[kB], &c = s[kC], visible = s[kZ] > 0;
   const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
   return {visible.to(at::kLong), shown(at::stack({s[kU], s[kV]}, -1)),
@@ -98,8 +98,8 @@ Projected project(const Inputs& in) {
 // 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two entries.
 Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
   const auto device = kernel_device(in.gaussians.means);
-  const Seen seen(*device, arguments_of(in));
-  const std::vector<Tensor> s = numbers_of(seen, in);
+  const ProjectedScenes projected(*device, arguments_of(in));
+  const std::vector<Tensor> s = numbers_of(projected, in);
   const Tensor &a = s[kA], &b = s[kB], &c = s[kC];
   const std::vector<Tensor> d_mean = gradients.mean2d.unbind(-1), d_conic = gradients.conic.unbind(-1);
   const std::vector<Tensor> d_colour = gradients.colour.unbind(-1);
@@ -112,7 +112,7 @@ Gradients project_backward(const Inputs& in, const Projected& gradients, bool of
   const Tensor records = all.flatten(0, 2).index_select(0, visible.nonzero().squeeze(1)).contiguous();
   const Tensor first = at::cat({at::zeros({1}, visible.options().dtype(at::kInt)), visible.cumsum(0, at::kInt)});
   const Gradients out = empty_gradients(in, of_cameras);
-  seen.backward(*device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
+  projected.backward(*device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
                 reinterpret_cast<const uint32_t*>(data<int32_t>(first)), places_of(out.gaussians), place_of_cameras(out));
   return out;
 }

@@ -150,13 +150,13 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   const Pixel pixel(call.grid);
   raster::lane::PixelGradients<float> state{};
   if (pixel.inside) {
-    const RenderOutput<const float> drawn = pictures_of(pictures, call.grid, blockIdx.y);
-    const RenderOutput<const float> asked = pictures_of(gradients, call.grid, blockIdx.y);
+    const RenderOutput<const float> outputs = pictures_of(pictures, call.grid, blockIdx.y);
+    const RenderOutput<const float> output_gradients = pictures_of(gradients, call.grid, blockIdx.y);
     const int64_t at = pixel.place;
-    const float colour[3] = {drawn.rgb[at], drawn.rgb[at + plane], drawn.rgb[at + 2 * plane]};
-    const float g_colour[3] = {asked.rgb[at], asked.rgb[at + plane], asked.rgb[at + 2 * plane]};
-    state = raster::lane::pixel_gradients<float>(1, colour, drawn.alpha[at], drawn.depth[at], g_colour, asked.alpha[at],
-                                                 asked.depth[at]);
+    const float colour[3] = {outputs.rgb[at], outputs.rgb[at + plane], outputs.rgb[at + 2 * plane]};
+    const float g_colour[3] = {output_gradients.rgb[at], output_gradients.rgb[at + plane], output_gradients.rgb[at + 2 * plane]};
+    state = raster::lane::pixel_gradients<float>(1, colour, outputs.alpha[at], outputs.depth[at], g_colour, output_gradients.alpha[at],
+                                                 output_gradients.depth[at]);
   }
 
   const uint32_t end = tile_start[tile + 1];

@@ -47,7 +47,7 @@ void for_some_queries(const AttentionShape& shape, const AttentionInputs<Number>
 void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums, int threads) {
   for_some_queries(shape, in, kProductRows, threads, [&](const AttentionHead<float>& of, int64_t head, int64_t begin) {
     kernels().attend(of, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
-                     room(attention_room(shape.width)));
+                     scratch(attention_scratch_size(shape.width)));
   });
 }
 
@@ -55,22 +55,22 @@ void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, H
                  const Bf16Products& products, int threads) {
   for_some_queries(shape, in, kBf16Columns, threads, [&](const AttentionHead<Bf16>& of, int64_t head, int64_t begin) {
     kernels().attend_bf16(of, products, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
-                          room(attention_bf16_room(shape.width)));
+                          scratch(attention_bf16_scratch_size(shape.width)));
   });
 }
 
 void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
-                     Heads<const float> slope, const AttentionGradients<float>& gradients, int threads) {
+                     Heads<const float> grad_out, const AttentionGradients<float>& gradients, int threads) {
   const int64_t heads = shape.scenes * shape.heads;
   // Every task processes a part of a head's keys, split by shapes alone, and computes a gradient for all of its queries; these are summed
   // in order.
   const int64_t size = part(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t whole = whole_product_rows(shape.queries), columns = attention_columns(shape.width), all = whole * columns;
-  const std::unique_ptr<float[]> q(new float[size_t(heads * all)]), slopes(new float[size_t(heads * all)]);
+  const std::unique_ptr<float[]> q(new float[size_t(heads * all)]), grads_out(new float[size_t(heads * all)]);
   const std::unique_ptr<float[]> means(new float[size_t(heads * whole)]), sums(new float[size_t(heads * parts * all)]);
   const auto packed = [&](int64_t head, int64_t begin) {
     const int64_t row = head * whole + begin;
-    return PackedQueries{q.get() + row * columns, slopes.get() + row * columns, means.get() + row};
+    return PackedQueries{q.get() + row * columns, grads_out.get() + row * columns, means.get() + row};
   };
   const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
 
@@ -79,10 +79,10 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& 
     const int64_t head = task / pieces, begin = task % pieces * kPiece, end = std::min(begin + kPiece, shape.queries);
     const PackedQueries to = packed(head, begin);
     kernels().pack_queries({rows(in.q, head, begin), {}, {}, end - begin, 0, shape.width},
-                           {rows(out, head, begin), rows(slope, head, begin)}, to);
+                           {rows(out, head, begin), rows(grad_out, head, begin)}, to);
     if (end < shape.queries) return;
     std::fill(to.q + (end - begin) * columns, to.q + (whole - begin) * columns, 0.f);
-    std::fill(to.slope + (end - begin) * columns, to.slope + (whole - begin) * columns, 0.f);
+    std::fill(to.grad_out + (end - begin) * columns, to.grad_out + (whole - begin) * columns, 0.f);
   });
   parallel_for(threads, heads * parts, [&](int64_t task) {
     const int64_t head = task / parts, begin = task % parts * size;
@@ -90,7 +90,7 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& 
                                shape.width},
                               packed(head, 0), log_sums + head * shape.queries, sums.get() + task * all,
                               rows(gradients.k, head, begin), rows(gradients.v, head, begin),
-                              room(attention_backward_room(shape.width)));
+                              scratch(attention_backward_scratch_size(shape.width)));
   });
   const float scale = float(1 / std::sqrt(double(shape.width)));
   parallel_for(threads, heads * pieces, [&](int64_t task) {
@@ -108,26 +108,26 @@ void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& 
 }
 
 void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out, const float* log_sums,
-                          Heads<const Bf16> slope, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
+                          Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
                           int threads) {
   // Work is split as in attend_backward().
   const int64_t heads = shape.scenes * shape.heads, width = shape.width;
   const int64_t size = part(heads, shape.keys, 64, kBf16BackwardKeys, kBf16BackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t whole = whole_bf16_columns(shape.queries), all = whole * width, rows_all = whole * attention_columns(shape.width);
-  const std::unique_ptr<Bf16[]> q_columns(new Bf16[size_t(heads * all)]), slope_columns(new Bf16[size_t(heads * all)]);
-  const std::unique_ptr<Bf16[]> q_rows(new Bf16[size_t(heads * rows_all)]), slope_rows(new Bf16[size_t(heads * rows_all)]);
+  const std::unique_ptr<Bf16[]> q_columns(new Bf16[size_t(heads * all)]), grad_out_columns(new Bf16[size_t(heads * all)]);
+  const std::unique_ptr<Bf16[]> q_rows(new Bf16[size_t(heads * rows_all)]), grad_out_rows(new Bf16[size_t(heads * rows_all)]);
   const std::unique_ptr<float[]> shifts(new float[size_t(heads * whole)]), means(new float[size_t(heads * whole)]);
   const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
   const auto packed = [&](int64_t head) {
-    return PackedBf16Queries{q_columns.get() + head * all,     slope_columns.get() + head * all,   q_rows.get() + head * rows_all,
-                             slope_rows.get() + head * rows_all, shifts.get() + head * whole, means.get() + head * whole};
+    return PackedBf16Queries{q_columns.get() + head * all,     grad_out_columns.get() + head * all,   q_rows.get() + head * rows_all,
+                             grad_out_rows.get() + head * rows_all, shifts.get() + head * whole, means.get() + head * whole};
   };
   const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
 
   const int64_t panels = whole / kBf16Columns;
   parallel_for(threads, heads * panels, [&](int64_t task) {
     const int64_t head = task / panels;
-    kernels().pack_queries_bf16({rows(in.q, head, 0), {}, {}, shape.queries, 0, shape.width}, {rows(out, head, 0), rows(slope, head, 0)},
+    kernels().pack_queries_bf16({rows(in.q, head, 0), {}, {}, shape.queries, 0, shape.width}, {rows(out, head, 0), rows(grad_out, head, 0)},
                                 log_sums + head * shape.queries, task % panels * kBf16Columns, whole, packed(head));
   });
   parallel_for(threads, heads * parts, [&](int64_t task) {
@@ -135,7 +135,7 @@ void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf1
     kernels().attend_backward_bf16({{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries,
                                     std::min(size, shape.keys - begin), shape.width},
                                    products, packed(head), sums.get() + task * all, rows(gradients.k, head, begin),
-                                   rows(gradients.v, head, begin), room(attention_bf16_backward_room(shape.width)));
+                                   rows(gradients.v, head, begin), scratch(attention_bf16_backward_scratch_size(shape.width)));
   });
   const float scale = float(1 / std::sqrt(double(width)));
   parallel_for(threads, heads * panels, [&](int64_t task) {

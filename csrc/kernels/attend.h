@@ -33,15 +33,15 @@ void attend(const AttentionShape& shape, const AttentionInputs<float>& in, Heads
 void attend_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
                  const Bf16Products& products, int threads);
 
-// Gradients of queries, keys and values, computed from the gradient `slope` of the output.
+// Gradients of queries, keys and values, computed from the gradient `grad_out` of the output.
 template <class Number>
 struct AttentionGradients {
   Heads<Number> q, k, v;
 };
 void attend_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out, const float* log_sums,
-                     Heads<const float> slope, const AttentionGradients<float>& gradients, int threads);
+                     Heads<const float> grad_out, const AttentionGradients<float>& gradients, int threads);
 void attend_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out, const float* log_sums,
-                          Heads<const Bf16> slope, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
+                          Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients, const Bf16Products& products,
                           int threads);
 
 }  // namespace globalsplat::raster

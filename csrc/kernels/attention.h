@@ -37,14 +37,14 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
   const int64_t queries = whole_product_rows(head.queries);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
 
-  Room room(memory);
-  float* const q = room.take(queries * columns);
-  float* const sums = room.take(queries * columns);     // of values
-  float* const weights = room.take(queries * lanes);    // l, in partial sums
-  float* const most = room.take(queries);               // m
-  float* const k = room.take(kForwardKeys * width);
-  float* const v = room.take(kForwardKeys * columns);
-  float* const scores = room.take(kProductRows * kForwardKeys);
+  ScratchArena scratch(memory);
+  float* const q = scratch.take(queries * columns);
+  float* const sums = scratch.take(queries * columns);     // of values
+  float* const weights = scratch.take(queries * lanes);    // l, in partial sums
+  float* const most = scratch.take(queries);               // m
+  float* const k = scratch.take(kForwardKeys * width);
+  float* const v = scratch.take(kForwardKeys * columns);
+  float* const scores = scratch.take(kProductRows * kForwardKeys);
 
   pack_rows(head.q, head.queries, width, scale, columns, queries, q);
   for (int64_t i = 0; i < queries; ++i) most[i] = -__builtin_inff();
@@ -91,11 +91,11 @@ inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<f
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
-  pack_rows(past.slope, head.queries, width, 1, columns, head.queries, to.slope);
+  pack_rows(past.grad_out, head.queries, width, 1, columns, head.queries, to.grad_out);
   for (int64_t i = 0; i < head.queries; ++i) {
-    const float *const out = past.out.data + i * past.out.stride, *const slope = to.slope + i * columns;
+    const float *const out = past.out.data + i * past.out.stride, *const grad_out = to.grad_out + i * columns;
     double sum = 0;
-    for (int c = 0; c < width; ++c) sum += double(out[c]) * double(slope[c]);
+    for (int c = 0; c < width; ++c) sum += double(out[c]) * double(grad_out[c]);
     to.means[i] = float(sum);
   }
 }
@@ -108,12 +108,12 @@ inline void attend_backward(const AttentionHead<float>& head, const PackedQuerie
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
 
-  Room room(memory);
-  const auto take_keys = [&] { return room.take(kBackwardKeys * columns); };
+  ScratchArena scratch(memory);
+  const auto take_keys = [&] { return scratch.take(kBackwardKeys * columns); };
   float *const k_panels = take_keys(), *const v_panels = take_keys(), *const k = take_keys();
   float *const dk_sums = take_keys(), *const dv_sums = take_keys();
-  float* const p = room.take(kBackwardQueries * kBackwardKeys);
-  float* const ds = room.take(kBackwardQueries * kBackwardKeys);
+  float* const p = scratch.take(kBackwardQueries * kBackwardKeys);
+  float* const ds = scratch.take(kBackwardQueries * kBackwardKeys);
 
   for (int64_t i = 0; i < whole_product_rows(head.queries) * columns; ++i) dq[i] = 0;
   for (int64_t first = 0; first < head.keys; first += kBackwardKeys) {
@@ -125,12 +125,12 @@ inline void attend_backward(const AttentionHead<float>& head, const PackedQuerie
 
     for (int64_t tile = 0; tile < head.queries; tile += kBackwardQueries) {
       const int64_t rows = head.queries - tile < kBackwardQueries ? head.queries - tile : kBackwardQueries;
-      const float *const q = of.q + tile * columns, *const slope = of.slope + tile * columns;
+      const float *const q = of.q + tile * columns, *const grad_out = of.grad_out + tile * columns;
       for (int64_t i = 0; i < rows; i += kProductRows) {
         for (int64_t j = 0; j < count; j += kProductColumns) {
           multiply_panel<kProductVectors, true>({q + i * columns, columns, 1}, k_panels + j * width, kProductColumns, width,
                                                 p + i * kBackwardKeys + j, kBackwardKeys, nullptr);
-          multiply_panel<kProductVectors, true>({slope + i * columns, columns, 1}, v_panels + j * width, kProductColumns, width,
+          multiply_panel<kProductVectors, true>({grad_out + i * columns, columns, 1}, v_panels + j * width, kProductColumns, width,
                                                 ds + i * kBackwardKeys + j, kBackwardKeys, nullptr);
         }
         for (int64_t r = i; r < i + kProductRows && r < rows; ++r) {
@@ -145,7 +145,7 @@ inline void attend_backward(const AttentionHead<float>& head, const PackedQuerie
                              columns);
       }
       for (int64_t j = 0; j < count; j += kProductRows) {
-        multiply_rows<false>({p + j, 1, kBackwardKeys}, slope, columns, rows, dv_sums + j * columns, columns, columns);
+        multiply_rows<false>({p + j, 1, kBackwardKeys}, grad_out, columns, rows, dv_sums + j * columns, columns, columns);
         multiply_rows<false>({ds + j, 1, kBackwardKeys}, q, columns, rows, dk_sums + j * columns, columns, columns);
       }
     }

@@ -93,12 +93,12 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   const V factor = broadcast<float>(scale);
 
-  Room room(memory);
-  const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(room.take(count / 2)); };
-  float* const sums = room.take(queries * width);  // of values, in panels of queries, [width, kBf16Columns]
-  float* const weights = room.take(queries);       // l
-  float* const most = room.take(queries);          // m without the factor
-  float* const scores = room.take(kBf16Keys * kBf16Columns);
+  ScratchArena scratch(memory);
+  const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(scratch.take(count / 2)); };
+  float* const sums = scratch.take(queries * width);  // of values, in panels of queries, [width, kBf16Columns]
+  float* const weights = scratch.take(queries);       // l
+  float* const most = scratch.take(queries);          // m without the factor
+  float* const scores = scratch.take(kBf16Keys * kBf16Columns);
   Bf16* const p = take_bf16(kBf16Keys * kBf16Columns);
   Bf16* const v = take_bf16(kBf16Keys * width);
   Bf16* const q = take_bf16(queries * width);
@@ -163,13 +163,13 @@ inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPa
       pack_pairs({from.data + c, from.stride}, count, width - c, panel, as_rows + c * whole + first * panel);
     }
   };
-  const Rows<const Bf16> slope = past.slope.from(first), out = past.out.from(first);
+  const Rows<const Bf16> grad_out = past.grad_out.from(first), out = past.out.from(first);
   pack(head.q.from(first), to.q_columns, to.q_rows);
-  pack(slope, to.slope_columns, to.slope_rows);
+  pack(grad_out, to.grad_out_columns, to.grad_out_rows);
   for (int64_t i = 0; i < kBf16Columns; ++i) {
     double sum = 0;
     for (int c = 0; i < count && c < width; ++c)
-      sum += double(to_float(out.data[i * out.stride + c])) * double(to_float(slope.data[i * slope.stride + c]));
+      sum += double(to_float(out.data[i * out.stride + c])) * double(to_float(grad_out.data[i * grad_out.stride + c]));
     to.means[first + i] = float(sum);
     to.log_sums[first + i] = i < count ? log_sums[first + i] : 0;
   }
@@ -186,12 +186,12 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
   const float scale = float(1 / __builtin_sqrt(double(width)));
   const V factor = broadcast<float>(float(kLog2E / __builtin_sqrt(double(width))));
 
-  Room room(memory);
-  const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(room.take(count / 2)); };
-  float* const dk_sums = room.take(kBf16BackwardKeys * columns);
-  float* const dv_sums = room.take(kBf16BackwardKeys * columns);
-  float* const scores = room.take(kBf16BackwardKeys * kBf16Columns);
-  float* const dp = room.take(kBf16BackwardKeys * kBf16Columns);
+  ScratchArena scratch(memory);
+  const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(scratch.take(count / 2)); };
+  float* const dk_sums = scratch.take(kBf16BackwardKeys * columns);
+  float* const dv_sums = scratch.take(kBf16BackwardKeys * columns);
+  float* const scores = scratch.take(kBf16BackwardKeys * kBf16Columns);
+  float* const dp = scratch.take(kBf16BackwardKeys * kBf16Columns);
   Bf16* const k_columns = take_bf16(kBf16BackwardKeys * width);
   Bf16* const p = take_bf16(kBf16BackwardKeys * kBf16BackwardQueries);
   Bf16* const ds = take_bf16(kBf16BackwardKeys * kBf16BackwardQueries);
@@ -212,7 +212,7 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
                             queries + query * width, to);
         };
         multiply(k, of.q_columns, scores);
-        multiply(v, of.slope_columns, dp);
+        multiply(v, of.grad_out_columns, dp);
         Bf16* const pairs = ds_pairs + i * kBf16BackwardKeys;
         for (int64_t j = 0; j < whole; j += 2)
           for (int64_t c = 0; c < kBf16Columns; c += lanes) {
@@ -221,10 +221,10 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
               if (j >= count) return Bits{};
               const int64_t at = j * kBf16Columns + c, to = j * kBf16BackwardQueries + i + c;
               const V weight = power_of_two(add_product(load<float>(scores + at), factor, -shift));
-              const Bits slope = rounded(weight * (load<float>(dp + at) - mean));
+              const Bits ds_bits = rounded(weight * (load<float>(dp + at) - mean));
               store_bf16(p + to, rounded(weight));
-              store_bf16(ds + to, slope);
-              return slope;
+              store_bf16(ds + to, ds_bits);
+              return ds_bits;
             };
             const Bits even = round(j);
             store_pair(pairs + j * kBf16Columns + 2 * c, even, round(j + 1));
@@ -238,7 +238,7 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
           products.multiply(count, panel, depth, kBf16BackwardQueries, panel, columns, tile > 0, keys, rows + c * queries + tile * panel,
                             sums + c);
         };
-        multiply(p, of.slope_rows, dv_sums);
+        multiply(p, of.grad_out_rows, dv_sums);
         multiply(ds, of.q_rows, dk_sums);
       }
     }

@@ -84,9 +84,9 @@ GS_INLINE void begin_block(const BlockPlace& at, Vector<T>* transmittance) {
 // instructions for a splat wait for one another several times as long as they take, and a processor looks ahead by only two or three
 // splats. Here the operands of each step have been ready since the previous splat.
 template <class T>
-class Approach {
+class SplatPipeline {
  public:
-  GS_INLINE Approach(Vector<T> x, Vector<T> y, const Splat<T>& first, const Splat<T>& second, const Splat<T>& third) : x_(x), y_(y) {
+  GS_INLINE SplatPipeline(Vector<T> x, Vector<T> y, const Splat<T>& first, const Splat<T>& second, const Splat<T>& third) : x_(x), y_(y) {
     offset_ = offset_of(first, x, y);
     step(first, second);
     step(second, third);
@@ -120,7 +120,7 @@ template <class T>
 void blend_tile(const TileJob<T>& job, const RenderOutput<T>& out) {
   using V = Vector<T>;
   constexpr int part = 128;
-  uint32_t splats[part], blocks_of[part], list[part + kListRoom];
+  uint32_t splats[part], blocks_of[part], list[part + kListPadding];
   Pixels<T> pixels[kBlocks][kVectors<T>];
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
@@ -141,7 +141,7 @@ void blend_tile(const TileJob<T>& job, const RenderOutput<T>& out) {
     }
     for (uint32_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
-      const int length = choose(splats, blocks_of, count, block, list);
+      const int length = compress(splats, blocks_of, count, block, list);
       if (length == 0) continue;
       for (int i = 0; i < 3; ++i) list[length + i] = splats[0];  // evaluated in advance, but not blended
       const auto splat = [&](int i) -> const Splat<T>& { return job.splats[list[i]]; };
@@ -150,9 +150,9 @@ void blend_tile(const TileJob<T>& job, const RenderOutput<T>& out) {
         Pixels<T> px = pixels[block][k];
         const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
         const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
-        Approach<T> approach(x, y, splat(0), splat(1), splat(2));
+        SplatPipeline<T> pipeline(x, y, splat(0), splat(1), splat(2));
         for (int i = 0; i < length; ++i)
-          add(splat(i), blend<T>(px.transmittance, approach.next(splat(i + 2), splat(i + 3))), px);
+          add(splat(i), blend<T>(px.transmittance, pipeline.next(splat(i + 2), splat(i + 3))), px);
         goes_on |= any(less(V{}, px.transmittance));
         pixels[block][k] = px;
       }

@@ -21,9 +21,9 @@ double sum_over_rows(int threads, int64_t planes, int rows, int width, const Bod
   std::vector<double> sums(size_t(planes * parts));
   parallel_for(threads, planes * parts, [&](int64_t task) {
     const int begin = int(task % parts) * kRows;
-    thread_local std::vector<T> room;
-    room.resize(std::max(room.size(), size_t(fit_room(width))));
-    sums[size_t(task)] = body(task / parts, begin, std::min(begin + kRows, rows), room.data());
+    thread_local std::vector<T> scratch;
+    scratch.resize(std::max(scratch.size(), size_t(fit_scratch_size(width))));
+    sums[size_t(task)] = body(task / parts, begin, std::min(begin + kRows, rows), scratch.data());
   });
   double total = 0;
   for (const double sum : sums) total += sum;
@@ -49,10 +49,10 @@ const T* ssim_window() {
 }
 
 template <class T>
-double photometric(const FitJob<T>& job, double absolute, double similar, T* gradient, int threads) {
+double photometric(const FitJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int threads) {
   const int64_t pixels = int64_t(job.width) * job.height;
   const int64_t windows = int64_t(job.width - kWindow + 1) * (job.height - kWindow + 1);
-  const Buffer<T> slopes(similar != 0 && gradient != nullptr ? size_t(3 * windows * job.planes) : 0);
+  const Buffer<T> slopes(ssim_weight != 0 && gradient != nullptr ? size_t(3 * windows * job.planes) : 0);
   const auto plane_of = [&](int64_t plane) {
     return FitPlane<T>{job.pictures + plane * pixels,
                        job.photos + plane * pixels,
@@ -64,17 +64,17 @@ double photometric(const FitJob<T>& job, double absolute, double similar, T* gra
   };
   const double each_pixel = 1 / double(pixels * job.planes), each_window = 1 / double(windows * job.planes);
   double value = 0;
-  if (similar != 0)
-    value += similar * each_window *
+  if (ssim_weight != 0)
+    value += ssim_weight * each_window *
              sum_over_rows<T>(threads, job.planes, job.height - kWindow + 1, job.width,
-                              [&](int64_t plane, int begin, int end, T* room) {
-                                return kernels().of<T>().ssim(plane_of(plane), begin, end, room);
+                              [&](int64_t plane, int begin, int end, T* scratch) {
+                                return kernels().of<T>().ssim(plane_of(plane), begin, end, scratch);
                               });
-  if (absolute != 0 || gradient != nullptr)
-    value += absolute * each_pixel *
-             sum_over_rows<T>(threads, job.planes, job.height, job.width, [&](int64_t plane, int begin, int end, T* room) {
-               return kernels().of<T>().fit_gradient(plane_of(plane), T(absolute * each_pixel),
-                                                             T(slopes.size > 0 ? similar * each_window : 0), begin, end, room);
+  if (l1_weight != 0 || gradient != nullptr)
+    value += l1_weight * each_pixel *
+             sum_over_rows<T>(threads, job.planes, job.height, job.width, [&](int64_t plane, int begin, int end, T* scratch) {
+               return kernels().of<T>().fit_gradient(plane_of(plane), T(l1_weight * each_pixel),
+                                                             T(slopes.size > 0 ? ssim_weight * each_window : 0), begin, end, scratch);
              });
   return value;
 }
@@ -84,10 +84,10 @@ double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int 
   const int64_t width = job.width, height = job.height, pixels = width * height;
   const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
   const double each = pairs > 0 ? factor / double(pairs) : 0;
-  return each * sum_over_rows<T>(threads, job.views, job.height, job.width, [&](int64_t view, int begin, int end, T* room) {
+  return each * sum_over_rows<T>(threads, job.views, job.height, job.width, [&](int64_t view, int begin, int end, T* scratch) {
            const DepthPlane<T> plane{job.depths + view * pixels, job.photos + 3 * view * pixels,
                                      gradient != nullptr ? gradient + view * pixels : nullptr, job.width, job.height};
-           return kernels().of<T>().unevenness(plane, T(each), begin, end, room);
+           return kernels().of<T>().unevenness(plane, T(each), begin, end, scratch);
          });
 }
 

@@ -23,7 +23,7 @@ struct Candidate {
   bool supported;
 };
 
-const Kernels& choose() {
+const Kernels& select_kernels() {
   // Sorted by preference, best first.
   const Candidate candidates[] = {
 #if defined(__x86_64__)
@@ -50,7 +50,7 @@ const Kernels& choose() {
 }  // namespace
 
 const Kernels& kernels() {
-  static const Kernels& chosen = choose();
+  static const Kernels& chosen = select_kernels();
   return chosen;
 }
 

@@ -21,9 +21,9 @@ struct KernelsOf {
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
   // Kernels outside of the rasterizer: ssim.h, smooth.h, adam.h.
-  double (*ssim)(const FitPlane<T>&, int begin, int end, T* room);
-  double (*fit_gradient)(const FitPlane<T>&, T absolute, T similar, int begin, int end, T* room);
-  double (*unevenness)(const DepthPlane<T>&, T factor, int begin, int end, T* room);
+  double (*ssim)(const FitPlane<T>&, int begin, int end, T* scratch);
+  double (*fit_gradient)(const FitPlane<T>&, T l1_weight, T ssim_weight, int begin, int end, T* scratch);
+  double (*unevenness)(const DepthPlane<T>&, T factor, int begin, int end, T* scratch);
   void (*adam)(const AdamStep&, const AdamNumbers<T>&, int64_t begin, int64_t end);
 };
 
@@ -32,17 +32,17 @@ struct Kernels {
   KernelsOf<float> of_float;
   KernelsOf<double> of_double;
   // attention.h
-  void (*attend)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* room);
+  void (*attend)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* scratch);
   void (*pack_queries)(const AttentionHead<float>&, const AttentionPast<float>&, const PackedQueries& to);
   void (*attend_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk,
-                          Rows<float> dv, float* room);
+                          Rows<float> dv, float* scratch);
   // attention_bf16.h
-  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* log_sums, float* room);
+  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* log_sums, float* scratch);
   void (*pack_queries_bf16)(const AttentionHead<Bf16>&, const AttentionPast<Bf16>&, const float* log_sums, int64_t first, int64_t whole,
                             const PackedBf16Queries& to);
   void (*attend_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
-                               Rows<Bf16> dv, float* room);
-  void (*muon)(const MuonStep&, const MuonMatrix&, float* room);  // muon.h
+                               Rows<Bf16> dv, float* scratch);
+  void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // muon.h
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

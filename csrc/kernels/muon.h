@@ -38,13 +38,13 @@ inline void muon(const MuonStep& step, const MuonMatrix& of, float* memory) {
   const int64_t panel_columns = (few + kProductColumns - 1) / kProductColumns * kProductColumns;
   const auto place = [&](int64_t i, int64_t j) { return upright ? j * row + i : i * row + j; };
 
-  Room room(memory);
-  float* x = room.take(rows * row);
-  float* next = room.take(rows * row);
-  float* const panels = room.take(square_row * wide);
-  float* const square = room.take(rows * square_row);  // S
-  float* const factor = room.take(rows * square_row);  // c S
-  float* const sum = room.take(rows * square_row);     // b S + c S²
+  ScratchArena scratch(memory);
+  float* x = scratch.take(rows * row);
+  float* next = scratch.take(rows * row);
+  float* const panels = scratch.take(square_row * wide);
+  float* const square = scratch.take(rows * square_row);  // S
+  float* const factor = scratch.take(rows * square_row);  // c S
+  float* const sum = scratch.take(rows * square_row);     // b S + c S²
 
   for (int64_t k = 0; k < rows * row; ++k) x[k] = 0;
   // Only the last panel is computed down to the padding rows.

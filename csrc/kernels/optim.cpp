@@ -22,7 +22,7 @@ void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, in
 void muon(const MuonStep& step, const std::vector<MuonMatrix>& matrices, int threads) {
   parallel_for(threads, int64_t(matrices.size()), [&](int64_t task) {
     const MuonMatrix& matrix = matrices[size_t(task)];
-    kernels().muon(step, matrix, room(muon_room(matrix.rows, matrix.columns)));
+    kernels().muon(step, matrix, scratch(muon_scratch_size(matrix.rows, matrix.columns)));
   });
 }
 

@@ -104,7 +104,7 @@ void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>
   for (int64_t i = 0; i < count; ++i) task(i);
 }
 
-float* room(int64_t count) {
+float* scratch(int64_t count) {
   thread_local std::vector<float> numbers;
   numbers.resize(std::max(numbers.size(), size_t(count) + 16));
   const auto address = reinterpret_cast<uintptr_t>(numbers.data());

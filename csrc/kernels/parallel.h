@@ -13,6 +13,6 @@ namespace globalsplat::raster {
 void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task);
 
 // Returns scratch memory for `count` floats, aligned to cache lines. It belongs to this thread until the thread's next call.
-float* room(int64_t count);
+float* scratch(int64_t count);
 
 }  // namespace globalsplat::raster

@@ -8,9 +8,9 @@
 namespace globalsplat::raster::GS_ISA {
 
 // Allocator within a task's scratch memory.
-class Room {
+class ScratchArena {
  public:
-  explicit Room(float* from) : next_(from) {}
+  explicit ScratchArena(float* from) : next_(from) {}
   float* take(int64_t count) {
     float* const taken = next_;
     next_ += (count + 15) / 16 * 16;

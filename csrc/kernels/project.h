@@ -395,10 +395,10 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
 // Computes all gradients of the group that begins at Gaussian `i` from the pixel sums of `views` cameras; records_of(view) returns a
 // camera's records. If `of_cameras` is set, asked(view, numbers) is called with the group's gradient of each camera, in CameraGradient's
 // order.
-template <class T, class RecordsOf, class Asked>
+template <class T, class RecordsOf, class AddCameraGradient>
 GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const Lens<T>* lenses, int64_t views,
                                       const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,
-                                      const Asked& asked) {
+                                      const AddCameraGradient& add_camera_gradient) {
   using V = Vector<T>;
   Group<T> group;
   load_group(g, i, end, group);
@@ -422,7 +422,7 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
         project_group_backward(group, lenses[view], projection, touched, d, d_r, sum, of_cameras, of_camera);
       }
     }
-    if (of_cameras) asked(view, of_camera);
+    if (of_cameras) add_camera_gradient(view, of_camera);
   }
   V d_scale[3], d_quaternion[4];
   axes_backward(group, sum.axes, d_scale, d_quaternion);
@@ -439,14 +439,14 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
 template <class T>
 void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
                       const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
-  const auto asked = [&](int64_t view, const Vector<T>(&of_camera)[kCameraNumbers]) {
+  const auto add_camera_gradient = [&](int64_t view, const Vector<T>(&of_camera)[kCameraNumbers]) {
     T numbers[kCameraNumbers];
     sum_each<T>(of_camera, numbers);
     for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += numbers[k];
   };
   for (int64_t i = begin; i < end; i += Simd<T>::lanes)
     project_backward_group(g, i, end, lenses, views, [&](int64_t view) { return records[view]; }, out, cameras != nullptr,
-                           asked);
+                           add_camera_gradient);
 }
 
 }  // namespace globalsplat::raster::GS_ISA

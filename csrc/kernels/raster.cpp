@@ -44,7 +44,7 @@ struct Frame<T>::PerView {
 
 // Result of a task for one view: the tiles that its Gaussians touch, and the depths of the Gaussians that touch any.
 template <class T>
-struct Frame<T>::Part {
+struct Frame<T>::TaskOutput {
   Buffer<TilePair> pairs;
   int64_t pair_count = 0;
   Buffer<DepthItem<T>> depths;
@@ -84,7 +84,7 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
 
 // Lists the tiles of one task's splats, while they are in the cache. first_record is relative to the part's own first pair.
 template <class T>
-void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, Part& part) const {
+void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const {
   part.pairs = Buffer<TilePair>(size_t(4 * kTask));
   part.depths = Buffer<DepthItem<T>>(size_t(end - begin));
   uint32_t* first = view.first_record.data.get();
@@ -107,8 +107,8 @@ void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, Part& part) cons
 
 // Projects all Gaussians to splats, and lists the tiles that these touch: one part for every task of every view.
 template <class T>
-std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussians<T>>& scenes) {
-  std::vector<Part> made(views_.size() * size_t(tasks_));
+std::vector<typename Frame<T>::TaskOutput> Frame<T>::project(const std::vector<Gaussians<T>>& scenes) {
+  std::vector<TaskOutput> task_outputs(views_.size() * size_t(tasks_));
   std::vector<Splat<T>*> splats;
   for (PerView& view : views_) {
     view.splats = Buffer<Splat<T>>(size_t(count_));
@@ -120,12 +120,12 @@ std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussia
     const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
     kernels().of<T>().project(scenes[scene], begin, end, lenses_.data() + first, int64_t(last - first),
                               splats.data() + first);
-    for (size_t k = first; k < last; ++k) cover(views_[k], begin, end, made[k * size_t(tasks_) + size_t(task % tasks_)]);
+    for (size_t k = first; k < last; ++k) cover(views_[k], begin, end, task_outputs[k * size_t(tasks_) + size_t(task % tasks_)]);
   });
   for (size_t k = 0; k < views_.size(); ++k) {
     int64_t pairs = 0, depths = 0;
     for (size_t i = 0; i < size_t(tasks_); ++i) {
-      Part& part = made[k * size_t(tasks_) + i];
+      TaskOutput& part = task_outputs[k * size_t(tasks_) + i];
       part.pairs_before = uint32_t(pairs);
       part.depths_before = uint32_t(depths);
       pairs += part.pair_count;
@@ -135,19 +135,19 @@ std::vector<typename Frame<T>::Part> Frame<T>::project(const std::vector<Gaussia
       throw std::length_error("more than 4 billion (Gaussian, tile) pairs in a view");
     views_[k].first_record[size_t(count_)] = uint32_t(pairs);
   }
-  return made;
+  return task_outputs;
 }
 
 // Sorts each view's splats that touch any tile front to back. Also makes first_record relative to all of the view's pairs.
 template <class T>
-std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) {
+std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<TaskOutput>& task_outputs) {
   std::vector<Buffer<DepthItem<T>>> order;
   for (size_t k = 0; k < views_.size(); ++k) {
-    const Part* last = tasks_ == 0 ? nullptr : &made[(k + 1) * size_t(tasks_) - 1];
+    const TaskOutput* last = tasks_ == 0 ? nullptr : &task_outputs[(k + 1) * size_t(tasks_) - 1];
     order.emplace_back(last == nullptr ? 0 : last->depths_before + size_t(last->depth_count));
   }
-  parallel_for(settings_.threads, int64_t(made.size()), [&](int64_t task) {
-    const Part& part = made[size_t(task)];
+  parallel_for(settings_.threads, int64_t(task_outputs.size()), [&](int64_t task) {
+    const TaskOutput& part = task_outputs[size_t(task)];
     const size_t k = size_t(task / tasks_);
     std::copy_n(part.depths.data.get(), part.depth_count, order[k].data.get() + part.depths_before);
     const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
@@ -159,7 +159,7 @@ std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<Part>& made) 
 
 // Builds the tiles' lists.
 template <class T>
-void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order) {
+void Frame<T>::bin(const std::vector<TaskOutput>& task_outputs, const std::vector<Buffer<DepthItem<T>>>& order) {
   for (PerView& view : views_) view.entries = Buffer<TileEntry>(view.first_record[size_t(count_)]);
   const auto each = [&](int64_t k, int64_t chunk, const auto& visit) {
     const Buffer<DepthItem<T>>& items = order[size_t(k)];
@@ -167,7 +167,7 @@ void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<Depth
     const size_t begin = items.size * size_t(chunk) / size_t(chunks());
     const size_t end = items.size * size_t(chunk + 1) / size_t(chunks());
     const auto first_pair = [&](uint32_t splat) {
-      const Part& part = made[size_t(k * tasks_) + splat / kTask];
+      const TaskOutput& part = task_outputs[size_t(k * tasks_) + splat / kTask];
       return part.pairs.data.get() + (view.first_record[splat] - part.pairs_before);
     };
     for (size_t i = begin; i < end; ++i) {
@@ -186,7 +186,7 @@ void Frame<T>::bin(const std::vector<Part>& made, const std::vector<Buffer<Depth
         if (chunks() > 1) return each(k, chunk, [&](int64_t tile, const TileEntry&) { visit(tile); });
         // With a single chunk, all of a view's pairs are counted in memory order.
         for (int64_t i = 0; i < tasks_; ++i) {
-          const Part& part = made[size_t(k * tasks_ + i)];
+          const TaskOutput& part = task_outputs[size_t(k * tasks_ + i)];
           for (int64_t pair = 0; pair < part.pair_count; ++pair) visit(int64_t(part.pairs[size_t(pair)].tile));
         }
       },
@@ -207,11 +207,11 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
   Stopwatch watch;
   std::unique_ptr<Frame> frame(new Frame(views, scenes, settings));
   {
-    const std::vector<Part> made = frame->project(scenes);
+    const std::vector<TaskOutput> task_outputs = frame->project(scenes);
     times.project = watch.lap();
-    const std::vector<Buffer<DepthItem<T>>> order = frame->sort(made);
+    const std::vector<Buffer<DepthItem<T>>> order = frame->sort(task_outputs);
     times.sort = watch.lap();
-    frame->bin(made, order);
+    frame->bin(task_outputs, order);
   }
   times.bin = watch.lap();
   const int64_t tiles = frame->grid_.tiles();
@@ -243,19 +243,19 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   times.blend_backward = watch.lap();
 
   // Gradients of the cameras of a scene from each task's Gaussians: [tasks][views].
-  std::vector<CameraGradient<T>> asked(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
+  std::vector<CameraGradient<T>> camera_gradients(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
   parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
     const size_t scene = size_t(task / tasks_), part = size_t(task % tasks_), first = first_view_[scene];
     const int64_t begin = int64_t(part) * kTask, end = std::min(begin + kTask, count_);
     kernels().of<T>().project_backward(scenes[scene], begin, end, lenses_.data() + first,
                                        int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene],
-                                       cameras == nullptr ? nullptr : &asked[part * views_.size() + first]);
+                                       cameras == nullptr ? nullptr : &camera_gradients[part * views_.size() + first]);
   });
   if (cameras != nullptr)
     for (size_t k = 0; k < views_.size() * kCameraNumbers; ++k) {
       double sum = 0;
       for (size_t part = 0; part < size_t(tasks_); ++part)
-        sum += double(asked[part * views_.size() + k / kCameraNumbers].numbers[k % kCameraNumbers]);
+        sum += double(camera_gradients[part * views_.size() + k / kCameraNumbers].numbers[k % kCameraNumbers]);
       cameras[k / kCameraNumbers].numbers[k % kCameraNumbers] = T(sum);
     }
   times.project_backward = watch.lap();

@@ -52,12 +52,12 @@ class Frame {
 
  private:
   struct PerView;
-  struct Part;
+  struct TaskOutput;
   Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings);
-  std::vector<Part> project(const std::vector<Gaussians<T>>& scenes);
-  void cover(PerView& view, int64_t begin, int64_t end, Part& part) const;
-  std::vector<Buffer<DepthItem<T>>> sort(const std::vector<Part>& made);
-  void bin(const std::vector<Part>& made, const std::vector<Buffer<DepthItem<T>>>& order);
+  std::vector<TaskOutput> project(const std::vector<Gaussians<T>>& scenes);
+  void cover(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const;
+  std::vector<Buffer<DepthItem<T>>> sort(const std::vector<TaskOutput>& task_outputs);
+  void bin(const std::vector<TaskOutput>& task_outputs, const std::vector<Buffer<DepthItem<T>>>& order);
   int64_t chunks() const;
   TileJob<T> job(const PerView& view, int tile) const;
 

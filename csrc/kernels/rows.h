@@ -54,20 +54,20 @@ struct Bf16Products {
 // Output of the forward pass, and its gradient.
 template <class Number>
 struct AttentionPast {
-  Rows<const Number> out, slope;
+  Rows<const Number> out, grad_out;
 };
 
 // Packed rows of all queries of a head, whole_product_rows() of attention_columns() with zero padding: the queries times log₂e / √w, and
 // the gradients of the output. `means` holds for every query the dot product of the output and its gradient.
 struct PackedQueries {
-  float *q, *slope, *means;
+  float *q, *grad_out, *means;
 };
 
 // Packed bfloat16 rows of whole_bf16_columns() queries: the queries themselves (without a factor) and the gradients of the output, each in
 // both layouts in which products take their second matrix. As columns: in panels of kBf16Columns queries, [width / 2, kBf16Columns, 2]. As
 // rows: in panels of kBf16Columns elements, [queries / 2, panel, 2].
 struct PackedBf16Queries {
-  Bf16 *q_columns, *slope_columns, *q_rows, *slope_rows;
+  Bf16 *q_columns, *grad_out_columns, *q_rows, *grad_out_rows;
   float *log_sums, *means;
 };
 
@@ -93,16 +93,16 @@ inline constexpr int64_t kBf16BackwardKeys = 128, kBf16BackwardQueries = 128;
 inline constexpr int64_t whole_bf16_columns(int64_t count) { return (count + kBf16Columns - 1) / kBf16Columns * kBf16Columns; }
 
 // Return the number of elements of scratch memory that a task needs.
-inline constexpr int64_t attention_room(int width) {
+inline constexpr int64_t attention_scratch_size(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
 }
-inline constexpr int64_t attention_bf16_room(int width) {
+inline constexpr int64_t attention_bf16_scratch_size(int width) {
   return kAttentionQueries * (3 * width / 2 + 2) + kBf16Keys * (3 * kBf16Columns + width) / 2 + 128;
 }
-inline constexpr int64_t attention_backward_room(int width) {
+inline constexpr int64_t attention_backward_scratch_size(int width) {
   return 5 * kBackwardKeys * attention_columns(width) + 2 * kBackwardQueries * kBackwardKeys;
 }
-inline constexpr int64_t attention_bf16_backward_room(int width) {
+inline constexpr int64_t attention_bf16_backward_scratch_size(int width) {
   return kBf16BackwardKeys * (5 * attention_columns(width) / 2 + 2 * kBf16Columns + 3 * kBf16BackwardQueries / 2) + 64;
 }
 

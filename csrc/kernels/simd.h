@@ -418,11 +418,11 @@ GS_INLINE Vector<T> log2_of(Vector<T> v) {
   return v;
 }
 
-// Copies to `out`, in order, those of `count` values whose flags have bit `bit` set, and returns their number. `out` must have kListRoom
+// Copies to `out`, in order, those of `count` values whose flags have bit `bit` set, and returns their number. `out` must have kListPadding
 // additional elements.
-inline constexpr int kListRoom = 16;
+inline constexpr int kListPadding = 16;
 #if defined(__AVX512F__)
-GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
+GS_INLINE int compress(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
   const __m512i wanted = _mm512_set1_epi32(1 << bit);
   int length = 0;
   for (int i = 0; i < count; i += 16) {
@@ -434,7 +434,7 @@ GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, i
   return length;
 }
 #else
-GS_INLINE int choose(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
+GS_INLINE int compress(const uint32_t* values, const uint32_t* flags, int count, int bit, uint32_t* out) {
   int length = 0;
   for (int i = 0; i < count; ++i) {
     out[length] = values[i];

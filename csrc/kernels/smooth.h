@@ -7,7 +7,7 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Depths and grey values of one row in `room`, preceded by one zero and followed by a vector of zeros for pixels beyond the border.
+// Depths and grey values of one row in `scratch`, preceded by one zero and followed by a vector of zeros for pixels beyond the border.
 template <class T>
 struct SmoothRow {
   T *depth, *grey;
@@ -33,14 +33,14 @@ GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>&
 }
 
 // Returns the sum over pairs whose first pixel is in the rows [begin, end). If requested, writes `factor` times the gradient of the sum
-// over all pairs at the pixels of these rows. `room` has fit_room(width) elements.
+// over all pairs at the pixels of these rows. `scratch` has fit_scratch_size(width) elements.
 template <class T>
-double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* room) {
+double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* scratch) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   const int stride = plane.width + 1 + 2 * lanes;
   SmoothRow<T> rows[3];
-  for (int k = 0; k < 3; ++k) rows[k] = {room + 2 * k * stride, room + (2 * k + 1) * stride};
+  for (int k = 0; k < 3; ++k) rows[k] = {scratch + 2 * k * stride, scratch + (2 * k + 1) * stride};
   load_row(plane, begin - 1, rows[0]);
   load_row(plane, begin, rows[1]);
   V sum{};

@@ -190,7 +190,7 @@ struct DepthJob {
 };
 
 // Returns the number of elements of scratch memory that a kernel needs for rows of this width.
-inline constexpr int fit_room(int width) { return 6 * (width + 33); }
+inline constexpr int fit_scratch_size(int width) { return 6 * (width + 33); }
 
 // Parameters of a step of Adam that all elements share; see adam.h.
 struct AdamStep {
@@ -223,7 +223,7 @@ struct MuonMatrix {
 inline constexpr int64_t muon_stride(int64_t columns) { return (columns + 63) / 64 * 64 + 16; }
 
 // Returns the number of elements of scratch memory that a step of Muon needs for a matrix.
-inline constexpr int64_t muon_room(int64_t rows, int64_t columns) {
+inline constexpr int64_t muon_scratch_size(int64_t rows, int64_t columns) {
   const int64_t few = rows < columns ? rows : columns, many = rows < columns ? columns : rows;
   return (2 * (few + 6) + muon_stride(few)) * muon_stride(many) + 3 * (few + 6) * muon_stride(few);
 }

@@ -51,18 +51,18 @@ GS_INLINE Vector<T> similarity_of(const WindowMeans<T>& means, bool with_slopes,
   return similarity;
 }
 
-// Computes the gradient of `absolute` · |x − y| at a pixel, which is 0 if they are equal.
+// Computes the gradient of `l1_weight` · |x − y| at a pixel, which is 0 if they are equal.
 template <class T>
-GS_INLINE Vector<T> gradient_of_difference(Vector<T> x, Vector<T> y, T absolute) {
+GS_INLINE Vector<T> gradient_of_difference(Vector<T> x, Vector<T> y, T l1_weight) {
   using V = Vector<T>;
-  const V d = x - y, up = select(less(V{}, d), broadcast<T>(absolute), V{});
-  return select(less(d, V{}), broadcast<T>(-absolute), up);
+  const V d = x - y, up = select(less(V{}, d), broadcast<T>(l1_weight), V{});
+  return select(less(d, V{}), broadcast<T>(-l1_weight), up);
 }
 
-// Adds `similar` times the gradient of Σ SSIM at a pixel, from the weighted sums of the slopes of the windows that contain it.
+// Adds `ssim_weight` times the gradient of Σ SSIM at a pixel, from the weighted sums of the slopes of the windows that contain it.
 template <class T>
-GS_INLINE Vector<T> add_gradient_of_similarity(Vector<T> x, Vector<T> y, T similar, const WindowSlopes<T>& slopes, Vector<T> gradient) {
-  return add_product(broadcast<T>(similar), add_product(x + x, slopes[1], add_product(y, slopes[2], slopes[0])), gradient);
+GS_INLINE Vector<T> add_gradient_of_similarity(Vector<T> x, Vector<T> y, T ssim_weight, const WindowSlopes<T>& slopes, Vector<T> gradient) {
+  return add_product(broadcast<T>(ssim_weight), add_product(x + x, slopes[1], add_product(y, slopes[2], slopes[0])), gradient);
 }
 
 }  // namespace globalsplat::raster::GS_ISA

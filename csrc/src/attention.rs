@@ -10,7 +10,7 @@ mod ffi {
         include!("attention.h");
 
         /// Returns `true` if `attention` supports heads of this width and kind; see `csrc/attention.h`.
-        fn attention_takes(width: i64, is_bf16: bool) -> Result<bool>;
+        fn supports_attention(width: i64, is_bf16: bool) -> Result<bool>;
 
         /// Computes attention; see `csrc/attention.h`.
         ///

@@ -11,19 +11,19 @@ mod ffi {
         include!("device.h");
 
         /// Event in a GPU's stream; see `csrc/device.h`.
-        type Mark;
+        type CudaEvent;
 
         /// Records an event in a GPU's current stream; see `csrc/device.h`.
-        fn mark(gpu: i32) -> Result<UniquePtr<Mark>>;
+        fn record_event(gpu: i32) -> Result<UniquePtr<CudaEvent>>;
 
         /// Returns the milliseconds between two events; see `csrc/device.h`.
-        fn since(self: &Mark, earlier: &Mark) -> Result<f64>;
+        fn since(self: &CudaEvent, earlier: &CudaEvent) -> Result<f64>;
 
         /// Copies on a GPU that may still be in progress; see `csrc/device.h`.
         type Copies;
 
         /// Returns the copied tensors; see `csrc/device.h`.
-        fn hand_over(self: &Copies, out: &mut [usize]) -> Result<()>;
+        fn take_tensors(self: &Copies, out: &mut [usize]) -> Result<()>;
 
         /// Stream for copies to a GPU; see `csrc/device.h`.
         type CopyStream;
@@ -44,15 +44,15 @@ mod ffi {
         fn peak_bytes(gpu: i32) -> Result<u64>;
 
         /// Resets the peak of a GPU's tensor memory; see `csrc/device.h`.
-        fn forget_peak_bytes(gpu: i32) -> Result<()>;
+        fn reset_peak_bytes(gpu: i32) -> Result<()>;
 
         /// Disables TF32 in convolutions; see `csrc/device.h`.
-        fn leave_out_tf32();
+        fn disable_tf32();
     }
 }
 
 // SAFETY: libtorch's streams and events are not bound to a thread.
-unsafe impl Send for Mark {}
+unsafe impl Send for CudaEvent {}
 // SAFETY: as above, and tensors may be sent between threads.
 unsafe impl Send for Copies {}
 // SAFETY: as above.

@@ -41,8 +41,8 @@ mod ffi {
         unsafe fn photometric(
             picture: usize,
             photo: usize,
-            absolute: f64,
-            similar: f64,
+            l1_weight: f64,
+            ssim_weight: f64,
             out: &mut [usize],
         ) -> Result<()>;
 

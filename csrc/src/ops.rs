@@ -6,26 +6,26 @@ mod ffi {
         include!("ops.h");
 
         /// Begins recording; see `csrc/ops.h`.
-        fn note_ops(outermost: bool);
+        fn start_recording_ops(outermost: bool);
 
         /// Ends recording and returns the ops; see `csrc/ops.h`.
-        fn noted_ops() -> Vec<String>;
+        fn stop_recording_ops() -> Vec<String>;
     }
 }
 
 /// Runs `work` and returns its result and all libtorch ops that it ran on this thread, in order and by the names that `csrc/ops.h`
 /// describes. These include ops called by other ops, and ops of backward passes on the CPU.
-pub fn ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
-    ffi::note_ops(false);
+pub fn record_ops<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
+    ffi::start_recording_ops(false);
     let done = work();
-    (done, ffi::noted_ops())
+    (done, ffi::stop_recording_ops())
 }
 
 /// Runs `work` and returns its result and the outermost libtorch ops that it ran on this thread, in order.
-pub fn outermost_ops_of<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
-    ffi::note_ops(true);
+pub fn record_outermost_ops<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
+    ffi::start_recording_ops(true);
     let done = work();
-    (done, ffi::noted_ops())
+    (done, ffi::stop_recording_ops())
 }
 
 /// Ops that return a view or allocate, or copy to another device. `reshape` and `flatten` copy a non-contiguous tensor, and those copies

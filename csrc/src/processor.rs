@@ -6,7 +6,7 @@ pub use ffi::*;
 mod ffi {
     /// Instructions for bf16 products.
     #[derive(Debug)]
-    enum Bf16 {
+    enum Bf16Support {
         /// No instructions: bf16 products are slower than float32 products.
         None,
         /// Vector instructions (avx512_bf16): products are about twice as fast as in float32.
@@ -19,7 +19,7 @@ mod ffi {
         include!("processor.h");
 
         /// Returns the CPU's bf16 instructions, as libtorch sees them; `None` if `GLOBALSPLAT_SIMD` hides them.
-        fn bf16_of_cpu() -> Bf16;
+        fn bf16_of_cpu() -> Bf16Support;
 
         /// Returns the instruction set of libtorch's own kernels, such as "AVX2".
         fn libtorch_simd_level() -> String;

@@ -34,34 +34,34 @@ mod ffi {
         fn has_nccl() -> bool;
 
         /// Process group; see `csrc/ranks.h`.
-        type Group;
+        type ProcessGroup;
 
         /// Creates a process group for CPU tensors; see `csrc/ranks.h`.
-        fn gloo(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<Group>>;
+        fn gloo(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<ProcessGroup>>;
 
         /// Creates a process group for GPU tensors; see `csrc/ranks.h`.
-        fn nccl(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<Group>>;
+        fn nccl(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<ProcessGroup>>;
 
         /// Replaces a tensor by its sum over all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
         /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
-        unsafe fn all_reduce(self: &Group, tensor: usize) -> Result<()>;
+        unsafe fn all_reduce(self: &ProcessGroup, tensor: usize) -> Result<()>;
 
         /// Copies a tensor of rank `from` to all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
         /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
-        unsafe fn broadcast(self: &Group, tensor: usize, from: i32) -> Result<()>;
+        unsafe fn broadcast(self: &ProcessGroup, tensor: usize, from: i32) -> Result<()>;
 
         /// Stacks the tensors of all ranks; see `csrc/ranks.h`.
         ///
         /// # Safety
         /// `tensor` must be the address of a live tensor.
-        unsafe fn all_gather(self: &Group, tensor: usize, out: &mut [usize]) -> Result<()>;
+        unsafe fn all_gather(self: &ProcessGroup, tensor: usize, out: &mut [usize]) -> Result<()>;
 
         /// Shuts the process group down in order; see `csrc/ranks.h`.
-        fn shut_down(self: &Group) -> Result<()>;
+        fn shut_down(self: &ProcessGroup) -> Result<()>;
 
         /// Gradient buckets that are reduced during the backward pass; see `csrc/ranks.h`.
         type Buckets;
@@ -70,7 +70,11 @@ mod ffi {
         ///
         /// # Safety
         /// `parameters` must be addresses of live tensors.
-        unsafe fn buckets(group: &Group, parameters: &[usize], bytes: i64) -> Result<UniquePtr<Buckets>>;
+        unsafe fn buckets(
+            group: &ProcessGroup,
+            parameters: &[usize],
+            bytes: i64,
+        ) -> Result<UniquePtr<Buckets>>;
 
         /// Announces the last backward pass of a step; see `csrc/ranks.h`.
         fn begin(self: &Buckets);
@@ -85,6 +89,6 @@ unsafe impl Send for Store {}
 // SAFETY: as above; concurrent calls are serialized.
 unsafe impl Sync for Store {}
 // SAFETY: c10d's process groups are not bound to a thread.
-unsafe impl Send for Group {}
+unsafe impl Send for ProcessGroup {}
 // SAFETY: buckets share nothing but parameters, which may be sent between threads.
 unsafe impl Send for Buckets {}

@@ -92,7 +92,7 @@ mod ffi {
         fn libtorch_version() -> String;
 
         /// Removes stack traces from libtorch's errors; see `csrc/splat.h`.
-        fn leave_out_stack_traces();
+        fn disable_stack_traces();
 
         /// Counts the pairs that a call has to blend; see `csrc/cpu/cpu.h`.
         ///

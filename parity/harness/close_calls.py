@@ -33,7 +33,7 @@ class Call:
     amount: float
 
 
-class Turned(TorchFunctionMode):
+class FlippedDecisions(TorchFunctionMode):
     """Context in which the reference computes with the values of `calls` moved across their thresholds."""
 
     def __init__(self, calls):
@@ -53,12 +53,12 @@ class Turned(TorchFunctionMode):
         return result
 
 
-def before_relu(x):
+def relu_decisions(x):
     """Returns the decisions of a ReLU on x: distances, flat indices, amounts."""
     return x.abs().flatten(), torch.arange(x.numel()), -2.0 * x.flatten()
 
 
-def in_windows(x, size):
+def pooling_decisions(x, size):
     """Returns the decisions of max pooling between the two largest values of each window with two positive values."""
 
     def windows(t):
@@ -72,7 +72,7 @@ def in_windows(x, size):
     return gap, index, 2.0 * gap
 
 
-def between_features(x, other):
+def difference_decisions(x, other):
     """Returns the decisions on the sign of the difference of two features that are not both zero.
 
     The amount is 0 for a feature of zero, because no gradient passes through it on either side.
@@ -113,9 +113,9 @@ def decisions_of_lpips(network, params, pictures):
     convolution = 0
     for picture in pictures:
         for name, x in lpips.convolutions(network, params, torch.tensor(picture).double()).items():
-            yield convolution, x, before_relu(x)
+            yield convolution, x, relu_decisions(x)
             if name in pooled:
-                yield convolution, x, in_windows(x, lpips.POOLING[network])
+                yield convolution, x, pooling_decisions(x, lpips.POOLING[network])
             convolution += 1
 
 
@@ -130,17 +130,17 @@ def decisions_of_vgg19(params, pairs):
         pictures = (torch.tensor(t).double().flatten(0, -4) for t in pair)
         (_, ours), (_, theirs) = (vgg19.convolutions(params, t) for t in pictures)
         for place, x in ours.items():
-            yield convolution, x, before_relu(x)
+            yield convolution, x, relu_decisions(x)
             if place in vgg19.FACTORS:
-                yield convolution, x, between_features(x, theirs[place])
+                yield convolution, x, difference_decisions(x, theirs[place])
             convolution += 1
         convolution += len(theirs)
 
 
-def settled(answer, expected, calls, turned):
+def resolve_close_calls(answer, expected, calls, flipped):
     """Finds which of `calls` the program decided differently: those that bring the reference closest to its gradients.
 
-    `turned(calls)` returns the reference's gradients with these calls on their other sides. Returns the expected
+    `flipped(calls)` returns the reference's gradients with these calls on their other sides. Returns the expected
     tensors for the chosen sides, and the number of calls that differ.
     """
     gradients = [name for name in expected if name.startswith("grad.") and name in answer]
@@ -154,7 +154,7 @@ def settled(answer, expected, calls, turned):
     for _ in range(SWEEPS):
         before = chosen
         for call in calls:
-            other = expected | turned(chosen ^ {call})
+            other = expected | flipped(chosen ^ {call})
             apart = distance(other)
             if apart < least:
                 best, chosen, least = other, chosen ^ {call}, apart

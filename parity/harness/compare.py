@@ -46,7 +46,7 @@ def gradient_scale(expected):
     return max((norm(value) for name, value in expected.items() if name.startswith("grad.")), default=0.0)
 
 
-def judge(name, ours, expected, tolerance, scale, doubtful=None):
+def compare_tensor(name, ours, expected, tolerance, scale, doubtful=None):
     """Compares a tensor with the reference's, `expected`. Pixels in the mask `doubtful` [B, C, H, W] are ignored."""
     is_gradient = name.startswith("grad.")
     allowed = tolerance.gradients if is_gradient else tolerance.outputs
@@ -95,8 +95,8 @@ def compare(answer, expected, tolerance, doubtful=None):
         return [Finding("answer", (), "exact", 0.0, problem=answer["error"])]
     scale = gradient_scale(expected)
     findings = [
-        judge(name, answer.get(name), value, tolerance, scale, doubtful) for name, value in expected.items()
+        compare_tensor(name, answer.get(name), value, tolerance, scale, doubtful) for name, value in expected.items()
     ]
     strangers = sorted(answer.keys() - expected.keys())
-    findings += [Finding(name, answer[name].shape, "exact", 0.0, problem="nobody asked for it") for name in strangers]
+    findings += [Finding(name, answer[name].shape, "exact", 0.0, problem="unexpected tensor") for name in strangers]
     return findings

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from .compare import gradient_scale, judge, norm
+from .compare import gradient_scale, compare_tensor, norm
 
 FACTOR = 1.001
 # The dropped slice is the smallest one whose norm is at least this fraction of the tensor's norm.
@@ -68,16 +68,16 @@ def undetected(answer, expected, tolerance, doubtful=None):
     def disturb(name):
         # judge() computes in float64: convert once for all perturbations.
         value = expected[name] if expected[name].dtype.kind == "i" else np.asarray(expected[name], dtype=np.float64)
-        finding = judge(name, answer[name], value, tolerance, scale, doubtful)
+        finding = compare_tensor(name, answer[name], value, tolerance, scale, doubtful)
         is_zero = finding.measure == "zero" or norm(value) == 0.0
-        tried, blind = 0, []
+        tried, missed = 0, []
         for what, wrong in disturbances(answer[name], finding.tolerance, is_zero, scale):
             tried += 1
-            if judge(name, wrong, value, tolerance, scale, doubtful).passed:
-                blind.append(f"{name}: {what}")
-        return tried, blind
+            if compare_tensor(name, wrong, value, tolerance, scale, doubtful).passed:
+                missed.append(f"{name}: {what}")
+        return tried, missed
 
     # For a large model this is most of the work, and numpy releases the GIL.
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(disturb, expected))
-    return sum(tried for tried, _ in found), [what for _, blind in found for what in blind]
+    return sum(tried for tried, _ in found), [what for _, missed in found for what in missed]

@@ -8,7 +8,7 @@ import textwrap
 from pathlib import Path
 
 from .disturb import BEYOND, FACTOR
-from .table import by_case, doubtful, failures, is_gradient, is_output, turned, undetected
+from .table import by_case, doubtful, failures, is_gradient, is_output, flipped, undetected
 from .tolerance import FLOAT32, FLOAT64
 
 WIDTH = 120
@@ -32,13 +32,13 @@ def processor():
 def document(results, command, device):
     """Returns the Markdown document. `command` is the command line that writes it."""
     sections = [
-        ["# What the program is held to", *about(results, command, device)],
+        ["# Verification", *about(results, command, device)],
         ["## Cases", *cases(results)],
-        ["## Tolerances of their own", bullets(whys(results))],
+        ["## Case-specific tolerances", bullets(whys(results))],
         ["## Pixels left out", bullets(doubtful(results))],
-        ["## Close calls decided otherwise", bullets(turned(results))],
+        ["## Close calls decided otherwise", bullets(flipped(results))],
         ["## Failures", bullets(failures(results))],
-        ["## Would wrong answers be noticed?", *self_test(results)],
+        ["## Self-test", *self_test(results)],
     ]
     return "\n\n".join(part for section in sections if any(section[1:]) for part in section if part) + "\n"
 
@@ -101,17 +101,17 @@ def whys(results):
 
 def self_test(results):
     tried = sum(result.tried for result in results)
-    blind = undetected(results)
+    missed = undetected(results)
     if not tried:
         return
-    noticed = f"{len(blind):,} were not noticed:" if blind else "every one was noticed."
+    noticed = f"{len(missed):,} were not noticed:" if missed else "every one was noticed."
     yield prose(
         "The self-test takes every answer that passes and makes it wrong, one tensor at a time: left out, made NaN, "
         f"multiplied by {FACTOR:g}, without a slice along each axis, with two axes swapped, one more where it is a "
         f"whole number, not zero where it should be. Where a tolerance is wide, mistakes are {BEYOND:g} times it. "
         f"Of {tried:,} wrong answers {noticed}"
     )
-    yield bullets(blind)
+    yield bullets(missed)
 
 
 def count(number, noun):

@@ -5,8 +5,8 @@ from contextlib import nullcontext
 import numpy as np
 import torch
 
-from .areas import TWINS
-from .close_calls import Turned
+from .areas import REFERENCES
+from .close_calls import FlippedDecisions
 from .exchange import read_request, write_answer
 
 
@@ -29,8 +29,8 @@ class Evaluation:
 
         params = tensors(request.params, lambda name: True)
         inputs = tensors(request.inputs, lambda name: name in request.differentiate)
-        with Turned(calls) if calls else nullcontext():
-            self.outputs = TWINS[request.module](request.config, params, inputs)
+        with FlippedDecisions(calls) if calls else nullcontext():
+            self.outputs = REFERENCES[request.module](request.config, params, inputs)
         self.leaves = {f"grad.param.{name}": value for name, value in params.items()}
         self.leaves |= {f"grad.in.{name}": inputs[name] for name in request.differentiate}
 

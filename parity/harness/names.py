@@ -21,6 +21,6 @@ def reference_config(config):
     return {theirs: config[ours] for ours, theirs in CONFIG_NAMES.items()}
 
 
-def under(prefix, params):
+def with_prefix(prefix, params):
     """Adds a prefix to parameter names, as requests name them relative to a module, and the reference from the root."""
     return {f"{prefix}.{name}": value for name, value in params.items()}

@@ -16,7 +16,7 @@ import numpy as np
 from .tolerance import FLOAT32, Tolerance
 
 CASES = {}
-TWINS = {}  # reference functions by module
+REFERENCES = {}  # reference functions by module
 
 
 @dataclass
@@ -46,11 +46,11 @@ def case(function):
     return function
 
 
-def twin(module):
+def reference_for(module):
     """Registers a function as the reference of `module`, which several cases may use (decorator)."""
 
     def register(function):
-        enter(TWINS, module, function)
+        enter(REFERENCES, module, function)
         return function
 
     return register

@@ -23,7 +23,7 @@ def table(results):
                 first = "", ""
     lines = layout(rows)
     lines += [f"[{number}] {why}" for number, why in enumerate(whys, start=1)]
-    return "\n".join([*lines, *doubtful(results), *turned(results), *failures(results)])
+    return "\n".join([*lines, *doubtful(results), *flipped(results), *failures(results)])
 
 
 def by_case(results):
@@ -77,9 +77,9 @@ def doubtful(results):
     return lines
 
 
-def turned(results):
+def flipped(results):
     """Returns lines with the number of close calls that the program decided differently from the reference."""
-    counts = {case: sum(result.turned for result in found) for case, found in by_case(results).items()}
+    counts = {case: sum(result.flipped for result in found) for case, found in by_case(results).items()}
     what = "numbers within rounding of a threshold lie on its other side"
     return [f"{case}: {count} {what}" for case, count in counts.items() if count]
 
@@ -98,15 +98,15 @@ def failures(results):
 
 def undetected(results):
     """Returns the perturbed results that pass nevertheless."""
-    return [f"{result.case}, {result.label}: {what}" for result in results for what in result.blind]
+    return [f"{result.case}, {result.label}: {what}" for result in results for what in result.missed]
 
 
 def self_test_report(results):
     tried = sum(result.tried for result in results)
-    blind = undetected(results)
+    missed = undetected(results)
     untested = [f"{result.case}, {result.label}" for result in results if not result.passed]
-    lines = [f"self-test: {tried} disturbed answers, {tried - len(blind)} judged failures"]
-    lines += [f"not detected: {what}" for what in blind]
+    lines = [f"self-test: {tried} disturbed answers, {tried - len(missed)} judged failures"]
+    lines += [f"not detected: {what}" for what in missed]
     lines += [f"not tested, as the answer itself fails: {what}" for what in untested]
     return "\n".join(lines)
 
@@ -121,10 +121,10 @@ def as_json(results, **about):
             "passed": result.passed,
             "why": result.tolerance.why,
             "doubtful_pixels": result.doubtful,
-            "turned_close_calls": result.turned,
+            "turned_close_calls": result.flipped,
             "reference_seconds": round(result.seconds, 3),
             "disturbed": result.tried,
-            "undetected": result.blind,
+            "undetected": result.missed,
             "tensors": [
                 {
                     "tensor": finding.tensor,

@@ -30,11 +30,11 @@ def doubtful_pixels(config, inputs, margin):
                 height,
                 config["eps2d"],
             )
-            doubtful[b, c] = of_view(projected, opacities, splat.pixel_centres(width, height, torch.float64), margin)
+            doubtful[b, c] = doubtful_in_view(projected, opacities, splat.pixel_centres(width, height, torch.float64), margin)
     return doubtful.reshape(batch, cameras, height, width).numpy()
 
 
-def of_view(projected, opacities, pixels, margin):
+def doubtful_in_view(projected, opacities, pixels, margin):
     """Returns the mask of doubtful pixels of one view, bool [Q], by the rules of splat.composite."""
     order = torch.argsort(projected["depth"], stable=True)
     order = order[projected["visible"][order]]

@@ -166,7 +166,7 @@ def test_names_are_found_behind_any_prefix(weights, tmp_path, prefix):
     assert same(read, weights) and told["left_out"] == 0
 
 
-def test_of_a_moving_average_and_a_model_the_model_is_taken(weights, tmp_path):
+def test_the_model_is_preferred_to_its_moving_average(weights, tmp_path):
     file = tmp_path / "model.ckpt"
     average = {f"ema.{name}": torch.zeros_like(tensor) for name, tensor in weights.items()}
     torch.save({"state_dict": {**average, **{f"model.{k}": v for k, v in weights.items()}}}, file)
@@ -183,7 +183,7 @@ def test_other_precisions_become_float32(weights, tmp_path, dtype):
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_tensors_may_share_storages_and_lie_in_them_as_they_like(weights, tmp_path, legacy):
+def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
     flat = torch.cat([tensor.flatten() for tensor in weights.values()])
     state, offset = {}, 0
     for name, tensor in weights.items():
@@ -306,7 +306,7 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
     single = tmp_path / "single.safetensors"
     single.write_bytes(model.read_bytes())
     error = refuse("import", "--from", model, "--out", single, "--max-shard-size", "1KB")
-    assert "would be taken for the shards" in error
+    assert "would be read instead of the shards" in error
     config = model.with_name("config.toml")
     as_torch = ["--config", config, "--format", "torch", "--out", tmp_path / "a.ckpt", "--max-shard-size", "1KB"]
     assert "a checkpoint for torch is one file" in refuse("export", *as_torch)
@@ -384,11 +384,11 @@ def test_what_is_no_model_is_told(weights, tmp_path):
         return {**weights, name: change(weights[name])}
 
     gate, sh = "gaussian_decoder.gate_readout.weight", "gaussian_decoder.sh_readout.weight"
-    assert "tensor scene_tokens is absent" in refusal({"state_dict": {"model.a": torch.zeros(3)}})
+    assert "tensor scene_tokens is missing" in refusal({"state_dict": {"model.a": torch.zeros(3)}})
     assert "a dict without tensors" in refusal({"state_dict": {}})
     assert "a list" in refusal([torch.zeros(3)])
     assert f"tensor {sh} is [48, 20]" in refusal(changed(gate, lambda t: t[:3]))
-    assert f"tensor {gate} is absent" in refusal({n: t for n, t in weights.items() if n != gate})
+    assert f"tensor {gate} is missing" in refusal({n: t for n, t in weights.items() if n != gate})
     assert "scene_tokens is [120]" in refusal(changed("scene_tokens", torch.flatten))
     assert "rgb_patch_embeds.1.weight is [12, 100]" in refusal(
         changed("rgb_patch_embeds.1.weight", lambda t: t[:, :100])

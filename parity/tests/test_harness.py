@@ -18,11 +18,11 @@ import run  # noqa: E402
 from harness import coverage, draw, exchange, scenes  # noqa: E402
 from harness.areas import CASES  # noqa: E402
 from harness.close_calls import closest, decisions_of_lpips  # noqa: E402
-from harness.compare import compare, judge  # noqa: E402
+from harness.compare import compare, compare_tensor  # noqa: E402
 from harness.disturb import undetected  # noqa: E402
 from harness.document import document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
-from harness.hold import generator, hold, questions  # noqa: E402
+from harness.runner import generator, run_cases, prepare_cases  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
 from harness.thresholds import doubtful_pixels  # noqa: E402
 from harness.tolerance import FLOAT32, FLOAT64, Tolerance  # noqa: E402
@@ -107,23 +107,23 @@ def test_pictures_are_compared_by_their_largest_difference_where_rounding_does_n
     assert passes(wrong, expected, tolerance, doubtful=at)
     assert not passes(wrong, expected, tolerance, doubtful=elsewhere)
     dim = np.full((1, 1, 2, 2), 1e-2)  # a hundredth of the brightness has a hundredth of the tolerance
-    assert not judge("out.alpha", dim + 2e-6, dim, tolerance, 0.0).passed
+    assert not compare_tensor("out.alpha", dim + 2e-6, dim, tolerance, 0.0).passed
 
 
 # ---- self-test -------------------------------------------------------------------------------------------------------
 
 
 def test_every_disturbance_of_a_right_answer_is_noticed():
-    tried, blind = undetected(canned(), canned(), FLOAT32)
-    assert tried > 15 and blind == []
+    tried, missed = undetected(canned(), canned(), FLOAT32)
+    assert tried > 15 and missed == []
 
 
 def test_a_blind_comparison_is_noticed():
     """If all pixels are excluded, images with any values pass."""
     pictures = {"out.alpha": np.full((1, 1, 2, 3), 0.5)}
-    tried, blind = undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))
-    assert "out.alpha: times 1.001" in blind and "out.alpha: slice 0 of axis 2 dropped" in blind
-    assert len(blind) == tried - 2  # all except "left out" and "not a number"
+    tried, missed = undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))
+    assert "out.alpha: times 1.001" in missed and "out.alpha: slice 0 of axis 2 dropped" in missed
+    assert len(missed) == tried - 2  # all except "left out" and "not a number"
 
 
 # ---- exchange --------------------------------------------------------------------------------------------------------
@@ -164,16 +164,16 @@ def test_an_answer_is_arrays_or_an_error(tmp_path):
 
 def test_the_reference_in_float32_passes_every_case_and_every_disturbance_is_noticed():
     """Tolerances are achievable in float32, so a program that fails is wrong."""
-    results = list(hold([name for name in CASES if name not in LEFT_OUT], 0, answer_files, self_test=True))
+    results = list(run_cases([name for name in CASES if name not in LEFT_OUT], 0, answer_files, self_test=True))
     assert {result.case for result in results} == CASES.keys() - LEFT_OUT
     assert [table([result]) for result in results if not result.passed] == []
-    assert [(result.case, result.label, what) for result in results for what in result.blind] == []
+    assert [(result.case, result.label, what) for result in results for what in result.missed] == []
     assert json.loads(json.dumps(as_json(results)))["passed"]
 
 
 def test_a_case_is_drawn_the_same_alone_and_with_others():
-    alone = next(questions(["mixer"], 3)).request
-    for other, same in [(list(questions(["heads", "mixer"], 3))[4], True), (next(questions(["mixer"], 4)), False)]:
+    alone = next(prepare_cases(["mixer"], 3)).request
+    for other, same in [(list(prepare_cases(["heads", "mixer"], 3))[4], True), (next(prepare_cases(["mixer"], 4)), False)]:
         equal = [
             np.array_equal(value, getattr(other.request, group).get(name))
             for group in ("params", "inputs", "cotangents")
@@ -245,7 +245,7 @@ def test_close_calls_of_lpips():
 @pytest.mark.parametrize(("case", "seed"), [("lpips_alex", 1), ("vgg19", 1)])
 def test_close_calls_may_go_either_way_and_nothing_else(case, seed):
     """A result with rounding errors and two close calls decided differently passes; with any other error it fails."""
-    question = next(questions([case], seed))
+    question = next(prepare_cases([case], seed))
     calls = question.drawn.close_calls()
     otherwise = Evaluation(question.request, torch.float64, calls[1:3]).gradient_arrays(question.request.cotangents)
     rng = np.random.default_rng(0)
@@ -254,11 +254,11 @@ def test_close_calls_may_go_either_way_and_nothing_else(case, seed):
         for name, value in (question.expected | otherwise).items()
     }
     assert not passes(answer, question.expected)
-    expected, turned = question.settled(answer)
-    assert passes(answer, expected) and turned == 2
+    expected, flipped = question.resolve_close_calls(answer)
+    assert passes(answer, expected) and flipped == 2
     name = max(otherwise, key=lambda name: otherwise[name].size)
     wrong = answer | {name: answer[name] * np.float32(1.001)}
-    assert not passes(wrong, question.settled(wrong)[0])
+    assert not passes(wrong, question.resolve_close_calls(wrong)[0])
 
 
 @pytest.mark.parametrize("case", ["perceptual", "lpips_alex"])
@@ -316,7 +316,7 @@ def test_exit_status(tmp_path, capsys, then, status, said):
         assert json.loads(report.read_text())["passed"] == (status == 0)
 
 
-def test_a_document_holds_the_figures_and_nothing_of_the_machine_s_files(tmp_path, capsys):
+def test_the_document_has_results_but_no_paths(tmp_path, capsys):
     program, written = stand_in(tmp_path, ""), []
     for name in ("first", "second"):
         path = tmp_path / name / "parity.md"
@@ -342,13 +342,13 @@ def test_a_document_tells_what_is_wrong():
                 answer = dict(np.load(path))
                 exchange.write_answer(path, answer | {"out.loss": answer["out.loss"] * np.float32(1.01)})
 
-    results = list(hold(["mse", "resample", "subsets"], 0, spoiled, self_test=True))
+    results = list(run_cases(["mse", "resample", "subsets"], 0, spoiled, self_test=True))
     text = document(results, "the command", "cpu")
     assert re.search(r"\| mse \| 2 \| \*\*1e-02 of 1e-05\*\* \|", text) and "\n- FAIL mse (seed 0), " in text
     assert "| subsets | 8 | exact |  |" in text and "- exact: " in text
     assert "\n- `resample`: rounded to levels" in text
-    blind = [dataclasses.replace(result, blind=["out.image: times 1.001"]) for result in results[-1:]]
-    assert "1 were not noticed:" in " ".join(document(blind, "the command", "cpu").split())
+    missed = [dataclasses.replace(result, missed=["out.image: times 1.001"]) for result in results[-1:]]
+    assert "1 were not noticed:" in " ".join(document(missed, "the command", "cpu").split())
     unheld = [dataclasses.replace(result, tried=0) for result in results]
     assert "wrong answers" not in document(unheld, "the command", "cpu")
 

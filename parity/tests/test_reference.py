@@ -48,7 +48,7 @@ def relative(ours, theirs):
     return ((ours - theirs).norm() / theirs.norm().clamp(min=1e-30)).item()
 
 
-def hold(what, ours, theirs, tolerance, record):
+def assert_close(what, ours, theirs, tolerance, record):
     error = relative(ours, theirs)
     record(what, f"{error:.2e}")
     assert error <= tolerance, f"{what}: relative L2 error {error:.2e}, tolerance {tolerance:.0e}"
@@ -61,12 +61,12 @@ def hold(what, ours, theirs, tolerance, record):
 def test_scene_normalization(dtype, record_property):
     g = load("scene_normalization.safetensors", dtype)
     c2w, w2c, scale = normalize.normalize_scene(g["c2w"])
-    hold("norm_c2w", c2w, g["norm_c2w"], OUTPUT_TOLERANCE, record_property)
-    hold("norm_w2c", w2c, g["norm_w2c"], OUTPUT_TOLERANCE, record_property)
-    hold("scene_scale", scale, g["scene_scale"], OUTPUT_TOLERANCE, record_property)
+    assert_close("norm_c2w", c2w, g["norm_c2w"], OUTPUT_TOLERANCE, record_property)
+    assert_close("norm_w2c", w2c, g["norm_w2c"], OUTPUT_TOLERANCE, record_property)
+    assert_close("scene_scale", scale, g["scene_scale"], OUTPUT_TOLERANCE, record_property)
     c2w, _, scale = normalize.normalize_scene(g["c2w"][:1])
-    hold("single_norm_c2w", c2w, g["single_norm_c2w"], OUTPUT_TOLERANCE, record_property)
-    hold("single_scene_scale", scale, g["single_scene_scale"], OUTPUT_TOLERANCE, record_property)
+    assert_close("single_norm_c2w", c2w, g["single_norm_c2w"], OUTPUT_TOLERANCE, record_property)
+    assert_close("single_scene_scale", scale, g["single_scene_scale"], OUTPUT_TOLERANCE, record_property)
 
 
 def test_scene_normalization_is_canonical():
@@ -108,8 +108,8 @@ def test_frustum_loss(dtype, record_property):
     width, height = int(size[0]), int(size[1])
     loss = frustum.frustum(means, g["w2c"], g["intrinsic"], height, width, g["max_depth"])
     loss.backward()
-    hold("loss", loss, g["loss"], OUTPUT_TOLERANCE, record_property)
-    hold("grad_means", means.grad, g["grad_means"], GRADIENT_TOLERANCE, record_property)
+    assert_close("loss", loss, g["loss"], OUTPUT_TOLERANCE, record_property)
+    assert_close("grad_means", means.grad, g["grad_means"], GRADIENT_TOLERANCE, record_property)
 
 
 def test_frustum_depth_bounds():
@@ -133,8 +133,8 @@ def test_sh_soft_cap(dtype, record_property):
     sh = g["sh"].requires_grad_()
     loss = decoder_regularization.sh_soft_cap(sh)
     loss.backward()
-    hold("reg", loss, g["reg"], OUTPUT_TOLERANCE, record_property)
-    hold("grad", sh.grad, g["grad"], GRADIENT_TOLERANCE, record_property)
+    assert_close("reg", loss, g["reg"], OUTPUT_TOLERANCE, record_property)
+    assert_close("grad", sh.grad, g["grad"], GRADIENT_TOLERANCE, record_property)
 
 
 def test_opacity_term_is_a_switch():
@@ -272,9 +272,9 @@ def test_encoder(case, dtype, record_property):
     g = load(f"{case}/encoder.safetensors", dtype)
     content = tokens.view_tokens(config, params, inputs["images"], inputs["c2w"], inputs["intrinsic"])
     geo, app = encoder.encode(config, params, content)
-    hold("content_tokens", content, g["content_tokens"], OUTPUT_TOLERANCE, record_property)
-    hold("encoded_geo", geo, g["encoded_geo"], OUTPUT_TOLERANCE, record_property)
-    hold("encoded_tex", app, g["encoded_tex"], OUTPUT_TOLERANCE, record_property)
+    assert_close("content_tokens", content, g["content_tokens"], OUTPUT_TOLERANCE, record_property)
+    assert_close("encoded_geo", geo, g["encoded_geo"], OUTPUT_TOLERANCE, record_property)
+    assert_close("encoded_tex", app, g["encoded_tex"], OUTPUT_TOLERANCE, record_property)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -292,14 +292,14 @@ def test_model(case, stage, mix, dtype, record_property):
     expected = {key.removeprefix("out."): value for key, value in g.items() if key.startswith("out.")}
     assert expected.keys() == out.keys() - {"raw"}
     for key, value in expected.items():
-        hold(f"out.{key}", out[key], value, OUTPUT_TOLERANCE, record_property)
+        assert_close(f"out.{key}", out[key], value, OUTPUT_TOLERANCE, record_property)
 
     cotangents = {key.removeprefix("cotangent."): value for key, value in g.items() if key.startswith("cotangent.")}
     sum((value * out[key]).sum() for key, value in cotangents.items()).backward()
 
     gradients = {key.removeprefix("grad."): value for key, value in g.items() if key.startswith("grad.")}
     assert gradients.keys() == params.keys() - {constant}
-    hold("grad images", images.grad, g["grad_input.images"], GRADIENT_TOLERANCE, record_property)
+    assert_close("grad images", images.grad, g["grad_input.images"], GRADIENT_TOLERANCE, record_property)
     largest = max(value.norm().item() for value in gradients.values())
     for name, value in gradients.items():
         if name.endswith("mem_k.bias"):
@@ -307,7 +307,7 @@ def test_model(case, stage, mix, dtype, record_property):
             record_property(f"grad {name}", f"{ours:.2e}")
             assert ours <= ZERO_TOLERANCE, f"grad {name}: {ours:.2e} of the largest gradient, expected 0"
         else:
-            hold(f"grad {name}", params[name].grad, value, GRADIENT_TOLERANCE, record_property)
+            assert_close(f"grad {name}", params[name].grad, value, GRADIENT_TOLERANCE, record_property)
 
 
 def test_ablations():

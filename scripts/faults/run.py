@@ -49,7 +49,7 @@ INTERRUPTIBLE = {"write", "truncate", "fsync", "open"}
 # Number of faults with --short: of an operation that waits for free disk space, and of any other.
 SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
 # Timeout of a command, in seconds.
-PATIENCE = 30
+TIMEOUT = 30
 # Lines on standard error that are not error messages.
 NOTICE = re.compile(
     "training paused: .* when there is disk space$|disk space is available again: training resumes$|.*the checkpoint before it is taken$"
@@ -326,12 +326,12 @@ class Bench:
         with open(into or told, "wb") as out, open(said, "wb") as err:
             process = subprocess.Popen([self.program, *arguments], stdout=out, stderr=err, env=environment)
             begun, code = time.monotonic(), None
-            while code is None and time.monotonic() - begun < PATIENCE:
+            while code is None and time.monotonic() - begun < TIMEOUT:
                 if stop_when_waiting and b"training paused" in said.read_bytes():
                     process.send_signal(signal.SIGTERM)
                     stop_when_waiting = False
                 try:
-                    code = process.wait(0.02 if stop_when_waiting else PATIENCE)
+                    code = process.wait(0.02 if stop_when_waiting else TIMEOUT)
                 except subprocess.TimeoutExpired:
                     pass
             if code is None:
@@ -480,7 +480,7 @@ def check(op, fault):
         return None, [], done
     tree, wrong = Tree(op.bench.out), []
     if done.code is None:
-        wrong.append(f"it hasn't ended after {PATIENCE} s")
+        wrong.append(f"it hasn't ended after {TIMEOUT} s")
     elif done.code not in (0, 1, 2) or "panicked" in done.said or "internal error" in done.said:
         wrong.append(f"it ended with {done.code}, by a signal or a panic")
     elif done.code == 0:

@@ -3,7 +3,7 @@
 use super::TimingStats;
 use super::peak_throughput::PeakThroughput;
 use crate::device::Stopwatch;
-use crate::model::{Precision, attention, by_libtorch};
+use crate::model::{Precision, attention, attention_libtorch};
 use crate::render::cpu::simd_level;
 use serde::Serialize;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -63,15 +63,15 @@ pub fn bench_attention(
     };
     let ways: [Way; 3] = [
         ("ours", &|[q, k, v]| attention(q, k, v, heads), &inputs, &gradient),
-        ("libtorch", &|[q, k, v]| by_libtorch(q, k, v, heads), &inputs, &gradient),
+        ("libtorch", &|[q, k, v]| attention_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
-    let yardstick = PeakThroughput::new(precision, Device::Cpu);
+    let peak = PeakThroughput::new(precision, Device::Cpu);
     let mut product = vec![];
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms up caches and threads.
     for round in 0..=repeats {
-        let one_product = yardstick.time();
+        let one_product = peak.time();
         let mut measured = vec![];
         for (_, call, inputs, gradient) in ways {
             let mut watch = Stopwatch::default();
@@ -90,11 +90,11 @@ pub fn bench_attention(
         }
     }
     let gflops = |operations: f64, spread: &TimingStats| 1e-6 * operations / spread.least;
-    let product_gflops = yardstick.gflops(TimingStats::of(product).least);
+    let product_gflops = peak.gflops(TimingStats::from_milliseconds(product).least);
     // Two products forward, five backward.
     let one = 2. * queries as f64 * keys as f64 * width as f64;
     let row = |pass, by, products: f64, milliseconds| {
-        let milliseconds = TimingStats::of(milliseconds);
+        let milliseconds = TimingStats::from_milliseconds(milliseconds);
         let gflops = gflops(products * one, &milliseconds);
         AttentionRow { pass, by, milliseconds, gflops, share: gflops / product_gflops }
     };

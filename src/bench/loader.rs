@@ -1,7 +1,7 @@
 //! Benchmark of the data loader: views per second that arrive as tensors, and the time of each stage.
 
 use super::video::write_videos;
-use crate::data::{DataConfig, LoadTimes, Loader, Sample, SceneGroups};
+use crate::data::{Batch, DataConfig, DataLoader, LoadTimes, SceneGroups};
 use crate::device::{peak_memory_bytes, resident_memory_bytes};
 use crate::error::Result;
 use serde::Serialize;
@@ -70,15 +70,15 @@ pub fn synthetic_videos(root: &Path) -> Result<()> {
 /// Loads `samples` samples of `scenes` one after the other, and converts them to tensors.
 ///
 /// # Errors
-/// Fails if the [`Loader`] fails.
+/// Fails if the [`DataLoader`] fails.
 pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: u64) -> Result<LoaderReport> {
-    let mut loader = Loader::start(config, 0, scenes, 1, 0)?;
-    let next = |loader: &mut Loader| -> Result<(u64, u64, LoadTimes, f64)> {
+    let mut loader = DataLoader::start(config, 0, scenes, 1, 0)?;
+    let next = |loader: &mut DataLoader| -> Result<(u64, u64, LoadTimes, f64)> {
         let scene = loader.next_scene()?;
         let start = Instant::now();
         let views = (scene.context.len() + scene.target.len()) as u64;
         let (photos, times) = (scene.cameras.len() as u64, scene.times);
-        drop(Sample::of(&[scene], Device::Cpu));
+        drop(Batch::from_scenes(&[scene], Device::Cpu));
         Ok((views, photos, times, start.elapsed().as_secs_f64()))
     };
     for _ in 0..WARM_UP {

@@ -18,7 +18,7 @@ pub use parts::Part;
 pub use raster::{RasterReport, bench_raster, synthetic_scene};
 pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
-pub use train::{Together, TrainReport, bench_train};
+pub use train::{DistributedCost, TrainReport, bench_train};
 
 use crate::device::Stopwatch;
 use serde::Serialize;
@@ -69,19 +69,19 @@ impl Measured {
 
     /// Returns the distributions of the total time and of each section. Requires at least one run.
     fn told(mut self) -> (TimingStats, Vec<Section>) {
-        (TimingStats::of(std::mem::take(&mut self.whole)), self.sections())
+        (TimingStats::from_milliseconds(std::mem::take(&mut self.whole)), self.sections())
     }
 
     /// Returns the distribution of each section, in the order in which the sections were first added.
     fn sections(self) -> Vec<Section> {
-        let section = |(name, all)| Section { name, milliseconds: TimingStats::of(all) };
+        let section = |(name, all)| Section { name, milliseconds: TimingStats::from_milliseconds(all) };
         self.sections.into_iter().map(section).collect()
     }
 }
 
 impl TimingStats {
     /// Computes the distribution of at least one measurement.
-    fn of(mut milliseconds: Vec<f64>) -> Self {
+    fn from_milliseconds(mut milliseconds: Vec<f64>) -> Self {
         milliseconds.sort_by(f64::total_cmp);
         let at = |share: f64| milliseconds[((milliseconds.len() - 1) as f64 * share).round() as usize];
         TimingStats { median: at(0.5), least: at(0.), upper_quartile: at(0.75) }

@@ -5,9 +5,9 @@ use super::parts::{Part, Parts};
 use super::peak_throughput::PeakThroughput;
 use super::train::synthetic_scene;
 use crate::config::Config;
-use crate::data::{Sample, ViewBatch};
+use crate::data::{Batch, ViewBatch};
 use crate::device::Stopwatch;
-use crate::device::{forget_peak_memory, peak_memory_bytes_on};
+use crate::device::{peak_memory_bytes_on, reset_peak_memory};
 use crate::error::Result;
 use crate::model::{GlobalSplat, Precision};
 use serde::Serialize;
@@ -61,27 +61,27 @@ pub fn bench_model(
     if device != Device::Cpu {
         model.fold_weights();
     }
-    let context = Sample::of(&[synthetic_scene(config, 0)], device).context;
+    let context = Batch::from_scenes(&[synthetic_scene(config, 0)], device).context;
     let stage = config.curriculum.final_stage();
-    let yardstick = PeakThroughput::new(precision, device);
+    let peak = PeakThroughput::new(precision, device);
     let ViewBatch { images, c2w, intrinsics, .. } = &context;
     let forward = || {
-        let mut watch = Stopwatch::of(device);
+        let mut watch = Stopwatch::new(device);
         drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
         1e3 * watch.sections()[0].1.as_secs_f64()
     };
     let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
     // The first pass warms up caches, threads and the GPU's libraries.
     forward();
-    forget_peak_memory(device);
+    reset_peak_memory(device);
     for _ in 0..repeats {
-        products.push(yardstick.time());
+        products.push(peak.time());
         // Events around every part slow down a GPU that runs kernels faster than the host launches them, so time a GPU's pass without them.
         let untold = (device != Device::Cpu).then(forward);
         let told = parts.watch(device, forward);
         passes.push(untold.unwrap_or(told));
     }
-    let peak_gflops = yardstick.gflops(TimingStats::of(products).least);
+    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);
     Ok(ModelReport {
         views: config.data.context_views,
         size: config.data.image_size.into(),
@@ -89,7 +89,7 @@ pub fn bench_model(
         precision,
         threads: tch::get_num_threads(),
         repeats,
-        milliseconds: TimingStats::of(passes),
+        milliseconds: TimingStats::from_milliseconds(passes),
         parts: parts.told(peak_gflops),
         peak_gflops,
         peak_bytes: peak_memory_bytes_on(device),

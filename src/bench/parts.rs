@@ -99,7 +99,7 @@ impl Parts {
     /// Returns the statistics. `peak_gflops` is the throughput of a product of large matrices, which [`Part::share_of_peak`] refers to.
     pub fn told(self, peak_gflops: f64) -> Vec<Part> {
         let part = |sum: Sum| {
-            let milliseconds = TimingStats::of(sum.milliseconds);
+            let milliseconds = TimingStats::from_milliseconds(sum.milliseconds);
             let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
             let [gflop, backward_gflop, gigabytes] =
                 [sum.flops, sum.backward_flops, sum.bytes].map(|of| 1e-9 * of);

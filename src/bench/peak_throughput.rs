@@ -22,7 +22,7 @@ impl PeakThroughput {
 
     /// Returns the time of one product, in milliseconds.
     pub fn time(&self) -> f64 {
-        let mut watch = Stopwatch::of(self.matrix.device());
+        let mut watch = Stopwatch::new(self.matrix.device());
         no_grad(|| watch.time("product", || drop(self.precision.linear(&self.layer, &self.matrix))));
         1e3 * watch.sections()[0].1.as_secs_f64()
     }

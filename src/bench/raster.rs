@@ -2,7 +2,7 @@
 
 use super::{Measured, Section, TimingStats};
 use crate::device::Stopwatch;
-use crate::device::{forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes};
+use crate::device::{peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
@@ -110,7 +110,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     let device = gaussians.means.device();
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
     let per_view = |seconds: f64| seconds * 1e3 / views as f64;
-    forget_peak_memory(device);
+    reset_peak_memory(device);
     let memory_before = match device {
         Device::Cpu => resident_memory_bytes(),
         _ => peak_memory_bytes_on(device),
@@ -119,7 +119,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     let mut stages: Vec<StageTimes> = vec![];
     // The first round warms up caches and threads.
     for round in 0..=repeats {
-        let mut watch = Stopwatch::of(device);
+        let mut watch = Stopwatch::new(device);
         watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
         let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
         let pictures = watch.time("with gradients", || render(&leaves, cameras, DEFAULT_EPS2D))?;
@@ -158,8 +158,8 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         views,
         width: cameras.width,
         height: cameras.height,
-        forward: TimingStats::of(forward),
-        forward_backward: TimingStats::of(forward_backward),
+        forward: TimingStats::from_milliseconds(forward),
+        forward_backward: TimingStats::from_milliseconds(forward_backward),
         stages,
         against_cpu,
         pairs,
@@ -227,7 +227,7 @@ fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Ve
 fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section> {
     let stage = |name: &'static str, seconds: fn(&StageTimes) -> f64| Section {
         name: name.into(),
-        milliseconds: TimingStats::of(stages.iter().map(|t| per_view(seconds(t))).collect()),
+        milliseconds: TimingStats::from_milliseconds(stages.iter().map(|t| per_view(seconds(t))).collect()),
     };
     vec![
         stage("project", |t| t.project),

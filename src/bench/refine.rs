@@ -57,12 +57,12 @@ pub fn bench_refine(
     let c2w = cameras.w2c.inverse();
     let photos =
         Photos::of(ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c, intrinsics: cameras.intrinsics });
-    let mut space = GaussianSpace::new(&RawGaussians::of(&gaussians), 1., config);
+    let mut space = GaussianSpace::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
     let mut none = Corrections::none();
     let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
     refine_timed(&mut space, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 
-    let mut stopwatch = Stopwatch::of(device);
+    let mut stopwatch = Stopwatch::new(device);
     let (mut whole, mut before, mut backward) = (vec![], Duration::ZERO, 0.);
     refine_timed(&mut space, &mut none, &task(steps), &mut stopwatch, |at| {
         whole.push(1e3 * (at.elapsed - before).as_secs_f64());
@@ -92,7 +92,7 @@ pub fn bench_refine(
         size: size.into(),
         threads: tch::get_num_threads(),
         steps,
-        milliseconds: TimingStats::of(whole),
+        milliseconds: TimingStats::from_milliseconds(whole),
         sections,
         other_share: (device == Device::Cpu).then_some(1. - rendering / all),
     })

@@ -4,14 +4,14 @@ use super::parts::{Part, Parts};
 use super::peak_throughput::PeakThroughput;
 use super::{Measured, Section, TimingStats};
 use crate::config::Config;
-use crate::data::{Capture, LoadTimes, LoadedScene, Sample};
+use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
 use crate::device::Stopwatch;
 use crate::device::Upload;
 use crate::device::peak_memory_bytes_on;
 use crate::error::Result;
 use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::model::Precision;
-use crate::ranks::Group;
+use crate::ranks::ProcessGroup;
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
@@ -63,12 +63,12 @@ pub struct TrainReport {
     pub peak_bytes: u64,
     /// Cost of distributed training; `None` for a single process.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub together: Option<Together>,
+    pub together: Option<DistributedCost>,
 }
 
 /// Cost of distributed training with several ranks.
 #[derive(Debug, Serialize)]
-pub struct Together {
+pub struct DistributedCost {
     /// Number of ranks.
     pub ranks: usize,
     /// Scenes per second of all ranks together.
@@ -94,7 +94,7 @@ pub fn bench_train(
     config: &Config,
     steps: usize,
     device: Device,
-    group: Group,
+    group: ProcessGroup,
     shards_optimizer: bool,
 ) -> Result<TrainReport> {
     let mut config = config.clone();
@@ -102,7 +102,7 @@ pub fn bench_train(
     if !PerceptualLoss::weights_file(&config.loss)?.is_file() {
         config.loss.perceptual = PerceptualKind::None;
     }
-    let (rank, ranks) = (group.rank(), group.ranks());
+    let (rank, ranks) = (group.rank(), group.world_size());
     let trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
     let mut trainer = match shards_optimizer {
         true => trainer.with_ranks(group).with_sharded_optimizer(),
@@ -112,17 +112,17 @@ pub fn bench_train(
     let seeds = (rank * config.train.batch_size) as u64..;
     let scenes: Vec<LoadedScene> =
         seeds.take(config.train.batch_size).map(|seed| synthetic_scene(&config, seed)).collect();
-    let upload = Upload::to(device);
+    let upload = Upload::new(device);
     let mut parts = Parts::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
-    let yardstick = PeakThroughput::new(precision, device);
+    let peak = PeakThroughput::new(precision, device);
     tch::set_num_threads(threads / slices_at_once as i32);
-    let products = (0..=PRODUCTS).map(|_| yardstick.time()).skip(1).collect();
+    let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect();
     tch::set_num_threads(threads);
-    let peak_gflops = yardstick.gflops(TimingStats::of(products).least);
+    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);
     let (milliseconds, sections) = measured.told();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
@@ -159,8 +159,8 @@ fn measure(
 ) -> Result<Measured> {
     let mut measured = Measured::default();
     for step in 0..=steps {
-        let mut watch = Stopwatch::of(upload.device());
-        let sample = watch.time("data", || Sample::by(scenes, upload));
+        let mut watch = Stopwatch::new(upload.device());
+        let sample = watch.time("data", || Batch::from_scenes_with(scenes, upload));
         let mut learn = || trainer.learn(&sample, &mut watch, &mut || true);
         match step {
             0 => learn()?,
@@ -181,11 +181,11 @@ fn together(
     upload: &Upload,
     scenes_per_second: f64,
     waited: f64,
-) -> Result<Together> {
-    let ranks = trainer.group().ranks();
+) -> Result<DistributedCost> {
+    let ranks = trainer.group().world_size();
     let mut communication = Measured::default();
     for step in 0..=steps {
-        let mut watch = Stopwatch::of(upload.device());
+        let mut watch = Stopwatch::new(upload.device());
         watch.time(COMMUNICATION, || trainer.add_gradients_up())?;
         if step > 0 {
             communication.add(&mut watch);
@@ -194,8 +194,8 @@ fn together(
     let communication = communication.told().0;
     let gradient_bytes = trainer.gradient_bytes();
     trainer.group().leave()?;
-    let mut apart = trainer.with_ranks(Group::alone());
-    Ok(Together {
+    let mut apart = trainer.with_ranks(ProcessGroup::single());
+    Ok(DistributedCost {
         ranks,
         scenes_per_second,
         apart_milliseconds: measure(&mut apart, scenes, steps, upload, &mut Parts::default())?.told().0,
@@ -260,7 +260,7 @@ mod tests {
         let ((), found) = peak_tensor_bytes(|| {
             let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
             let scenes: Vec<_> = (0..2).map(|seed| synthetic_scene(&config, seed)).collect();
-            let sample = Sample::by(&scenes, &Upload::to(Device::Cpu));
+            let sample = Batch::from_scenes_with(&scenes, &Upload::new(Device::Cpu));
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
         });
         MemoryEstimate::of(&config, Device::Cpu).unwrap().total() as f64 / found as f64

@@ -2,11 +2,11 @@ use super::bench_common::{print_parts, print_sections, read_config};
 use super::{memory, print_json, ranks};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::bench::{Part, Together, TrainReport, bench_train};
+use globalsplat::bench::{DistributedCost, Part, TrainReport, bench_train};
 use globalsplat::config::Config;
 use globalsplat::device::total_memory_bytes;
 use globalsplat::error::{Error, panic_message};
-use globalsplat::ranks::Group;
+use globalsplat::ranks::ProcessGroup;
 use globalsplat::train::batch_within;
 use serde_json::json;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -67,7 +67,7 @@ fn parse_batch(text: &str) -> Result<Batch, String> {
 impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
-        let is_first = group.is_first();
+        let is_main_process = group.is_main_process();
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::request(format!("--set {set}: expected --batch N")).into());
@@ -78,12 +78,12 @@ impl Train {
                 config.train.batch_size = scenes;
                 bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?
             }
-            Batch::Auto if group.ranks() > 1 => {
+            Batch::Auto if group.world_size() > 1 => {
                 return Err(Error::request("--batch auto: expected a number under torchrun").into());
             }
             Batch::Auto => self.bench_what_fits(config, device)?,
         };
-        if !is_first {
+        if !is_main_process {
             return Ok(());
         }
         if self.json {
@@ -111,7 +111,7 @@ impl Train {
         config.train.micro_batch = 0;
         loop {
             let batch = config.train.batch_size;
-            let (steps, alone) = (self.steps as usize, Group::alone());
+            let (steps, alone) = (self.steps as usize, ProcessGroup::single());
             let bench = || bench_train(&config, steps, device, alone, self.shard_optimizer);
             let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
             match catch_unwind(AssertUnwindSafe(bench)) {
@@ -158,8 +158,9 @@ fn print_report(r: &TrainReport) {
     }
 }
 
-fn print_together(together: &Together) {
-    let Together { ranks, scenes_per_second, apart_milliseconds, communication_milliseconds, .. } = together;
+fn print_together(together: &DistributedCost) {
+    let DistributedCost { ranks, scenes_per_second, apart_milliseconds, communication_milliseconds, .. } =
+        together;
     println!("{ranks} processes make {scenes_per_second:.2} scenes a second together");
     println!(
         "a step apart takes {:.1} ms, adding up {:.1} MB of gradients {:.1} ms, of which {:.0} % is hidden",

@@ -204,8 +204,8 @@ fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str)
     match prepared {
         None => format!("this libtorch can't use it: {unusable}"),
         Some(Err(why)) => format!("its kernels are missing: {why}"),
-        Some(Ok(Prepared { architecture, file, was_kept })) => {
-            let how = if *was_kept { "read from" } else { "compiled just now, and kept in" };
+        Some(Ok(Prepared { architecture, file, was_cached })) => {
+            let how = if *was_cached { "read from" } else { "compiled just now, and kept in" };
             let of = capability(*architecture);
             match file {
                 Some(file) => format!("kernels for {of}, {how} {}", file.display()),

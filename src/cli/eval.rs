@@ -245,7 +245,7 @@ impl Eval {
             Some(height) => Input::at(height, self.views_as, trained)?,
             None => Input::PLAIN,
         };
-        if !input.is_plain() && ranks::is_first() {
+        if !input.is_plain() && ranks::is_main_process() {
             eprintln!("photos are cut and resized to {}", model::shown_as(input, trained));
         }
         Ok(Some(Model { input, ..loaded.into() }))
@@ -357,7 +357,7 @@ impl Eval {
                 out: &folder,
                 group: &group,
             };
-            let bar = progress::of_first(group.is_first(), 0, "scenes");
+            let bar = progress::of_first(group.is_main_process(), 0, "scenes");
             let evaluation = sweep.run(
                 || Perceptual::find(device),
                 |done, of| {
@@ -367,7 +367,7 @@ impl Eval {
                 },
             )?;
             bar.finish_and_clear();
-            if !group.is_first() {
+            if !group.is_main_process() {
                 continue;
             }
             if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
@@ -385,7 +385,7 @@ impl Eval {
             evaluations.push((folder, evaluation));
         }
         group.leave()?;
-        if !group.is_first() {
+        if !group.is_main_process() {
             return Ok(());
         }
         let report = out.join(REPORT);

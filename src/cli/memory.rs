@@ -62,7 +62,7 @@ pub fn end_as_failed() {
         set_new_handler(end_of_cpp);
     }
     // If there is no memory for the stack trace of an error, which nobody sees, libtorch reads it from address 0.
-    globalsplat_csrc::render::leave_out_stack_traces();
+    globalsplat_csrc::render::disable_stack_traces();
     faults::tell_from_refusals();
     grow_stack();
     expect_room_for_small_pieces();

@@ -123,7 +123,7 @@ pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            if ranks::is_first() {
+            if ranks::is_main_process() {
                 let _ = e.print();
             }
             // clap returns --help and --version as errors too, with exit code 0.
@@ -218,7 +218,7 @@ fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
 
 /// Prints warnings about what is ignored or changed in an input, one per line.
 fn warn(lines: &[String]) {
-    if ranks::is_first() {
+    if ranks::is_main_process() {
         lines.iter().for_each(|line| eprintln!("{line}"));
     }
 }

@@ -24,7 +24,10 @@ pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
 /// slower one.
 pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precision {
     let precision = asked.unwrap_or_else(|| Precision::best_on(device, width));
-    if precision == Precision::Bf16 && Precision::fastest_on(device) == Precision::F32 && ranks::is_first() {
+    if precision == Precision::Bf16
+        && Precision::fastest_on(device) == Precision::F32
+        && ranks::is_main_process()
+    {
         eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
     }
     precision
@@ -38,7 +41,7 @@ pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) ->
     };
     let precision = precision(asked, device, file.config.model.width);
     let loaded = file.load_mmap(device, precision)?;
-    if !ranks::is_first() {
+    if !ranks::is_main_process() {
         return Ok(loaded);
     }
     if let Some(assumed) = &loaded.assumed {

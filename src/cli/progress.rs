@@ -45,8 +45,8 @@ fn progress(length: u64, template: &str, unit: Unit) -> Progress {
 }
 
 /// Creates a [`bar`] in the first of the processes that share the work, and a hidden one in the others.
-pub fn of_first(is_first: bool, length: u64, unit: &'static str) -> Progress {
-    match is_first {
+pub fn of_first(is_main_process: bool, length: u64, unit: &'static str) -> Progress {
+    match is_main_process {
         true => bar(length, unit),
         false => Progress { bar: ProgressBar::hidden(), _lines: None },
     }

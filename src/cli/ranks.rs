@@ -2,18 +2,20 @@
 
 use super::device;
 use globalsplat::error::{Error, Result};
-use globalsplat::ranks::{Group, Place, Watch};
+use globalsplat::ranks::{DistributedEnv, ProcessGroup, Watchdog};
 use std::sync::OnceLock;
 use tch::Device;
 
 /// Connection to the other processes, if there are any.
-static WATCH: OnceLock<Watch> = OnceLock::new();
+static WATCH: OnceLock<Watchdog> = OnceLock::new();
 
 /// Joins the group of processes started together with this one, to work on the device called `name`: `cuda` means a GPU of its
 /// own for each process.
-pub fn join(name: &str) -> Result<(Group, Device)> {
-    let Some(place) = Place::from_env()? else { return Ok((Group::alone(), device::parse(name)?)) };
-    let watch = Watch::begin(&place, |why| {
+pub fn join(name: &str) -> Result<(ProcessGroup, Device)> {
+    let Some(dist_env) = DistributedEnv::from_env()? else {
+        return Ok((ProcessGroup::single(), device::parse(name)?));
+    };
+    let watch = Watchdog::begin(&dist_env, |why| {
         why.iter().for_each(|why| eprintln!("globalsplat: {why}"));
         // Work that waits for a hung rank is abandoned.
         // SAFETY: nothing runs after it.
@@ -22,34 +24,34 @@ pub fn join(name: &str) -> Result<(Group, Device)> {
     let watch = WATCH.get_or_init(|| watch);
     // The processes of a machine share its cores, as torchrun divides libtorch's threads.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let threads = (cores / place.local_world_size).max(1);
+    let threads = (cores / dist_env.local_world_size).max(1);
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build_global()
         .expect("nothing has used threads yet");
     let device = match name {
-        "cuda" => device::parse(&format!("cuda:{}", place.local_rank))?,
-        one if one.starts_with("cuda:") && place.local_world_size > 1 => {
+        "cuda" => device::parse(&format!("cuda:{}", dist_env.local_rank))?,
+        one if one.starts_with("cuda:") && dist_env.local_world_size > 1 => {
             let why = format!(
                 "{} processes of this machine can't share a GPU, expected --device cuda",
-                place.local_world_size
+                dist_env.local_world_size
             );
             return Err(Error::request(format!("--device {one}: {why}")));
         }
         name => device::parse(name)?,
     };
-    Ok((Group::join(&place, watch.store(), device)?, device))
+    Ok((ProcessGroup::join(&dist_env, watch.store(), device)?, device))
 }
 
 /// Returns `true` in the process that prints messages on behalf of all.
-pub fn is_first() -> bool {
-    !matches!(Place::from_env(), Ok(Some(Place { rank: 1.., .. })))
+pub fn is_main_process() -> bool {
+    !matches!(DistributedEnv::from_env(), Ok(Some(DistributedEnv { rank: 1.., .. })))
 }
 
 /// Returns an error if torchrun started several processes for a command that can't be distributed.
 pub fn refuse() -> Result<()> {
     let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
-    let Ok(Some(Place { rank, ranks, .. })) = Place::from_env() else { return Ok(()) };
+    let Ok(Some(DistributedEnv { rank, ranks, .. })) = DistributedEnv::from_env() else { return Ok(()) };
     match (by_torchrun, rank) {
         (false, _) => Ok(()),
         (true, 0) => Err(Error::request(format!(
@@ -63,7 +65,7 @@ pub fn refuse() -> Result<()> {
 /// Returns the error message that this process should print, or `None` if another process reports it.
 pub fn what_to_tell(message: &str, others_are_lost: bool) -> Option<String> {
     match WATCH.get() {
-        Some(watch) => watch.tell(message, others_are_lost),
+        Some(watch) => watch.message_to_print(message, others_are_lost),
         None => Some(message.into()),
     }
 }

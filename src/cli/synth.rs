@@ -96,7 +96,7 @@ impl Synth {
             Ok(())
         };
         let depth_file = |capture: &Capture| depths.join(&capture.name).with_extension("npy");
-        let made_before = writer.go_on(
+        let made_before = writer.resume(
             &videos.keys(),
             || Ok(videos.capture(0)?),
             |number, capture| {

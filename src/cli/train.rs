@@ -65,7 +65,7 @@ const CURVES_FILE: &str = "curves.svg";
 impl Train {
     pub fn run(self) -> Result<()> {
         let (group, device) = ranks::join(&self.device)?;
-        let (is_first, count) = (group.is_first(), group.ranks());
+        let (is_main_process, count) = (group.is_main_process(), group.world_size());
         let config = Config::read(&self.config, &self.set)?;
         memory::keep_for(&config.train);
         let resume = match self.resume.to_str() {
@@ -83,12 +83,12 @@ impl Train {
             )
             .into());
         }
-        if is_first {
+        if is_main_process {
             check_writable_dir(&self.out)?;
             self.check_outputs(&config, &scenes)?;
         }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
-        if let ([first, others @ ..], true) = (held_out.trained_on(), is_first) {
+        if let ([first, others @ ..], true) = (held_out.trained_on(), is_main_process) {
             let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
             eprintln!(
                 "{first}{more} of data.validation is also a training scene: its score says nothing about unseen scenes"
@@ -105,7 +105,7 @@ impl Train {
         if self.shard_optimizer {
             trainer = trainer.with_sharded_optimizer();
         }
-        if count > 1 && is_first {
+        if count > 1 && is_main_process {
             eprintln!("{count} processes train together: {} scenes in a step", trainer.batch());
         }
 
@@ -115,7 +115,7 @@ impl Train {
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
         trainer.group().leave()?;
-        if !is_first {
+        if !is_main_process {
             return Ok(());
         }
         if outcome.skipped > 0 {
@@ -157,8 +157,8 @@ impl Train {
         resume: &Resume,
         stop: &AtomicBool,
     ) -> Result<Outcome> {
-        let is_first = trainer.group().is_first();
-        let bar = progress::of_first(is_first, config.train.steps, "steps");
+        let is_main_process = trainer.group().is_main_process();
+        let bar = progress::of_first(is_main_process, config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut validation = String::new();
         let mut first = true;
@@ -172,7 +172,7 @@ impl Train {
                     return go_on;
                 }
                 Event::Notice(text) => {
-                    if is_first {
+                    if is_main_process {
                         bar.suspend(|| eprintln!("{text}"));
                     }
                     return go_on;

@@ -114,7 +114,7 @@ impl TrainConfig {
             return Err(Error::setting("train.weight_decay", self.weight_decay, "0 or more"));
         }
         if !(0. ..=1.).contains(&self.warmup) {
-            return Err(Error::setting("train.warmup", self.warmup, "a share from 0 to 1"));
+            return Err(Error::setting("train.warmup", self.warmup, "a fraction from 0 to 1"));
         }
         Ok(())
     }

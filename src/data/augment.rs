@@ -45,9 +45,10 @@ impl Augmentation {
     pub fn frame(&self, camera: &Camera, size: ImageSize) -> Result<(Region, Camera)> {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let k = camera.intrinsics;
-        let (room_x, room_y) = (2. * k.cx.min(full_width - k.cx), 2. * k.cy.min(full_height - k.cy));
+        let (centred_width, centred_height) =
+            (2. * k.cx.min(full_width - k.cx), 2. * k.cy.min(full_height - k.cy));
         let aspect = f64::from(size.width) / f64::from(size.height);
-        let width = room_x.min(room_y * aspect);
+        let width = centred_width.min(centred_height * aspect);
         let height = width / aspect;
         if width.min(height) < SMALLEST_PART {
             return Err(Error::failed(format!(
@@ -126,7 +127,7 @@ mod tests {
 
     /// A bright dot on black keeps its ray in the world. The dot's position in the image is its centroid.
     #[test]
-    fn what_a_pixel_sees_does_not_change() {
+    fn augmentation_keeps_the_rays_of_pixels() {
         let (x, y) = (300u32, 200u32);
         let mut photo = RgbImage::new(640, 360);
         for (dx, dy) in (0..8).flat_map(|dx| (0..8).map(move |dy| (dx, dy))) {

@@ -55,13 +55,13 @@ impl ViewBatch {
         ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
-    /// Returns the four tensors in the order that [`ViewBatch::of_tensors`] takes.
+    /// Returns the four tensors in the order that [`ViewBatch::from_tensors`] takes.
     pub(super) fn tensors(&self) -> [&Tensor; 4] {
         [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
     }
 
     /// Builds a batch from tensors in the order of [`ViewBatch::tensors`].
-    pub(super) fn of_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4]) -> Self {
+    pub(super) fn from_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4]) -> Self {
         ViewBatch { images, c2w, w2c, intrinsics }
     }
 

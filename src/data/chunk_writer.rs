@@ -31,7 +31,7 @@ impl ChunkWriter {
             return Err(Error::input(
                 folder,
                 "the output",
-                "a folder of chunks already",
+                "a folder that already contains chunks",
                 "one without index.json",
             ));
         }
@@ -51,7 +51,7 @@ impl ChunkWriter {
     ///
     /// # Errors
     /// Fails if the chunks belong to other work, or if `make` or `each` fails.
-    pub fn go_on(
+    pub fn resume(
         &mut self,
         keys: &[String],
         make: impl FnOnce() -> Result<Capture>,
@@ -63,7 +63,7 @@ impl ChunkWriter {
             if !file.exists() {
                 return Ok(self.index.len());
             }
-            let other = || Error::input(&file, "the output", "a chunk already", "a folder without chunks");
+            let other = || Error::input(&file, "the output", "an existing chunk", "a folder without chunks");
             let chunk = Chunk::read(&file)?;
             for key in chunk.keys() {
                 let capture = chunk.capture(key)?;
@@ -91,7 +91,7 @@ impl ChunkWriter {
     /// Fails if the name is already taken, if a photo can't be read, or if a file can't be written.
     pub fn add(&mut self, capture: &Capture) -> Result<()> {
         if let Some(chunk) = self.index.get(&capture.name) {
-            let found = format!("{:?}, which {chunk} holds already", capture.name);
+            let found = format!("{:?}, which is already in {chunk}", capture.name);
             return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
         }
         let (views, _) = capture.split(Holdout::None);
@@ -134,7 +134,7 @@ impl ChunkWriter {
         let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
         // An existing file with the same bytes was left by an interrupted run of the same work.
         if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes.as_slice() {
-            return Err(Error::input(&file, "the output", "a chunk already", "a folder without chunks"));
+            return Err(Error::input(&file, "the output", "an existing chunk", "a folder without chunks"));
         }
         write_atomically(&file, |writer| writer.write_all(bytes.as_slice()).map_err(Error::write(&file)))?;
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);

@@ -64,7 +64,7 @@ pub struct Dataset {
     pub name: String,
     groups: Vec<SceneGroup>,
     warnings: Vec<String>,
-    made_by: Option<String>,
+    generator: Option<String>,
 }
 
 /// A group in memory, with images still encoded.
@@ -89,9 +89,9 @@ impl Dataset {
     /// looked for until they are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = SyntheticDataset::named(root)? {
-            let made_by = Some(videos.generator());
+            let generator = Some(videos.generator());
             let name = root.to_string_lossy().into_owned();
-            return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![], made_by });
+            return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![], generator });
         }
         let name = folder_name(root);
         let indexed = [root.to_owned(), root.join(split.folder())]
@@ -106,7 +106,7 @@ impl Dataset {
                 capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
             }
         };
-        Ok(Dataset { name, groups, warnings, made_by: None })
+        Ok(Dataset { name, groups, warnings, generator: None })
     }
 
     /// Returns a line for each folder that couldn't be read.
@@ -121,8 +121,8 @@ impl Dataset {
 
     /// Returns what synthetic videos depend on besides their name: the program's version, and the images that appear in them.
     /// Returns `None` for other datasets.
-    pub fn made_by(&self) -> Option<&str> {
-        self.made_by.as_deref()
+    pub fn generator(&self) -> Option<&str> {
+        self.generator.as_deref()
     }
 
     /// Adds to `inputs` the files of the dataset that writing below the folder `output` could overwrite.
@@ -209,7 +209,7 @@ fn chunk_groups(folder: &Path) -> Result<Vec<SceneGroup>> {
                 &file,
                 format!("the chunk of {key}"),
                 chunk,
-                "the name of a file beside it",
+                "the name of a file in the same folder",
             ));
         }
         chunks.entry(chunk).or_default().push(key);
@@ -233,8 +233,13 @@ fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<St
     let CaptureFolders { mut folders, warnings } = capture_folders(root)?;
     folders.retain(|folder| !folder.starts_with(except));
     if folders.is_empty() {
-        let found = format!("without captures but those in {}", except.display());
-        return Err(Error::input(root, "the folder", found, "captures of the other part, too"));
+        let found = format!("a folder whose captures are all in {}", except.display());
+        return Err(Error::input(
+            root,
+            "the folder",
+            found,
+            "captures outside the folder of the other split",
+        ));
     }
     let names: Vec<String> = folders.iter().map(|folder| folder_name(folder)).collect();
     let mut counts: BTreeMap<&String, usize> = BTreeMap::new();

@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn a_third_of_the_circle_swaps_the_colours() {
+    fn hue_of_a_third_permutes_the_channels() {
         let (before, pixels) = (picture(), 40 * 33);
         let after = adjusted(&[Adjustment::Hue(1. / 3.)]);
         // Red becomes green, green becomes blue, and blue becomes red.

@@ -21,12 +21,14 @@ pub use globalsplat_capture::{
     find_captures, fit, open_capture, points_of, read_camera_path, write_cameras_json,
 };
 pub use globalsplat_synth::{SyntheticDataset, read_pictures};
-pub use loading::{BadData, LoadTimes, LoadedScene, Loader, Part, Sample, SceneGroups, TrainingScenes};
+pub use loading::{
+    BadData, Batch, BatchShard, DataLoader, LoadTimes, LoadedScene, SceneGroups, TrainingScenes,
+};
 pub use polyphase::polyphase;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};
 
 // Exchanged between processes.
-pub(crate) use loading::News;
+pub(crate) use loading::BadSceneReport;
 // Used by the parity checks, which run every part separately.
 pub(crate) use globalsplat_capture::{Region, Resampler};
 pub(crate) use jitter::Jitter;

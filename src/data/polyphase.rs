@@ -92,7 +92,7 @@ mod tests {
 
     /// The code that builds the model's image tokens computes the same rays for the views as for the photo.
     #[test]
-    fn the_model_is_told_the_same_rays() {
+    fn plucker_rays_match_those_of_the_photo() {
         let photo = photo();
         let rays = |views: &[View]| {
             let poses: Vec<DMat4> = views.iter().map(|view| view.camera.c2w).collect();

@@ -16,7 +16,7 @@ pub fn resident_memory_bytes() -> u64 {
     from_linux().unwrap_or_else(peak_memory_bytes)
 }
 
-/// Returns the peak memory of the tensors on `device` in bytes, since the start of the program or the last [`forget_peak_memory`]; `None`
+/// Returns the peak memory of the tensors on `device` in bytes, since the start of the program or the last [`reset_peak_memory`]; `None`
 /// for the CPU.
 pub fn device_memory_bytes(device: Device) -> Option<u64> {
     match device {
@@ -58,11 +58,11 @@ pub fn peak_memory_bytes_on(device: Device) -> u64 {
 
 /// Resets the peak memory of the process and of `device`, so that later peaks count from now on. The peak of the process can be reset on
 /// Linux only.
-pub fn forget_peak_memory(device: Device) {
+pub fn reset_peak_memory(device: Device) {
     // If the reset isn't supported, the old peak remains.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     if let Device::Cuda(number) = device {
-        let _ = ffi::forget_peak_bytes(number as i32);
+        let _ = ffi::reset_peak_bytes(number as i32);
     }
 }
 

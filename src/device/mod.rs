@@ -5,7 +5,7 @@ mod memory;
 mod stopwatch;
 
 pub(crate) use memory::{
-    device_memory_bytes, forget_peak_memory, peak_memory_bytes_on, resident_memory_bytes,
+    device_memory_bytes, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes,
 };
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 pub use stopwatch::Stopwatch;
@@ -17,7 +17,7 @@ use std::fmt;
 use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};
 
-pub(crate) use ffi::leave_out_tf32;
+pub(crate) use ffi::disable_tf32;
 
 /// Returns the CUDA device index, or `None` for a device that isn't a CUDA device.
 fn gpu(device: Device) -> Option<i32> {
@@ -30,14 +30,14 @@ fn gpu(device: Device) -> Option<i32> {
 /// Event for timing the work of a device: on a GPU, it is reached when all work queued before it is done.
 pub(crate) enum DeviceEvent {
     Host(Instant),
-    Gpu(UniquePtr<ffi::Mark>),
+    Gpu(UniquePtr<ffi::CudaEvent>),
 }
 
 impl DeviceEvent {
     /// Records an event now, without waiting for the GPU.
     pub fn now(device: Device) -> Self {
         match gpu(device) {
-            Some(gpu) => DeviceEvent::Gpu(ffi::mark(gpu).expect("a GPU that works")),
+            Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu).expect("a GPU that works")),
             None => DeviceEvent::Host(Instant::now()),
         }
     }
@@ -45,12 +45,12 @@ impl DeviceEvent {
     /// Returns the time elapsed since `earlier`, an event of the same device. Waits until the GPU has reached both events.
     pub fn since(&self, earlier: &DeviceEvent) -> Duration {
         match (self, earlier) {
-            (DeviceEvent::Gpu(mark), DeviceEvent::Gpu(earlier)) => {
-                let milliseconds = mark.since(earlier).expect("a GPU that works");
+            (DeviceEvent::Gpu(event), DeviceEvent::Gpu(earlier)) => {
+                let milliseconds = event.since(earlier).expect("a GPU that works");
                 Duration::from_secs_f64(1e-3 * milliseconds.max(0.))
             }
             (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
-            _ => panic!("moments of two devices"),
+            _ => panic!("events of two devices"),
         }
     }
 }
@@ -69,7 +69,7 @@ pub(crate) struct Upload {
 
 impl Upload {
     /// Creates an upload to `device`, to be reused for all copies to it.
-    pub fn to(device: Device) -> Self {
+    pub fn new(device: Device) -> Self {
         let stream = gpu(device).map(|gpu| ffi::copy_stream(gpu).expect("a GPU that works"));
         Upload { device, stream }
     }
@@ -123,7 +123,7 @@ impl<const N: usize> PendingCopy<N> {
             PendingCopy::Done(tensors) => tensors,
             PendingCopy::Gpu(copies) => {
                 // SAFETY: on success the C++ side has stored new tensors in `out`.
-                let done = unsafe { take_outputs(|out| copies.hand_over(out)) };
+                let done = unsafe { take_outputs(|out| copies.take_tensors(out)) };
                 done.expect("a GPU that works")
             }
         }

@@ -17,14 +17,14 @@ pub struct Stopwatch {
 impl Default for Stopwatch {
     /// Returns a stopwatch on the host's clock. For work on a GPU, it measures the time to launch the work.
     fn default() -> Self {
-        Stopwatch::of(Device::Cpu)
+        Stopwatch::new(Device::Cpu)
     }
 }
 
 impl Stopwatch {
     /// Returns a stopwatch on the clock of `device`. A section lasts from when the device has finished all earlier work to when it has
     /// finished the section.
-    pub fn of(device: Device) -> Self {
+    pub fn new(device: Device) -> Self {
         Stopwatch { device, sections: vec![], parts: vec![] }
     }
 

@@ -158,7 +158,7 @@ impl HeldOut {
     /// Evaluates this rank's share of the scenes: every n-th of them for n ranks.
     fn judge_share(&self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Found {
         let (mut found, group) = (Found::default(), trainer.group());
-        for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.ranks()) {
+        for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.world_size()) {
             if !go_on() {
                 found.stopped = true;
                 break;
@@ -208,7 +208,7 @@ impl Validator for HeldOut {
     fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
         self.scores.clear();
         let (mut scores, mut unusable) = (vec![], vec![]);
-        for found in trainer.group().gather(self.judge_share(trainer, go_on))? {
+        for found in trainer.group().all_gather_object(self.judge_share(trainer, go_on))? {
             if let Some(why) = found.failed {
                 return Err(Error::failed(why));
             }

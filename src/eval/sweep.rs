@@ -13,7 +13,7 @@ use super::scores_file::comparison_path;
 use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::error::{Error, Result};
 use crate::io::{WeightsFile, checksum, write_jpeg};
-use crate::ranks::Group;
+use crate::ranks::ProcessGroup;
 use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
 use std::cell::OnceCell;
@@ -29,7 +29,7 @@ use tch::{Device, Tensor};
 /// use globalsplat::eval::{
 ///     DatasetEvaluation, EvaluationIndex, Method, Perceptual, machine, weights_fingerprint, write_evaluation, write_report,
 /// };
-/// use globalsplat::ranks::Group;
+/// use globalsplat::ranks::ProcessGroup;
 /// use globalsplat::reconstruct::load_model;
 /// use std::path::Path;
 /// use tch::Device;
@@ -52,7 +52,7 @@ use tch::{Device, Tensor};
 ///     machine: machine(device)?,
 ///     device,
 ///     out,
-///     group: &Group::alone(),
+///     group: &ProcessGroup::single(),
 /// }
 /// .run(
 ///     || Perceptual::find(device),
@@ -91,8 +91,8 @@ pub struct DatasetEvaluation<'a> {
     pub device: Device,
     /// Output folder, which holds `scenes/`.
     pub out: &'a Path,
-    /// Group of processes that divide the scenes among themselves. All of them have access to `out`.
-    pub group: &'a Group,
+    /// ProcessGroup of processes that divide the scenes among themselves. All of them have access to `out`.
+    pub group: &'a ProcessGroup,
 }
 
 /// Returns a string that identifies the model in the file `weights`, for [`DatasetEvaluation::fingerprint`]: the file's name and a checksum
@@ -156,11 +156,11 @@ impl DatasetEvaluation<'_> {
         judges: impl FnOnce() -> Result<Perceptual>,
         mut observe: impl FnMut(usize, usize) -> bool,
     ) -> Result<Evaluation> {
-        let begun = self.group.is_first().then(|| self.begin()).transpose()?;
+        let begun = self.group.is_main_process().then(|| self.begin()).transpose()?;
         let (kept, missing) = self.group.broadcast_object(begun)?;
         let share = self.run_share(self.share(&missing), kept.len(), judges, &mut observe)?;
         let (mut scenes, mut failures, mut stopped) = (kept, vec![], false);
-        for share in self.group.gather(share)? {
+        for share in self.group.all_gather_object(share)? {
             scenes.extend(share.scenes);
             failures.extend(share.failures);
             stopped |= share.stopped;
@@ -226,7 +226,7 @@ impl DatasetEvaluation<'_> {
     /// Returns this rank's share of the scenes `missing`, with the groups that hold them.
     fn share(&self, missing: &[String]) -> Vec<(&SceneGroup, Vec<String>)> {
         let own: BTreeSet<&String> =
-            missing.iter().skip(self.group.rank()).step_by(self.group.ranks()).collect();
+            missing.iter().skip(self.group.rank()).step_by(self.group.world_size()).collect();
         let of_group =
             |group: &SceneGroup| group.keys.iter().filter(|key| own.contains(key)).cloned().collect();
         self.dataset.groups().iter().map(|group| (group, of_group(group))).collect()
@@ -294,10 +294,11 @@ impl DatasetEvaluation<'_> {
         // The folder's name alone doesn't identify a dataset, since many folders are called `test`, so use its absolute path. Synthetic
         // videos have no folder, so the path stays as it is.
         let root = self.root.canonicalize().unwrap_or(self.root.to_owned());
-        let made_by = self.dataset.made_by().map_or(String::new(), |made_by| format!(" of {made_by}"));
+        let generator =
+            self.dataset.generator().map_or(String::new(), |generator| format!(" of {generator}"));
         Ok(Identity {
             method: self.fingerprint.clone(),
-            dataset: root.display().to_string() + &made_by,
+            dataset: root.display().to_string() + &generator,
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
             image_size: self.picture_size.into(),
         })

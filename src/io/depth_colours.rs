@@ -28,13 +28,13 @@ pub struct DepthScale {
 }
 
 impl DepthScale {
-    /// Computes the scale from the 2nd to the 98th percentile of inverse depth in all `pictures`, each a depth and its opacity, [H, W].
-    pub fn of(pictures: &[(&Tensor, &Tensor)]) -> Self {
+    /// Computes the scale from the 2nd to the 98th percentile of inverse depth in all `images`, each a depth and its opacity, [H, W].
+    pub fn from_depths(images: &[(&Tensor, &Tensor)]) -> Self {
         /// Number of pixels that suffices for percentiles; libtorch sorts at most 2²⁴ values.
         const ENOUGH: i64 = 1 << 20;
         let inverses =
-            |&(depth, alpha): &(&Tensor, &Tensor)| inverse(depth).masked_select(&seen(depth, alpha));
-        let values = Tensor::cat(&pictures.iter().map(inverses).collect::<Vec<_>>(), 0);
+            |&(depth, alpha): &(&Tensor, &Tensor)| inverse(depth).masked_select(&visible_mask(depth, alpha));
+        let values = Tensor::cat(&images.iter().map(inverses).collect::<Vec<_>>(), 0);
         if values.numel() == 0 {
             return DepthScale { far: 0., near: 0. };
         }
@@ -58,7 +58,7 @@ impl DepthScale {
         let count = cameras.len().min(FEW);
         let spread = (0..count).map(|i| small(&cameras[i * (cameras.len() - 1) / (count - 1).max(1)]));
         let rendered = renderer.render(&spread.collect::<Vec<_>>())?;
-        Ok(DepthScale::of(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
+        Ok(DepthScale::from_depths(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
     }
 
     /// Converts depth [H, W] to colours [3, H, W]: near is bright, far is dark, linear in inverse depth. Where little is visible (`alpha`),
@@ -68,22 +68,21 @@ impl DepthScale {
         let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
         let colours = Tensor::from_slice2(&depth_colours()).to_device(depth.device());
         let (height, width) = (depth.size()[0], depth.size()[1]);
-        let picture =
-            colours.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
-        picture * seen(depth, alpha).to_kind(Kind::Float) * alpha.clamp(0., 1.)
+        let image = colours.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
+        image * visible_mask(depth, alpha).to_kind(Kind::Float) * alpha.clamp(0., 1.)
     }
 }
 
 /// Converts depth to colours like [`DepthScale::colourize`], on the scale of this image.
 pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
-    DepthScale::of(&[(depth, alpha)]).colourize(depth, alpha)
+    DepthScale::from_depths(&[(depth, alpha)]).colourize(depth, alpha)
 }
 
 fn inverse(depth: &Tensor) -> Tensor {
     depth.clamp_min(SMALLEST).reciprocal()
 }
 
-fn seen(depth: &Tensor, alpha: &Tensor) -> Tensor {
+fn visible_mask(depth: &Tensor, alpha: &Tensor) -> Tensor {
     alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.))
 }
 
@@ -129,11 +128,10 @@ mod tests {
     fn near_is_bright_and_what_is_not_seen_black() {
         let depth = Tensor::from_slice(&[1f32, 2., 4., 0., 1.]).view([1, 5]);
         let alpha = Tensor::from_slice(&[1f32, 1., 1., 1., 0.01]).view([1, 5]);
-        let picture = colourize_depth(&depth, &alpha);
-        assert_eq!(picture.size(), [3, 1, 5]);
-        let at = |x: i64| {
-            <[f32; 3]>::try_from(Vec::try_from(picture.select(2, x).flatten(0, -1)).unwrap()).unwrap()
-        };
+        let image = colourize_depth(&depth, &alpha);
+        assert_eq!(image.size(), [3, 1, 5]);
+        let at =
+            |x: i64| <[f32; 3]>::try_from(Vec::try_from(image.select(2, x).flatten(0, -1)).unwrap()).unwrap();
         let all = depth_colours();
         assert_eq!((at(0), at(2)), (all[STEPS - 1], all[0]));
         assert!(lightness(at(0)) > lightness(at(1)) && lightness(at(1)) > lightness(at(2)));
@@ -144,8 +142,8 @@ mod tests {
     fn one_scale_gives_one_depth_one_colour() {
         let opaque = Tensor::ones([1, 2], (Kind::Float, tch::Device::Cpu));
         let [first, second] = [[1f32, 2.], [2., 8.]].map(|depths| Tensor::from_slice(&depths).view([1, 2]));
-        let scale = DepthScale::of(&[(&first, &opaque), (&second, &opaque)]);
-        let two = |picture: &Tensor, x: i64| scale.colourize(picture, &opaque).select(2, x);
+        let scale = DepthScale::from_depths(&[(&first, &opaque), (&second, &opaque)]);
+        let two = |image: &Tensor, x: i64| scale.colourize(image, &opaque).select(2, x);
         assert_eq!(two(&first, 1), two(&second, 0));
         // On scales of their own, a depth of 2 is the farthest in one image and the nearest in the other.
         assert_ne!(

@@ -54,7 +54,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Returns an error if the file can't be written.
-    pub fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
+    pub fn write_scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
             summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
         });
@@ -65,8 +65,8 @@ impl EventFile {
     ///
     /// # Errors
     /// Returns an error if the file can't be written.
-    pub fn picture(&mut self, step: u64, tag: &str, picture: &Tensor) -> Result<()> {
-        let pixels = rgb_from_tensor(picture)?;
+    pub fn write_image(&mut self, step: u64, tag: &str, image: &Tensor) -> Result<()> {
+        let pixels = rgb_from_tensor(image)?;
         let image = Message::default()
             .varint(1, u64::from(pixels.height()))
             .varint(2, u64::from(pixels.width()))

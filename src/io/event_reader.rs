@@ -16,14 +16,14 @@ const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
 
 /// An event of an event file.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SeenEvent {
+pub struct LoggedEvent {
     pub step: u64,
     /// Time at which it was written, in seconds since 1970.
     pub wall_time: f64,
     /// `true` if the run starts here: earlier events of this step and later steps are invalid.
     pub is_start: bool,
     /// Offset of the event in the file, if it has an image.
-    pub picture: Option<u64>,
+    pub image_offset: Option<u64>,
 }
 
 /// Reader for a file that may still grow, which continues where it stopped.
@@ -40,7 +40,7 @@ impl EventReader {
     }
 
     /// Returns `true` if the file is no longer the one that was read: it is missing or shorter.
-    pub fn is_void(&self) -> bool {
+    pub fn is_stale(&self) -> bool {
         std::fs::metadata(&self.path).map_or(true, |file| file.len() < self.position)
     }
 
@@ -49,7 +49,7 @@ impl EventReader {
     ///
     /// # Errors
     /// Returns an error if the file can't be read.
-    pub fn read_new(&mut self) -> Result<Vec<SeenEvent>> {
+    pub fn read_new(&mut self) -> Result<Vec<LoggedEvent>> {
         let read = || Error::read(&self.path);
         let file = File::open(&self.path).map_err(read())?;
         let end = file.metadata().map_err(read())?.len();
@@ -80,7 +80,7 @@ impl EventReader {
 ///
 /// # Errors
 /// Returns an error if the file can't be read.
-pub fn read_picture(path: &Path, at: u64) -> Result<Option<Vec<u8>>> {
+pub fn read_event_image(path: &Path, at: u64) -> Result<Option<Vec<u8>>> {
     let mut file = File::open(path).map_err(Error::read(path))?;
     file.seek(SeekFrom::Start(at)).map_err(Error::read(path))?;
     let Some(length) = read_head(&mut file).map_err(Error::read(path))? else { return Ok(None) };
@@ -98,11 +98,11 @@ fn read_head(file: &mut impl Read) -> std::io::Result<Option<u64>> {
     Ok(is_right.then(|| u64::from_le_bytes(length.try_into().expect("eight bytes"))))
 }
 
-fn event(message: &[u8], at: u64) -> Option<SeenEvent> {
-    let mut event = SeenEvent { step: 0, wall_time: 0., is_start: false, picture: None };
+fn event(message: &[u8], at: u64) -> Option<LoggedEvent> {
+    let mut event = LoggedEvent { step: 0, wall_time: 0., is_start: false, image_offset: None };
     for (number, field) in Fields(message) {
         match (number, field) {
-            (1, Field::Eight(bytes)) => event.wall_time = f64::from_le_bytes(bytes),
+            (1, Field::Fixed64(bytes)) => event.wall_time = f64::from_le_bytes(bytes),
             (2, Field::Varint(step)) => event.step = step,
             // The version of the format belongs to no step.
             (3, _) => return None,
@@ -110,7 +110,7 @@ fn event(message: &[u8], at: u64) -> Option<SeenEvent> {
             _ => {}
         }
     }
-    event.picture = png(message).map(|_| at);
+    event.image_offset = png(message).map(|_| at);
     Some(event)
 }
 
@@ -132,9 +132,9 @@ struct Fields<'a>(&'a [u8]);
 
 enum Field<'a> {
     Varint(u64),
-    Eight([u8; 8]),
+    Fixed64([u8; 8]),
     Bytes(&'a [u8]),
-    Four,
+    Fixed32,
 }
 
 impl<'a> Fields<'a> {
@@ -165,12 +165,12 @@ impl<'a> Iterator for Fields<'a> {
         let key = self.varint()?;
         let field = match key & 7 {
             0 => Field::Varint(self.varint()?),
-            1 => Field::Eight(self.take(8)?.try_into().ok()?),
+            1 => Field::Fixed64(self.take(8)?.try_into().ok()?),
             2 => {
                 let length = self.varint()?;
                 Field::Bytes(self.take(length)?)
             }
-            5 => self.take(4).map(|_| Field::Four)?,
+            5 => self.take(4).map(|_| Field::Fixed32)?,
             _ => return None,
         };
         Some((key >> 3, field))
@@ -189,35 +189,35 @@ mod tests {
         let path = folder.path().join("tfevents");
         let mut file = EventFile::create(&path).unwrap();
         file.start(7).unwrap();
-        file.scalars(8, &[("train/psnr".into(), 12.5)]).unwrap();
+        file.write_scalars(8, &[("train/psnr".into(), 12.5)]).unwrap();
         let mut reader = EventReader::new(&path);
         let seen = reader.read_new().unwrap();
         assert_eq!(seen.iter().map(|e| (e.step, e.is_start)).collect::<Vec<_>>(), [(7, true), (8, false)]);
-        assert!(seen.iter().all(|event| event.wall_time > 1.7e9 && event.picture.is_none()));
+        assert!(seen.iter().all(|event| event.wall_time > 1.7e9 && event.image_offset.is_none()));
 
         // An incomplete record is read once it is complete.
-        file.picture(9, "train/views", &Tensor::zeros([3, 4, 5], (Kind::Float, Device::Cpu))).unwrap();
+        file.write_image(9, "train/views", &Tensor::zeros([3, 4, 5], (Kind::Float, Device::Cpu))).unwrap();
         let whole = std::fs::read(&path).unwrap();
         std::fs::write(&path, &whole[..whole.len() - 9]).unwrap();
         assert_eq!(reader.read_new().unwrap(), []);
         std::fs::write(&path, &whole).unwrap();
         let seen = reader.read_new().unwrap();
-        let picture = read_picture(&path, seen[0].picture.unwrap()).unwrap().unwrap();
+        let picture = read_event_image(&path, seen[0].image_offset.unwrap()).unwrap().unwrap();
         let picture = image::load_from_memory(&picture).unwrap();
         assert_eq!((seen[0].step, picture.width(), picture.height()), (9, 5, 4));
         assert_eq!(reader.read_new().unwrap(), []);
-        assert!(!reader.is_void());
+        assert!(!reader.is_stale());
 
         // Nothing after a damaged length is read.
         std::fs::write(&path, [&whole[..], &[255; 40]].concat()).unwrap();
         assert_eq!(reader.read_new().unwrap(), []);
-        assert_eq!(read_picture(&path, whole.len() as u64).unwrap(), None);
+        assert_eq!(read_event_image(&path, whole.len() as u64).unwrap(), None);
         std::fs::write(&path, &whole[..20]).unwrap();
-        assert!(reader.is_void());
+        assert!(reader.is_stale());
     }
 
     #[test]
-    fn no_bytes_are_too_odd() {
+    fn arbitrary_bytes_do_not_panic() {
         for length in 0..40 {
             for byte in [0, 0x0a, 0x2a, 0x7f, 0x80, 0xff] {
                 let message = vec![byte; length];

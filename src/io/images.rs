@@ -17,18 +17,18 @@ pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
 ///
 /// # Errors
 /// Returns libtorch's error, for example for another shape.
-pub fn rgb_from_tensor(picture: &Tensor) -> Result<RgbImage> {
-    let planes = if picture.dim() == 2 {
-        picture.unsqueeze(0).f_expand([3, -1, -1], false)?
+pub fn rgb_from_tensor(image: &Tensor) -> Result<RgbImage> {
+    let planes = if image.dim() == 2 {
+        image.unsqueeze(0).f_expand([3, -1, -1], false)?
     } else {
-        picture.shallow_clone()
+        image.shallow_clone()
     };
     let (height, width) = (planes.size()[1], planes.size()[2]);
     let bytes =
         (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
     let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
-        .ok_or_else(|| Error::failed("a picture has another size than its pixels"))
+        .ok_or_else(|| Error::failed("the number of pixels doesn't match the image size"))
 }
 
 /// Returns `true` if `path` has the extension of a PNG.
@@ -42,7 +42,7 @@ pub fn is_png_name(path: &Path) -> bool {
 /// Returns an error for another extension, and the errors of [`check_writable_file`].
 pub fn check_writable_png(path: &Path) -> Result<()> {
     if !is_png_name(path) {
-        return Err(Error::input(path, "the picture's ending", "another", ".png"));
+        return Err(Error::input(path, "the image's file extension", "another", ".png"));
     }
     Ok(check_writable_file(path)?)
 }
@@ -51,20 +51,20 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub fn write_png(path: &Path, picture: &Tensor) -> Result<()> {
-    write_picture(path, picture, false)
+pub fn write_png(path: &Path, image: &Tensor) -> Result<()> {
+    write_tensor_image(path, image, false)
 }
 
 /// Writes a tensor like [`write_png`], but as a JPEG, which is smaller and lossy.
 ///
 /// # Errors
 /// Returns the errors of [`write_png`].
-pub fn write_jpeg(path: &Path, picture: &Tensor) -> Result<()> {
-    write_picture(path, picture, true)
+pub fn write_jpeg(path: &Path, image: &Tensor) -> Result<()> {
+    write_tensor_image(path, image, true)
 }
 
-fn write_picture(path: &Path, picture: &Tensor, as_jpeg: bool) -> Result<()> {
-    write_image(path, &rgb_from_tensor(picture)?, as_jpeg)
+fn write_tensor_image(path: &Path, image: &Tensor, as_jpeg: bool) -> Result<()> {
+    write_image(path, &rgb_from_tensor(image)?, as_jpeg)
 }
 
 /// Writes an image as a JPEG, or as a PNG.
@@ -76,17 +76,17 @@ pub(super) fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Resul
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-/// Enlarges `picture` [3, H, W] by an integer factor, repeating its pixels, until it is `height` high or a little less.
-pub fn enlarge(picture: &Tensor, height: i64) -> Tensor {
-    let factor = (height / picture.size()[1]).max(1);
-    picture.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
+/// Enlarges `image` [3, H, W] by an integer factor, repeating its pixels, until it is `height` high or a little less.
+pub fn enlarge(image: &Tensor, height: i64) -> Tensor {
+    let factor = (height / image.size()[1]).max(1);
+    image.repeat_interleave_self_int(factor, 1, None).repeat_interleave_self_int(factor, 2, None)
 }
 
-/// Shrinks `picture` [3, H, W] by an integer factor: every pixel is the mean of `factor`² pixels.
-pub fn shrink(picture: &Tensor, factor: i64) -> Tensor {
+/// Shrinks `image` [3, H, W] by an integer factor: every pixel is the mean of `factor`² pixels.
+pub fn shrink(image: &Tensor, factor: i64) -> Tensor {
     match factor {
-        1 => picture.shallow_clone(),
-        _ => picture.avg_pool2d(factor, factor, 0, false, true, None),
+        1 => image.shallow_clone(),
+        _ => image.avg_pool2d(factor, factor, 0, false, true, None),
     }
 }
 
@@ -103,13 +103,13 @@ pub fn subsample(numbers: &Tensor, factor: i64) -> Tensor {
 const GAP: i64 = 4;
 
 /// Tiles images [3, H, W] side by side, with a white gap, and white below those that are lower than others.
-pub fn tile_horizontally(pictures: &[Tensor]) -> Tensor {
-    tile(pictures, 2)
+pub fn tile_horizontally(images: &[Tensor]) -> Tensor {
+    tile(images, 2)
 }
 
 /// Tiles images [3, H, W] one below the other, with a white gap, and white beside those that are narrower than others.
-pub fn tile_vertically(pictures: &[Tensor]) -> Tensor {
-    tile(pictures, 1)
+pub fn tile_vertically(images: &[Tensor]) -> Tensor {
+    tile(images, 1)
 }
 
 /// Tiles images one below the other, or else side by side, like [`tile_vertically`] and [`tile_horizontally`].
@@ -138,28 +138,28 @@ pub fn tiled_size(size: ImageSize, count: u32) -> ImageSize {
     ImageSize { width: count * size.width + (count - 1) * GAP as u32, ..size }
 }
 
-fn tile(pictures: &[Tensor], dim: i64) -> Tensor {
+fn tile(images: &[Tensor], dim: i64) -> Tensor {
     let mut parts = vec![];
-    for (i, picture) in padded(pictures, 3 - dim).into_iter().enumerate() {
+    for (i, image) in padded(images, 3 - dim).into_iter().enumerate() {
         if i > 0 {
-            let mut gap = picture.size();
+            let mut gap = image.size();
             gap[dim as usize] = GAP;
-            parts.push(Tensor::ones(gap, (picture.kind(), picture.device())));
+            parts.push(Tensor::ones(gap, (image.kind(), image.device())));
         }
-        parts.push(picture);
+        parts.push(image);
     }
     Tensor::cat(&parts, dim)
 }
 
 /// Pads images [3, H, W] with white below or to the right, to the size of the largest of them along `dim`.
-fn padded(pictures: &[Tensor], dim: i64) -> Vec<Tensor> {
-    let largest = pictures.iter().map(|picture| picture.size()[dim as usize]).max().unwrap_or(0);
-    let pad = |picture: &Tensor| {
-        let missing = largest - picture.size()[dim as usize];
+fn padded(images: &[Tensor], dim: i64) -> Vec<Tensor> {
+    let largest = images.iter().map(|image| image.size()[dim as usize]).max().unwrap_or(0);
+    let pad = |image: &Tensor| {
+        let missing = largest - image.size()[dim as usize];
         let sides = if dim == 1 { [0, 0, 0, missing] } else { [0, missing, 0, 0] };
-        picture.pad(sides, "constant", 1.)
+        image.pad(sides, "constant", 1.)
     };
-    pictures.iter().map(pad).collect()
+    images.iter().map(pad).collect()
 }
 
 #[cfg(test)]
@@ -169,15 +169,15 @@ mod tests {
 
     #[test]
     fn pictures_of_different_sizes_are_tiled_with_white() {
-        let picture = |height, width| Tensor::zeros([3, height, width], (Kind::Float, Device::Cpu));
-        let row = tile_horizontally(&[picture(2, 3), picture(5, 1)]);
+        let image = |height, width| Tensor::zeros([3, height, width], (Kind::Float, Device::Cpu));
+        let row = tile_horizontally(&[image(2, 3), image(5, 1)]);
         assert_eq!(row.size(), [3, 5, 3 + GAP + 1]);
-        let of_three = tile_horizontally(&[picture(2, 3), picture(2, 3), picture(2, 3)]);
+        let of_three = tile_horizontally(&[image(2, 3), image(2, 3), image(2, 3)]);
         let ImageSize { height, width } = tiled_size(ImageSize { height: 2, width: 3 }, 3);
         assert_eq!(of_three.size(), [3, height.into(), width.into()]);
         let black = |t: &Tensor| t.eq(0.).sum(Kind::Int64).int64_value(&[]);
         assert_eq!(black(&row), 3 * (2 * 3 + 5));
         assert_eq!(black(&row.narrow(1, 0, 2).narrow(2, 0, 3)), 3 * 2 * 3);
-        assert_eq!(tile_vertically(&[picture(2, 3), picture(5, 1)]).size(), [3, 2 + GAP + 5, 3]);
+        assert_eq!(tile_vertically(&[image(2, 3), image(5, 1)]).size(), [3, 2 + GAP + 5, 3]);
     }
 }

@@ -5,7 +5,6 @@ mod depth_colours;
 mod dtype;
 mod event_file;
 mod event_reader;
-mod film;
 mod images;
 mod mosaic;
 mod npy;
@@ -13,6 +12,7 @@ mod pretrained;
 mod shards;
 mod splat;
 mod state_dict;
+mod video;
 mod weights;
 mod weights_file;
 
@@ -25,7 +25,6 @@ pub use globalsplat_splat_file::{
 };
 
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
-pub use film::{Film, find_ffmpeg};
 pub use globalsplat_capture::{decode_photo, encode_photo, read_image};
 pub use images::{
     check_writable_png, is_png_name, rgb_from_tensor, tensor_from_rgb, tile_horizontally, tile_vertically,
@@ -36,6 +35,7 @@ pub use npy::write_npy;
 pub use pretrained::{WEIGHTS_VARIABLE, find_pretrained};
 pub use shards::{shard_index, write_sharded};
 pub use splat::{fit_splat, rounding_warning};
+pub use video::{VideoWriter, find_ffmpeg};
 pub use weights::{Weights, write_checkpoint, write_weights};
 pub use weights_file::{MappedWeights, WeightsFile, is_weights_name, read_weights, weights_files};
 
@@ -44,7 +44,7 @@ pub(crate) use globalsplat_files::{
 };
 
 pub(crate) use event_file::EventFile;
-pub(crate) use event_reader::{EventReader, read_picture};
+pub(crate) use event_reader::{EventReader, read_event_image};
 pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};
 pub(crate) use images::{enlarge, shrink, subsample, write_jpeg};
 pub(crate) use mosaic::shrink_factor;

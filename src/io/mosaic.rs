@@ -44,7 +44,7 @@ impl Mosaic {
 
     /// Returns the factor by which to divide the sides of an image that consists of `parts` tensors, each of the size of `part` [.., H, W].
     pub fn factor(&mut self, parts: usize, part: &Tensor) -> i64 {
-        let [.., height, width] = part.size()[..] else { panic!("a picture has two sides") };
+        let [.., height, width] = part.size()[..] else { panic!("an image has height and width") };
         let factor = shrink_factor(parts as i64 * height * width, self.most_pixels);
         self.shrunk_by = self.shrunk_by.max(factor);
         factor
@@ -85,11 +85,11 @@ mod tests {
 
     #[test]
     fn many_large_pictures_are_shrunk_and_few_are_not() {
-        let picture = Tensor::ones([3, 64, 96], (Kind::Float, Device::Cpu)) * 0.5;
+        let image = Tensor::ones([3, 64, 96], (Kind::Float, Device::Cpu)) * 0.5;
         for (count, most, size, by) in [(2, 1 << 26, [64, 196], 1), (2, 2 * 64 * 96 / 4, [32, 100], 2)] {
             let mut mosaic = Mosaic { most_pixels: most / count, ..Mosaic::row(2) };
             for _ in 0..count {
-                mosaic.add(std::slice::from_ref(&picture)).unwrap();
+                mosaic.add(std::slice::from_ref(&image)).unwrap();
             }
             assert_eq!(mosaic.shrunk_by(), by);
             let file = tempfile::NamedTempFile::with_suffix(".png").unwrap();

@@ -38,17 +38,17 @@ pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBu
     };
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     if path.exists() {
-        let expected = "none: it would be taken for the shards that are to be written";
+        let expected = "no file: it would be read instead of the shards";
         return Err(Error::input(path, "the output", "a file", expected));
     }
     let mut shards: Vec<BTreeMap<String, Tensor>> = vec![];
-    let mut room = 0;
+    let mut remaining = 0;
     for (name, tensor) in &weights.tensors {
-        if shards.is_empty() || bytes(tensor) > room {
+        if shards.is_empty() || bytes(tensor) > remaining {
             shards.push(BTreeMap::new());
-            room = most;
+            remaining = most;
         }
-        room = room.saturating_sub(bytes(tensor));
+        remaining = remaining.saturating_sub(bytes(tensor));
         shards.last_mut().expect("one at least").insert(name.clone(), tensor.shallow_clone());
     }
     let (mut weight_map, mut written) = (BTreeMap::new(), vec![]);

@@ -21,7 +21,7 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camer
     let local = gaussians.to_local(&frame, splat.origin);
     let fitted = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
     // Logits of opacities that stay are kept to the bit.
-    let logits = RawGaussians::of(&fitted).opacity_logits;
+    let logits = RawGaussians::from_gaussians(&fitted).opacity_logits;
     let kept = RawGaussians::from_splat(splat).opacity_logits;
     let logits = logits.where_self(&fitted.opacities.not_equal_tensor(&gaussians.opacities), &kept);
     let sh = Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec();

@@ -9,7 +9,7 @@ use std::path::Path;
 pub(super) type Contents = (BTreeMap<String, Array>, HashMap<String, String>);
 
 /// Keys under which a checkpoint may hold its state dict. Lightning uses the first.
-const PLACES: [&str; 3] = ["state_dict", "model_state_dict", "model"];
+const STATE_DICT_KEYS: [&str; 3] = ["state_dict", "model_state_dict", "model"];
 /// Names of settings that the shapes of weights don't determine. A setting is used wherever it occurs in a checkpoint, if all occurrences
 /// have the same value.
 const SETTINGS: [&str; 1] = ["num_heads"];
@@ -28,7 +28,7 @@ pub(super) fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
         Value::Dict(items) => items,
         other => return refuse(other.type_name()),
     };
-    let inner = PLACES.iter().find_map(|place| match values.find(root, place) {
+    let inner = STATE_DICT_KEYS.iter().find_map(|place| match values.find(root, place) {
         Some(Value::Dict(items)) => Some(items),
         _ => None,
     });

@@ -146,7 +146,7 @@ pub(super) fn fit(
     let mut misfits = vec![];
     for (name, variable) in &variables {
         match shapes.get(name.as_str()) {
-            None => misfits.push((name.as_str(), "absent".to_string(), format!("{:?}", variable.size()))),
+            None => misfits.push((name.as_str(), "missing".to_string(), format!("{:?}", variable.size()))),
             Some(shape) if shape != &variable.size() => {
                 misfits.push((name, format!("{shape:?}"), format!("{:?}", variable.size())));
             }

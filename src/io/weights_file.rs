@@ -72,8 +72,8 @@ pub struct WeightsFile {
     path: PathBuf,
     /// The index, if there is one, and the files with tensors.
     files: Vec<PathBuf>,
-    parts: Vec<Bytes>,
-    tensors: BTreeMap<String, Place>,
+    shards: Vec<Bytes>,
+    tensors: BTreeMap<String, TensorLocation>,
     metadata: HashMap<String, String>,
 }
 
@@ -135,8 +135,8 @@ impl Bytes {
 
 /// Location of a tensor in one of the files.
 #[derive(Debug)]
-struct Place {
-    part: usize,
+struct TensorLocation {
+    shard: usize,
     array: Array,
 }
 
@@ -150,23 +150,24 @@ impl WeightsFile {
     pub fn open(path: &Path) -> Result<Self> {
         match index_at(path) {
             Some(index) => Self::open_shards(&index),
-            None => Self::of(Bytes::map(path)?, path),
+            None => Self::from_bytes(Bytes::map(path)?, path),
         }
     }
 
     /// Opens weights that are embedded in the program; errors call them `path`.
-    pub(crate) fn carried(bytes: &'static [u8], path: &Path) -> Result<Self> {
-        Self::of(Bytes::Embedded(bytes), path)
+    pub(crate) fn from_embedded(bytes: &'static [u8], path: &Path) -> Result<Self> {
+        Self::from_bytes(Bytes::Embedded(bytes), path)
     }
 
-    fn of(bytes: Bytes, path: &Path) -> Result<Self> {
+    fn from_bytes(bytes: Bytes, path: &Path) -> Result<Self> {
         let (arrays, metadata) = match is_torch_file(bytes.get()) {
             true => state_dict(&TorchFile::parse(path, bytes.get())?, path)?,
             false => safetensors(bytes.get(), path)?,
         };
-        let tensors = arrays.into_iter().map(|(name, array)| (name, Place { part: 0, array })).collect();
+        let tensors =
+            arrays.into_iter().map(|(name, array)| (name, TensorLocation { shard: 0, array })).collect();
         let path = path.to_owned();
-        Ok(WeightsFile { files: vec![path.clone()], path, parts: vec![bytes], tensors, metadata })
+        Ok(WeightsFile { files: vec![path.clone()], path, shards: vec![bytes], tensors, metadata })
     }
 
     fn open_shards(path: &Path) -> Result<Self> {
@@ -174,28 +175,33 @@ impl WeightsFile {
         let mut names: Vec<&String> = index.weight_map.values().collect();
         names.sort();
         names.dedup();
-        let (mut parts, mut tensors, mut metadata) = (vec![], BTreeMap::new(), HashMap::new());
+        let (mut shards, mut tensors, mut metadata) = (vec![], BTreeMap::new(), HashMap::new());
         let mut files = vec![path.to_owned()];
         for name in names {
             if Path::new(name).components().count() != 1 || name.starts_with('.') {
-                return Err(Error::input(path, "weight_map", name, "the name of a file beside the index"));
+                return Err(Error::input(
+                    path,
+                    "weight_map",
+                    name,
+                    "the name of a file in the folder of the index",
+                ));
             }
             let file = path.with_file_name(name);
             let bytes = Bytes::map(&file)?;
             let (arrays, described) = safetensors(bytes.get(), &file)?;
             for (tensor, array) in arrays.into_iter().filter(|(t, _)| index.weight_map.get(t) == Some(name)) {
-                tensors.insert(tensor, Place { part: parts.len(), array });
+                tensors.insert(tensor, TensorLocation { shard: shards.len(), array });
             }
             metadata.extend(described);
-            parts.push(bytes);
+            shards.push(bytes);
             files.push(file);
         }
         match index.weight_map.iter().find(|(tensor, _)| !tensors.contains_key(*tensor)) {
             Some((tensor, name)) => {
                 let file = path.with_file_name(name);
-                Err(Error::input(&file, format!("tensor {tensor}"), "absent", "what the index says"))
+                Err(Error::input(&file, format!("tensor {tensor}"), "missing", "what the index says"))
             }
-            None => Ok(WeightsFile { path: path.to_owned(), files, parts, tensors, metadata }),
+            None => Ok(WeightsFile { path: path.to_owned(), files, shards, tensors, metadata }),
         }
     }
 
@@ -228,7 +234,7 @@ impl WeightsFile {
     }
 
     /// Renames every tensor with `rename`, and drops those for which it returns `None`.
-    pub fn renamed(self, rename: impl Fn(&str) -> Option<String>) -> Self {
+    pub fn rename_tensors(self, rename: impl Fn(&str) -> Option<String>) -> Self {
         let tensors = self.tensors.into_iter().filter_map(|(name, s)| Some((rename(&name)?, s))).collect();
         WeightsFile { tensors, ..self }
     }
@@ -259,14 +265,14 @@ impl WeightsFile {
     /// Returns the errors of [`WeightsFile::load_into`], and an error if a file can't be mapped.
     pub fn load_mmap(mut self, vs: &nn::VarStore) -> Result<MappedWeights> {
         let path = &self.path;
-        self.parts = self.parts.into_iter().map(|bytes| bytes.make_private(path)).collect::<Result<_>>()?;
-        let are_files = self.parts.iter().all(|bytes| matches!(bytes, Bytes::Private(_)));
+        self.shards = self.shards.into_iter().map(|bytes| bytes.make_private(path)).collect::<Result<_>>()?;
+        let are_files = self.shards.iter().all(|bytes| matches!(bytes, Bytes::Private(_)));
         let takes = |variable: &Tensor, view: &Tensor| {
             variable.device() == Device::Cpu && variable.kind() == view.kind() && view.is_contiguous()
         };
         self.fill(vs, |variable, view| are_files && takes(variable, view))?;
         // The files stay mapped, because nothing limits how long the variables live.
-        Ok(MappedWeights(Box::leak(self.parts.into_boxed_slice())))
+        Ok(MappedWeights(Box::leak(self.shards.into_boxed_slice())))
     }
 
     /// Fills the variables of `vs`. If `lies_in_file` returns `true` for a variable and the view of its weights in the file, the variable
@@ -281,13 +287,13 @@ impl WeightsFile {
         fit(vs, &shapes, &self.path, |name, variable| {
             let place = &self.tensors[name];
             let Array { dtype, shape, strides, bytes } = &place.array;
-            let part = &self.parts[place.part].get()[bytes.clone()];
-            match part.as_ptr().align_offset(dtype.size()) {
-                0 if !part.is_empty() => {
+            let shard = &self.shards[place.shard].get()[bytes.clone()];
+            match shard.as_ptr().align_offset(dtype.size()) {
+                0 if !shard.is_empty() => {
                     // SAFETY: the array lies inside the file, which stays mapped until the array is copied, or else forever.
                     let view = unsafe {
                         let (size, stride) = (dimensions(shape), dimensions(strides));
-                        Tensor::f_from_blob(part.as_ptr(), &size, &stride, to_kind(*dtype), Device::Cpu)?
+                        Tensor::f_from_blob(shard.as_ptr(), &size, &stride, to_kind(*dtype), Device::Cpu)?
                     };
                     if lies_in_file(variable, &view) {
                         variable.set_data(&view);
@@ -297,13 +303,13 @@ impl WeightsFile {
                 }
                 _ => variable.f_copy_(&self.copy(place)?)?,
             }
-            self.parts[place.part].release_pages(bytes.clone());
+            self.shards[place.shard].release_pages(bytes.clone());
             Ok(())
         })
     }
 
-    fn copy(&self, Place { part, array }: &Place) -> Result<Tensor> {
-        let bytes = &self.parts[*part].get()[array.bytes.clone()];
+    fn copy(&self, TensorLocation { shard, array }: &TensorLocation) -> Result<Tensor> {
+        let bytes = &self.shards[*shard].get()[array.bytes.clone()];
         let count = bytes.len() / array.dtype.size();
         let numbers = Tensor::f_from_data_size(bytes, &[count as i64], to_kind(array.dtype))?;
         Ok(numbers

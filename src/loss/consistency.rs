@@ -4,16 +4,16 @@ use tch::{Kind, Tensor};
 
 /// Part of a training step that one forward pass covers: a step may run the model in slices.
 #[derive(Debug)]
-pub struct Share {
+pub struct StepFraction {
     /// Fraction of the step's scenes.
     pub scenes: f64,
     /// Number of pixels of the whole step whose depth L_con compares, a scalar; `None` if this pass is the whole step.
     pub depth_pixels: Option<Tensor>,
 }
 
-impl Share {
-    /// Share of a pass that is the whole step.
-    pub const WHOLE: Share = Share { scenes: 1., depth_pixels: None };
+impl StepFraction {
+    /// Fraction of a pass that is the whole step.
+    pub const WHOLE: StepFraction = StepFraction { scenes: 1., depth_pixels: None };
 }
 
 /// Minimum opacity of both splats at a pixel whose depth is compared.
@@ -27,7 +27,7 @@ pub fn consistency(
     depth: [&Tensor; 2],
     alpha_factor: f64,
     depth_factor: f64,
-    share: &Share,
+    share: &StepFraction,
 ) -> Tensor {
     let opacity = symmetric_distance(alpha).mean(None::<Kind>) * share.scenes;
     let both = opaque_in_both(alpha).to_kind(depth[0].kind());

@@ -1,7 +1,7 @@
 //! LPIPS, a perceptual image distance: Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", 2018,
 //! equation 1. It uses version 0.1 of the linear weights, as published results do.
 
-use crate::device::leave_out_tf32;
+use crate::device::disable_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
 use crate::model::{Precision, convolve};
@@ -141,9 +141,9 @@ struct Tile {
     /// End of the tile: the pixel after its last.
     end: i64,
     /// First pixel of the network's input.
-    shown: i64,
+    input_start: i64,
     /// End of the network's input: the pixel after its last.
-    shown_end: i64,
+    input_end: i64,
 }
 
 impl Tile {
@@ -153,21 +153,21 @@ impl Tile {
         let step = (side / count / LARGEST_STRIDE + 1) * LARGEST_STRIDE;
         (0..side).step_by(step as usize).map(move |first| {
             let end = (first + step).min(side);
-            Tile { first, end, shown: (first - HALO).max(0), shown_end: (end + HALO).min(side) }
+            Tile { first, end, input_start: (first - HALO).max(0), input_end: (end + HALO).min(side) }
         })
     }
 
-    /// Returns the network's input for this tile: a slice of `pictures` along `dim`.
-    fn cut(self, pictures: &Tensor, dim: i64) -> Tensor {
-        pictures.narrow(dim, self.shown, self.shown_end - self.shown)
+    /// Returns the network's input for this tile: a slice of `images` along `dim`.
+    fn cut(self, images: &Tensor, dim: i64) -> Tensor {
+        images.narrow(dim, self.input_start, self.input_end - self.input_start)
     }
 
     /// Returns the tile's own values of `features`, whose stride along `dim` is `stride` pixels. At the end of the image a layer may have
     /// fewer features than the pixels and the stride suggest.
     fn keep(self, features: &Tensor, dim: i64, stride: i64) -> Tensor {
         let there = features.size()[dim as usize];
-        let first = ((self.first - self.shown) / stride).min(there);
-        let is_last = self.end == self.shown_end;
+        let first = ((self.first - self.input_start) / stride).min(there);
+        let is_last = self.end == self.input_end;
         let count = if is_last { there } else { (self.end - self.first) / stride };
         features.narrow(dim, first, count.min(there - first))
     }
@@ -199,7 +199,7 @@ impl Lpips {
     /// Builds the network under `vs`: `conv….weight` [O, I, k, k] and `.bias` [O], `lin0.weight` to `lin4.weight` [1, C, 1, 1]. They are
     /// zero until they are loaded.
     pub(crate) fn new(vs: &nn::Path, network: LpipsNetwork) -> Self {
-        leave_out_tf32();
+        disable_tf32();
         let zero = nn::Init::Const(0.);
         let (mut inputs, mut compared, mut steps) = (3, 0, vec![]);
         for layer in network.layers() {
@@ -258,19 +258,19 @@ impl Lpips {
     ///
     /// # Panics
     /// Panics if the images have another shape or a smaller size.
-    pub fn distance(&self, picture: &Tensor, ground_truth: &Tensor) -> Tensor {
-        let size = picture.size();
-        let [.., height, width] = size[..] else { panic!("a picture has shape {size:?}") };
+    pub fn distance(&self, image: &Tensor, ground_truth: &Tensor) -> Tensor {
+        let size = image.size();
+        let [.., height, width] = size[..] else { panic!("an image has shape {size:?}") };
         let distance = match height * width <= MOST_PIXELS {
-            true => self.compare(self.features(picture), self.features(ground_truth)),
-            false => self.distance_in_tiles(picture, ground_truth, TILE),
+            true => self.compare(self.features(image), self.features(ground_truth)),
+            false => self.distance_in_tiles(image, ground_truth, TILE),
         };
         distance.view(&size[..size.len() - 3])
     }
 
     /// Computes [`Lpips::distance`] of B images, `[B]`, in tiles with sides of about `length` pixels.
-    fn distance_in_tiles(&self, picture: &Tensor, ground_truth: &Tensor, length: i64) -> Tensor {
-        let [.., height, width] = picture.size()[..] else { panic!("a picture has two sides") };
+    fn distance_in_tiles(&self, image: &Tensor, ground_truth: &Tensor, length: i64) -> Tensor {
+        let [.., height, width] = image.size()[..] else { panic!("an image has height and width") };
         let columns = Tile::cover(width, length);
         let tiles =
             Tile::cover(height, length).flat_map(|row| columns.clone().map(move |column| (row, column)));
@@ -278,12 +278,12 @@ impl Lpips {
         // For every layer: the sum over pixels, [B], and the number of pixels.
         let mut sums: Vec<Option<(Tensor, i64)>> = strides.iter().map(|_| None).collect();
         for (row, column) in tiles {
-            let cut = |pictures: &Tensor| {
-                let dims = pictures.dim() as i64;
-                column.cut(&row.cut(pictures, dims - 2), dims - 1)
+            let cut = |images: &Tensor| {
+                let dims = images.dim() as i64;
+                column.cut(&row.cut(images, dims - 2), dims - 1)
             };
-            let (picture, ground_truth) = (cut(picture), cut(ground_truth));
-            let differences = self.differences(self.features(&picture), self.features(&ground_truth));
+            let (image, ground_truth) = (cut(image), cut(ground_truth));
+            let differences = self.differences(self.features(&image), self.features(&ground_truth));
             for ((difference, stride), sum) in differences.zip(&strides).zip(&mut sums) {
                 let own = column.keep(&row.keep(&difference, 2, *stride), 3, *stride);
                 let count = own.size()[2] * own.size()[3];
@@ -299,11 +299,11 @@ impl Lpips {
     }
 
     /// Computes the features that [`Lpips::compare`] compares, layer by layer and lazily: [B, C, H', W'], divided by their norm over the
-    /// channels. `pictures` are B images as in [`Lpips::distance`].
-    pub fn features(&self, pictures: &Tensor) -> impl Iterator<Item = Tensor> {
-        let size = pictures.size();
-        let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
-        let mut xs = self.precision.images(&((pictures * 2. - 1. - &self.shift) / &self.scale));
+    /// channels. `images` are B images as in [`Lpips::distance`].
+    pub fn features(&self, images: &Tensor) -> impl Iterator<Item = Tensor> {
+        let size = images.size();
+        let images = images.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
+        let mut xs = self.precision.images(&((images * 2. - 1. - &self.shift) / &self.scale));
         self.steps.iter().filter_map(move |step| {
             if step.pooled {
                 let pool = self.network.pool();
@@ -347,7 +347,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tiles_are_the_whole() {
+    fn tiled_distance_matches_the_whole_image() {
         tch::manual_seed(3);
         for network in LpipsNetwork::ALL {
             let vs = nn::VarStore::new(Device::Cpu);
@@ -366,8 +366,8 @@ mod tests {
             assert_eq!(network.strides().last(), Some(&LARGEST_STRIDE));
             // Sides that the strides divide and sides that they don't, including a last tile for which AlexNet has no feature.
             for (height, width) in [(64, 288), (81, 241), (129, 193)] {
-                let picture = || Tensor::rand([1, 3, height, width], (Kind::Float, Device::Cpu));
-                let (a, b) = (picture(), picture());
+                let image = || Tensor::rand([1, 3, height, width], (Kind::Float, Device::Cpu));
+                let (a, b) = (image(), image());
                 let whole = Vec::<f64>::try_from(lpips.distance(&a, &b).to_kind(Kind::Double)).unwrap();
                 let tiled = lpips.distance_in_tiles(&a, &b, 96).to_kind(Kind::Double);
                 for (whole, tiled) in whole.into_iter().zip(Vec::<f64>::try_from(tiled).unwrap()) {

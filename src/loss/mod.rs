@@ -24,42 +24,42 @@ pub use terms::{Losses, Term};
 pub use vgg19::Vgg19;
 
 // Used by training, which may run the model in slices.
-pub(crate) use consistency::{Share, consistency, depth_pixels};
+pub(crate) use consistency::{StepFraction, consistency, depth_pixels};
 
-use crate::data::Sample;
+use crate::data::Batch;
 use crate::model::Decoded;
 use crate::render::RenderOutput;
 use tch::Tensor;
 
-/// Computes the loss terms of `decoded`, whose `pictures` were rendered from the sample's target cameras. All terms are means over equally
+/// Computes the loss terms of `decoded`, whose `rendered` were rendered from the sample's target cameras. All terms are means over equally
 /// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. The losses of all shares of a step add up to the step's loss.
 pub(crate) fn losses(
     config: &LossConfig,
     perceptual: Option<&PerceptualLoss>,
-    sample: &Sample,
+    batch: &Batch,
     decoded: &Decoded,
-    pictures: &RenderOutput,
-    share: &Share,
+    rendered: &RenderOutput,
+    share: &StepFraction,
 ) -> Losses<Tensor> {
-    let ground_truth = &sample.target.images;
-    let mse = mse(&pictures.rgb, ground_truth) * share.scenes;
+    let ground_truth = &batch.target.images;
+    let mse = mse(&rendered.rgb, ground_truth) * share.scenes;
     let perceptual = match perceptual {
         Some(network) => {
             // Both halves of a paired sample have the same targets.
-            let halves = ground_truth.chunk(if sample.paired { 2 } else { 1 }, 0);
-            network.loss(&pictures.rgb, &halves[0]) * share.scenes
+            let halves = ground_truth.chunk(if batch.paired { 2 } else { 1 }, 0);
+            network.loss(&rendered.rgb, &halves[0]) * share.scenes
         }
         None => mse.zeros_like(),
     };
-    let consistency = match sample.paired {
+    let consistency = match batch.paired {
         true => {
-            let (alpha, depth) = (pictures.alpha.chunk(2, 0), pictures.depth.chunk(2, 0));
+            let (alpha, depth) = (rendered.alpha.chunk(2, 0), rendered.depth.chunk(2, 0));
             let factors = (config.consistency_alpha, config.consistency_depth);
             consistency([&alpha[0], &alpha[1]], [&depth[0], &depth[1]], factors.0, factors.1, share)
         }
         false => mse.zeros_like(),
     };
-    let frustum = frustum(&decoded.gaussians.means, &sample.context, &sample.far) * share.scenes;
+    let frustum = frustum(&decoded.gaussians.means, &batch.context, &batch.far) * share.scenes;
     let decoder = decoder_regularization(&decoded.raw, config.decoder_opacity);
     Losses::weighted(config, |term| match term {
         Term::Mse => mse.shallow_clone(),

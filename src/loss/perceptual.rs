@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
 
 /// Number of 256×256 images that go through the network together on a GPU. VGG-19 keeps 0.2 GB in float32 for each.
-const AT_ONCE_ON_A_GPU: i64 = 16;
+const GPU_CHUNK_SIZE: i64 = 16;
 
 /// Perceptual network with its weights.
 #[derive(Debug)]
@@ -35,14 +35,14 @@ impl PerceptualLoss {
             PerceptualKind::Vgg19 => (
                 "torchvision's vgg19 as a safetensors",
                 "save_file(torchvision.models.vgg19(weights=\"IMAGENET1K_V1\").features.state_dict(prefix=\"features.\"), FILE) \
-                 makes it, and loss.perceptual=\"lpips_vgg\" needs what make weights makes",
+                 creates it; loss.perceptual=\"lpips_vgg\" needs only the files that `make weights` creates",
             ),
             PerceptualKind::LpipsVgg | PerceptualKind::LpipsAlex => {
-                ("the weights of LPIPS", "make weights makes it")
+                ("the weights of LPIPS", "`make weights` creates it")
             }
         };
         if !file.is_file() {
-            let found = format!("{}, which is not there", file.display());
+            let found = format!("{}, which doesn't exist", file.display());
             return Err(Error::request(format!(
                 "loss.perceptual_weights is {found}, expected {expected} ({how})"
             )));
@@ -63,13 +63,13 @@ impl PerceptualLoss {
         Ok(Some(loss))
     }
 
-    /// Returns an upper bound on the memory of the network in bytes: its weights, and the activations of those of `pictures` images of
+    /// Returns an upper bound on the memory of the network in bytes: its weights, and the activations of those of `images` images of
     /// `size` that go through it at a time.
-    pub fn bytes_kept(
+    pub fn max_memory_bytes(
         config: &LossConfig,
         precision: Precision,
         size: ImageSize,
-        pictures: usize,
+        images: usize,
         device: Device,
     ) -> u64 {
         // Number of weights, and number of elements per pixel: activations, their gradients, and differences of the compared features.
@@ -81,15 +81,15 @@ impl PerceptualLoss {
         };
         let number = if precision == Precision::Bf16 { 2.5 } else { 4. };
         let pixels = i64::from(size.height) * i64::from(size.width);
-        let at_once = Self::at_once(pixels, device).min(pictures as i64);
-        (number * (weights + of_pixel * (at_once * pixels) as f64)) as u64
+        let chunk_size = Self::chunk_size(pixels, device).min(images as i64);
+        (number * (weights + of_pixel * (chunk_size * pixels) as f64)) as u64
     }
 
     /// Returns the number of images of `pixels` pixels each that go through the network at a time.
-    fn at_once(pixels: i64, device: Device) -> i64 {
+    fn chunk_size(pixels: i64, device: Device) -> i64 {
         match device {
             Device::Cpu => 1,
-            _ => (AT_ONCE_ON_A_GPU * 256 * 256 / pixels).max(1),
+            _ => (GPU_CHUNK_SIZE * 256 * 256 / pixels).max(1),
         }
     }
 
@@ -131,30 +131,30 @@ impl PerceptualLoss {
     /// a training step. The number of images that go together depends on their size alone, because the last bits of sums depend on it.
     pub fn loss(&self, rendered: &Tensor, ground_truth: &Tensor) -> Tensor {
         let pixels = ground_truth.size()[3..].iter().product();
-        let at_once = Self::at_once(pixels, rendered.device());
-        self.loss_by_chunks(rendered, ground_truth, at_once)
+        let chunk_size = Self::chunk_size(pixels, rendered.device());
+        self.loss_by_chunks(rendered, ground_truth, chunk_size)
     }
 
-    /// Computes [`PerceptualLoss::loss`] with `at_once` images at a time.
-    fn loss_by_chunks(&self, rendered: &Tensor, ground_truth: &Tensor, at_once: i64) -> Tensor {
+    /// Computes [`PerceptualLoss::loss`] with `chunk_size` images at a time.
+    fn loss_by_chunks(&self, rendered: &Tensor, ground_truth: &Tensor, chunk_size: i64) -> Tensor {
         let ground_truth = ground_truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) =
             (ground_truth.size()[0], rendered.size()[0] * rendered.size()[1] / ground_truth.size()[0]);
-        let pictures = rendered.detach().reshape([&[repeats][..], &ground_truth.size()].concat());
-        let gradient = tracks_grad(rendered).then(|| pictures.empty_like());
+        let images = rendered.detach().reshape([&[repeats][..], &ground_truth.size()].concat());
+        let gradient = tracks_grad(rendered).then(|| images.empty_like());
         let mut sum = Tensor::zeros([], (Kind::Float, rendered.device()));
-        for first in (0..count).step_by(at_once as usize) {
-            let length = at_once.min(count - first);
+        for first in (0..count).step_by(chunk_size as usize) {
+            let length = chunk_size.min(count - first);
             let share = length as f64 / (count * repeats) as f64;
             let ground_truth = ground_truth.narrow(0, first, length);
             let ground_truth = part("L_perc", || tch::no_grad(|| self.features(&ground_truth)));
             for turn in 0..repeats {
                 let place = |of: &Tensor| of.select(0, turn).narrow(0, first, length);
-                let picture = place(&pictures).detach().set_requires_grad(gradient.is_some());
-                let loss = part("L_perc", || self.compare(&self.features(&picture), &ground_truth)) * share;
+                let image = place(&images).detach().set_requires_grad(gradient.is_some());
+                let loss = part("L_perc", || self.compare(&self.features(&image), &ground_truth)) * share;
                 if let Some(gradient) = &gradient {
                     loss.backward();
-                    place(gradient).copy_(&picture.grad());
+                    place(gradient).copy_(&image.grad());
                 }
                 sum += loss.detach();
             }
@@ -169,20 +169,20 @@ impl PerceptualLoss {
         }
     }
 
-    fn features(&self, pictures: &Tensor) -> Vec<Tensor> {
+    fn features(&self, images: &Tensor) -> Vec<Tensor> {
         match self {
-            PerceptualLoss::Vgg19(network) => network.features(pictures),
-            PerceptualLoss::Lpips(lpips) => lpips.features(pictures).collect(),
+            PerceptualLoss::Vgg19(network) => network.features(images),
+            PerceptualLoss::Lpips(lpips) => lpips.features(images).collect(),
         }
     }
 
     /// Computes the mean loss over the images with these features.
-    fn compare(&self, picture: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
+    fn compare(&self, image: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
         let each = |features: &[Tensor]| features.iter().map(Tensor::shallow_clone).collect::<Vec<_>>();
         match self {
-            PerceptualLoss::Vgg19(network) => network.compare(picture, ground_truth),
+            PerceptualLoss::Vgg19(network) => network.compare(image, ground_truth),
             PerceptualLoss::Lpips(lpips) => {
-                lpips.compare(each(picture).into_iter(), each(ground_truth).into_iter()).mean(None::<Kind>)
+                lpips.compare(each(image).into_iter(), each(ground_truth).into_iter()).mean(None::<Kind>)
             }
         }
     }
@@ -194,7 +194,7 @@ mod tests {
     use tch::nn;
 
     #[test]
-    fn pictures_may_be_compared_in_any_chunks() {
+    fn loss_is_the_same_for_any_chunk_size() {
         tch::manual_seed(3);
         let vs = nn::VarStore::new(Device::Cpu);
         let network = Lpips::new(&vs.root(), LpipsNetwork::AlexNet);
@@ -203,21 +203,21 @@ mod tests {
         });
         let loss = PerceptualLoss::Lpips(network);
         // Two renderings of five images.
-        let pictures = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
-        let (rendered, ground_truth) = (pictures(2), pictures(1));
-        let of_chunks = |at_once: i64| {
+        let images = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
+        let (rendered, ground_truth) = (images(2), images(1));
+        let of_chunks = |chunk_size: i64| {
             let rendered = rendered.detach().set_requires_grad(true);
-            let loss = loss.loss_by_chunks(&rendered, &ground_truth, at_once);
+            let loss = loss.loss_by_chunks(&rendered, &ground_truth, chunk_size);
             loss.backward();
             (loss.double_value(&[]), rendered.grad())
         };
         let (value, gradient) = of_chunks(5);
         assert!(value > 0. && gradient.abs().max().double_value(&[]) > 0.);
-        for at_once in [1, 2, 3, 7] {
-            let (other, of_other) = of_chunks(at_once);
+        for chunk_size in [1, 2, 3, 7] {
+            let (other, of_other) = of_chunks(chunk_size);
             let off = (&of_other - &gradient).abs().max() / gradient.abs().max();
-            assert!((other / value - 1.).abs() < 1e-6, "{at_once}: {other} instead of {value}");
-            assert!(off.double_value(&[]) < 1e-5, "{at_once}: {off}");
+            assert!((other / value - 1.).abs() < 1e-6, "{chunk_size}: {other} instead of {value}");
+            assert!(off.double_value(&[]) < 1e-5, "{chunk_size}: {off}");
         }
     }
 }

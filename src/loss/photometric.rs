@@ -5,17 +5,18 @@ use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
-/// Computes `absolute` times the mean absolute difference plus `similar` times the mean SSIM. Both are means over images and channels; the
+/// Computes `l1_weight` times the mean absolute difference plus `ssim_weight` times the mean SSIM. Both are means over images and channels; the
 /// first is over all pixels, the second over pixels whose 11×11 window lies inside the image. The result is a scalar, differentiable with
-/// respect to `picture`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H and
-/// W at least 11; float64 if `picture` is, and float32 otherwise.
+/// respect to `image`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H and
+/// W at least 11; float64 if `image` is, and float32 otherwise.
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller.
-pub fn photometric(picture: &Tensor, ground_truth: &Tensor, absolute: f64, similar: f64) -> Tensor {
-    let (picture, ground_truth) = (picture.as_ptr() as usize, ground_truth.as_ptr() as usize);
+pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_weight: f64) -> Tensor {
+    let (image, ground_truth) = (image.as_ptr() as usize, ground_truth.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { take_outputs(|out| fit::photometric(picture, ground_truth, absolute, similar, out)) };
+    let done =
+        unsafe { take_outputs(|out| fit::photometric(image, ground_truth, l1_weight, ssim_weight, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }
@@ -24,6 +25,6 @@ pub fn photometric(picture: &Tensor, ground_truth: &Tensor, absolute: f64, simil
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller than 11×11.
-pub fn ssim(picture: &Tensor, ground_truth: &Tensor) -> Tensor {
-    photometric(picture, ground_truth, 0., 1.)
+pub fn ssim(image: &Tensor, ground_truth: &Tensor) -> Tensor {
+    photometric(image, ground_truth, 0., 1.)
 }

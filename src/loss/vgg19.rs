@@ -1,7 +1,7 @@
 //! L_perc of kind `vgg19` (spec 7.3): the distance of an image from the ground truth in the features of VGG-19 (Simonyan & Zisserman 2015)
 //! with average pooling.
 
-use crate::device::leave_out_tf32;
+use crate::device::disable_tf32;
 use crate::error::Result;
 use crate::io::WeightsFile;
 use crate::model::{Precision, convolve};
@@ -51,7 +51,7 @@ impl Vgg19 {
     /// Builds the network under `vs`, with torchvision's names: `features.0.weight` [64, 3, 3, 3], `features.0.bias` [64], …. They are zero
     /// until they are loaded.
     pub(crate) fn new(vs: &nn::Path) -> Self {
-        leave_out_tf32();
+        disable_tf32();
         let zero = nn::Init::Const(0.);
         let config = nn::ConvConfig { padding: 1, ws_init: zero, bs_init: zero, ..Default::default() };
         let mut inputs = 3;
@@ -77,7 +77,7 @@ impl Vgg19 {
         let network = Vgg19::new(&vs.root());
         let known = vs.variables();
         let weights = WeightsFile::open(path)?;
-        weights.renamed(|name| known.contains_key(name).then(|| name.into())).load_into(&vs)?;
+        weights.rename_tensors(|name| known.contains_key(name).then(|| name.into())).load_into(&vs)?;
         vs.freeze();
         Ok(network)
     }
@@ -93,10 +93,10 @@ impl Vgg19 {
     ///
     /// # Panics
     /// Panics if the images have another shape or a smaller size.
-    pub fn features(&self, pictures: &Tensor) -> Vec<Tensor> {
-        let size = pictures.size();
-        let pictures = pictures.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
-        let mut xs = pictures * RANGE - &self.means;
+    pub fn features(&self, images: &Tensor) -> Vec<Tensor> {
+        let size = images.size();
+        let images = images.reshape([-1, 3, size[size.len() - 2], size[size.len() - 1]]);
+        let mut xs = images * RANGE - &self.means;
         let mut features = vec![xs.shallow_clone()];
         xs = self.precision.images(&xs);
         for ((.., pooled, counts), convolution) in LAYERS.iter().zip(&self.convolutions) {
@@ -112,9 +112,9 @@ impl Vgg19 {
     }
 
     /// Computes the loss from two lists of features: Σ of their mean absolute differences, each divided by its own divisor, over 255.
-    pub fn compare(&self, picture: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
+    pub fn compare(&self, image: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
         let divisors = std::iter::once(1.).chain(LAYERS.iter().filter_map(|(.., divisor)| *divisor));
-        let differences = picture.iter().zip(ground_truth).zip(divisors);
+        let differences = image.iter().zip(ground_truth).zip(divisors);
         let float = |features: &Tensor| features.to_kind(Kind::Float);
         let differences =
             differences.map(|((a, b), divisor)| (float(a) - float(b)).abs().mean(None::<Kind>) / divisor);

@@ -2,7 +2,7 @@
 
 use super::parts::record_flops;
 use globalsplat_csrc::attention as ours;
-use globalsplat_csrc::processor::{Bf16, bf16_of_cpu};
+use globalsplat_csrc::processor::{Bf16Support, bf16_of_cpu};
 use tch::{Device, Kind, Tensor};
 
 /// Computes softmax(q kᵀ / √(d/h)) v over `heads` heads. q is [B, n, d], k and v are [B, m, d]; the result is [B, n, d] and of their kind.
@@ -19,21 +19,21 @@ fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let (kind, width, all) = (q.kind(), q.size()[2] / heads, [q, k, v]);
     let fits = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == kind && t.size()[1] > 0;
     if !all.iter().all(fits) {
-        return by_libtorch(q, k, v, heads);
+        return attention_libtorch(q, k, v, heads);
     }
-    let takes = |is_bf16| ours::attention_takes(width, is_bf16).unwrap_or_else(|error| panic!("{error}"));
+    let takes = |is_bf16| ours::supports_attention(width, is_bf16).unwrap_or_else(|error| panic!("{error}"));
     match kind {
-        Kind::Float if takes(false) => by_ours(all, heads),
-        Kind::BFloat16 if takes(true) => by_ours(all, heads),
+        Kind::Float if takes(false) => attention_cpu_kernel(all, heads),
+        Kind::BFloat16 if takes(true) => attention_cpu_kernel(all, heads),
         // Our kernel lacks bf16 products on this CPU, and libtorch's bf16 kernel is fast only with tiles (AMX): compute in float32.
-        Kind::BFloat16 if bf16_of_cpu() != Bf16::Tiles && takes(false) => {
-            by_ours(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
+        Kind::BFloat16 if bf16_of_cpu() != Bf16Support::Tiles && takes(false) => {
+            attention_cpu_kernel(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
         }
-        _ => by_libtorch(q, k, v, heads),
+        _ => attention_libtorch(q, k, v, heads),
     }
 }
 
-fn by_ours(all: [&Tensor; 3], heads: i64) -> Tensor {
+fn attention_cpu_kernel(all: [&Tensor; 3], heads: i64) -> Tensor {
     let [q, k, v] = all.map(|t| t.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
     let out = unsafe { ours::attention(q, k, v, heads) }.unwrap_or_else(|error| panic!("{error}"));
@@ -41,7 +41,7 @@ fn by_ours(all: [&Tensor; 3], heads: i64) -> Tensor {
 }
 
 /// Computes [`attention`] with libtorch, on any device and for any kind and width.
-pub(crate) fn by_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+pub(crate) fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let split = |t: &Tensor| {
         let (b, n, d) = t.size3().expect("[B, n, d]");
         t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn bfloat16_is_as_exact_as_its_numbers() {
+    fn bf16_attention_matches_float64() {
         let of = |n: i64, width: i64, phase: f64| {
             let numbers = Tensor::arange(2 * n * width, (Kind::Double, Device::Cpu)).square() + phase;
             (numbers.sin() * 1.5).to_kind(Kind::BFloat16).view([2, n, width])
@@ -116,7 +116,7 @@ mod tests {
         for (queries, keys, heads, width) in
             [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128), (200, 131, 1, 72)]
         {
-            if !ours::attention_takes(width, true).unwrap() {
+            if !ours::supports_attention(width, true).unwrap() {
                 let why = "this processor has no products of bfloat16 numbers";
                 return globalsplat_test_kit::skip_on_this_processor("bfloat16 products", why);
             }
@@ -125,7 +125,7 @@ mod tests {
             let found = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
             assert_eq!((found[0].kind(), found[0].size()), (Kind::BFloat16, all[0].size()));
             let exact = answers(&all.each_ref().map(|t| t.to_kind(Kind::Double)), &|[q, k, v]| {
-                by_libtorch(q, k, v, heads)
+                attention_libtorch(q, k, v, heads)
             });
             for (name, (found, exact)) in ["seen", "dq", "dk", "dv"].iter().zip(found.iter().zip(&exact)) {
                 // With a single key, the scores have zero gradients.

@@ -80,7 +80,7 @@ impl Decoded {
     }
 
     /// Pairs every tensor with the corresponding one of `other`.
-    pub(crate) fn beside<'a>(&'a self, other: &'a Decoded) -> [(&'a Tensor, &'a Tensor); 10] {
+    pub(crate) fn zip_tensors<'a>(&'a self, other: &'a Decoded) -> [(&'a Tensor, &'a Tensor); 10] {
         let (ours, theirs) = (&self.gaussians, &other.gaussians);
         [
             (&ours.means, &theirs.means),

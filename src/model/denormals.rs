@@ -29,7 +29,7 @@ mod tests {
     use tch::Tensor;
 
     #[test]
-    fn all_threads_take_them_for_0() {
+    fn denormals_are_zero_on_all_threads() {
         // Enough elements for libtorch to split them among its threads, which it starts separately for each calling thread.
         const MANY: i64 = 1 << 20;
         let left = || {

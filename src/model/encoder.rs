@@ -31,7 +31,7 @@ impl EncodedTokens {
     }
 
     /// Pairs both tensors with the corresponding ones of `other`.
-    pub(crate) fn beside<'a>(&'a self, other: &'a EncodedTokens) -> [(&'a Tensor, &'a Tensor); 2] {
+    pub(crate) fn zip_tensors<'a>(&'a self, other: &'a EncodedTokens) -> [(&'a Tensor, &'a Tensor); 2] {
         [(&self.geometry, &other.geometry), (&self.appearance, &other.appearance)]
     }
 }
@@ -114,9 +114,9 @@ impl Encoder {
         Memory::new(&Tensor::cat(&[&registers, tokens], 1))
     }
 
-    /// Computes the memory without gradients from `views` views, one after the other, with [`Memory::of_views`].
+    /// Computes the memory without gradients from `views` views, one after the other, with [`Memory::from_views`].
     pub fn memory_of_views(&self, views: i64, view: impl Fn(i64) -> Tensor) -> Memory {
-        Memory::of_views(&self.memory_registers, views, view, self.precision)
+        Memory::from_views(&self.memory_registers, views, view, self.precision)
     }
 
     /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`].
@@ -180,7 +180,7 @@ impl Slots {
     }
 
     /// Pairs every stream with the corresponding one of `other`.
-    pub fn beside<'a>(&'a self, other: &'a Slots) -> Vec<(&'a Tensor, &'a Tensor)> {
+    pub fn zip_tensors<'a>(&'a self, other: &'a Slots) -> Vec<(&'a Tensor, &'a Tensor)> {
         let appearance = self.appearance.as_ref().zip(other.appearance.as_ref());
         std::iter::once((&self.geometry, &other.geometry)).chain(appearance).collect()
     }

@@ -4,7 +4,7 @@ use super::config::ModelConfig;
 use super::decoder::{OPACITY, PARAMETERS};
 use tch::{Kind, Tensor};
 
-/// Standard deviation of the noise between latent_ratio of a scene token, relative to that of all scene tokens.
+/// Standard deviation of the noise between the copies of a scene token, relative to that of all scene tokens.
 const SPREAD: f64 = 0.2;
 
 /// Differences by which one model is larger than another.
@@ -20,7 +20,7 @@ pub(crate) struct Growth {
 
 impl Growth {
     /// Returns the growth from `from` towards `to`, as far as there are rules for it. Other differences are ignored.
-    pub fn between(from: &ModelConfig, to: &ModelConfig) -> Self {
+    pub fn from_configs(from: &ModelConfig, to: &ModelConfig) -> Self {
         let times = |whole: i64, part: i64| if whole % part == 0 { whole / part } else { 1 };
         Growth {
             patch_size_ratio: times(from.patch_size, to.patch_size),
@@ -39,7 +39,7 @@ impl Growth {
     }
 
     /// Converts `weights`, called `name` in the smaller model, to the larger model. Draws from libtorch's random generator.
-    pub fn of(&self, name: &str, weights: &Tensor) -> Tensor {
+    pub fn convert(&self, name: &str, weights: &Tensor) -> Tensor {
         match name {
             "ray_patch_embeds.1.weight" | "rgb_patch_embeds.1.weight" => {
                 for_smaller_patches(weights, self.from.patch_size, self.patch_size_ratio)
@@ -87,7 +87,7 @@ mod tests {
     use tch::Device;
 
     #[test]
-    fn a_small_patch_is_looked_at_as_if_enlarged() {
+    fn smaller_patches_match_enlarged_patches() {
         let numbers = |size: &[i64], seed: f64| {
             let count = size.iter().product();
             (Tensor::linspace(0., seed, count, (Kind::Double, Device::Cpu)) * 1e3).sin().view(size)
@@ -107,36 +107,34 @@ mod tests {
     }
 
     #[test]
-    fn copies_of_a_token_differ_a_little_and_cover_as_much_together() {
+    fn repeated_tokens_differ_by_noise_and_keep_total_opacity() {
         tch::manual_seed(4);
         let of = |latents| ModelConfig { latents, ..Default::default() };
         for latent_ratio in [1, 2, 3] {
-            let growth = Growth::between(&of(500), &of(500 * latent_ratio));
+            let growth = Growth::from_configs(&of(500), &of(500 * latent_ratio));
             let tokens = Tensor::randn([500, 16], (Kind::Float, Device::Cpu)) * 3.;
             let apart =
-                growth.of("scene_tokens", &tokens).view([500, latent_ratio, 16]) - tokens.unsqueeze(1);
+                growth.convert("scene_tokens", &tokens).view([500, latent_ratio, 16]) - tokens.unsqueeze(1);
             let apart = apart.square().mean(None::<Kind>).sqrt().double_value(&[]);
             let expected = if latent_ratio == 1 { 0. } else { 3. * SPREAD };
-            assert!(
-                (apart - expected).abs() < 0.05 * expected + 1e-9,
-                "{latent_ratio} latent_ratio: {apart}"
-            );
+            assert!((apart - expected).abs() < 0.05 * expected + 1e-9, "{latent_ratio} copies: {apart}");
 
             // Bias of two candidates that are half opaque.
             let bias = Tensor::zeros([2 * PARAMETERS], (Kind::Double, Device::Cpu));
-            let grown = growth.of("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
+            let grown =
+                growth.convert("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
             let left = grown.select(1, OPACITY).sigmoid().neg() + 1.;
             let covered: Tensor = 1. - left.pow_tensor_scalar(latent_ratio);
             assert!(
                 covered.allclose(&covered.full_like(0.5), 1e-12, 0., false),
-                "{latent_ratio} latent_ratio: {covered:?}"
+                "{latent_ratio} copies: {covered:?}"
             );
             assert_eq!(grown.narrow(1, 0, OPACITY).abs().sum(None::<Kind>).double_value(&[]), 0.);
         }
     }
 
     #[test]
-    fn what_there_is_no_rule_for_stays_as_it_was() {
+    fn unsupported_differences_are_ignored() {
         let from = ModelConfig { patch_size: 8, latents: 16, ..Default::default() };
         let to = |patch_size, latents| ModelConfig { patch_size, latents, ..from.clone() };
         for (wanted, reached) in [
@@ -146,7 +144,7 @@ mod tests {
             (to(2, 24), to(2, 16)),
             (to(16, 8), to(8, 16)),
         ] {
-            assert_eq!(Growth::between(&from, &wanted).result(), reached);
+            assert_eq!(Growth::from_configs(&from, &wanted).result(), reached);
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::parts::{part, record_flops};
 use super::precision::Precision;
-use globalsplat_csrc::room::expect_room_for_code;
+use globalsplat_csrc::memory_check::ensure_memory_for_code;
 use std::cell::Cell;
 use tch::{Device, Tensor, nn, nn::Module};
 
@@ -12,24 +12,24 @@ pub(super) const ENCODER_STD: f64 = 0.02;
 /// Returns a normal initialization with mean 0. Spec 4.4 truncates normals at ±2, as torch's `trunc_normal_` does. That is a hundred
 /// standard deviations away, so this is the plain normal distribution.
 pub(super) fn randn(stdev: f64) -> nn::Init {
-    drawn(nn::Init::Randn { mean: 0., stdev })
+    init_or_zeros(nn::Init::Randn { mean: 0., stdev })
 }
 
 thread_local! {
-    static DRAWS: Cell<bool> = const { Cell::new(true) };
+    static RANDOM_INIT: Cell<bool> = const { Cell::new(true) };
 }
 
 /// Runs `build` with zeros in place of random initial weights. tch's `nn::Path`, from which every module is built, has no option for this.
-pub(super) fn without_drawing<M>(build: impl FnOnce() -> M) -> M {
-    let before = DRAWS.replace(false);
+pub(super) fn without_random_init<M>(build: impl FnOnce() -> M) -> M {
+    let before = RANDOM_INIT.replace(false);
     let built = build();
-    DRAWS.set(before);
+    RANDOM_INIT.set(before);
     built
 }
 
-/// Returns `init`, or zeros within [`without_drawing`].
-pub(super) fn drawn(init: nn::Init) -> nn::Init {
-    if DRAWS.get() { init } else { nn::Init::Const(0.) }
+/// Returns `init`, or zeros within [`without_random_init`].
+pub(super) fn init_or_zeros(init: nn::Init) -> nn::Init {
+    if RANDOM_INIT.get() { init } else { nn::Init::Const(0.) }
 }
 
 /// Creates a linear layer with normally distributed weights and zero bias.
@@ -42,7 +42,7 @@ pub(super) fn linear(vs: nn::Path, inputs: i64, outputs: i64, stdev: f64) -> nn:
 /// differs.)
 pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool) -> nn::Linear {
     let bound = 1. / (inputs as f64).sqrt();
-    let uniform = drawn(nn::Init::Uniform { lo: -bound, up: bound });
+    let uniform = init_or_zeros(nn::Init::Uniform { lo: -bound, up: bound });
     nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
 }
 
@@ -120,7 +120,7 @@ impl Mlp {
 /// Panics if the system has no memory for oneDNN's generated code, which libtorch uses for this on a CPU.
 pub(super) fn gelu(mut xs: Tensor) -> Tensor {
     if xs.device() == Device::Cpu {
-        expect_room_for_code(0).unwrap_or_else(|error| panic!("{error}"));
+        ensure_memory_for_code(0).unwrap_or_else(|error| panic!("{error}"));
     }
     if xs.requires_grad() { xs.gelu("none") } else { xs.gelu_("none") }
 }

@@ -35,7 +35,7 @@ impl Memory {
     /// Builds the memory from `registers` [1, r, token width] and `views` views, for products in `precision`. `view` computes the tokens of
     /// one view, [B, P, token width], and is called for one view after the other. All tokens in float32 would not fit into memory, so a few
     /// views are computed twice: their common part is close to that of all.
-    pub(super) fn of_views(
+    pub(super) fn from_views(
         registers: &Tensor,
         views: i64,
         view: impl Fn(i64) -> Tensor,
@@ -99,15 +99,15 @@ pub(super) mod tests {
     #[test]
     fn views_make_the_same_memory_one_by_one() {
         let registers = alike(2).get(0).unsqueeze(0);
-        let of_views = |views: i64| {
+        let from_views = |views: i64| {
             let tokens = alike(5 * views);
             let view = |n| tokens.narrow(1, 5 * n, 5);
             let all = Tensor::cat(&[&registers.expand([2, -1, -1], false), &tokens], 1);
-            (Memory::new(&all), Memory::of_views(&registers, views, view, Precision::F32))
+            (Memory::new(&all), Memory::from_views(&registers, views, view, Precision::F32))
         };
         let largest = |t: Tensor| t.abs().max().double_value(&[]);
         for views in [1, 3, 9] {
-            let (at_once, one_by_one) = of_views(views);
+            let (at_once, one_by_one) = from_views(views);
             let whole = |memory: &Memory| &memory.tokens + &memory.common;
             assert!(largest(whole(&at_once) - whole(&one_by_one)) < 1e-6, "{views} views");
             // A twentieth of each token is its own, by construction of `alike`.

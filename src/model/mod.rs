@@ -38,10 +38,10 @@ pub use shapes::MODULES;
 // Used by training, which runs the model in parts and grows smaller models into larger ones.
 pub(crate) use autograd::{backward_from_grads, leaf, tracks_grad};
 pub(crate) use growth::Growth;
-pub(crate) use recompute::KeptRounds;
+pub(crate) use recompute::CheckpointedRounds;
 
 // Used by the parity checks, which run every module by itself.
-pub(crate) use attention::{attention, by_libtorch};
+pub(crate) use attention::{attention, attention_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
 pub(crate) use encoder::Encoder;
@@ -53,7 +53,7 @@ pub(crate) use stream::{SelfAttentionBlock, StreamRound};
 pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
-use layers::{ENCODER_STD, drawn, randn, without_drawing};
+use layers::{ENCODER_STD, init_or_zeros, randn, without_random_init};
 use std::collections::HashSet;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -92,7 +92,7 @@ impl GlobalSplat {
     pub fn uninitialized(vs: &mut nn::VarStore, config: &ModelConfig, precision: Precision) -> Result<Self> {
         // Creates every parameter in the kind of the products; the few others are converted to float32 below.
         vs.set_kind(precision.kind());
-        let mut model = without_drawing(|| Self::new(&vs.root(), config))?;
+        let mut model = without_random_init(|| Self::new(&vs.root(), config))?;
         model.set_precision(precision);
         let layers = model.encoder.linear_layers().chain(model.decoder.linear_layers());
         let kept: HashSet<_> = layers
@@ -150,8 +150,8 @@ impl GlobalSplat {
     }
 
     /// Runs [`GlobalSplat::encode`] with activation checkpointing: the backward pass recomputes every round.
-    pub(crate) fn encode_keeping_rounds(&self, tokens: &Tensor) -> (EncodedTokens, KeptRounds<'_>) {
-        self.encoder.forward_keeping_rounds(&self.scene_tokens, self.memory_of(tokens))
+    pub(crate) fn encode_checkpointed(&self, tokens: &Tensor) -> (EncodedTokens, CheckpointedRounds<'_>) {
+        self.encoder.forward_checkpointed(&self.scene_tokens, self.memory_of(tokens))
     }
 
     /// Decodes scene tokens into the Gaussians of `stage`: the last part of [`GlobalSplat::forward`].
@@ -186,7 +186,7 @@ impl GlobalSplat {
 /// as many tokens as dimensions, and normally distributed otherwise.
 pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
     let init = match config.latents <= config.width {
-        true => drawn(nn::Init::Orthogonal { gain: ENCODER_STD }),
+        true => init_or_zeros(nn::Init::Orthogonal { gain: ENCODER_STD }),
         false => randn(ENCODER_STD),
     };
     vs.var("scene_tokens", &[config.latents, config.width], init)
@@ -195,7 +195,7 @@ pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::ops::{computing, outermost_ops_of, without_own_linear_layers};
+    use globalsplat_csrc::ops::{computing, record_outermost_ops, without_own_linear_layers};
 
     /// A pass launches a bounded number of kernels, whatever the number of photos. On a GPU, a pass of the main model takes about as long
     /// as the host needs to launch its kernels.
@@ -220,7 +220,7 @@ mod tests {
             let options = (Kind::Float, Device::Cpu);
             let images = Tensor::rand([1, views, 3, 32, 32], options);
             let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
-            let (tokens, ops) = outermost_ops_of(|| model.tokens(&images, &c2w, &intrinsics));
+            let (tokens, ops) = record_outermost_ops(|| model.tokens(&images, &c2w, &intrinsics));
             const LINEAR_LAYERS: usize = 2;
             (tokens.to_kind(Kind::Double), computing(&without_own_linear_layers(ops)) + LINEAR_LAYERS)
         };
@@ -228,7 +228,7 @@ mod tests {
         vs.double();
         model.fold_weights();
         let pass = |(tokens, of_tokens): (Tensor, usize)| {
-            let (_, ops) = outermost_ops_of(|| {
+            let (_, ops) = record_outermost_ops(|| {
                 model.decode(&model.encode_memory(&model.memory_of(&tokens)), Stage::complete(2))
             });
             of_tokens + computing(&ops)

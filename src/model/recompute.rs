@@ -7,7 +7,7 @@ use tch::{Tensor, no_grad};
 
 /// State that the backward pass needs from the encoder's forward pass.
 #[derive(Debug)]
-pub(crate) struct KeptRounds<'a> {
+pub(crate) struct CheckpointedRounds<'a> {
     encoder: &'a Encoder,
     /// Slots before the first round, attached to the graph of scene tokens and image tokens.
     slots: Slots,
@@ -19,12 +19,12 @@ pub(crate) struct KeptRounds<'a> {
 }
 
 impl Encoder {
-    /// Runs [`Encoder::forward`] with activation checkpointing. Run the backward pass of the result first, then [`KeptRounds::backward`].
-    pub(crate) fn forward_keeping_rounds(
+    /// Runs [`Encoder::forward`] with activation checkpointing. Run the backward pass of the result first, then [`CheckpointedRounds::backward`].
+    pub(crate) fn forward_checkpointed(
         &self,
         scene_tokens: &Tensor,
         memory: Memory,
-    ) -> (EncodedTokens, KeptRounds<'_>) {
+    ) -> (EncodedTokens, CheckpointedRounds<'_>) {
         let slots = self.start(scene_tokens, memory.common.size()[0]);
         let memory_leaf = memory.leaf();
         let mut between = vec![slots.map(leaf)];
@@ -33,19 +33,19 @@ impl Encoder {
             between.push(after.map(leaf));
         }
         let encoded = self.decoded(between.last().expect("one more than rounds"));
-        (encoded, KeptRounds { encoder: self, slots, memory, memory_leaf, between })
+        (encoded, CheckpointedRounds { encoder: self, slots, memory, memory_leaf, between })
     }
 }
 
-impl KeptRounds<'_> {
+impl CheckpointedRounds<'_> {
     /// Runs the backward pass from the last round to the first, then through the initial slots and the memory.
     pub fn backward(mut self) {
         for round in (0..self.encoder.rounds()).rev() {
             let after = self.between.pop().expect("one more than rounds");
             let again = self.encoder.round(round, &self.between[round], &self.memory_leaf);
-            backward_from_grads(&again.beside(&after));
+            backward_from_grads(&again.zip_tensors(&after));
         }
-        let mut start = self.slots.beside(&self.between[0]);
+        let mut start = self.slots.zip_tensors(&self.between[0]);
         start.push((&self.memory.tokens, &self.memory_leaf.tokens));
         backward_from_grads(&start);
     }

@@ -15,14 +15,14 @@ impl ModelConfig {
     ///
     /// # Errors
     /// Returns an error if a required parameter is missing or has a shape that no model has. `origin` is the file named in the error.
-    pub fn of_shapes(shapes: &BTreeMap<String, Vec<i64>>, origin: &Path) -> Result<Self> {
+    pub fn from_shapes(shapes: &BTreeMap<String, Vec<i64>>, origin: &Path) -> Result<Self> {
         let refuse = |name: &str, found: String, expected: &str| {
             Error::input(origin, format!("tensor {name}"), found, expected)
         };
         let matrix = |name: &str| match shapes.get(name).map(Vec::as_slice) {
             Some(&[rows, columns]) if rows > 0 && columns > 0 => Ok([rows, columns]),
             Some(other) => Err(refuse(name, format!("{other:?}"), "a matrix")),
-            None => Err(refuse(name, "absent".into(), "one of a GlobalSplat model's weights")),
+            None => Err(refuse(name, "missing".into(), "one of a GlobalSplat model's weights")),
         };
         let count = |name: &dyn Fn(usize) -> String| {
             (0..).take_while(|&i| shapes.contains_key(&name(i))).count() as i64

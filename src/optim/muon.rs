@@ -26,7 +26,7 @@ pub(super) struct Matrices<'a> {
 pub(super) fn update(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64) {
     let is_here = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == Kind::Float;
     if !of.values.iter().all(is_here) {
-        return by_libtorch(of, parts, learning_rate, weight_decay);
+        return update_by_libtorch(of, parts, learning_rate, weight_decay);
     }
     let list = |tensors: &[&Tensor]| addresses(tensors.iter().copied());
     let numbers = MuonNumbers { parts, learning_rate, weight_decay, beta: BETA };
@@ -36,7 +36,7 @@ pub(super) fn update(of: &Matrices, parts: i64, learning_rate: f64, weight_decay
 }
 
 /// Updates all matrices with libtorch, on any device and in any kind. Matrices of one shape are processed together.
-fn by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64) {
+fn update_by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64) {
     let mut alike: BTreeMap<Vec<i64>, Vec<usize>> = BTreeMap::new();
     for (i, value) in of.values.iter().enumerate() {
         alike.entry(value.size()).or_default().push(i);
@@ -51,8 +51,8 @@ fn by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64)
                 })
                 .collect();
             let (rows, columns) = (size[0] / parts, size[1]);
-            let steps =
-                level(&Tensor::cat(&ahead, 0).view([-1, rows, columns])).reshape([-1, size[0], columns]);
+            let steps = orthogonalize(&Tensor::cat(&ahead, 0).view([-1, rows, columns]))
+                .reshape([-1, size[0], columns]);
             let rate = learning_rate * SIZE * (rows.max(columns) as f64).sqrt();
             for (k, &i) in which.iter().enumerate() {
                 let mut value = of.values[i].shallow_clone();
@@ -65,7 +65,7 @@ fn by_libtorch(of: &Matrices, parts: i64, learning_rate: f64, weight_decay: f64)
 
 /// Returns the matrices nearest to `matrices`, `[n, rows, columns]`, whose singular values are all about 1. They are between 0.68 and 1.21,
 /// except those that were below 0.0015 of the matrix's norm.
-fn level(matrices: &Tensor) -> Tensor {
+fn orthogonalize(matrices: &Tensor) -> Tensor {
     let is_upright = matrices.size()[1] > matrices.size()[2];
     let flat = if is_upright { matrices.transpose(1, 2) } else { matrices.shallow_clone() };
     let norms = flat.square().sum_dim_intlist([1i64, 2].as_slice(), true, None::<Kind>).sqrt();
@@ -108,7 +108,7 @@ mod tests {
     fn our_kernel_and_libtorch_agree() {
         for parts in [1, 3] {
             let exact = stepped(Kind::Double, update, parts);
-            for way in [update, by_libtorch] {
+            for way in [update, update_by_libtorch] {
                 for (found, exact) in stepped(Kind::Float, way, parts).iter().zip(&exact) {
                     let error = ((found - exact).norm() / exact.norm()).double_value(&[]);
                     assert!(error < 1e-5, "{:?}, {parts} parts: {error:.1e}", exact.size());
@@ -123,11 +123,11 @@ mod tests {
             Tensor::arange(2 * 40 * 70, (Kind::Double, Device::Cpu)).square().sin().view([2, 40, 70]);
         let (u, _, v) = numbers.svd(true, true);
         for matrices in [numbers.shallow_clone(), numbers.transpose(1, 2).contiguous() * 1e-6] {
-            let (_, s, _) = level(&matrices).svd(true, true);
+            let (_, s, _) = orthogonalize(&matrices).svd(true, true);
             let [least, most] = [s.min(), s.max()].map(|t| t.double_value(&[]));
             assert!(least > 0.6 && most < 1.3, "{least} to {most}");
         }
-        let off = (level(&numbers) - u.matmul(&v.transpose(1, 2))).norm() / (2f64 * 40.).sqrt();
+        let off = (orthogonalize(&numbers) - u.matmul(&v.transpose(1, 2))).norm() / (2f64 * 40.).sqrt();
         assert!(off.double_value(&[]) < 0.3, "{off:?}");
     }
 

@@ -52,7 +52,7 @@ struct Parameter {
     second: Option<Tensor>,
     group: usize,
     /// Index of the optimizer's shard that updates this parameter.
-    part: usize,
+    shard_index: usize,
 }
 
 impl Parameter {
@@ -103,7 +103,7 @@ pub struct Optimizer {
     epsilon: f64,
     steps: i64,
     /// Index of the shard that this process updates.
-    part: usize,
+    shard_index: usize,
 }
 
 impl Optimizer {
@@ -117,14 +117,14 @@ impl Optimizer {
             for (name, value) in of.parameters {
                 let zeros = || value.zeros_like().detach();
                 let (first, second) = (zeros(), (of.rule == Rule::AdamW).then(zeros));
-                let parameter = Parameter { name: name.clone(), value, first, second, group, part: 0 };
+                let parameter = Parameter { name: name.clone(), value, first, second, group, shard_index: 0 };
                 assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
             }
             let ParameterGroup { rule, learning_rate, weight_decay, .. } = of;
             settings.push(Settings { rule, learning_rate, weight_decay });
         }
         let parameters = parameters.into_values().collect();
-        Optimizer { parameters, groups: settings, epsilon: EPS, steps: 0, part: 0 }
+        Optimizer { parameters, groups: settings, epsilon: EPS, steps: 0, shard_index: 0 }
     }
 
     /// Sets the ε that is added to the root of the second moments, instead of 1e-8.
@@ -139,35 +139,35 @@ impl Optimizer {
         }
     }
 
-    /// Makes this optimizer shard `part` of `parts`: it updates its share of the parameters and drops the moments of the others. Parameters
+    /// Makes this optimizer shard `shard_index` of `parts`: it updates its share of the parameters and drops the moments of the others. Parameters
     /// are not split. They are assigned in descending order of their moments' size, each to the shard that has least so far (ZeRO stage 1,
     /// Rajbhandari et al. 2020, by tensors).
-    pub fn shard(&mut self, part: usize, parts: usize) {
-        self.part = part;
+    pub fn shard(&mut self, shard_index: usize, parts: usize) {
+        self.shard_index = shard_index;
         let mut order: Vec<usize> = (0..self.parameters.len()).collect();
         let size = |p: &Parameter| p.moments().map(|(_, moment)| moment.numel()).sum::<usize>();
         order.sort_by_key(|&i| std::cmp::Reverse(size(&self.parameters[i])));
         let mut sizes = vec![0; parts];
         for i in order {
-            let least = (0..parts).min_by_key(|&part| sizes[part]).expect("a part");
+            let least = (0..parts).min_by_key(|&shard_index| sizes[shard_index]).expect("a shard");
             let p = &mut self.parameters[i];
             sizes[least] += size(p);
-            p.part = least;
-            if least != part {
+            p.shard_index = least;
+            if least != shard_index {
                 let none = || Tensor::empty([0], (p.value.kind(), p.value.device()));
                 (p.first, p.second) = (none(), p.second.as_ref().map(|_| none()));
             }
         }
     }
 
-    /// Returns the parameters of shard `part`, which only this shard updates.
-    pub fn of_part(&self, part: usize) -> impl Iterator<Item = &Tensor> {
-        self.parameters.iter().filter(move |p| p.part == part).map(|p| &p.value)
+    /// Returns the parameters of shard `shard_index`, which only this shard updates.
+    pub fn shard_parameters(&self, shard_index: usize) -> impl Iterator<Item = &Tensor> {
+        self.parameters.iter().filter(move |p| p.shard_index == shard_index).map(|p| &p.value)
     }
 
     /// Returns `true` if other ranks update some of the parameters.
     pub fn is_sharded(&self) -> bool {
-        self.parameters.iter().any(|p| p.part != self.part)
+        self.parameters.iter().any(|p| p.shard_index != self.shard_index)
     }
 
     /// Returns the running means of the gradients and of their squares, which the caller may change in place.
@@ -227,7 +227,8 @@ impl Optimizer {
 
     /// Returns the parameters of a group that this shard updates and that have gradients, and these gradients.
     fn with_gradients(&self, group: usize) -> (Vec<&Parameter>, Vec<Tensor>) {
-        let of_group = self.parameters.iter().filter(|p| p.group == group && p.part == self.part);
+        let of_group =
+            self.parameters.iter().filter(|p| p.group == group && p.shard_index == self.shard_index);
         let with_gradient = of_group.map(|p| (p, p.value.grad())).filter(|(_, gradient)| gradient.defined());
         with_gradient.map(|(p, gradient)| (p, gradient.contiguous())).unzip()
     }
@@ -303,7 +304,7 @@ impl Optimizer {
         let mut state = BTreeMap::from([("steps".to_string(), Tensor::from_slice(&[self.steps]))]);
         for p in &self.parameters {
             for (name, moment) in p.moments() {
-                state.insert(format!("{name}.{}", p.name), of(moment, &p.value.size(), p.part)?);
+                state.insert(format!("{name}.{}", p.name), of(moment, &p.value.size(), p.shard_index)?);
             }
         }
         Ok(state)
@@ -334,7 +335,7 @@ impl Optimizer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::ops::ops_of;
+    use globalsplat_csrc::ops::record_ops;
     use tch::Kind;
 
     fn leaf(values: &[f32]) -> Tensor {
@@ -418,7 +419,7 @@ mod tests {
         let named: Vec<(&str, &Tensor)> = named.iter().map(|(name, t)| (name.as_str(), *t)).collect();
         let mut adamw = Optimizer::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
         leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
-        let (_, mut ops) = ops_of(|| WAYS[1](&mut adamw));
+        let (_, mut ops) = record_ops(|| WAYS[1](&mut adamw));
         // On the CPU, the op itself reads the number of steps of each parameter.
         ops.retain(|op| op != "aten::item" && op != "aten::_local_scalar_dense");
         let fused = ops.iter().filter(|op| *op == "aten::_fused_adamw_").count();

@@ -341,8 +341,8 @@ fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {
 
 fn rasterizer(request: &Request) -> Result<Answer> {
     let (gaussians, cameras) = gaussians_and_cameras(request)?;
-    let pictures = render::render(&gaussians, &cameras, request.number("eps2d")?)?;
-    outputs([("rgb", pictures.rgb), ("alpha", pictures.alpha), ("depth", pictures.depth)])
+    let rendered = render::render(&gaussians, &cameras, request.number("eps2d")?)?;
+    outputs([("rgb", rendered.rgb), ("alpha", rendered.alpha), ("depth", rendered.depth)])
 }
 
 fn projection(request: &Request) -> Result<Answer> {
@@ -383,7 +383,7 @@ fn consistency(request: &Request) -> Result<Answer> {
     let alpha = [request.input("alpha_a")?, request.input("alpha_b")?];
     let depth = [request.input("depth_a")?, request.input("depth_b")?];
     let factors = (request.number("alpha_factor")?, request.number("depth_factor")?);
-    loss_of(loss::consistency(alpha, depth, factors.0, factors.1, &loss::Share::WHOLE))
+    loss_of(loss::consistency(alpha, depth, factors.0, factors.1, &loss::StepFraction::WHOLE))
 }
 
 fn subsets(request: &Request) -> Result<Answer> {

@@ -1,6 +1,6 @@
 //! Gradient buckets, which are summed over all ranks while the backward pass is still running.
 
-use super::group::{Group, lost};
+use super::group::{ProcessGroup, distributed_error};
 use crate::error::Result;
 use cxx::UniquePtr;
 use globalsplat_csrc::ranks as ffi;
@@ -32,12 +32,12 @@ impl Buckets {
     ///
     /// # Panics
     /// Panics if the parameters differ in kind or device, or aren't leaves that require gradients.
-    pub fn new(group: &Group, parameters: &[Tensor]) -> Self {
+    pub fn new(group: &ProcessGroup, parameters: &[Tensor]) -> Self {
         let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
         Buckets::of_bytes(group, parameters, (bytes as i64 / FEW).clamp(LEAST_BYTES, MOST_BYTES))
     }
 
-    pub(super) fn of_bytes(group: &Group, parameters: &[Tensor], bytes: i64) -> Self {
+    pub(super) fn of_bytes(group: &ProcessGroup, parameters: &[Tensor], bytes: i64) -> Self {
         let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
         // SAFETY: the tensors outlive the call; the C++ side holds references of its own to what it keeps.
         let inner = group.inner().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });
@@ -57,6 +57,6 @@ impl Buckets {
     /// Returns an error if another rank is gone.
     pub fn finish(&self) -> Result<usize> {
         let Some(inner) = &self.inner else { return Ok(0) };
-        inner.finish().map_err(lost)
+        inner.finish().map_err(distributed_error)
     }
 }

@@ -1,6 +1,6 @@
 //! Collectives of all ranks, by c10d. Every rank calls them in the same order.
 
-use super::place::Place;
+use super::dist_env::DistributedEnv;
 use crate::error::{Error, Result};
 use crate::ffi::take_outputs;
 use cxx::UniquePtr;
@@ -10,15 +10,15 @@ use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watch`] notices a rank that is gone.
+/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watchdog`] notices a rank that is gone.
 /// The collective waits for a rank that has more to do, writes to a slow disk, or waits for free space on a full one. The timeout in
 /// milliseconds fits into 32 bits.
-pub(super) const PATIENCE_SECONDS: i64 = 20 * 24 * 60 * 60;
+pub(super) const COLLECTIVE_TIMEOUT_SECONDS: i64 = 20 * 24 * 60 * 60;
 
-/// Group of all ranks, as seen by one of them.
-pub struct Group {
+/// ProcessGroup of all ranks, as seen by one of them.
+pub struct ProcessGroup {
     /// C++ implementation, or `None` if the group has only one rank.
-    inner: Option<UniquePtr<ffi::Group>>,
+    inner: Option<UniquePtr<ffi::ProcessGroup>>,
     rank: usize,
     ranks: usize,
     local_world_size: usize,
@@ -26,14 +26,14 @@ pub struct Group {
     device: Device,
 }
 
-impl fmt::Debug for Group {
+impl fmt::Debug for ProcessGroup {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "Group({} of {} on {:?})", self.rank, self.ranks, self.device)
+        write!(f, "ProcessGroup(rank {} of {} on {:?})", self.rank, self.ranks, self.device)
     }
 }
 
 /// Returns the error for a failed collective. The cause is almost always that another rank is gone.
-pub(super) fn lost(why: cxx::Exception) -> Error {
+pub(super) fn distributed_error(why: cxx::Exception) -> Error {
     Error::Distributed { message: why.what().lines().next().unwrap_or_default().to_string() }
 }
 
@@ -53,23 +53,23 @@ impl Backends {
     }
 }
 
-impl Group {
+impl ProcessGroup {
     /// Returns the group of a process that runs alone.
-    pub fn alone() -> Self {
-        Group { inner: None, rank: 0, ranks: 1, local_world_size: 1, device: Device::Cpu }
+    pub fn single() -> Self {
+        ProcessGroup { inner: None, rank: 0, ranks: 1, local_world_size: 1, device: Device::Cpu }
     }
 
     /// Joins the group of all ranks at `store`, for collectives on `device`: by Gloo on CPUs, by NCCL on GPUs.
     ///
     /// # Errors
     /// Returns an error if the build lacks this backend, or if other ranks don't join.
-    pub fn join(place: &Place, store: &ffi::Store, device: Device) -> Result<Self> {
-        Group::join_with_timeout(place, store, device, PATIENCE_SECONDS)
+    pub fn join(dist_env: &DistributedEnv, store: &ffi::Store, device: Device) -> Result<Self> {
+        ProcessGroup::join_with_timeout(dist_env, store, device, COLLECTIVE_TIMEOUT_SECONDS)
     }
 
-    /// Joins a group like [`Group::join`], with a timeout of `seconds` for collectives.
+    /// Joins a group like [`ProcessGroup::join`], with a timeout of `seconds` for collectives.
     pub(super) fn join_with_timeout(
-        place: &Place,
+        dist_env: &DistributedEnv,
         store: &ffi::Store,
         device: Device,
         seconds: i64,
@@ -78,10 +78,10 @@ impl Group {
             Error::request(format!(
                 "this program was built without {what}, which {} processes need: {install}, then `touch csrc/build.rs` and build \
                  again",
-                place.ranks
+                dist_env.ranks
             ))
         };
-        let (rank, ranks) = (place.rank as i32, place.ranks as i32);
+        let (rank, ranks) = (dist_env.rank as i32, dist_env.ranks as i32);
         let Backends { gloo, nccl } = Backends::built_in();
         let inner = match device {
             Device::Cuda(_) if !nccl => {
@@ -99,13 +99,13 @@ impl Group {
         };
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
-            Error::failed(format!("rank {rank} of {ranks} can't meet the others: {why}"))
+            Error::failed(format!("rank {rank} of {ranks} can't join the process group: {why}"))
         })?);
-        Ok(Group {
+        Ok(ProcessGroup {
             inner,
-            rank: place.rank,
-            ranks: place.ranks,
-            local_world_size: place.local_world_size,
+            rank: dist_env.rank,
+            ranks: dist_env.ranks,
+            local_world_size: dist_env.local_world_size,
             device,
         })
     }
@@ -116,7 +116,7 @@ impl Group {
     }
 
     /// Returns the number of ranks.
-    pub fn ranks(&self) -> usize {
+    pub fn world_size(&self) -> usize {
         self.ranks
     }
 
@@ -126,11 +126,11 @@ impl Group {
     }
 
     /// Returns `true` if this is the first rank, which writes files and prints messages.
-    pub fn is_first(&self) -> bool {
+    pub fn is_main_process(&self) -> bool {
         self.rank == 0
     }
 
-    pub(super) fn inner(&self) -> Option<&ffi::Group> {
+    pub(super) fn inner(&self) -> Option<&ffi::ProcessGroup> {
         self.inner.as_deref()
     }
 
@@ -139,7 +139,7 @@ impl Group {
     /// # Errors
     /// Returns an error if another rank is gone.
     pub fn leave(&self) -> Result<()> {
-        self.inner.as_ref().map_or(Ok(()), |inner| inner.shut_down().map_err(lost))
+        self.inner.as_ref().map_or(Ok(()), |inner| inner.shut_down().map_err(distributed_error))
     }
 
     /// Replaces `tensor` by its sum over all ranks, in place (an all-reduce). It has the same shape and kind on all ranks.
@@ -149,7 +149,7 @@ impl Group {
     pub fn all_reduce(&self, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
-            Some(inner) => unsafe { inner.all_reduce(tensor.as_ptr() as usize) }.map_err(lost),
+            Some(inner) => unsafe { inner.all_reduce(tensor.as_ptr() as usize) }.map_err(distributed_error),
             None => Ok(()),
         }
     }
@@ -161,7 +161,9 @@ impl Group {
     pub fn broadcast(&self, from: usize, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
-            Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(lost),
+            Some(inner) => {
+                unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(distributed_error)
+            }
             None => Ok(()),
         }
     }
@@ -170,33 +172,33 @@ impl Group {
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn gather<T: Serialize + DeserializeOwned>(&self, said: T) -> Result<Vec<T>> {
+    pub fn all_gather_object<T: Serialize + DeserializeOwned>(&self, value: T) -> Result<Vec<T>> {
         if self.inner.is_none() {
-            return Ok(vec![said]);
+            return Ok(vec![value]);
         }
-        let bytes = rmp_serde::to_vec_named(&said).expect("what is said can be written down");
+        let bytes = rmp_serde::to_vec_named(&value).expect("a serializable value");
         let lengths = self.all_gather(&Tensor::from_slice(&[bytes.len() as i64]))?;
         let lengths = Vec::<i64>::try_from(lengths.view(-1)).expect("whole numbers");
         let longest = *lengths.iter().max().expect("a rank") as usize;
         let padded = [bytes.as_slice(), &vec![0; longest - bytes.len()]].concat();
         let all =
             Vec::<u8>::try_from(self.all_gather(&Tensor::from_slice(&padded))?.view(-1)).expect("bytes");
-        let said = lengths.iter().enumerate().map(|(rank, &length)| {
+        let value = lengths.iter().enumerate().map(|(rank, &length)| {
             let bytes = &all[rank * longest..][..length as usize];
             rmp_serde::from_slice(bytes)
-                .map_err(|e| Error::failed(format!("rank {rank} isn't understood: {e}")))
+                .map_err(|e| Error::failed(format!("can't decode the value of rank {rank}: {e}")))
         });
-        said.collect()
+        value.collect()
     }
 
     /// Returns the value that the first rank passes. The other ranks pass `None`.
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn broadcast_object<T: Serialize + DeserializeOwned>(&self, said: Option<T>) -> Result<T> {
+    pub fn broadcast_object<T: Serialize + DeserializeOwned>(&self, value: Option<T>) -> Result<T> {
         // The value itself may be `None`, so every rank sends a list, which is empty on ranks that send no value.
-        let said = self.gather(Vec::from_iter(said))?.into_iter().flatten().next();
-        said.ok_or_else(|| Error::failed("the first rank said nothing"))
+        let value = self.all_gather_object(Vec::from_iter(value))?.into_iter().flatten().next();
+        value.ok_or_else(|| Error::failed("rank 0 sent no value"))
     }
 
     /// Returns the tensors of all ranks, stacked along a new first dimension, on the CPU.
@@ -204,8 +206,8 @@ impl Group {
         let inner = self.inner.as_deref().expect("other ranks");
         let tensor = tensor.to_device(self.device);
         // SAFETY: the tensor is alive, and on success the C++ side has stored a new tensor at `out`.
-        let [all] =
-            unsafe { take_outputs(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }.map_err(lost)?;
+        let [all] = unsafe { take_outputs(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }
+            .map_err(distributed_error)?;
         Ok(all.to_device(Device::Cpu))
     }
 }

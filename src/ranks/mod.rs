@@ -2,14 +2,14 @@
 //! A program that runs alone is the only rank of its group; all collectives are then no-ops.
 
 mod buckets;
+mod dist_env;
 mod group;
-mod place;
 mod watch;
 
 pub use buckets::Buckets;
-pub use group::{Backends, Group};
-pub use place::Place;
-pub use watch::Watch;
+pub use dist_env::DistributedEnv;
+pub use group::{Backends, ProcessGroup};
+pub use watch::Watchdog;
 
 #[cfg(test)]
 pub(crate) mod tests {
@@ -18,14 +18,14 @@ pub(crate) mod tests {
     use tch::{Device, Kind, Tensor};
 
     /// Runs `work` on every rank of a group of `ranks` ranks, each in its own thread, and returns the results.
-    pub(crate) fn together<T: Send>(ranks: usize, work: impl Fn(Group) -> T + Sync) -> Vec<T> {
-        together_with_timeout(ranks, group::PATIENCE_SECONDS, work)
+    pub(crate) fn run_on_ranks<T: Send>(ranks: usize, work: impl Fn(ProcessGroup) -> T + Sync) -> Vec<T> {
+        run_on_ranks_with_timeout(ranks, group::COLLECTIVE_TIMEOUT_SECONDS, work)
     }
 
-    fn together_with_timeout<T: Send>(
+    fn run_on_ranks_with_timeout<T: Send>(
         ranks: usize,
         seconds: i64,
-        work: impl Fn(Group) -> T + Sync,
+        work: impl Fn(ProcessGroup) -> T + Sync,
     ) -> Vec<T> {
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
         // A rank that leaves before all ranks have joined would fail the join, not the test.
@@ -34,7 +34,7 @@ pub(crate) mod tests {
             let rank = |rank| {
                 let (store, have_met, work) = (store.another().expect("a connection"), &have_met, &work);
                 scope.spawn(move || {
-                    let place = Place {
+                    let dist_env = DistributedEnv {
                         rank,
                         ranks,
                         local_rank: rank,
@@ -42,9 +42,9 @@ pub(crate) mod tests {
                         restarts: 0,
                         host: "127.0.0.1".into(),
                         port: 0,
-                        store_is_kept: true,
+                        is_agent_store: true,
                     };
-                    let group = Group::join_with_timeout(&place, &store, Device::Cpu, seconds);
+                    let group = ProcessGroup::join_with_timeout(&dist_env, &store, Device::Cpu, seconds);
                     have_met.wait();
                     work(group.expect("a group"))
                 })
@@ -63,12 +63,12 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn ranks_add_copy_and_tell() {
+    fn collectives_return_the_expected_values() {
         if !can_meet() {
             return;
         }
         for ranks in [2, 3] {
-            let found = together(ranks, |group| {
+            let found = run_on_ranks(ranks, |group| {
                 let number = group.rank() as f32 + 1.;
                 let sum = Tensor::full([2, 3], f64::from(number), (Kind::Float, Device::Cpu));
                 group.all_reduce(&sum).expect("a sum");
@@ -76,8 +76,9 @@ pub(crate) mod tests {
                 group.broadcast(ranks - 1, &copy).expect("a copy");
                 // A list of a different length on each rank, a NaN, and a nested `None`, which JSON can't represent.
                 let said = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
-                let heard = group.gather(said).expect("words");
-                let first = group.broadcast_object(group.is_first().then_some(None::<u64>)).expect("a word");
+                let heard = group.all_gather_object(said).expect("words");
+                let first =
+                    group.broadcast_object(group.is_main_process().then_some(None::<u64>)).expect("a word");
                 (Vec::<f32>::try_from(sum.view(-1)).unwrap(), copy.double_value(&[0]), heard, first)
             });
             let expected = (1..=ranks).sum::<usize>() as f32;
@@ -94,18 +95,18 @@ pub(crate) mod tests {
 
     /// Ranks wait for a slower rank, as in `eval --data`, where all ranks gather their results when each has processed its scenes.
     #[test]
-    fn a_rank_that_works_longer_is_waited_for() {
+    fn collectives_wait_for_slow_ranks() {
         if !can_meet() {
             return;
         }
-        const { assert!(group::PATIENCE_SECONDS > 7 * 24 * 60 * 60) };
+        const { assert!(group::COLLECTIVE_TIMEOUT_SECONDS > 7 * 24 * 60 * 60) };
         // c10d fails after its timeout. Joining must also take less than the timeout, even on a busy machine.
-        for (timeout, work, is_heard) in [(5, 7, false), (group::PATIENCE_SECONDS, 2, true)] {
-            let found = together_with_timeout(2, timeout, |group| {
+        for (timeout, work, is_heard) in [(5, 7, false), (group::COLLECTIVE_TIMEOUT_SECONDS, 2, true)] {
+            let found = run_on_ranks_with_timeout(2, timeout, |group| {
                 if group.rank() == 1 {
                     std::thread::sleep(std::time::Duration::from_secs(work));
                 }
-                group.gather(group.rank())
+                group.all_gather_object(group.rank())
             });
             assert_eq!(found[0].is_ok(), is_heard, "a timeout of {timeout} s: {:?}", found[0]);
         }
@@ -116,7 +117,7 @@ pub(crate) mod tests {
         if !can_meet() {
             return;
         }
-        let found = together(2, |group| match group.rank() {
+        let found = run_on_ranks(2, |group| match group.rank() {
             0 => Some(group.all_reduce(&Tensor::from_slice(&[1f32]))),
             _ => None,
         });
@@ -130,7 +131,7 @@ pub(crate) mod tests {
         if !can_meet() {
             return;
         }
-        let found = together(3, |group| {
+        let found = run_on_ranks(3, |group| {
             let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
             let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
             // One bucket for each of the first two leaves, and one for the others.
@@ -165,11 +166,11 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_gradient_that_comes_twice_is_refused() {
+    fn a_second_gradient_of_a_parameter_is_an_error() {
         if !can_meet() {
             return;
         }
-        let found = together(2, |group| {
+        let found = run_on_ranks(2, |group| {
             let leaf = Tensor::from_slice(&[1f32]).set_requires_grad(true);
             let buckets = Buckets::new(&group, &[leaf.shallow_clone()]);
             buckets.begin();

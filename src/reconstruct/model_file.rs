@@ -140,7 +140,7 @@ impl ModelFile {
     /// # Errors
     /// Fails only if the embedded weights are damaged.
     pub fn shipped() -> Result<Self> {
-        Self::of(WeightsFile::carried(SHIPPED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
+        Self::of(WeightsFile::from_embedded(SHIPPED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
     }
 
     /// Reads the configuration and the stage of an open weights file. `overrides` change its configuration, as in [`Config::read`].

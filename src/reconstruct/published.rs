@@ -46,13 +46,13 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
         prefixes.min_by_key(|prefix| (!prefix.is_empty(), *prefix != CHECKPOINT_PREFIX, prefix.len()))
     else {
         let expected = "weights of a GlobalSplat model, as `globalsplat export` or its authors wrote them";
-        return Err(Error::input(file.path(), format!("tensor {ANCHOR}"), "absent", expected));
+        return Err(Error::input(file.path(), format!("tensor {ANCHOR}"), "missing", expected));
     };
     let of_model = |name: &str| {
         let name = plain(name).strip_prefix(prefix)?.to_string();
         is_ours(&name).then_some(name)
     };
-    let file = file.renamed(of_model);
+    let file = file.rename_tensors(of_model);
     let left_out = names.len() - file.names().len();
     Ok((file, left_out))
 }
@@ -63,7 +63,7 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
 /// Fails if the shapes fit no model.
 pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
     let shapes: BTreeMap<_, _> = file.shapes().into_iter().map(|(name, (_, shape))| (name, shape)).collect();
-    let mut model = ModelConfig::of_shapes(&shapes, file.path())?;
+    let mut model = ModelConfig::from_shapes(&shapes, file.path())?;
     model.heads = said_heads(file).unwrap_or_else(|| {
         let halves = std::iter::successors(Some(model.heads), |heads| Some(heads / 2));
         halves.into_iter().find(|heads| model.width % heads == 0).expect("one divides all")

@@ -47,7 +47,7 @@ pub fn gaussians_from_photos(
     let Some(known) = known else { return Some(anew(&swept, points, count, seed).to_device(device)) };
     let kept = known.select(&supported(known, &swept)).to_device(device);
     let left = count.saturating_sub(kept.means.size()[1] as usize);
-    Some(kept.and(&anew(&swept, points, left, seed).to_device(device)))
+    Some(kept.concat(&anew(&swept, points, left, seed).to_device(device)))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at

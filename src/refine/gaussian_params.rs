@@ -40,7 +40,7 @@ impl GaussianParams {
     }
 
     /// Returns the parameters with their names, in this order.
-    pub fn named(&self) -> [(&'static str, &Tensor); 6] {
+    pub fn named_parameters(&self) -> [(&'static str, &Tensor); 6] {
         [
             ("means", &self.means),
             ("log_scales", &self.log_scales),

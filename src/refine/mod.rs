@@ -183,7 +183,7 @@ mod tests {
     use crate::bench::synthetic_scene;
     use crate::data::ViewBatch;
     use crate::scene::{ImageSize, RawGaussians};
-    use globalsplat_csrc::ops::{WAITING, computing, ops_of, outermost_ops_of};
+    use globalsplat_csrc::ops::{WAITING, computing, record_ops, record_outermost_ops};
     use tch::Device;
 
     /// A step copies nothing between devices beyond what is counted here: photos, Gaussians and corrections are on the device. It waits for
@@ -207,14 +207,14 @@ mod tests {
             seed: 0,
         };
         let steps = |count| {
-            let mut space = GaussianSpace::new(&RawGaussians::of(&gaussians), 1., &config);
+            let mut space = GaussianSpace::new(&RawGaussians::from_gaussians(&gaussians), 1., &config);
             let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
             refine(&mut space, &mut corrections, &task_of(count), |_| true).unwrap();
         };
         let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();
-        let [two, five] = [2, 5].map(|number| ops_of(|| steps(number)).1);
+        let [two, five] = [2, 5].map(|number| record_ops(|| steps(number)).1);
         let of_a_step = |name: &str| (count(&five, name) - count(&two, name)) as f64 / 3.;
-        let (_, of_a_render) = ops_of(|| render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap());
+        let (_, of_a_render) = record_ops(|| render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap());
         // Both losses move the images to the photos' device and move their value back, which counts even on one device.
         let sent = count(&of_a_render, "aten::to.device") + 2 * 3;
         assert_eq!(of_a_step("aten::to.device"), sent as f64);
@@ -223,7 +223,7 @@ mod tests {
             let asked = if op == "aten::_local_scalar_dense" { 2. } else { 0. };
             assert_eq!(of_a_step(op), asked, "{op}");
         }
-        let [two, five] = [2, 5].map(|number| computing(&outermost_ops_of(|| steps(number)).1));
+        let [two, five] = [2, 5].map(|number| computing(&record_outermost_ops(|| steps(number)).1));
         let kernels = (five - two) / 3;
         assert!((50..=125).contains(&kernels), "{kernels}");
     }

@@ -45,7 +45,7 @@ pub fn relocate(leaves: &GaussianParams, dead: f64, random: &mut impl Rng) -> Ve
         let _ = leaves.opacity_logits.shallow_clone().index_copy_(1, &at, &numbers(&logits).view([1, count]));
         let smaller = leaves.log_scales.index_select(1, &at) + numbers(&shrink).view([1, count, 1]);
         let _ = leaves.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
-        for (_, tensor) in leaves.named() {
+        for (_, tensor) in leaves.named_parameters() {
             let _ = tensor.shallow_clone().index_copy_(1, &to, &tensor.index_select(1, &from));
         }
     });

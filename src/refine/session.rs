@@ -273,7 +273,7 @@ impl<'a> RefineSession<'a> {
         let start = match initial {
             Initial::Splat(splat) => {
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
-                Start::Splat(splat, RawGaussians::of(&local.to_device(self.options.device)))
+                Start::Splat(splat, RawGaussians::from_gaussians(&local.to_device(self.options.device)))
             }
             Initial::Model(loaded) => {
                 let data = &loaded.config.data;
@@ -555,7 +555,7 @@ impl<'a> RefineSession<'a> {
     /// Fills up to the requested number of Gaussians with new ones at the depths on which the photos agree. They also replace Gaussians
     /// that contradict the photos.
     fn filled(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
-        let mut raw = RawGaussians::of(gaussians);
+        let mut raw = RawGaussians::from_gaussians(gaussians);
         if self.photos.len() < 2 || gaussians.count() >= self.options.gaussians as i64 {
             return Ok(raw);
         }

@@ -41,7 +41,7 @@ impl GaussianSpace {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = GaussianParams::of(raw, degrees[1]);
-        let optimizer = Optimizer::new(leaves.named().map(alone).into()).with_epsilon(EPSILON);
+        let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         GaussianSpace { leaves, optimizer, config: config.clone(), depth, degrees }
     }
 }
@@ -65,7 +65,7 @@ impl Space for GaussianSpace {
     fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) {
         let config = &self.config;
         let (means, others) = (config.means_end.powf(progress), config.lr_final_factor.powf(progress));
-        // The order is that of `GaussianParams::named`.
+        // The order is that of `GaussianParams::named_parameters`.
         self.optimizer.set_learning_rates(&[
             config.means * self.depth * means,
             config.log_scales * others,

@@ -50,7 +50,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimit
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
             let radius =
                 scales[3 * index..][..3].iter().fold(0., |largest: f64, &s| largest.max(f64::from(s)));
-            Fit::of(mean, REACH * radius, coefficients, &cameras, limits).best(f64::from(opacities[index]))
+            Fit::new(mean, REACH * radius, coefficients, &cameras, limits).best(f64::from(opacities[index]))
         })
         .collect();
     let kept = bases.min((limits.degree + 1).pow(2));
@@ -87,7 +87,7 @@ struct Fit<'a> {
 }
 
 impl<'a> Fit<'a> {
-    fn of(
+    fn new(
         mean: DVec3,
         radius: f64,
         original: Coefficients,
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_bright_becomes_opaque() {
+    fn opacity_rises_if_limits_darken_the_colour() {
         let limits = ShLimits { degree: 0, dc: -1.77..=1.77, rest: 0. ..=0. };
         let mut original = gaussians(0.);
         original.sh = Tensor::zeros_like(&original.sh);

@@ -53,12 +53,12 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
     cameras
         .iter()
         .map(|camera| {
-            let pictures = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
+            let rendered = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
             let first = |t: Tensor| t.select(0, 0).select(0, 0);
             Ok(RenderedView {
-                rgb: first(pictures.rgb),
-                alpha: first(pictures.alpha),
-                depth: first(pictures.depth),
+                rgb: first(rendered.rgb),
+                alpha: first(rendered.alpha),
+                depth: first(rendered.depth),
             })
         })
         .collect()

@@ -58,7 +58,7 @@ pub struct RawGaussians {
 
 impl RawGaussians {
     /// Returns the parameters that activate to `gaussians`: opacities up to 1e-6, everything else up to rounding.
-    pub fn of(gaussians: &Gaussians) -> Self {
+    pub fn from_gaussians(gaussians: &Gaussians) -> Self {
         let Gaussians { means, scales, quaternions, opacities, sh } = gaussians;
         RawGaussians {
             means: means.shallow_clone(),
@@ -109,7 +109,7 @@ impl RawGaussians {
 
     /// Concatenates these Gaussians and `others` of the same scenes. The result has the higher of both degrees of spherical
     /// harmonics.
-    pub fn and(&self, others: &RawGaussians) -> Self {
+    pub fn concat(&self, others: &RawGaussians) -> Self {
         let joined = |a: &Tensor, b: &Tensor| Tensor::cat(&[a, b], 1);
         let bases = self.sh.size()[2].max(others.sh.size()[2]);
         let padded = |sh: &Tensor| sh.constant_pad_nd([0, 0, 0, bases - sh.size()[2]]);
@@ -123,7 +123,7 @@ impl RawGaussians {
     }
 
     /// Returns every tensor with its name, as optimizers take them.
-    pub fn named(&self) -> [(&'static str, &Tensor); 5] {
+    pub fn named_parameters(&self) -> [(&'static str, &Tensor); 5] {
         [
             ("means", &self.means),
             ("log_scales", &self.log_scales),
@@ -151,7 +151,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn raw_gaussians_activate_to_what_they_are_of() {
+    fn activation_inverts_from_gaussians() {
         let gaussians = Gaussians {
             means: Tensor::from_slice(&[1f32, -2., 3., 0., 0., 5.]).view([1, 2, 3]),
             scales: Tensor::from_slice(&[1e-4f32, 0.5, 20., 1., 1., 0.]).view([1, 2, 3]),
@@ -159,8 +159,8 @@ mod tests {
             opacities: Tensor::from_slice(&[0f32, 0.99]).view([1, 2]),
             sh: Tensor::from_slice(&[0.5f32, -3., 0., 1., 2., 3.]).view([1, 2, 1, 3]),
         };
-        let raw = RawGaussians::of(&gaussians);
-        assert!(raw.named().iter().all(|(_, t)| t.isfinite().all().int64_value(&[]) == 1));
+        let raw = RawGaussians::from_gaussians(&gaussians);
+        assert!(raw.named_parameters().iter().all(|(_, t)| t.isfinite().all().int64_value(&[]) == 1));
         let again = raw.activate();
         let off = |a: &Tensor, b: &Tensor| (a - b).abs().max().double_value(&[]);
         assert!(again.means.equal(&gaussians.means) && again.sh.equal(&gaussians.sh));

@@ -45,7 +45,7 @@ impl Gaussians {
             return Err(Error::request(format!("a splat holds one scene, found {scenes}")));
         }
         let on_host = self.map(|t| t.detach().to_device(Device::Cpu).to_kind(Kind::Float));
-        let raw = RawGaussians::of(&on_host);
+        let raw = RawGaussians::from_gaussians(&on_host);
         let splat = Splat::new(
             raw.sh.size()[2].isqrt() as usize - 1,
             rows(&raw.means)?,

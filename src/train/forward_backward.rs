@@ -5,12 +5,12 @@
 //! encoder can recompute its rounds instead of storing them, and each module can be timed.
 
 use crate::config::Config;
-use crate::data::Sample;
+use crate::data::Batch;
 use crate::device::Stopwatch;
 use crate::error::Result;
-use crate::loss::{PerceptualLoss, Share, depth_pixels, losses};
+use crate::loss::{PerceptualLoss, StepFraction, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, backward_from_grads, leaf};
-use crate::ranks::Group;
+use crate::ranks::ProcessGroup;
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use tch::{Tensor, no_grad};
 
@@ -21,22 +21,22 @@ pub(super) struct ForwardBackward<'a> {
     pub model: &'a GlobalSplat,
     pub perceptual: Option<&'a PerceptualLoss>,
     pub stage: Stage,
-    /// Group of the ranks that make the step together.
-    pub group: &'a Group,
+    /// ProcessGroup of the ranks that make the step together.
+    pub group: &'a ProcessGroup,
 }
 
 impl ForwardBackward<'_> {
-    /// Adds the gradient of the loss of `sample`, which is `share` of the step, to the gradients of the variables. Returns the loss and its
+    /// Adds the gradient of the loss of `batch`, which is `share` of the step, to the gradients of the variables. Returns the loss and its
     /// terms, packed by [`Losses::packed`](crate::loss::Losses::packed).
-    pub fn gradients(&self, sample: &Sample, share: &Share, watch: &mut Stopwatch) -> Result<Tensor> {
-        let context = &sample.context;
+    pub fn gradients(&self, batch: &Batch, share: &StepFraction, watch: &mut Stopwatch) -> Result<Tensor> {
+        let context = &batch.context;
         let model = self.model;
         let tokens =
             watch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
         let tokens_leaf = leaf(&tokens);
         let (encoded, kept) = watch.time("encoder", || match self.config.train.checkpoint_rounds {
             true => {
-                let (encoded, kept) = model.encode_keeping_rounds(&tokens_leaf);
+                let (encoded, kept) = model.encode_checkpointed(&tokens_leaf);
                 (encoded, Some(kept))
             }
             false => (model.encode(&tokens_leaf), None),
@@ -44,26 +44,26 @@ impl ForwardBackward<'_> {
         let encoded_leaves = encoded.map(leaf);
         let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));
         let decoded_leaves = decoded.map(leaf);
-        let cameras = sample.target.cameras();
+        let cameras = batch.target.cameras();
         let RenderOutput { rgb, alpha, depth } =
             watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
-        let pictures = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
-        let share = self.counted(sample, &pictures.alpha, share)?;
+        let rendered = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+        let share = self.counted(batch, &rendered.alpha, share)?;
         let losses = watch.time("losses", || {
-            losses(&self.config.loss, self.perceptual, sample, &decoded_leaves, &pictures, &share)
+            losses(&self.config.loss, self.perceptual, batch, &decoded_leaves, &rendered, &share)
         });
 
         watch.time("losses backward", || losses.total.backward());
         watch.time("render backward", || {
             backward_from_grads(&[
-                (&rgb, &pictures.rgb),
-                (&alpha, &pictures.alpha),
-                (&depth, &pictures.depth),
+                (&rgb, &rendered.rgb),
+                (&alpha, &rendered.alpha),
+                (&depth, &rendered.depth),
             ]);
         });
-        watch.time("decoder backward", || backward_from_grads(&decoded.beside(&decoded_leaves)));
+        watch.time("decoder backward", || backward_from_grads(&decoded.zip_tensors(&decoded_leaves)));
         watch.time("encoder backward", || {
-            backward_from_grads(&encoded.beside(&encoded_leaves));
+            backward_from_grads(&encoded.zip_tensors(&encoded_leaves));
             if let Some(kept) = kept {
                 kept.backward();
             }
@@ -73,25 +73,25 @@ impl ForwardBackward<'_> {
     }
 
     /// Returns `share` with the number of pixels that L_con compares on all ranks. If there is only one rank, the loss counts them itself.
-    fn counted(&self, sample: &Sample, alpha: &Tensor, share: &Share) -> Result<Share> {
+    fn counted(&self, batch: &Batch, alpha: &Tensor, share: &StepFraction) -> Result<StepFraction> {
         let mut pixels = share.depth_pixels.as_ref().map(Tensor::shallow_clone);
-        let compares = sample.paired && self.config.loss.consistency_depth > 0.;
-        if pixels.is_none() && compares && self.group.ranks() > 1 {
+        let compares = batch.paired && self.config.loss.consistency_depth > 0.;
+        if pixels.is_none() && compares && self.group.world_size() > 1 {
             let alpha = alpha.detach().chunk(2, 0);
             let counted = depth_pixels([&alpha[0], &alpha[1]]);
             self.group.all_reduce(&counted)?;
             pixels = Some(counted);
         }
-        Ok(Share { depth_pixels: pixels, ..*share })
+        Ok(StepFraction { depth_pixels: pixels, ..*share })
     }
 
     /// Returns the number of pixels of a paired sample whose depth L_con compares, as a scalar.
-    pub fn depth_pixels(&self, sample: &Sample) -> Result<Tensor> {
-        let context = &sample.context;
+    pub fn depth_pixels(&self, batch: &Batch) -> Result<Tensor> {
+        let context = &batch.context;
         no_grad(|| {
             let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, self.stage);
-            let pictures = render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D)?;
-            let alpha = pictures.alpha.chunk(2, 0);
+            let rendered = render(&decoded.gaussians, &batch.target.cameras(), DEFAULT_EPS2D)?;
+            let alpha = rendered.alpha.chunk(2, 0);
             Ok(depth_pixels([&alpha[0], &alpha[1]]))
         })
     }

@@ -95,7 +95,7 @@ impl MemoryEstimate {
             photos: bytes(batch as f64 * (context + target) * 3. * pixels),
             encoder: bytes(at_once * per_scene + folded),
             pictures: bytes(at_once * pictures),
-            perceptual: PerceptualLoss::bytes_kept(
+            perceptual: PerceptualLoss::max_memory_bytes(
                 &config.loss,
                 precision,
                 data.image_size,

@@ -1,16 +1,16 @@
 //! Preview image of the training progress.
 
-use crate::data::Sample;
+use crate::data::Batch;
 use crate::error::Result;
 use crate::io::{colourize_depth, tile_horizontally};
 use crate::model::{GlobalSplat, Stage};
 use crate::render::{DEFAULT_EPS2D, render};
 use tch::{Device, Tensor};
 
-/// Renders a preview of the first scene of `sample`, which isn't paired: a context photo, a target photo, its rendered image, its depth
+/// Renders a preview of the first scene of `batch`, which isn't paired: a context photo, a target photo, its rendered image, its depth
 /// and its accumulated opacity, side by side, `[3, H, W']` in [0, 1] on the CPU.
-pub(super) fn preview(model: &GlobalSplat, sample: &Sample, stage: Stage) -> Result<Tensor> {
-    let Sample { context, target, .. } = sample.slice(0, 1);
+pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Result<Tensor> {
+    let Batch { context, target, .. } = batch.slice(0, 1);
     let middle = |views: &Tensor| views.size()[1] as usize / 2;
     let (shown, target) =
         (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));

@@ -3,11 +3,11 @@
 use super::step_tests::{config, far_from_the_start, scenes, small, trained};
 use super::{StepReport, Trainer};
 use crate::config::{Config, OptimizerKind, TrainConfig};
-use crate::data::{LoadedScene, Sample, TrainingScenes};
+use crate::data::{Batch, LoadedScene, TrainingScenes};
 use crate::device::Stopwatch;
 use crate::loss::Term;
-use crate::ranks::Group;
-use crate::ranks::tests::{can_meet, together};
+use crate::ranks::ProcessGroup;
+use crate::ranks::tests::{can_meet, run_on_ranks};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use tch::{Device, Tensor};
@@ -27,17 +27,17 @@ fn training(train: TrainConfig) -> Config {
 /// reports.
 fn trained_on(
     config: &Config,
-    group: Group,
+    group: ProcessGroup,
     disturb: impl Fn(usize, &mut [LoadedScene]),
 ) -> (Trainer, Vec<StepReport>) {
-    let (rank, share) = (group.rank(), SCENES / group.ranks());
+    let (rank, share) = (group.rank(), SCENES / group.world_size());
     let mut trainer = far_from_the_start(config).with_ranks(group);
     // L_perc takes most of the time. It is a mean over scenes like L_mse, so the tests don't need it.
     trainer.perceptual = None;
     let step = |step: usize| {
         let mut scenes = scenes(SCENES);
         disturb(step, &mut scenes);
-        let sample = Sample::of(&scenes[rank * share..][..share], Device::Cpu);
+        let sample = Batch::from_scenes(&scenes[rank * share..][..share], Device::Cpu);
         trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step")
     };
     let reports = (0..STEPS).map(step).collect();
@@ -63,9 +63,9 @@ fn assert_like_one(
     disturb: impl Fn(usize, &mut [LoadedScene]) + Copy + Sync,
 ) -> Vec<StepReport> {
     let start = weights(&far_from_the_start(config));
-    let (alone, expected) = trained_on(alone, Group::alone(), disturb);
+    let (alone, expected) = trained_on(alone, ProcessGroup::single(), disturb);
     let alone = weights(&alone);
-    let found = together(ranks, |group| {
+    let found = run_on_ranks(ranks, |group| {
         let (trainer, reports) = trained_on(config, group, disturb);
         (weights(&trainer), reports)
     });
@@ -156,7 +156,7 @@ fn of_a_skipped_step_all_ranks_know_all_scenes() {
         return;
     }
     let config = training(TrainConfig::default());
-    let found = together(2, |group| {
+    let found = run_on_ranks(2, |group| {
         let disturb = |step: usize, scenes: &mut [LoadedScene]| {
             if step == 0 {
                 scenes[0].far = f64::NAN;
@@ -181,7 +181,7 @@ fn a_sharded_optimizer_is_the_whole_one() {
 fn sharding_changes_nothing(optimizer: OptimizerKind) {
     let config = training(TrainConfig { optimizer, ..Default::default() });
     let trained = |sharded: bool| {
-        together(3, |group| {
+        run_on_ranks(3, |group| {
             let rank = group.rank();
             let mut trainer = far_from_the_start(&config).with_ranks(group);
             if sharded {
@@ -189,7 +189,7 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
             }
             trainer.broadcast_state().expect("the first rank");
             for _ in 0..3 {
-                let sample = Sample::of(&scenes(3)[rank..][..1], Device::Cpu);
+                let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu);
                 trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             }
             let moments: usize = trainer.optimizer.moments().map(Tensor::numel).sum();
@@ -207,15 +207,15 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
 }
 
 #[test]
-fn ranks_stop_together() {
+fn ranks_stop_run_on_ranks() {
     if !can_meet() {
         return;
     }
     let config = training(TrainConfig::default());
-    let found = together(3, |group| {
+    let found = run_on_ranks(3, |group| {
         let rank = group.rank();
         let mut trainer = far_from_the_start(&config).with_ranks(group);
-        let sample = Sample::of(&scenes(3)[rank..][..1], Device::Cpu);
+        let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu);
         let step = |step: usize| {
             let asked = rank == 1 && step == 2;
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || !asked).expect("a step").go_on
@@ -232,10 +232,10 @@ fn ranks_follow_the_first() {
         return;
     }
     let config = training(TrainConfig::default());
-    let found = together(2, |group| {
+    let found = run_on_ranks(2, |group| {
         let mut trainer = far_from_the_start(&config);
-        if group.is_first() {
-            let sample = Sample::of(&scenes(1), Device::Cpu);
+        if group.is_main_process() {
+            let sample = Batch::from_scenes(&scenes(1), Device::Cpu);
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             trainer.samples = 7;
             // Weights from elsewhere may have another value here.
@@ -266,9 +266,9 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
     }
     // Returns the error of the second of two ranks.
     let refused = |second: fn(Config) -> Trainer| {
-        let mut found = together(2, |group| {
+        let mut found = run_on_ranks(2, |group| {
             let config = training(TrainConfig::default());
-            let trainer = if group.is_first() { far_from_the_start(&config) } else { second(config) };
+            let trainer = if group.is_main_process() { far_from_the_start(&config) } else { second(config) };
             trainer.with_ranks(group).broadcast_state().map_err(|e| e.to_string())
         });
         found.remove(1).expect_err("the second rank goes on")

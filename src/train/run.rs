@@ -76,7 +76,7 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut observe: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let writes = trainer.group.is_first();
+    let writes = trainer.group.is_main_process();
     let begun = writes.then(|| RunLogger::open(trainer, out, resume, &mut observe)).transpose()?;
     trainer.broadcast_state()?;
     let held_out = validator.as_ref().map(|validator| validator.scenes());
@@ -287,7 +287,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// ranks with the next step, so that they stop together.
     fn tell(&mut self, event: Event) -> bool {
         self.asked_to_stop |= !(self.observe)(event);
-        self.trainer.group.ranks() > 1 || !self.asked_to_stop
+        self.trainer.group.world_size() > 1 || !self.asked_to_stop
     }
 
     /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.

@@ -4,13 +4,13 @@
 //! are independent until their gradients are summed, so each slice of a step can have its own threads.
 
 use super::forward_backward::ForwardBackward;
-use crate::data::Sample;
+use crate::data::Batch;
 use crate::device::Stopwatch;
 use crate::error::Result;
-use crate::loss::Share;
+use crate::loss::StepFraction;
 use crate::model::GlobalSplat;
 use crate::optim::zero_grad;
-use crate::ranks::Group;
+use crate::ranks::ProcessGroup;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 use tch::{Kind, Tensor, nn, no_grad};
@@ -63,7 +63,7 @@ impl ModelReplica {
 pub(super) fn gradients_in_parallel(
     part: &ForwardBackward,
     replicas: &mut [ModelReplica],
-    slices: Vec<(Sample, Share)>,
+    slices: Vec<(Batch, StepFraction)>,
     watch: &mut Stopwatch,
 ) -> Result<Tensor> {
     let threads = tch::get_num_threads();
@@ -77,7 +77,7 @@ pub(super) fn gradients_in_parallel(
             .map(|((sample, share), twin)| {
                 scope.spawn(move || {
                     tch::set_num_threads(each);
-                    let (model, group) = (&twin.model, &Group::alone());
+                    let (model, group) = (&twin.model, &ProcessGroup::single());
                     let part = ForwardBackward { config, model, perceptual: None, stage, group };
                     part.gradients(&sample, &share, &mut Stopwatch::default())
                 })

@@ -2,14 +2,14 @@
 
 use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
-use crate::data::{Capture, LoadTimes, LoadedScene, Sample, ViewBatch};
+use crate::data::{Batch, Capture, LoadTimes, LoadedScene, ViewBatch};
 use crate::device::Stopwatch;
-use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, Share, Term, Vgg19, losses};
+use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
-use globalsplat_csrc::ops::{computing, moves, ops_of, outermost_ops_of, without_own_linear_layers};
+use globalsplat_csrc::ops::{computing, moves, record_ops, record_outermost_ops, without_own_linear_layers};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
@@ -20,8 +20,8 @@ const SIZE: u32 = 32;
 const STAGE: Stage = Stage { index: 2, mix: 0.4 };
 
 /// Returns a sample of three scenes.
-fn sample() -> Sample {
-    Sample::of(&scenes(3), Device::Cpu)
+fn sample() -> Batch {
+    Batch::from_scenes(&scenes(3), Device::Cpu)
 }
 
 /// Returns scenes of five context and two target views, with noise as images.
@@ -77,7 +77,7 @@ pub(super) fn small() -> ModelConfig {
 type Step = (Losses<f64>, BTreeMap<String, Tensor>);
 
 /// Computes the loss and gradients of a step with the trainer.
-fn gradients(config: &Config, sample: &Sample) -> Step {
+fn gradients(config: &Config, sample: &Batch) -> Step {
     of_model(config, |trainer| {
         numbers(&trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
     })
@@ -242,7 +242,7 @@ fn a_step_in_parts_is_the_plain_one() {
             let pictures =
                 render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D).expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
-            let losses = losses(&config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE);
+            let losses = losses(&config.loss, perceptual, &sample, &decoded, &pictures, &StepFraction::WHOLE);
             losses.total.backward();
             numbers(&losses.packed())
         });
@@ -282,32 +282,34 @@ fn a_step_takes_few_kernels() {
     let model =
         ModelConfig { latents: 16, width: 24, heads: 3, rgb_width: 16, ray_width: 8, ..Default::default() };
     let mut trainer = far_from_the_start(&config(model, TrainConfig::default()));
-    let (network, sample) = (&trainer.model, Sample::of(&scenes(2), Device::Cpu));
-    let sample = Sample { paired: true, ..sample };
+    let (network, sample) = (&trainer.model, Batch::from_scenes(&scenes(2), Device::Cpu));
+    let sample = Batch { paired: true, ..sample };
     let with_gradient = |t: &Tensor| {
         let leaf = leaf(t);
         leaf.sum(leaf.kind()).backward();
         leaf
     };
     let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-    let (tokens, forward) = outermost_ops_of(|| network.tokens(images, c2w, intrinsics));
+    let (tokens, forward) = record_outermost_ops(|| network.tokens(images, c2w, intrinsics));
     let leaf_of_tokens = with_gradient(&tokens);
-    let (_, backward) = outermost_ops_of(|| backward_from_grads(&[(&tokens, &leaf_of_tokens)]));
+    let (_, backward) = record_outermost_ops(|| backward_from_grads(&[(&tokens, &leaf_of_tokens)]));
     // Two layers, forward and for the gradients of their weights.
     let of_tokens = computing(&without_own_linear_layers([forward, backward].concat())) + 2 * 2;
 
     let decoded = network.decode(&network.encode(&tokens), STAGE).map(leaf);
     let cameras = sample.target.cameras();
     let pictures = render(&decoded.gaussians, &cameras, DEFAULT_EPS2D).expect("pictures");
-    let (_, of_losses) = outermost_ops_of(|| {
-        losses(&trainer.config.loss, None, &sample, &decoded, &pictures, &Share::WHOLE).total.backward();
+    let (_, of_losses) = record_outermost_ops(|| {
+        losses(&trainer.config.loss, None, &sample, &decoded, &pictures, &StepFraction::WHOLE)
+            .total
+            .backward();
     });
 
     trainer.vs.double();
     let tokens = leaf(&tokens.to_kind(Kind::Double));
-    let (decoded, forward) = outermost_ops_of(|| network.decode(&network.encode(&tokens), STAGE));
+    let (decoded, forward) = record_outermost_ops(|| network.decode(&network.encode(&tokens), STAGE));
     let leaves = decoded.map(with_gradient);
-    let (_, backward) = outermost_ops_of(|| backward_from_grads(&decoded.beside(&leaves)));
+    let (_, backward) = record_outermost_ops(|| backward_from_grads(&decoded.zip_tensors(&leaves)));
     let counts = [of_tokens, computing(&forward), computing(&backward), computing(&of_losses)];
     assert!((1000..=2100).contains(&counts.iter().sum::<usize>()), "{counts:?}");
 }
@@ -321,7 +323,7 @@ fn a_step_moves_nothing_but_what_is_told() {
         let train = TrainConfig { micro_batch, checkpoint_rounds, precision, ..Default::default() };
         of_model(&config(small(), train), |trainer| {
             let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-            let (decoded, ops) = ops_of(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
+            let (decoded, ops) = record_ops(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
             assert_eq!(moves(&ops), 0, "an inference");
             let is_fused = |op: &&String| {
                 op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"
@@ -329,17 +331,18 @@ fn a_step_moves_nothing_but_what_is_told() {
             // In every round of either stream: cross-attention to the memory, and self-attention among the slots.
             assert_eq!(ops.iter().filter(is_fused).count(), 2 * 2 * 2, "attention");
             let cameras = sample.target.cameras();
-            let (pictures, ops) = ops_of(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));
+            let (pictures, ops) = record_ops(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));
             // Rendering moves the rendered images to the device of the Gaussians.
             let of_pictures = moves(&ops);
             let pictures = pictures.expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
-            let (_, ops) = ops_of(|| {
-                losses(&trainer.config.loss, perceptual, &sample, &decoded, &pictures, &Share::WHOLE)
+            let (_, ops) = record_ops(|| {
+                losses(&trainer.config.loss, perceptual, &sample, &decoded, &pictures, &StepFraction::WHOLE)
             });
             assert_eq!(moves(&ops), 0, "the losses");
 
-            let (report, ops) = ops_of(|| trainer.learn(&sample, &mut Stopwatch::default(), &mut || true));
+            let (report, ops) =
+                record_ops(|| trainer.learn(&sample, &mut Stopwatch::default(), &mut || true));
             let renders = match micro_batch {
                 0 => 1,
                 // Depths are compared over all slices, so their pixels are counted in an earlier pass.

@@ -59,12 +59,12 @@ impl TensorBoard {
         let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
         let progress = progress(report, samples_per_second).map(tagged("train"));
         let terms = loss_terms(report).map(tagged("loss"));
-        self.file.scalars(report.step, &[&progress[..], &terms].concat())
+        self.file.write_scalars(report.step, &[&progress[..], &terms].concat())
     }
 
     pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {
         match &report.picture {
-            Some(picture) => self.file.picture(report.step, "train/views", picture),
+            Some(picture) => self.file.write_image(report.step, "train/views", picture),
             None => Ok(()),
         }
     }
@@ -76,6 +76,6 @@ impl TensorBoard {
             ("validation/ssim", score.ssim),
             ("validation/stage", f64::from(score.stage.index)),
         ];
-        self.file.scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
+        self.file.write_scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
     }
 }

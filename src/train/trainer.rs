@@ -10,13 +10,13 @@ use super::side_by_side::{ModelReplica, gradients_in_parallel};
 use super::step_report::StepReport;
 use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
-use crate::data::{BadData, Loader, News, Part, Sample, SceneGroups};
+use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
 use crate::error::{Error, Result};
-use crate::loss::{Losses, PerceptualLoss, Share};
+use crate::loss::{Losses, PerceptualLoss, StepFraction};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
 use crate::optim::Optimizer;
-use crate::ranks::{Buckets, Group};
+use crate::ranks::{Buckets, ProcessGroup};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -66,10 +66,10 @@ pub struct Trainer {
     /// Number of samples drawn, which is the position in the data.
     pub(super) samples: u64,
     scenes: Arc<dyn SceneGroups>,
-    /// Loader of the samples, started by the first step that is done.
-    loader: Option<Loader>,
-    /// Group of the ranks that make every step together, each with its own samples.
-    pub(super) group: Group,
+    /// DataLoader of the samples, started by the first step that is done.
+    loader: Option<DataLoader>,
+    /// ProcessGroup of the ranks that make every step together, each with its own samples.
+    pub(super) group: ProcessGroup,
     buckets: Buckets,
     /// `true` if each rank has only the moments of its share of the parameters.
     shards_optimizer: bool,
@@ -111,7 +111,7 @@ impl Trainer {
         model.set_precision(config.train.precision);
         let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
         let config = config.clone();
-        let group = Group::alone();
+        let group = ProcessGroup::single();
         let buckets = Buckets::new(&group, &[]);
         let (step, samples, loader) = (0, 0, None);
         Ok(Trainer {
@@ -134,9 +134,9 @@ impl Trainer {
 
     /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with the
     /// samples of all ranks.
-    pub fn with_ranks(mut self, group: Group) -> Self {
+    pub fn with_ranks(mut self, group: ProcessGroup) -> Self {
         // Parameters notify only one set of buckets, so the old one is dropped first.
-        self.buckets = Buckets::new(&Group::alone(), &[]);
+        self.buckets = Buckets::new(&ProcessGroup::single(), &[]);
         let parameters: Vec<Tensor> =
             in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
         let buckets = Buckets::new(&group, &parameters);
@@ -169,7 +169,7 @@ impl Trainer {
             // The number of heads can't be inferred from shapes.
             theirs.heads = ours.heads;
         }
-        let growth = Growth::between(&theirs, &ours);
+        let growth = Growth::from_configs(&theirs, &ours);
         let [found, expected] =
             [growth.result(), ours.clone()].map(|model| Config { model, ..Default::default() });
         let changed = changed_keys(&found.to_toml(), &expected.to_toml());
@@ -186,7 +186,7 @@ impl Trainer {
         let smaller = smaller.variables();
         no_grad(|| {
             for (name, mut variable) in self.vs.variables() {
-                variable.copy_(&growth.of(&name, &smaller[&name]));
+                variable.copy_(&growth.convert(&name, &smaller[&name]));
             }
         });
         Ok(())
@@ -201,7 +201,7 @@ impl Trainer {
         let sample = self.loader()?.next_batch(batch, device)?;
         self.samples += self.batch();
         let stage = stage_at(&self.config.curriculum, self.step);
-        let picture = (self.group.is_first() && is_due(self.config.train.log_images_every, self.step))
+        let picture = (self.group.is_main_process() && is_due(self.config.train.log_images_every, self.step))
             .then(|| preview(&self.model, &sample, stage))
             .transpose()?;
         Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default(), go_on)? })
@@ -209,11 +209,15 @@ impl Trainer {
 
     /// Returns the number of samples in a step, on all ranks together.
     pub fn batch(&self) -> u64 {
-        self.part().of_step()
+        self.batch_shard().global_batch_size()
     }
 
-    fn part(&self) -> Part {
-        Part { batch: self.config.train.batch_size, number: self.group.rank(), parts: self.group.ranks() }
+    fn batch_shard(&self) -> BatchShard {
+        BatchShard {
+            batch: self.config.train.batch_size,
+            number: self.group.rank(),
+            parts: self.group.world_size(),
+        }
     }
 
     /// Computes the loss and gradient of `sample`, which isn't paired yet, and updates the weights. Records the time of each section of the
@@ -223,14 +227,14 @@ impl Trainer {
     /// Returns an error if rendering fails, or if another rank is gone.
     pub(crate) fn learn(
         &mut self,
-        sample: &Sample,
+        sample: &Batch,
         watch: &mut Stopwatch,
         go_on: &mut dyn FnMut() -> bool,
     ) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
-        let told = match self.group.ranks() {
+        let told = match self.group.world_size() {
             1 => self.add_up(losses, go_on)?,
             _ => watch.time(COMMUNICATION, || self.add_up(losses, go_on))?,
         };
@@ -252,7 +256,7 @@ impl Trainer {
             watch.time("parameters", || self.spread_parameters())?;
         }
         let [gradients, squares] = word.gradients;
-        if gradients * gradients != squares * self.group.ranks() as f64 {
+        if gradients * gradients != squares * self.group.world_size() as f64 {
             return Err(Error::failed(
                 "ranks have different parameters: were they started with the same program?",
             ));
@@ -261,7 +265,7 @@ impl Trainer {
             self.tell_bad_data()?;
         }
         let scenes = match skipped {
-            true => self.group.gather(sample.names.clone())?.concat(),
+            true => self.group.all_gather_object(sample.names.clone())?.concat(),
             false => sample.names.clone(),
         };
         let report = StepReport {
@@ -285,7 +289,7 @@ impl Trainer {
         let gradients = self.buckets.finish()? as f64;
         let word = StepSync {
             asked_to_stop: f64::from(!go_on()),
-            found_bad_data: f64::from(self.loader.as_ref().is_some_and(Loader::has_bad_scene_reports)),
+            found_bad_data: f64::from(self.loader.as_ref().is_some_and(DataLoader::has_bad_scene_reports)),
             gradients: [gradients, gradients * gradients],
         };
         // Filling a new tensor on a GPU doesn't wait for the GPU.
@@ -297,8 +301,8 @@ impl Trainer {
 
     /// Broadcasts the parameters that each rank has updated to all others.
     fn spread_parameters(&self) -> Result<()> {
-        for part in 0..self.group.ranks() {
-            let parameters: Vec<&Tensor> = self.optimizer.of_part(part).collect();
+        for part in 0..self.group.world_size() {
+            let parameters: Vec<&Tensor> = self.optimizer.shard_parameters(part).collect();
             if parameters.is_empty() {
                 continue;
             }
@@ -331,17 +335,18 @@ impl Trainer {
                 Tensor::empty(shape, (Kind::Float, self.vs.device()))
             };
             self.group.broadcast(part, &moment)?;
-            Ok(if self.group.is_first() { moment.to_device(Device::Cpu) } else { Tensor::new() })
+            Ok(if self.group.is_main_process() { moment.to_device(Device::Cpu) } else { Tensor::new() })
         })
     }
 
     /// Exchanges the bad data that the ranks found, so that every rank counts all of it.
     fn tell_bad_data(&self) -> Result<()> {
         let Some(loader) = &self.loader else { return Ok(()) };
-        if self.group.ranks() > 1 {
-            let news: Vec<Vec<News>> = self.group.gather(loader.take_bad_scene_reports())?;
-            let others = news.into_iter().enumerate().filter(|(rank, _)| *rank != self.group.rank());
-            others.map(|(_, news)| news).try_for_each(|news| loader.hear(news))?;
+        if self.group.world_size() > 1 {
+            let reports: Vec<Vec<BadSceneReport>> =
+                self.group.all_gather_object(loader.take_bad_scene_reports())?;
+            let others = reports.into_iter().enumerate().filter(|(rank, _)| *rank != self.group.rank());
+            others.map(|(_, reports)| reports).try_for_each(|reports| loader.record_reports(reports))?;
         }
         Ok(())
     }
@@ -366,7 +371,8 @@ impl Trainer {
     /// Returns an error if this rank's configuration or scenes differ from the first rank's, or if another rank is gone.
     pub(crate) fn broadcast_state(&mut self) -> Result<()> {
         self.agree_with_first()?;
-        let position = self.group.is_first().then(|| (self.step, self.samples, self.optimizer.steps()));
+        let position =
+            self.group.is_main_process().then(|| (self.step, self.samples, self.optimizer.steps()));
         let (step, samples, updates) = self.group.broadcast_object(position)?;
         (self.step, self.samples) = (step, samples);
         self.optimizer.set_steps(updates);
@@ -375,7 +381,7 @@ impl Trainer {
         let moments = self.optimizer.moments();
         variables.values().chain(moments).try_for_each(|t| self.group.broadcast(0, t))?;
         if self.shards_optimizer {
-            self.optimizer.shard(self.group.rank(), self.group.ranks());
+            self.optimizer.shard(self.group.rank(), self.group.world_size());
         }
         Ok(())
     }
@@ -384,7 +390,7 @@ impl Trainer {
     fn agree_with_first(&self) -> Result<()> {
         let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
         let (config, scenes, shards) =
-            self.group.broadcast_object(self.group.is_first().then(|| own.clone()))?;
+            self.group.broadcast_object(self.group.is_main_process().then(|| own.clone()))?;
         let mut changed = changed_keys(&config, &own.0);
         // A change has the form `key first → own`.
         changed.retain(|change| {
@@ -412,7 +418,7 @@ impl Trainer {
     /// Computes the gradient of the sample's loss, stores it in the variables, and returns the loss, packed.
     pub(super) fn gradients(
         &mut self,
-        sample: &Sample,
+        sample: &Batch,
         stage: Stage,
         watch: &mut Stopwatch,
     ) -> Result<Tensor> {
@@ -437,9 +443,9 @@ impl Trainer {
                 None => slice,
             }
         };
-        let share = |first: usize| Share {
-            scenes: count.min(scenes - first) as f64 / (scenes * group.ranks()) as f64,
-            ..Share::WHOLE
+        let share = |first: usize| StepFraction {
+            scenes: count.min(scenes - first) as f64 / (scenes * group.world_size()) as f64,
+            ..StepFraction::WHOLE
         };
         let firsts = (0..scenes).step_by(count);
         if at_once > 1 {
@@ -465,7 +471,7 @@ impl Trainer {
             }
             let depth_pixels = depth_pixels.as_ref().map(Tensor::shallow_clone);
             let slice = watch.time("data", || slice(first));
-            losses += part.gradients(&slice, &Share { depth_pixels, ..share(first) }, watch)?;
+            losses += part.gradients(&slice, &StepFraction { depth_pixels, ..share(first) }, watch)?;
         }
         Ok(losses)
     }
@@ -476,7 +482,7 @@ impl Trainer {
     /// send their gradients during the backward pass.
     pub(crate) fn slices_at_once(&self, scenes: usize) -> usize {
         let apart = self.vs.device() == Device::Cpu
-            && self.group.ranks() == 1
+            && self.group.world_size() == 1
             && self.config.train.micro_batch == 0
             && self.perceptual.is_none()
             && self.config.loss.consistency_depth == 0.;
@@ -485,11 +491,11 @@ impl Trainer {
     }
 
     /// Returns the loader at the position of the next step's samples. Starts a new one if necessary.
-    fn loader(&mut self) -> Result<&mut Loader> {
+    fn loader(&mut self) -> Result<&mut DataLoader> {
         let first = self.samples;
         let loader = match self.loader.take() {
             // The first samples of a step may belong to another rank.
-            Some(loader) if loader.position() == self.part().sample(first, 0) => loader,
+            Some(loader) if loader.position() == self.batch_shard().sample(first, 0) => loader,
             _ => {
                 let mut config = self.config.data.clone();
                 if config.threads == 0 {
@@ -497,7 +503,7 @@ impl Trainer {
                     config.threads = (cores / self.group.local_world_size()).max(1);
                 }
                 let (seed, scenes) = (self.config.train.seed, self.scenes.clone());
-                Loader::start(&config, seed, scenes, self.part(), first)?
+                DataLoader::start(&config, seed, scenes, self.batch_shard(), first)?
             }
         };
         Ok(self.loader.insert(loader))
@@ -511,7 +517,7 @@ impl Trainer {
 
     /// Returns the scenes that were skipped since the run was started or resumed.
     pub fn bad_data(&self) -> BadData {
-        self.loader.as_ref().map(Loader::bad_data).unwrap_or_default()
+        self.loader.as_ref().map(DataLoader::bad_data).unwrap_or_default()
     }
 
     /// Returns the configuration.
@@ -520,7 +526,7 @@ impl Trainer {
     }
 
     /// Returns the group of ranks that train together.
-    pub fn group(&self) -> &Group {
+    pub fn group(&self) -> &ProcessGroup {
         &self.group
     }
 

@@ -13,7 +13,7 @@ use tch::Tensor;
 use tempfile::TempDir;
 
 /// Timeout after which an unresponsive browser counts as hung.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 pub struct Browser {
     process: Child,
@@ -116,7 +116,7 @@ impl Browser {
     }
 
     fn next_message(&self, during: &str) -> Value {
-        self.messages.recv_timeout(PATIENCE).unwrap_or_else(|e| panic!("no answer to {during}: {e}"))
+        self.messages.recv_timeout(TIMEOUT).unwrap_or_else(|e| panic!("no answer to {during}: {e}"))
     }
 
     fn go(&mut self, offline: bool) {
@@ -149,7 +149,7 @@ impl Browser {
     }
 
     /// Sets the viewport and media: `width` in pixels; `scheme` is `light` or `dark`; `media` is `screen` or `print`.
-    pub fn look(&mut self, width: u32, scheme: &str, media: &str) {
+    pub fn set_viewport(&mut self, width: u32, scheme: &str, media: &str) {
         let size = json!({"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": false});
         self.call("Emulation.setDeviceMetricsOverride", size);
         let feature = json!({"name": "prefers-color-scheme", "value": scheme});

@@ -17,7 +17,7 @@ use tch::{Kind, Tensor};
 pub fn has_lpips() -> bool {
     let has = LpipsNetwork::ALL.iter().all(|network| find_pretrained(network.file_name()).is_some());
     if !has {
-        skip("the weights of LPIPS", "the weights of LPIPS are not there; run make weights");
+        skip("the weights of LPIPS", "the LPIPS weights are missing; run make weights");
     }
     has
 }

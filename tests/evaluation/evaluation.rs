@@ -83,7 +83,7 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
 }
 
 #[test]
-fn a_stopped_sweep_goes_on_with_what_it_has() {
+fn an_interrupted_evaluation_resumes() {
     let set = Set::new();
     let weights = tiny_weights(set.folder.path(), &set.path("captures"));
     let arguments = set.arguments(&["--precision", "f32", "--weights", arg(&weights)], "chunks");
@@ -136,7 +136,7 @@ fn a_stopped_sweep_goes_on_with_what_it_has() {
 }
 
 #[test]
-fn what_changed_since_is_scored_again() {
+fn changed_splats_and_new_metrics_are_scored_again() {
     let set = Set::new();
     let splats = set.path("splats");
     let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
@@ -172,7 +172,7 @@ fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
 }
 
 #[test]
-fn what_changed_unnoticed_is_scored_again() {
+fn changes_of_same_size_and_time_are_scored_again() {
     let set = Set::new();
     let photo = set.path("captures/room_000/images/001.png");
     std::fs::write(&photo, [std::fs::read(&photo).unwrap(), vec![0; 1 << 20]].concat()).unwrap();
@@ -236,11 +236,11 @@ fn sharded_weights_are_told_apart_by_their_shards() {
 }
 
 #[test]
-fn made_up_videos_are_told_apart_by_what_they_depend_on() {
+fn synthetic_videos_are_identified_by_version_and_pictures() {
     let folder = tempfile::tempdir().unwrap();
     let made_by = |pictures: &str| {
         let name = format!("synth:seed=1,scenes=1{pictures}");
-        Dataset::open(Path::new(&name), Split::Test).unwrap().made_by().map(String::from)
+        Dataset::open(Path::new(&name), Split::Test).unwrap().generator().map(String::from)
     };
     let with_pictures = |grey: f64| {
         let picture = tch::Tensor::full([3, 16, 16], grey, (tch::Kind::Float, tch::Device::Cpu));
@@ -309,7 +309,7 @@ fn photos_are_scored_one_at_a_time() {
 }
 
 #[test]
-fn anybodys_pictures_are_scored_by_an_index() {
+fn external_renders_are_scored_by_an_index() {
     let set = Set::new();
     for (room, folder) in [("room_000", "renders/room_000"), ("room_002", "renders/room_002/color")] {
         let folder = set.path(folder);
@@ -372,7 +372,7 @@ fn several_indices_make_one_report() {
 }
 
 #[test]
-fn what_data_sets_are_called_is_told_apart() {
+fn ambiguous_dataset_names_are_refused() {
     let set = Set::new();
     let splats = set.path("splats");
     let frames = std::fs::read(set.path("re10k_3v.json")).unwrap();
@@ -423,7 +423,7 @@ fn what_data_sets_are_called_is_told_apart() {
 }
 
 #[test]
-fn what_an_index_gets_wrong_is_named() {
+fn invalid_indices_are_refused() {
     let set = Set::new();
     let splats = set.path("splats");
     let one = splats.join("room_000.ply");
@@ -466,7 +466,7 @@ fn the_first_scene_that_can_be_judged_warms_up() {
 }
 
 #[test]
-fn scores_of_somebody_else_are_kept() {
+fn foreign_scores_are_not_overwritten() {
     let set = Set::new();
     let (splats, scores) = (set.path("splats"), set.path("out/scores.csv"));
     std::fs::create_dir(set.path("out")).unwrap();

@@ -164,7 +164,7 @@ fn one_capture_is_scored_in_every_setting() {
 }
 
 #[test]
-fn a_data_set_is_scored_in_every_setting_and_none_goes_on_with_another() {
+fn an_evaluation_does_not_resume_at_another_resolution() {
     let set = Set::new();
     assert_eq!(set.sweep("plain", &[]).0, Some(0));
     let plain = read_evaluation(&set.path("plain")).unwrap();
@@ -210,7 +210,7 @@ fn a_data_set_is_scored_in_every_setting_and_none_goes_on_with_another() {
 
 /// A photo counts once for the normalization of the scene, however many views it becomes.
 #[test]
-fn settings_share_one_normalized_world() {
+fn normalization_does_not_depend_on_the_resolution() {
     let set = Set::new();
     let loaded = load_model(&set.weights, Device::Cpu).unwrap();
     let (capture, size) = (set.capture(), loaded.config.data.image_size);
@@ -228,7 +228,7 @@ fn settings_share_one_normalized_world() {
 }
 
 #[test]
-fn what_can_not_be_shown_is_told_in_a_sentence() {
+fn invalid_resolutions_are_refused() {
     let set = Set::new();
     let (room, out, data) = (set.room(), set.path("room.ply"), set.path("captures"));
     let (weights, scene) = (arg(&set.weights), arg(&room));

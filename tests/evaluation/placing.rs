@@ -19,7 +19,7 @@ fn photos_of(room: &Path, model: &LoadedModel) -> Vec<View> {
 }
 
 /// Reconstructs `photos` normalized to `extents`; the photos are also the targets.
-fn made_of(photos: &[View], model: &mut LoadedModel, extents: &[f64]) -> Reconstruction {
+fn reconstruct_at_scales(photos: &[View], model: &mut LoadedModel, extents: &[f64]) -> Reconstruction {
     model.config.data.scene_scales = extents.to_vec();
     let targets: Vec<_> = photos.iter().map(|photo| photo.camera.c2w).collect();
     reconstruct(&*model, photos, &targets).unwrap()
@@ -41,14 +41,14 @@ fn the_splat_that_shows_the_photos_best_is_kept() {
     let photos = photos_of(folder.path(), &model);
     let extents = [0.2, 0.5, 1., 2., 5.];
     let alone = extents.map(|extent| {
-        let made = made_of(&photos, &mut model, &[extent]);
+        let made = reconstruct_at_scales(&photos, &mut model, &[extent]);
         assert_eq!(made.placement, Placement { extent, forward: 0. });
         psnr(&made, &photos)
     });
     let best = (0..extents.len()).max_by(|&a, &b| alone[a].total_cmp(&alone[b])).unwrap();
     assert!(alone.iter().all(|&psnr| psnr == alone[best] || psnr < alone[best] - 0.05), "{alone:?} tell");
     for order in [[0, 1, 2, 3, 4], [4, 3, 2, 1, 0]] {
-        let kept = made_of(&photos, &mut model, &order.map(|i| extents[i]));
+        let kept = reconstruct_at_scales(&photos, &mut model, &order.map(|i| extents[i]));
         let (placement, psnr) = (kept.placement, psnr(&kept, &photos));
         let nudged = (placement.extent / extents[best]).ln().abs();
         assert!(nudged < 0.151 && placement.forward.abs() < 0.226, "{placement:?}, {alone:?}");
@@ -79,7 +79,7 @@ fn reconstruct_tells_where_the_scene_was_shown() {
 }
 
 #[test]
-fn a_scene_has_a_size() {
+fn invalid_scene_scales_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let room = folder.path().join("room");
     write_room(&room, 3, 8, [32, 32].into()).unwrap();

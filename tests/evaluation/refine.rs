@@ -174,7 +174,7 @@ fn photos_from_one_place_are_shown_at_one_distance() {
 
 /// An interrupted refinement returns a splat at any time, once there is one.
 #[test]
-fn work_that_is_ended_early_keeps_what_there_is() {
+fn an_interrupted_refinement_returns_its_gaussians() {
     let (_folder, room) = room();
     let capture = open_capture(&room).unwrap();
     let options =
@@ -314,7 +314,7 @@ fn many_photos_are_used_as_they_are() {
 
 /// Points of a COLMAP model, text or binary, initialize Gaussians.
 #[test]
-fn points_are_begun_with() {
+fn colmap_points_initialize_gaussians() {
     for format in [Format::ColmapText, Format::ColmapBinary] {
         let (_folder, room) = room();
         assert!(points_of(&open_capture(&room).unwrap()).unwrap().is_empty());
@@ -344,7 +344,7 @@ fn points_are_begun_with() {
 
 /// Small pose errors and exposure differences are estimated, for a room whose splat is known.
 #[test]
-fn what_photos_hide_is_found_out() {
+fn pose_and_exposure_errors_are_corrected() {
     let (folder, room) = room();
     let out = folder.path().join("a.ply");
     let file = room.join("cameras.json");

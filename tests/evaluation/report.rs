@@ -102,7 +102,7 @@ fn report() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn the_file_needs_no_other_and_says_what_is_absent() {
+fn the_report_is_self_contained_and_marks_missing_scores() {
     let (_folder, page) = report();
     let text = std::fs::read_to_string(page).unwrap();
     for attribute in ["src=\"", "href=\"", "url(", "@import", "srcset"] {
@@ -255,7 +255,7 @@ fn a_browser_shows_it_in_light_and_dark_wide_and_narrow() {
     let mut grounds = vec![];
     for scheme in ["light", "dark"] {
         for width in [1280, 400] {
-            browser.look(width, scheme, "screen");
+            browser.set_viewport(width, scheme, "screen");
             browser.open(&page);
             browser.evaluate(OPEN_ALL);
             let faint = browser.evaluate(FAINT);
@@ -301,14 +301,14 @@ fn tables_are_whole_without_scripts_and_sort_with_them() {
     let headings = "[...document.querySelectorAll('thead th, tbody th')].every((th) => ['col', 'row'].includes(th.scope))";
     for scripts_off in [true, false] {
         browser.call("Emulation.setScriptExecutionDisabled", json!({"value": scripts_off}));
-        browser.look(1280, "light", "screen");
+        browser.set_viewport(1280, "light", "screen");
         browser.open(&page);
         assert_eq!(browser.evaluate(ROWS), folded);
         assert_eq!(browser.evaluate(headings), true);
         let buttons = browser.evaluate("document.querySelectorAll('thead button').length");
         assert_eq!(buttons == 0, scripts_off, "no button that does nothing");
         // In print, everything is unfolded and the background is white, whatever the screen's scheme.
-        browser.look(1280, "dark", "print");
+        browser.set_viewport(1280, "dark", "print");
         let printed = browser.evaluate(ROWS);
         let counts: Vec<u64> =
             printed.as_object().expect("tables").values().filter_map(Value::as_u64).collect();
@@ -319,7 +319,7 @@ fn tables_are_whole_without_scripts_and_sort_with_them() {
         assert_eq!(browser.evaluate("getComputedStyle(document.body).backgroundColor"), "rgb(255, 255, 255)");
         assert_eq!(strings(&browser.evaluate(FAINT)["faint"]), [""; 0]);
     }
-    browser.look(1280, "light", "screen");
+    browser.set_viewport(1280, "light", "screen");
     let sorted = |browser: &mut Browser, column: usize| {
         browser.evaluate(&format!(
             "(() => {{

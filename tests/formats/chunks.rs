@@ -79,7 +79,7 @@ fn chunks_that_interrupted_work_left_are_taken_over() {
         let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
         let mut seen = vec![];
         let count = writer
-            .go_on(
+            .resume(
                 &SCENES.map(String::from),
                 || Ok(capture(SCENES[0])?),
                 |number, capture| {
@@ -102,8 +102,8 @@ fn chunks_that_interrupted_work_left_are_taken_over() {
     let others = ["room_1", "room_0", "room_2"].map(String::from);
     for (keys, first) in [(others, SCENES[0]), (SCENES.map(String::from), SCENES[1])] {
         let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
-        let error = writer.go_on(&keys, || Ok(capture(first)?), |_, _| Ok(())).unwrap_err().to_string();
-        assert!(error.contains("000000.torch: the output is a chunk already"), "{error}");
+        let error = writer.resume(&keys, || Ok(capture(first)?), |_, _| Ok(())).unwrap_err().to_string();
+        assert!(error.contains("000000.torch: the output is an existing chunk"), "{error}");
     }
 }
 
@@ -122,7 +122,7 @@ fn a_data_set_is_found_split_by_split() {
 }
 
 #[test]
-fn what_is_in_the_folder_of_one_part_is_not_in_the_other() {
+fn split_folders_contain_only_their_own_captures() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("set");
     let write = |name: &str| write_room(&root.join(name), 0, 3, [24, 24].into()).unwrap();
@@ -132,7 +132,7 @@ fn what_is_in_the_folder_of_one_part_is_not_in_the_other() {
     };
     write("test/seen_never");
     let error = Dataset::open(&root, Split::Train).unwrap_err().to_string();
-    assert!(error.contains("without captures but those in") && error.contains("test"), "{error}");
+    assert!(error.contains("a folder whose captures are all in") && error.contains("test"), "{error}");
     write("a");
     write("more/b");
     assert_eq!(scenes(Split::Train), ["a", "b"]);
@@ -159,9 +159,9 @@ fn pack_and_inspect_tell_what_they_did() {
     let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&out), "--json"])).unwrap();
     assert_eq!((told["kind"].as_str(), told["scenes"].as_u64()), (Some("data set"), Some(1)));
     let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
-    assert!(again.contains("a folder of chunks already"), "{again}");
+    assert!(again.contains("a folder that already contains chunks"), "{again}");
     let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
-    assert!(twice.contains("which 000000.torch holds already"), "{twice}");
+    assert!(twice.contains("which is already in 000000.torch"), "{twice}");
 }
 
 /// Returns a torch.save archive with `pickle` and the bytes of one tensor.
@@ -243,7 +243,7 @@ fn good_timestamps() -> Vec<u8> {
 }
 
 #[test]
-fn what_a_pickle_may_not_do_is_not_done() {
+fn pickles_that_call_functions_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let trap = folder.path().join("trap");
     // Call that Python would execute: os.system("touch trap").
@@ -314,7 +314,7 @@ fn data_saved_on_another_device_are_read_here() {
 }
 
 #[test]
-fn what_is_said_again_and_again_takes_no_more_than_it_says() {
+fn repeated_references_are_limited_by_size() {
     // One image and one scene, each referenced many times by two bytes.
     for (views, scenes, fits) in [(50, 50, true), (2000, 50, true), (2000, 2000, false)] {
         let count = views as u32;

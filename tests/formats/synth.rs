@@ -45,7 +45,7 @@ fn a_seed_makes_the_same_bytes() {
 }
 
 #[test]
-fn where_it_was_stopped_the_same_command_goes_on() {
+fn interrupted_synth_resumes() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("worlds");
     let (chunk, indices) =
@@ -75,7 +75,7 @@ fn where_it_was_stopped_the_same_command_goes_on() {
     for other in [["1", "3", "24", "0"], ["2", "4", "24", "0"], ["2", "3", "25", "0"], ["2", "3", "24", "1"]]
     {
         let error = refuse(&synth(other));
-        assert!(error.contains("000000.torch: the output is a chunk already"), "{other:?}: {error}");
+        assert!(error.contains("000000.torch: the output is an existing chunk"), "{other:?}: {error}");
     }
     assert!(std::fs::read(&chunk).unwrap() == bytes, "lost");
 }
@@ -152,7 +152,7 @@ fn cameras_are_in_free_space_and_move() {
 /// Some videos go around an object, as people photograph objects: all cameras look at nearly the same point, by more than 45
 /// degrees from one another.
 #[test]
-fn things_are_looked_at_from_around() {
+fn some_videos_orbit_an_object() {
     let is_around = |index| {
         let cameras = Video::new(5, index, &settings(5, 16)).cameras().to_vec();
         let rays: Vec<(DVec3, DVec3)> =

@@ -36,7 +36,7 @@ struct Source {
 }
 
 #[test]
-fn arrows_go_down() {
+fn modules_use_only_lower_layers() {
     let sources = sources();
     for module in
         sources.keys().filter(|module| module.len() == 1 && !["error", "ffi"].contains(&module[0].as_str()))
@@ -45,7 +45,7 @@ fn arrows_go_down() {
     }
     let floor = |module: &Module| LAYERS.iter().position(|name| *name == module[0]);
     let mut arrows = 0;
-    for (from, to) in arrows_of(&sources) {
+    for (from, to) in dependencies(&sources) {
         if from.is_empty() || from[0] == to[0] || GROUND.contains(&to[0].as_str()) {
             continue;
         }
@@ -58,8 +58,8 @@ fn arrows_go_down() {
 /// No modules of one folder, each with all its submodules, use each other in a cycle, directly or indirectly. Items of a
 /// `mod.rs` are for the files below it, and these are for it.
 #[test]
-fn files_use_each_other_in_one_direction() {
-    let graph = siblings(arrows_of(&sources()));
+fn modules_have_no_dependency_cycles() {
+    let graph = siblings(dependencies(&sources()));
     assert!(graph.keys().any(|module| module.starts_with(&["cli".to_string()])), "the program is looked at");
     if let Some(circle) = circle(&graph) {
         let names: Vec<String> = circle.iter().map(|module| module.join("::")).collect();
@@ -120,7 +120,7 @@ fn circles_and_paths_are_found() {
 }
 
 /// Returns pairs (user, used), where `used` is the file that defines the item.
-fn arrows_of(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
+fn dependencies(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
     let mut arrows = BTreeSet::new();
     for (module, source) in sources {
         for path in paths(&source.text) {

@@ -3,7 +3,7 @@
 use glam::{DMat4, DVec3};
 use globalsplat::data::DataConfig;
 use globalsplat::data::{
-    Capture, JitterConfig, LoadedScene, Loader, Sample, SceneGroups, open_capture, write_cameras_json,
+    Batch, Capture, DataLoader, JitterConfig, LoadedScene, SceneGroups, open_capture, write_cameras_json,
 };
 use globalsplat::error::{Error, Result};
 use globalsplat::scene::{Camera, Intrinsics};
@@ -82,7 +82,7 @@ fn groups(folder: &Path, sizes: &[usize]) -> Groups {
     Groups(sizes.iter().map(|&count| group(count)).collect())
 }
 
-fn scenes(loader: &mut Loader, count: usize) -> Vec<LoadedScene> {
+fn scenes(loader: &mut DataLoader, count: usize) -> Vec<LoadedScene> {
     (0..count).map(|_| loader.next_scene().unwrap()).collect()
 }
 
@@ -103,7 +103,7 @@ fn samples_depend_on_seed_and_number_alone() {
     let data = Arc::new(groups(folder.path(), &[2, 3, 2]));
     let load = |seed: u64, threads: usize, first: u64, count: usize| {
         let config = DataConfig { threads, ..config() };
-        scenes(&mut Loader::start(&config, seed, data.clone(), 1, first).unwrap(), count)
+        scenes(&mut DataLoader::start(&config, seed, data.clone(), 1, first).unwrap(), count)
     };
     let all = load(3, 1, 0, 17);
     assert_same(&load(3, 3, 0, 17), &all);
@@ -116,14 +116,14 @@ fn samples_depend_on_seed_and_number_alone() {
 }
 
 #[test]
-fn decoded_photos_that_are_kept_change_nothing() {
+fn the_photo_cache_does_not_change_samples() {
     let folder = tempfile::tempdir().unwrap();
     let captures: Vec<Capture> =
         (0..3).map(|i| write_capture(&folder.path().join(format!("{i}")), i, 12)).collect();
     let data = Arc::new(captures);
     let load = |photo_cache_mb: u64| {
         let config = DataConfig { photo_cache_mb, ..config() };
-        scenes(&mut Loader::start(&config, 0, data.clone(), 1, 0).unwrap(), 9)
+        scenes(&mut DataLoader::start(&config, 0, data.clone(), 1, 0).unwrap(), 9)
     };
     assert_same(&load(0), &load(1));
 }
@@ -134,7 +134,7 @@ fn the_scenes_of_a_step_show_equally_many_views() {
     let data = Arc::new(groups(folder.path(), &[4]));
     let config = DataConfig { min_context_views: 2, ..config() };
     let counts = |first: u64| -> Vec<usize> {
-        let mut loader = Loader::start(&config, 0, data.clone(), 3, first).unwrap();
+        let mut loader = DataLoader::start(&config, 0, data.clone(), 3, first).unwrap();
         let batches = (0..12).map(|_| loader.next_batch(3, Device::Cpu).unwrap());
         batches.map(|batch| batch.context_views()).collect()
     };
@@ -145,10 +145,10 @@ fn the_scenes_of_a_step_show_equally_many_views() {
 }
 
 #[test]
-fn batches_are_what_the_scenes_are() {
+fn batches_stack_their_scenes() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(groups(folder.path(), &[4]));
-    let loader = || Loader::start(&config(), 0, data.clone(), 1, 0).unwrap();
+    let loader = || DataLoader::start(&config(), 0, data.clone(), 1, 0).unwrap();
     let batch = loader().next_batch(3, Device::Cpu).unwrap();
     assert_eq!(batch.context.images.size(), [3, 4, 3, 16, 24]);
     assert_eq!(batch.target.w2c.size(), [3, 2, 4, 4]);
@@ -164,18 +164,18 @@ fn batches_are_what_the_scenes_are() {
     }
 }
 
-fn tensors(sample: &Sample) -> [&Tensor; 9] {
-    let Sample { context: a, target: b, far, .. } = sample;
+fn tensors(sample: &Batch) -> [&Tensor; 9] {
+    let Batch { context: a, target: b, far, .. } = sample;
     [&a.images, &a.c2w, &a.w2c, &a.intrinsics, &b.images, &b.c2w, &b.w2c, &b.intrinsics, far]
 }
 
 /// Batches that are prefetched to the device are the same. Tested on the CPU, which does the same as for a GPU except for the
 /// copies.
 #[test]
-fn batches_that_are_sent_ahead_are_the_same() {
+fn prefetched_batches_are_the_same() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(groups(folder.path(), &[4]));
-    let loader = |first| Loader::start(&config(), 0, data.clone(), 2, first).unwrap();
+    let loader = |first| DataLoader::start(&config(), 0, data.clone(), 2, first).unwrap();
     let (mut plain, mut ahead) = (loader(4), loader(4));
     for step in 0..4 {
         if step != 2 {
@@ -201,7 +201,7 @@ fn errors_come_when_their_samples_would() {
     let data = Arc::new(with_bad_data(folder.path()));
     let config = DataConfig { max_bad_share: 0.2, threads: 1, ..config() };
     let errors = [false, true].map(|sends_ahead| {
-        let mut loader = Loader::start(&config, 0, data.clone(), 1, 0).unwrap();
+        let mut loader = DataLoader::start(&config, 0, data.clone(), 1, 0).unwrap();
         let position = (0..24).find_map(|_| {
             if sends_ahead {
                 loader.prefetch_to_device(2, Device::Cpu);
@@ -226,7 +226,7 @@ fn without_augmentation_every_view_is_the_same_in_every_sample() {
         flip: false,
         ..config()
     };
-    let shown = scenes(&mut Loader::start(&config, 0, data, 1, 0).unwrap(), 4);
+    let shown = scenes(&mut DataLoader::start(&config, 0, data, 1, 0).unwrap(), 4);
     assert!(shown.iter().all(|scene| scene.images == shown[0].images && scene.context == [0, 1, 2, 3, 4, 5]));
 }
 
@@ -252,7 +252,7 @@ fn bad_data_are_counted_and_skipped() {
     let data = Arc::new(with_bad_data(folder.path()));
     let load = |threads: usize, first: u64, count: usize| {
         let config = DataConfig { max_bad_share: 0.5, threads, ..config() };
-        let mut loader = Loader::start(&config, 0, data.clone(), 1, first).unwrap();
+        let mut loader = DataLoader::start(&config, 0, data.clone(), 1, first).unwrap();
         (scenes(&mut loader, count), loader.bad_data())
     };
     let (all, bad) = load(1, 0, 24);
@@ -288,10 +288,10 @@ impl SceneGroups for Panics {
 }
 
 #[test]
-fn what_goes_wrong_inside_is_told() {
-    let mut loader = Loader::start(&config(), 0, Arc::new(Panics), 1, 0).unwrap();
+fn a_panic_while_loading_is_an_error() {
+    let mut loader = DataLoader::start(&config(), 0, Arc::new(Panics), 1, 0).unwrap();
     let error = loader.next_scene().unwrap_err().to_string();
-    assert_eq!(error, "loading sample 0 failed inside: group 0 must not be opened");
+    assert_eq!(error, "internal error while loading sample 0: group 0 must not be opened");
 }
 
 #[test]
@@ -299,7 +299,7 @@ fn too_much_bad_data_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(with_bad_data(folder.path()));
     let config = DataConfig { max_bad_share: 0.2, threads: 2, ..config() };
-    let mut loader = Loader::start(&config, 0, data, 1, 0).unwrap();
+    let mut loader = DataLoader::start(&config, 0, data, 1, 0).unwrap();
     let error = (0..24).find_map(|_| loader.next_scene().err()).expect("3 of 12 are too many").to_string();
     assert!(
         error.contains("of 12 scenes were skipped") && error.contains("data.max_bad_share allows 0.2"),
@@ -312,9 +312,9 @@ fn nothing_but_bad_data_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(vec![write_capture(folder.path(), 0, 5)]);
     let config = DataConfig { max_bad_share: 1., ..config() };
-    let error = Loader::start(&config, 0, data, 1, 0).unwrap().next_scene().unwrap_err().to_string();
+    let error = DataLoader::start(&config, 0, data, 1, 0).unwrap().next_scene().unwrap_err().to_string();
     assert!(error.contains("no scene can be trained on: 1 of 1 scenes were skipped: 1 too short"), "{error}");
-    assert!(error.contains("cameras.json: 5 views to show, expected 6 or more (data.window)"), "{error}");
+    assert!(error.contains("cameras.json: 5 training views, expected 6 or more (data.window)"), "{error}");
     let none = Arc::new(Vec::<Capture>::new());
-    assert!(Loader::start(&config, 0, none, 1, 0).unwrap_err().to_string().contains("no scenes"));
+    assert!(DataLoader::start(&config, 0, none, 1, 0).unwrap_err().to_string().contains("no scenes"));
 }

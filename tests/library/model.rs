@@ -224,7 +224,7 @@ fn resident(file: &std::path::Path) -> u64 {
 }
 
 #[test]
-fn weights_that_lie_in_their_file_are_those_that_are_copied() {
+fn mapped_weights_give_the_outputs_of_copied_weights() {
     let model = ModelConfig { width: 64, heads: 4, ..small() };
     let config = Config { model, ..Default::default() };
     let (vs, _) = build(&config.model);
@@ -309,7 +309,7 @@ fn configurations_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn a_memory_that_nobody_follows_is_kept_as_products_take_it() {
+fn memory_without_gradients_is_stored_in_bf16() {
     let (_vs, mut model) = build(&small());
     model.set_precision(Precision::Bf16);
     let [images, c2w, intrinsics] = inputs(3, 16, 24);

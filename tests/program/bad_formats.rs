@@ -124,7 +124,7 @@ fn transforms_with_lenses_that_are_none() {
 }
 
 #[test]
-fn the_program_says_so_too() {
+fn inspect_refuses_invalid_captures() {
     for (format, file) in [
         (Format::Transforms, "transforms.json"),
         (Format::ColmapText, "sparse/0/cameras.txt"),

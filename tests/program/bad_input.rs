@@ -223,7 +223,7 @@ fn weights_whose_names_do_not_fit() {
         let stranger = tensors["slot_encoder.slot_regs"].copy();
         tensors.insert("stranger".into(), stranger);
     });
-    assert_says(&error, &["tensor scene_tokens is absent", "[16, 32]", "2 more"]);
+    assert_says(&error, &["tensor scene_tokens is missing", "[16, 32]", "2 more"]);
 }
 
 #[test]
@@ -248,7 +248,7 @@ fn weights_that_are_something_else() {
     globalsplat::io::write_weights(&file, &tensors, Default::default()).unwrap();
     let error =
         refuse(&["reconstruct", "--weights", arg(&file), "--scene", arg(&room), "--out", arg(&splat)]);
-    assert_says(&error, &["tensor scene_tokens is absent", "globalsplat export"]);
+    assert_says(&error, &["tensor scene_tokens is missing", "globalsplat export"]);
 }
 
 #[test]
@@ -358,7 +358,7 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
         &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&photo)][..],
         &["synth", "--out", arg(&folder.path().join("worlds")), "--sheet", arg(&photo)],
     ] {
-        assert_says(&refuse(command), &["sheet.jpg", "the picture's ending is another, expected .png"]);
+        assert_says(&refuse(command), &["sheet.jpg", "the image's file extension is another, expected .png"]);
     }
     let taken = folder.path().join("taken.ply");
     std::fs::create_dir(&taken).unwrap();
@@ -463,7 +463,7 @@ fn lpips_weights_of_something_else() {
     std::fs::write(&file, "no weights").unwrap();
     assert_says(&score(), &[arg(&file), "broken", "safetensors"]);
     std::fs::rename(tiny_weights(folder.path(), &room), &file).unwrap();
-    assert_says(&score(), &[arg(&file), "tensor conv1_1.bias is absent, expected [64]"]);
+    assert_says(&score(), &[arg(&file), "tensor conv1_1.bias is missing, expected [64]"]);
 }
 
 #[test]
@@ -481,11 +481,11 @@ fn perceptual_losses_without_their_weights() {
     let error = train("vgg19", "perceptual_factor=1");
     assert_says(
         &error,
-        &["loss.perceptual_weights is", "vgg19.safetensors, which is not there", "torchvision"],
+        &["loss.perceptual_weights is", "vgg19.safetensors, which doesn't exist", "torchvision"],
     );
     assert_says(
         &train("lpips_vgg", "perceptual_factor=1"),
-        &["lpips_vgg.safetensors", "make weights makes it"],
+        &["lpips_vgg.safetensors", "`make weights` creates it"],
     );
     assert_says(
         &train("vgg19", "perceptual_weights=elsewhere/v.safetensors"),

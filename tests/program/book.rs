@@ -23,7 +23,7 @@ fn read(path: impl AsRef<Path>) -> String {
 }
 
 /// Compares a reference page with what the code gives, or writes it if the environment asks for that.
-fn hold(page: &str, expected: &str) {
+fn check_or_write(page: &str, expected: &str) {
     if std::env::var_os("GLOBALSPLAT_WRITE_REFERENCE").is_some() {
         fs::write(root().join(page), expected).expect("a file that can be written");
     }
@@ -78,7 +78,7 @@ fn the_page_of_commands_is_their_help() {
     for name in names {
         append_command(&mut page, &[name]);
     }
-    hold("docs/commands.md", &page);
+    check_or_write("docs/commands.md", &page);
 }
 
 /// A key of a configuration, as its source documents it.
@@ -147,7 +147,7 @@ fn the_page_of_the_configuration_is_its_source() {
         "\n## refine\n\n`globalsplat refine --set key=value` changes these.\n\n{}",
         table(&keys(&read("src/refine/config.rs"), "RefineConfig"), &refine)
     ));
-    hold("docs/configuration.md", &page);
+    check_or_write("docs/configuration.md", &page);
 }
 
 /// Returns every page, relative to the repository's root.

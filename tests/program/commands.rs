@@ -14,7 +14,7 @@ fn json(arguments: &[&str]) -> Value {
 }
 
 #[test]
-fn who_reads_no_further_is_told_nothing() {
+fn a_closed_stdout_ends_without_a_message() {
     let (_folder, room) = room();
     let mut program = command(&["inspect", arg(&room)])
         .stdout(std::process::Stdio::piped())
@@ -548,7 +548,7 @@ fn a_run_is_not_begun_anew_over_another() {
 }
 
 #[test]
-fn memory_of_a_step_is_told_before_and_bench_train_takes_the_batch_that_fits() {
+fn doctor_estimates_memory_and_bench_train_fits_the_batch() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
     let text = succeed(&["doctor", "--config", arg(&config), "--set", "train.batch_size=3"]);
@@ -578,7 +578,7 @@ fn wrong_usage_is_exit_code_2() {
 }
 
 #[test]
-fn a_data_set_of_chunks_is_learned_from_and_told_of() {
+fn training_on_chunks_reports_skipped_scenes() {
     let folder = tempfile::tempdir().unwrap();
     let (captures, set) = (folder.path().join("captures"), folder.path().join("set/train"));
     rooms(&captures, 3, 6, 40);

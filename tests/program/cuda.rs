@@ -50,7 +50,7 @@ fn a_splat_s_sums_take_eleven_shuffles() {
 }
 
 #[test]
-fn newer_gpus_get_what_their_driver_compiles_and_older_ones_a_sentence() {
+fn newer_gpus_get_ptx_and_older_ones_are_refused() {
     let Some(nvrtc) = nvrtc() else { return };
     let newest = *nvrtc.architectures.last().unwrap();
     assert_eq!(nvrtc.target(newest), Ok((newest, Form::Cubin)));
@@ -95,7 +95,7 @@ fn kernels_are_compiled_once() {
         assert_eq!((driver.version, gpu.name.as_str(), gpu.architecture), (13000, "Imaginary", 90));
         assert_eq!((gpu.memory, gpu.multiprocessors), (8 << 30, 132));
         let prepared = prepare(0).unwrap();
-        assert_eq!((prepared.architecture, prepared.was_kept), (90, expected == "kept"));
+        assert_eq!((prepared.architecture, prepared.was_cached), (90, expected == "kept"));
         let file = prepared.file.expect("a place for it");
         assert!(file.starts_with(cache_folder().unwrap()) && file.is_file());
         assert!(prepare(1).unwrap_err().contains("1 GPUs"));

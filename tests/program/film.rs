@@ -383,7 +383,7 @@ fn a_path_takes_every_format_and_needs_no_photos() {
 }
 
 #[test]
-fn photos_that_would_tell_their_size_and_are_gone_are_asked_for() {
+fn a_path_without_image_sizes_needs_photos_or_size() {
     let (_folder, room) = room();
     rewrite(&room, Format::Transforms);
     let file = room.join("transforms.json");

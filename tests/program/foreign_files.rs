@@ -34,7 +34,7 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 #[test]
-fn folders_of_other_names_than_ours_are_no_business_of_a_run() {
+fn a_run_keeps_foreign_files() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let files = [
@@ -61,7 +61,7 @@ fn folders_of_other_names_than_ours_are_no_business_of_a_run() {
 }
 
 #[test]
-fn a_broken_checkpoint_takes_no_good_ones_place() {
+fn broken_checkpoints_do_not_count_as_kept() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let train = |settings: &[&str]| succeed(&text(&train(&config, &run, settings)));
@@ -82,7 +82,7 @@ fn pack_replaces_no_chunk_but_one_that_it_would_write() {
     let out = folder.path().join("chunks");
     let chunk = put(out.join("000000.torch"));
     let error = refuse(&["pack", arg(&room), "--out", arg(&out)]);
-    assert!(error.contains("000000.torch: the output is a chunk already"), "{error}");
+    assert!(error.contains("000000.torch: the output is an existing chunk"), "{error}");
     assert_kept(&chunk);
     std::fs::remove_file(&chunk).unwrap();
     succeed(&["pack", arg(&room), "--out", arg(&out)]);

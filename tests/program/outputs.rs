@@ -391,7 +391,7 @@ fn endings_are_the_same_in_capitals() {
 }
 
 #[test]
-fn parts_of_pictures_have_names_of_their_own() {
+fn output_image_names_do_not_collide() {
     let (folder, room) = room();
     // One photo has the name of another's depth image.
     fs::rename(room.join("images/001.png"), room.join("images/000_depth.png")).unwrap();
@@ -482,7 +482,7 @@ fn checkpoints_that_list_no_files_or_others_are_broken() {
 }
 
 #[test]
-fn what_few_may_read_is_replaced_by_what_few_may_read() {
+fn replaced_files_keep_their_permissions() {
     let files = Captured::new();
     let out = files.at("private.ply");
     fs::write(&out, "").unwrap();

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 /// Runs the program with a limit on its address space, in KiB.
-fn limited(kibibytes: u64, arguments: &[&str]) -> Output {
+fn run_with_memory_limit(kibibytes: u64, arguments: &[&str]) -> Output {
     Command::new("bash")
         .args(["-c", "ulimit -v $0; exec \"$@\"", &kibibytes.to_string(), env!("CARGO_BIN_EXE_globalsplat")])
         .args(arguments)
@@ -32,14 +32,15 @@ fn range(arguments: &[&str]) -> (u64, u64) {
         enough
     };
     static STARTS: OnceLock<u64> = OnceLock::new();
-    let starts =
-        *STARTS.get_or_init(|| STACK + search(&|limit| limited(limit, &["--version"]).status.success()));
-    (starts, search(&|limit| limit >= starts && limited(limit, arguments).status.success()))
+    let starts = *STARTS.get_or_init(|| {
+        STACK + search(&|limit| run_with_memory_limit(limit, &["--version"]).status.success())
+    });
+    (starts, search(&|limit| limit >= starts && run_with_memory_limit(limit, arguments).status.success()))
 }
 
 /// Asserts that at `limits` values between starting and completing, `arguments` end with one sentence and leave `file` either
 /// unchanged or complete.
-fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
+fn assert_oom_is_reported(arguments: &[&str], file: &Path, limits: u64) {
     let before = b"what was there before".to_vec();
     std::fs::write(file, &before).unwrap();
     let (starts, enough) = range(arguments);
@@ -49,7 +50,7 @@ fn refused_politely(arguments: &[&str], file: &Path, limits: u64) {
     for i in 0..limits {
         std::fs::write(file, &before).unwrap();
         let limit = starts + (enough - starts) * i / limits;
-        let output = limited(limit, arguments);
+        let output = run_with_memory_limit(limit, arguments);
         let (code, err) = (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
         let left = std::fs::read(file).unwrap();
         if code == Some(0) {
@@ -86,12 +87,12 @@ fn config(folder: &Path, room: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_splat_is_made_or_not() {
+fn reconstruct_out_of_memory_leaves_no_partial_splat() {
     let (folder, room) = room();
     let (weights, out) = (folder.path().join("weights.safetensors"), folder.path().join("out.ply"));
     succeed(&["export", "--config", arg(&config(folder.path(), &room)), "--out", arg(&weights)]);
     // Some libraries fail only within a range of a few MiB.
-    refused_politely(
+    assert_oom_is_reported(
         &["reconstruct", "--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&out)],
         &out,
         120,
@@ -99,30 +100,31 @@ fn a_splat_is_made_or_not() {
 }
 
 #[test]
-fn weights_are_exported_or_not() {
+fn export_out_of_memory_leaves_no_partial_file() {
     let (folder, room) = room();
     let (config, out) = (config(folder.path(), &room), folder.path().join("out.safetensors"));
-    refused_politely(&["export", "--config", arg(&config), "--out", arg(&out)], &out, 12);
+    assert_oom_is_reported(&["export", "--config", arg(&config), "--out", arg(&out)], &out, 12);
 }
 
 #[test]
-fn a_run_goes_on_where_memory_ended_it() {
+fn training_resumes_after_out_of_memory() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let whole = folder.path().join("whole");
     let (starts, enough) = range(&text(&train(&config, &whole, &[])));
     let enough = enough.max(starts);
     for i in 0..8 {
-        let output = limited(starts + (enough - starts) * i / 8, &text(&train(&config, &run, &[])));
+        let output =
+            run_with_memory_limit(starts + (enough - starts) * i / 8, &text(&train(&config, &run, &[])));
         let err = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}: {err}", output.status);
         assert!(!err.contains("panicked"), "{err}");
     }
-    goes_on_as(&config, &run, &whole);
+    assert_resumes_as(&config, &run, &whole);
 }
 
 /// Asserts that the resumed run ends as `whole` did.
-fn goes_on_as(config: &Path, run: &Path, whole: &Path) {
+fn assert_resumes_as(config: &Path, run: &Path, whole: &Path) {
     succeed(&text(&train(config, run, &[])));
     let weights = |run: &Path| {
         let checkpoint = globalsplat::train::latest_checkpoint(run).unwrap();
@@ -169,5 +171,5 @@ fn a_run_goes_on_where_a_cgroup_killed_it() {
     }
     std::fs::remove_dir(&group).unwrap();
     assert!(killed > 0);
-    goes_on_as(&config, &run, &whole);
+    assert_resumes_as(&config, &run, &whole);
 }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 /// Timeout for everything that normally takes seconds.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Serializes the tests: each uses all cores of a small machine.
 fn turn() -> Option<MutexGuard<'static, ()>> {
@@ -124,7 +124,7 @@ impl Started {
                 return found;
             }
             let ended = self.processes.iter_mut().any(|process| process.try_wait().unwrap().is_some());
-            assert!(!ended && begun.elapsed() < PATIENCE, "{what} never came: {}", self.told("err0"));
+            assert!(!ended && begun.elapsed() < TIMEOUT, "{what} never came: {}", self.told("err0"));
             sleep(Duration::from_micros(200));
         }
     }
@@ -137,7 +137,7 @@ impl Started {
                 break status.code();
             }
             let err = || fs::read_to_string(self.folder.path().join(format!("err{i}"))).unwrap();
-            assert!(begun.elapsed() < PATIENCE, "process {i} doesn't end: {}", err());
+            assert!(begun.elapsed() < TIMEOUT, "process {i} doesn't end: {}", err());
             sleep(Duration::from_millis(5));
         };
         let codes: Vec<_> =
@@ -466,7 +466,7 @@ fn a_rank_that_dies_ends_all_with_one_sentence() {
     let second = started.rank(1, 0);
     signal(second, libc::SIGKILL);
     let ended = started.end().remove(0);
-    assert!(begun.elapsed() < PATIENCE && ended.code != Some(0), "{:?}", ended.code);
+    assert!(begun.elapsed() < TIMEOUT && ended.code != Some(0), "{:?}", ended.code);
     let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
     let expected =
         ["distributed communication failed (", "); restart the processes to resume from the last checkpoint"];
@@ -497,10 +497,10 @@ fn a_rank_that_hangs_ends_all_with_one_sentence() {
     // All processes are blocked: other tests may run.
     drop(turn);
     while state(first).is_some_and(|(state, _)| state != 'Z') {
-        assert!(begun.elapsed() < PATIENCE, "the first rank still waits");
+        assert!(begun.elapsed() < TIMEOUT, "the first rank still waits");
         sleep(Duration::from_millis(20));
     }
-    assert_eq!(sentences(&started.told("err0")), ["rank 1 of 2 gave no sign of life for 25 seconds"]);
+    assert_eq!(sentences(&started.told("err0")), ["rank 1 of 2 sent no heartbeat for 25 seconds"]);
     // torchrun would wait for it half a minute longer.
     signal(second, libc::SIGKILL);
     let ended = started.end().remove(0);
@@ -604,7 +604,7 @@ fn ranks_that_train_something_else_are_refused() {
 }
 
 #[test]
-fn work_that_is_not_shared_out_is_refused_once() {
+fn commands_for_one_process_are_refused_once() {
     let Some(_turn) = turn() else { return };
     let Some(torchrun) = torchrun() else { return };
     let ended = Started::by_torchrun(&torchrun, 2, &[], &["inspect", "x"]).end().remove(0);
@@ -675,7 +675,7 @@ fn ranks_evaluate_like_one() {
 }
 
 #[test]
-fn bad_data_are_told_of_whichever_rank_finds_them() {
+fn bad_data_is_reported_by_any_rank() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(6);
     // Truncate the photos of the scene of sample 1, the second rank's first.

@@ -240,7 +240,7 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
 }
 
 #[test]
-fn a_run_that_ends_in_trouble_is_saved_as_it_was_before() {
+fn the_last_finite_state_is_saved() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let ruin = ["train.steps=6", "train.learning_rate=1e30", "train.checkpoint_every=100"];
@@ -254,7 +254,7 @@ fn a_run_that_ends_in_trouble_is_saved_as_it_was_before() {
 }
 
 #[test]
-fn a_run_that_goes_on_otherwise_says_so_and_keeps_its_place_in_the_data() {
+fn a_changed_configuration_is_reported_and_resumes_in_the_data() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let stderr = |settings: &[&str]| {
@@ -327,7 +327,7 @@ fn the_best_checkpoint_is_kept_and_exported() {
 }
 
 #[test]
-fn the_best_checkpoint_is_looked_for_anew_where_validation_asks_for_something_else() {
+fn a_changed_validation_discards_the_best_checkpoint() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     succeed(&text(&train(&config, &run, &["train.steps=4", "train.validate_every=2"])));
@@ -368,7 +368,7 @@ fn a_run_goes_on_from_a_checkpoint_that_is_named_unless_it_has_later_ones() {
 }
 
 #[test]
-fn what_kills_left_is_put_right() {
+fn leftovers_of_killed_saves_are_repaired() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     succeed(&text(&train(&config, &run, &["train.steps=3"])));

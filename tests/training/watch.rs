@@ -140,7 +140,7 @@ fn notices(state: &Value) -> String {
 }
 
 #[test]
-fn it_tells_what_the_run_wrote_down() {
+fn the_state_contains_the_recorded_metrics() {
     let run = run();
     let state = Watch::start(run).state();
     let curves = &state["curves"];
@@ -169,7 +169,7 @@ fn it_tells_what_the_run_wrote_down() {
 }
 
 #[test]
-fn what_is_added_or_begun_anew_is_seen() {
+fn appended_and_rewritten_metrics_are_followed() {
     let (_folder, run) = copy();
     let metrics = run.join("metrics.jsonl");
     let watch = Watch::start(&run);
@@ -257,7 +257,7 @@ fn a_long_run_fits_on_the_page() {
 }
 
 #[test]
-fn only_this_machine_is_answered_and_only_what_there_is() {
+fn requests_from_other_hosts_and_unknown_paths_are_refused() {
     let watch = Watch::start(run());
     let port = watch.port;
     for own in ["127.0.0.1", "localhost", "[::1]"] {
@@ -404,7 +404,7 @@ fn a_browser_shows_it_and_follows_the_run() {
     let mut grounds = vec![];
     for scheme in ["light", "dark"] {
         for width in [1280, 400] {
-            browser.look(width, scheme, "screen");
+            browser.set_viewport(width, scheme, "screen");
             browser.open_served(&url);
             let shown = wait_for(&mut browser, SHOWN, |shown| shown["pictures"] == 3);
             assert_eq!(shown["heading"], "my <b>run", "a name is text");

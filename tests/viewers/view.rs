@@ -331,7 +331,7 @@ fn without_a_browser_view_says_where_the_page_is() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn pages_are_for_their_owner_and_go_with_the_next() {
+fn pages_are_private_and_replaced_by_the_next() {
     if !has_viewer() {
         return;
     }

@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_stored_is_read_and_what_was_harmed_is_not() {
+    fn corrupt_cache_files_are_ignored() {
         let folder = std::env::temp_dir().join(format!("globalsplat-cache-{}", std::process::id()));
         let file = folder.join("deeper/kernels");
         assert_eq!(read(&file), None);

@@ -88,10 +88,10 @@ impl Nvrtc {
         let (mut major, mut minor, mut count) = (0, 0, 0);
         // SAFETY: the list has as many elements as NVRTC reported.
         unsafe {
-            nvrtc.told((nvrtc.nvrtcVersion)(&mut major, &mut minor))?;
-            nvrtc.told((nvrtc.nvrtcGetNumSupportedArchs)(&mut count))?;
+            nvrtc.check((nvrtc.nvrtcVersion)(&mut major, &mut minor))?;
+            nvrtc.check((nvrtc.nvrtcGetNumSupportedArchs)(&mut count))?;
             let mut architectures = vec![0; count as usize];
-            nvrtc.told((nvrtc.nvrtcGetSupportedArchs)(architectures.as_mut_ptr()))?;
+            nvrtc.check((nvrtc.nvrtcGetSupportedArchs)(architectures.as_mut_ptr()))?;
             // Warps of older GPUs lack instructions that the kernels need.
             architectures.retain(|&of| of >= OLDEST);
             architectures.sort_unstable();
@@ -135,7 +135,7 @@ impl Nvrtc {
         let mut program = ptr::null_mut();
         // SAFETY: all strings are null-terminated and live until the program is destroyed.
         unsafe {
-            nvrtc.told((nvrtc.nvrtcCreateProgram)(
+            nvrtc.check((nvrtc.nvrtcCreateProgram)(
                 &mut program,
                 text.as_ptr(),
                 c"kernels.cu".as_ptr(),
@@ -144,7 +144,7 @@ impl Nvrtc {
                 name_addresses.as_ptr(),
             ))?;
             let compiled = nvrtc.compile(program, &addresses(&options), form);
-            nvrtc.told((nvrtc.nvrtcDestroyProgram)(&mut program))?;
+            nvrtc.check((nvrtc.nvrtcDestroyProgram)(&mut program))?;
             compiled
         }
     }
@@ -161,7 +161,7 @@ impl NvrtcFunctions {
             let done = (self.nvrtcCompileProgram)(program, options.len() as c_int, options.as_ptr());
             let log = self.filled(program, self.nvrtcGetProgramLogSize, self.nvrtcGetProgramLog)?;
             let log = CStr::from_bytes_until_nul(&log).unwrap_or_default().to_string_lossy().into_owned();
-            if let Err(error) = self.told(done) {
+            if let Err(error) = self.check(done) {
                 return Err(format!("{error}: {log}"));
             }
             let image = match form {
@@ -185,15 +185,15 @@ impl NvrtcFunctions {
         let mut bytes = 0;
         // SAFETY: the caller's promise.
         unsafe {
-            self.told(size(program, &mut bytes))?;
+            self.check(size(program, &mut bytes))?;
             let mut out = vec![0; bytes];
-            self.told(fill(program, out.as_mut_ptr().cast()))?;
+            self.check(fill(program, out.as_mut_ptr().cast()))?;
             Ok(out)
         }
     }
 
     /// Converts a result code of NVRTC to a `Result`.
-    fn told(&self, result: c_int) -> Result<()> {
+    fn check(&self, result: c_int) -> Result<()> {
         if result == 0 {
             return Ok(());
         }

@@ -103,7 +103,7 @@ impl DriverFunctions {
                 if text.is_null() { "unknown".into() } else { CStr::from_ptr(text).to_string_lossy() }
             }
         });
-        Err(format!("CUDA's driver fails: {}", words.join(", ")))
+        Err(format!("the CUDA driver failed: {}", words.join(", ")))
     }
 }
 
@@ -126,7 +126,7 @@ pub struct Prepared {
     /// Cache file of the kernels, if there is one.
     pub file: Option<PathBuf>,
     /// `true` if the kernels were read from the cache file.
-    pub was_kept: bool,
+    pub was_cached: bool,
 }
 
 impl Loaded {
@@ -136,7 +136,7 @@ impl Loaded {
         let gpu = found
             .gpus
             .get(number as usize)
-            .ok_or(format!("there are {known} GPUs, not one of number {number}"))?;
+            .ok_or(format!("GPU {number} doesn't exist: the driver reports {known} GPUs"))?;
         let nvrtc = Nvrtc::find()?;
         let (architecture, form) = nvrtc.target(gpu.architecture)?;
         let file = cache::cache_folder()
@@ -156,7 +156,7 @@ impl Loaded {
             Ok::<_, String>(module)
         };
         let kept = file.as_deref().and_then(cache::read).and_then(|image| load(&image).ok());
-        let was_kept = kept.is_some();
+        let was_cached = kept.is_some();
         let (module, file) = match kept {
             Some(module) => (module, file),
             None => {
@@ -171,7 +171,7 @@ impl Loaded {
             }
         };
         let kernels = HashMap::new();
-        Ok((Loaded { context, module, kernels }, Prepared { architecture, file, was_kept }))
+        Ok((Loaded { context, module, kernels }, Prepared { architecture, file, was_cached }))
     }
 
     fn kernel(&mut self, driver: &DriverFunctions, name: &str) -> Result<Handle> {

@@ -1,6 +1,6 @@
 """The cases, in one module per area: each case, followed by its reference function (twin)."""
 
-from ..registry import CASES, TWINS
+from ..registry import CASES, REFERENCES
 
 # Imported in the order of the cases in the table.
 from . import tokens, encoder, decoder, growth, normalization, rasterizer  # noqa: F401

@@ -9,8 +9,8 @@ import torch
 
 from .. import draw
 from ..draw import normal, uniform, whole
-from ..names import reference_config, under
-from ..registry import Draw, by, case, twin
+from ..names import reference_config, with_prefix
+from ..registry import Draw, by, case, reference_for
 
 # Constant offset of the decoder, which is not a parameter: program and reference each define it.
 MEAN_OFFSET = (0.0, 0.0, 1.5)
@@ -61,9 +61,9 @@ def heads(rng):
         yield Draw(label, inputs, config, params, ("geometry", "appearance"))
 
 
-@twin("heads")
-def heads_twin(config, params, inputs):
-    params = under("gaussian_decoder", params)
+@reference_for("heads")
+def heads_reference(config, params, inputs):
+    params = with_prefix("gaussian_decoder", params)
     raw = reference.decoder.heads(reference_config(config), params, inputs["geometry"], inputs["appearance"])
     return {
         "positions": raw["position"],
@@ -93,8 +93,8 @@ def merge(rng):
             yield Draw(label, inputs, {"stage": stage, "mix": mix}, differentiate=tuple(inputs))
 
 
-@twin("merge")
-def merge_twin(config, params, inputs):
+@reference_for("merge")
+def merge_reference(config, params, inputs):
     full = {theirs: inputs[ours] for theirs, ours in MERGED.items()}
     merged = reference.decoder.merge_with_transition(full, inputs["gate"], config["stage"], config["mix"])
     return {MERGED[name]: value for name, value in merged.items()}
@@ -113,10 +113,10 @@ def decoder(rng):
             yield Draw(label, inputs, config, params, ("geometry", "appearance"))
 
 
-@twin("decoder")
-def decoder_twin(config, params, inputs):
+@reference_for("decoder")
+def decoder_reference(config, params, inputs):
     geometry, appearance = inputs["geometry"], inputs["appearance"]
-    params = decoder_params(under("gaussian_decoder", params), geometry)
+    params = decoder_params(with_prefix("gaussian_decoder", params), geometry)
     decoded = reference.decoder.decode(
         reference_config(config), params, geometry, appearance, config["stage"], config["mix"]
     )
@@ -139,8 +139,8 @@ def rotation_matrix(rng):
         yield Draw(by(*six.shape), {"rotations": six}, differentiate=("rotations",))
 
 
-@twin("rotation_matrix")
-def rotation_matrix_twin(config, params, inputs):
+@reference_for("rotation_matrix")
+def rotation_matrix_reference(config, params, inputs):
     return {"matrix": reference.rotation.matrix_from_6d(inputs["rotations"])}
 
 
@@ -151,7 +151,7 @@ def quaternion(rng):
         yield Draw(by(*six.shape), {"rotations": six}, differentiate=("rotations",))
 
 
-@twin("quaternion")
-def quaternion_twin(config, params, inputs):
+@reference_for("quaternion")
+def quaternion_reference(config, params, inputs):
     matrix = reference.rotation.matrix_from_6d(inputs["rotations"])
     return {"quaternion": reference.rotation.quaternion_from_matrix(matrix)}

@@ -10,8 +10,8 @@ import torch
 
 from .. import draw
 from ..draw import normal, whole
-from ..names import reference_config, under
-from ..registry import Draw, by, case, twin
+from ..names import reference_config, with_prefix
+from ..registry import Draw, by, case, reference_for
 from ..tolerance import Tolerance
 
 REGISTERS = 4  # number of registers, which are the last slots of a stream
@@ -53,8 +53,8 @@ def cut_to_bf16(inputs):
         numbers.view(np.uint32)[...] &= 0xFFFF0000
 
 
-@twin("linear")
-def linear_twin(config, params, inputs):
+@reference_for("linear")
+def linear_reference(config, params, inputs):
     layer = {f"layer.{name}": value for name, value in inputs.items()}
     return {"out": reference.layers.linear(layer, "layer", inputs["xs"])}
 
@@ -143,8 +143,8 @@ def attention_bf16(rng):
         yield replace(attention_draw(inputs, heads, tolerance=tolerance), config={"heads": heads, "bf16": True})
 
 
-@twin("attention")
-def attention_twin(config, params, inputs):
+@reference_for("attention")
+def attention_reference(config, params, inputs):
     q, k, v = inputs["rows"].chunk(3, dim=-1) if config.get("thirds") else (inputs[name] for name in "qkv")
     return {"seen": reference.layers.attention(q, k, v, config["heads"])}
 
@@ -164,13 +164,13 @@ def stream_round(rng):
         yield Draw(label, inputs, config, params, ("slots", "memory"))
 
 
-@twin("stream_round")
-def stream_round_twin(config, params, inputs):
+@reference_for("stream_round")
+def stream_round_reference(config, params, inputs):
     slots, memory = inputs["slots"], inputs["memory"]
     mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype)
     mask[-REGISTERS:] = 0.0
     heads, blocks = config["heads"], config["self_attention_blocks"]
-    return {"slots": reference.stream.stream_round(under("round", params), "round", slots, memory, heads, blocks, mask)}
+    return {"slots": reference.stream.stream_round(with_prefix("round", params), "round", slots, memory, heads, blocks, mask)}
 
 
 @case
@@ -183,9 +183,9 @@ def self_attention_block(rng):
         yield Draw(f"{by(*slots.shape)}, heads {config['heads']}", {"slots": slots}, config, params, ("slots",))
 
 
-@twin("self_attention_block")
-def self_attention_block_twin(config, params, inputs):
-    params = under("block", params)
+@reference_for("self_attention_block")
+def self_attention_block_reference(config, params, inputs):
+    params = with_prefix("block", params)
     return {"slots": reference.stream.self_attention_block(params, "block", inputs["slots"], config["heads"])}
 
 
@@ -200,9 +200,9 @@ def mixer(rng):
         yield Draw(by(*shape), inputs, config, params, ("geometry", "appearance"))
 
 
-@twin("mixer")
-def mixer_twin(config, params, inputs):
-    params = under("mixer", params)
+@reference_for("mixer")
+def mixer_reference(config, params, inputs):
+    params = with_prefix("mixer", params)
     geometry, appearance = reference.encoder.mixer(params, "mixer", inputs["geometry"], inputs["appearance"])
     return {"geometry": geometry, "appearance": appearance}
 
@@ -219,8 +219,8 @@ def encoder(rng):
         yield Draw(label, {"tokens": normal(rng, *shape)}, config, params, ("tokens",))
 
 
-@twin("encoder")
-def encoder_twin(config, params, inputs):
+@reference_for("encoder")
+def encoder_reference(config, params, inputs):
     tokens = inputs["tokens"][:, None]  # as tokens of one view, because the encoder doesn't distinguish views
     geometry, appearance = reference.encoder.encode(reference_config(config), params, tokens)
     return {"geometry": geometry, "appearance": appearance}

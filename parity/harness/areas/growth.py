@@ -3,7 +3,7 @@
 import reference.growth
 
 from ..draw import normal
-from ..registry import Draw, case, twin
+from ..registry import Draw, case, reference_for
 
 
 @case
@@ -21,8 +21,8 @@ def growth(rng):
         yield Draw(label, inputs, {"patch_size": patch, "times": times, "copies": copies}, differentiate=tuple(inputs))
 
 
-@twin("growth")
-def growth_twin(config, params, inputs):
+@reference_for("growth")
+def growth_reference(config, params, inputs):
     return {
         "patch_weights": reference.growth.for_smaller_patches(
             inputs["patch_weights"], config["patch_size"], config["times"]

@@ -10,7 +10,7 @@ import reference.loss.ssim
 
 from .. import draw
 from ..draw import normal, uniform, whole
-from ..registry import Draw, by, case, twin
+from ..registry import Draw, by, case, reference_for
 
 
 @case
@@ -21,8 +21,8 @@ def mse(rng):
         yield Draw(by(*shape), images, differentiate=("rendered",))
 
 
-@twin("mse")
-def mse_twin(config, params, inputs):
+@reference_for("mse")
+def mse_reference(config, params, inputs):
     return {"loss": reference.loss.mse.mse(inputs["rendered"], inputs["truth"])}
 
 
@@ -45,8 +45,8 @@ def frustum(rng):
         yield Draw(label, inputs, {"image": image}, differentiate=("means",))
 
 
-@twin("frustum")
-def frustum_twin(config, params, inputs):
+@reference_for("frustum")
+def frustum_reference(config, params, inputs):
     loss = reference.loss.frustum.frustum(
         inputs["means"], inputs["w2c"], inputs["intrinsics"], *config["image"], inputs["far"]
     )
@@ -60,8 +60,8 @@ def sh_soft_cap(rng):
         yield Draw(by(*shape), {"sh": normal(rng, *shape, scale=5.0)}, differentiate=("sh",))
 
 
-@twin("sh_soft_cap")
-def sh_soft_cap_twin(config, params, inputs):
+@reference_for("sh_soft_cap")
+def sh_soft_cap_reference(config, params, inputs):
     return {"loss": reference.loss.decoder_regularization.sh_soft_cap(inputs["sh"])}
 
 
@@ -80,8 +80,8 @@ def decoder_regularization(rng):
         yield Draw(label, inputs, {"opacity": opacity}, differentiate=tuple(inputs))
 
 
-@twin("decoder_regularization")
-def decoder_regularization_twin(config, params, inputs):
+@reference_for("decoder_regularization")
+def decoder_regularization_reference(config, params, inputs):
     raw = {
         "log_scale": inputs["log_scales"],
         "rotation": inputs["rotations"],
@@ -114,8 +114,8 @@ def consistency(rng):
         yield Draw(label, inputs, config, differentiate=tuple(inputs))
 
 
-@twin("consistency")
-def consistency_twin(config, params, inputs):
+@reference_for("consistency")
+def consistency_reference(config, params, inputs):
     loss = reference.loss.consistency.consistency(
         inputs["alpha_a"],
         inputs["alpha_b"],
@@ -151,8 +151,8 @@ def ssim(rng):
     yield Draw("2×3×12×16, identical", {"picture": truth, "truth": truth})
 
 
-@twin("ssim")
-def ssim_twin(config, params, inputs):
+@reference_for("ssim")
+def ssim_reference(config, params, inputs):
     return {"ssim": reference.loss.ssim.ssim(inputs["picture"], inputs["truth"])}
 
 
@@ -176,8 +176,8 @@ def photometric(rng):
         yield Draw(label, {"picture": picture, "truth": truth}, config=config, differentiate=("picture",))
 
 
-@twin("photometric")
-def photometric_twin(config, params, inputs):
+@reference_for("photometric")
+def photometric_reference(config, params, inputs):
     picture, truth = (inputs[name].flatten(0, -4) for name in ("picture", "truth"))
     difference = (picture - truth).abs().mean()
     return {"loss": config["absolute"] * difference + config["similar"] * reference.loss.ssim.ssim(picture, truth)}
@@ -196,6 +196,6 @@ def depth_smoothness(rng):
         yield Draw(by(*shape), {"depth": depth, "photo": photo}, config=config, differentiate=("depth",))
 
 
-@twin("depth_smoothness")
-def depth_smoothness_twin(config, params, inputs):
+@reference_for("depth_smoothness")
+def depth_smoothness_reference(config, params, inputs):
     return {"loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])}

@@ -5,7 +5,7 @@ import reference.model
 from .. import draw
 from ..draw import uniform, whole
 from ..names import reference_config
-from ..registry import Draw, by, case, twin
+from ..registry import Draw, by, case, reference_for
 from .decoder import decoder_params, gaussians
 
 
@@ -41,8 +41,8 @@ def model_16k(rng):
     )
 
 
-@twin("model")
-def model_twin(config, params, inputs):
+@reference_for("model")
+def model_reference(config, params, inputs):
     params = decoder_params(params, inputs["images"])
     decoded = reference.model.forward(
         reference_config(config),

@@ -4,7 +4,7 @@ import reference.normalize
 
 from .. import draw
 from ..draw import whole
-from ..registry import Draw, case, twin
+from ..registry import Draw, case, reference_for
 from ..tolerance import FLOAT64
 
 
@@ -29,7 +29,7 @@ def scene_normalization(rng):
         yield Draw(f"8 cameras around a thing, tilted by {tilt}", {"c2w": around}, tolerance=FLOAT64)
 
 
-@twin("scene_normalization")
-def scene_normalization_twin(config, params, inputs):
+@reference_for("scene_normalization")
+def scene_normalization_reference(config, params, inputs):
     c2w, _, scale = reference.normalize.normalize_scene(inputs["c2w"])
     return {"c2w": c2w, "scale": scale}

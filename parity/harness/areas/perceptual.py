@@ -7,7 +7,7 @@ import reference.loss.vgg19
 from .. import draw
 from ..close_calls import ON_CPU, ON_GPU, calls_within, closest, decisions_of_lpips, decisions_of_vgg19
 from ..draw import uniform
-from ..registry import Draw, by, case, twin
+from ..registry import Draw, by, case, reference_for
 from ..thresholds import MOST_TRIES
 from ..tolerance import Tolerance
 
@@ -19,7 +19,7 @@ ON_GPU_TOLERANCE = Tolerance(
 )
 
 
-def sure_pictures(rng, decisions, *shapes):
+def draw_without_close_calls(rng, decisions, *shapes):
     """Draws random images of these shapes until no decision is a close call on a CPU.
 
     Returns the images, and a function that returns the close calls on a GPU.
@@ -37,7 +37,7 @@ def lpips_draws(rng, network, shapes, dead=()):
     for name in dead:
         params[f"{name}.bias"] -= np.float32(100.0)
     for shape in shapes:
-        (picture, truth), close_calls = sure_pictures(
+        (picture, truth), close_calls = draw_without_close_calls(
             rng, lambda *pair: decisions_of_lpips(network, params, pair), shape, shape
         )
         inputs = {"picture": picture, "truth": truth}
@@ -67,8 +67,8 @@ def lpips_alex(rng):
     yield from lpips_draws(rng, "lpips_alex", [(1, 3, 47, 63)], dead=("conv5",))
 
 
-@twin("lpips")
-def lpips_twin(config, params, inputs):
+@reference_for("lpips")
+def lpips_reference(config, params, inputs):
     distance = reference.loss.lpips.lpips(config["network"], params, inputs["picture"], inputs["truth"])
     return {"distance": distance}
 
@@ -78,15 +78,15 @@ def vgg19(rng):
     """The VGG-19 loss on the smallest images that its poolings support, and on odd sizes."""
     params = draw.vgg19_parameters(rng)
     for shape in [(1, 3, 16, 16), (1, 3, 19, 17)]:
-        (picture, truth), close_calls = sure_pictures(
+        (picture, truth), close_calls = draw_without_close_calls(
             rng, lambda *pair: decisions_of_vgg19(params, [pair]), shape, shape
         )
         inputs = {"picture": picture, "truth": truth}
         yield Draw(by(*shape), inputs, {}, params, ("picture",), close_calls=close_calls)
 
 
-@twin("vgg19")
-def vgg19_twin(config, params, inputs):
+@reference_for("vgg19")
+def vgg19_reference(config, params, inputs):
     return {"loss": reference.loss.vgg19.vgg19(params, inputs["picture"], inputs["truth"])}
 
 
@@ -97,7 +97,7 @@ def perceptual(rng):
     The network's weights are inputs that take no gradient.
     """
     of_vgg = draw.vgg19_parameters(rng)
-    (rendered, truth), close_calls = sure_pictures(
+    (rendered, truth), close_calls = draw_without_close_calls(
         rng,
         lambda rendered, truth: decisions_of_vgg19(of_vgg, [(half, truth) for half in np.split(rendered, 2)]),
         (2, 2, 3, 16, 16),
@@ -111,13 +111,13 @@ def perceptual(rng):
         both = [pictures for half in np.split(rendered, 2) for pictures in (half, truth)]
         return decisions_of_lpips("lpips_alex", of_alex, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
 
-    (rendered, truth), close_calls = sure_pictures(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
+    (rendered, truth), close_calls = draw_without_close_calls(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
     inputs = {"rendered": rendered, "truth": truth, **of_alex}
     yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",), close_calls=close_calls)
 
 
-@twin("perceptual")
-def perceptual_twin(config, params, inputs):
+@reference_for("perceptual")
+def perceptual_reference(config, params, inputs):
     halves = inputs["rendered"].chunk(2)
     if config["kind"] == "vgg19":
         losses = [reference.loss.vgg19.vgg19(inputs, half, inputs["truth"]) for half in halves]

@@ -5,7 +5,7 @@ import reference.jitter
 import reference.resample
 
 from ..draw import uniform
-from ..registry import Draw, by, case, twin
+from ..registry import Draw, by, case, reference_for
 from ..tolerance import Tolerance
 
 RESAMPLE = Tolerance(
@@ -32,8 +32,8 @@ def resample(rng):
             yield Draw(label, {"image": image.astype(np.uint8)}, config, tolerance=RESAMPLE)
 
 
-@twin("resample")
-def resample_twin(config, params, inputs):
+@reference_for("resample")
+def resample_reference(config, params, inputs):
     height, width = config["size"]
     return {"image": reference.resample.resample(inputs["image"], config["region"], height, width)}
 
@@ -51,7 +51,7 @@ def jitter(rng):
         yield Draw(names, {"image": image}, {"adjustments": adjustments})
 
 
-@twin("jitter")
-def jitter_twin(config, params, inputs):
+@reference_for("jitter")
+def jitter_reference(config, params, inputs):
     adjustments = [next(iter(adjustment.items())) for adjustment in config["adjustments"]]
     return {"image": reference.jitter.jitter(inputs["image"], adjustments)}

@@ -5,7 +5,7 @@ import reference.splat
 import torch
 
 from .. import scenes
-from ..registry import Draw, case, twin
+from ..registry import Draw, case, reference_for
 from ..thresholds import MOST_TRIES, doubtful_pixels
 from ..tolerance import FLOAT32, FLOAT64, Tolerance
 
@@ -49,7 +49,7 @@ def splat_draws(rng, module, dtype, family, tolerance):
         )
 
 
-def of_every_camera(inputs, function):
+def map_cameras(inputs, function):
     """Calls function(Gaussians of a scene, w2c, intrinsics) -> dict for every camera; stacks values to [B, C, ...]."""
     rows = []
     for b in range(inputs["w2c"].shape[0]):
@@ -77,8 +77,8 @@ def projection_thin_float32(rng):
     yield from splat_draws(rng, "projection", np.float32, scenes.THIN, PROJECTION_THIN_FLOAT32)
 
 
-@twin("projection")
-def projection_twin(config, params, inputs):
+@reference_for("projection")
+def projection_reference(config, params, inputs):
     size = config["width"], config["height"], config["eps2d"]
 
     def project(means, scales, quaternions, opacities, sh, w2c, intrinsics):
@@ -93,7 +93,7 @@ def projection_twin(config, params, inputs):
             "colour": torch.where(visible[:, None], colour, 0.0),
         }
 
-    return of_every_camera(inputs, project)
+    return map_cameras(inputs, project)
 
 
 @case
@@ -122,12 +122,12 @@ def rasterizer_thin_float32(rng):
     yield from splat_draws(rng, "rasterizer", np.float32, scenes.THIN, RASTERIZER_FLOAT32)
 
 
-@twin("rasterizer")
-def rasterizer_twin(config, params, inputs):
+@reference_for("rasterizer")
+def rasterizer_reference(config, params, inputs):
     def render(*scene_and_camera):
         rgb, alpha, depth = reference.splat.render(
             *scene_and_camera, config["width"], config["height"], config["eps2d"]
         )
         return {"rgb": rgb.movedim(-1, 0), "alpha": alpha, "depth": depth}
 
-    return of_every_camera(inputs, render)
+    return map_cameras(inputs, render)

@@ -5,8 +5,8 @@ import reference.tokens
 
 from .. import draw
 from ..draw import normal, whole
-from ..names import reference_config, under
-from ..registry import Draw, by, case, twin
+from ..names import reference_config, with_prefix
+from ..registry import Draw, by, case, reference_for
 
 
 @case
@@ -17,8 +17,8 @@ def patchify(rng):
         yield Draw(label, {"xs": normal(rng, *shape)}, {"patch_size": patch}, differentiate=("xs",))
 
 
-@twin("patchify")
-def patchify_twin(config, params, inputs):
+@reference_for("patchify")
+def patchify_reference(config, params, inputs):
     return {"tokens": reference.tokens.patchify(inputs["xs"].movedim(-1, 2), config["patch_size"])}
 
 
@@ -34,8 +34,8 @@ def rgb_tokens(rng):
         yield Draw(label, images, config, params, ("images",))
 
 
-@twin("rgb_tokens")
-def rgb_tokens_twin(config, params, inputs):
+@reference_for("rgb_tokens")
+def rgb_tokens_reference(config, params, inputs):
     return {"tokens": reference.tokens.rgb_tokens(params, inputs["images"], config["patch_size"])}
 
 
@@ -52,8 +52,8 @@ def ray_tokens(rng):
         yield Draw(label, inputs, config | {"image": image}, params)
 
 
-@twin("ray_tokens")
-def ray_tokens_twin(config, params, inputs):
+@reference_for("ray_tokens")
+def ray_tokens_reference(config, params, inputs):
     tokens = reference.tokens.ray_tokens(
         params, inputs["c2w"], inputs["intrinsics"], *config["image"], config["patch_size"], config["camera_code"]
     )
@@ -67,8 +67,8 @@ def rays(rng):
         yield Draw(by(batch, count, *image), draw.views(rng, batch, count, *image), {"image": image})
 
 
-@twin("rays")
-def rays_twin(config, params, inputs):
+@reference_for("rays")
+def rays_reference(config, params, inputs):
     rays = reference.rays.plucker_rays(inputs["c2w"], inputs["intrinsics"], *config["image"])
     return {"rays": rays.movedim(2, -1)}
 
@@ -83,9 +83,9 @@ def camera_code(rng):
         yield Draw(f"{by(batch, count)}, image {by(*image)}", inputs, config | {"image": image}, params)
 
 
-@twin("camera_code")
-def camera_code_twin(config, params, inputs):
-    params = under("view_pe", params)
+@reference_for("camera_code")
+def camera_code_reference(config, params, inputs):
+    params = with_prefix("view_pe", params)
     return {"code": reference.rays.camera_code(params, inputs["c2w"], inputs["intrinsics"], *config["image"])}
 
 
@@ -102,8 +102,8 @@ def tokens(rng):
         yield Draw(label, inputs, config, params, ("images",))
 
 
-@twin("tokens")
-def tokens_twin(config, params, inputs):
+@reference_for("tokens")
+def tokens_reference(config, params, inputs):
     tokens = reference.tokens.view_tokens(
         reference_config(config), params, inputs["images"], inputs["c2w"], inputs["intrinsics"]
     )

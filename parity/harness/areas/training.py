@@ -8,7 +8,7 @@ import reference.schedule
 import torch
 
 from ..draw import normal
-from ..registry import Draw, case, twin
+from ..registry import Draw, case, reference_for
 from ..tolerance import FLOAT64
 
 
@@ -19,8 +19,8 @@ def subsets(rng):
         yield Draw(f"{views} views, step {step}", config={"views": views, "step": step})
 
 
-@twin("subsets")
-def subsets_twin(config, params, inputs):
+@reference_for("subsets")
+def subsets_reference(config, params, inputs):
     a, b = reference.loss.subsets.subsets(list(range(config["views"])), config["step"])
     return {"a": torch.tensor(a), "b": torch.tensor(b)}
 
@@ -35,8 +35,8 @@ def learning_rate(rng):
         yield Draw(f"{total} steps", {"steps": steps}, config, tolerance=FLOAT64)
 
 
-@twin("learning_rate")
-def learning_rate_twin(config, params, inputs):
+@reference_for("learning_rate")
+def learning_rate_reference(config, params, inputs):
     rates = [
         reference.schedule.learning_rate(step, config["total"], config["peak"], config["warmup"])
         for step in inputs["steps"].tolist()
@@ -60,8 +60,8 @@ def stages(rng):
         yield Draw(label, {"steps": steps}, config, tolerance=FLOAT64)
 
 
-@twin("stages")
-def stages_twin(config, params, inputs):
+@reference_for("stages")
+def stages_reference(config, params, inputs):
     def at(step):
         if config["full_capacity"]:
             return config["final_stage"], 1.0
@@ -85,8 +85,8 @@ def adamw(rng):
         yield Draw(f"{steps} steps", gradients, config, params, gradients=False)
 
 
-@twin("adamw")
-def adamw_twin(config, params, inputs):
+@reference_for("adamw")
+def adamw_reference(config, params, inputs):
     # "token" stands for a learnable token of the model, which is recognized by its name.
     published = {"token": "scene_tokens", "slot_encoder.token": "slot_encoder.slot_regs"}
     after = {}
@@ -119,8 +119,8 @@ def muon(rng):
         yield Draw(f"{steps} steps", gradients, config, params, gradients=False)
 
 
-@twin("muon")
-def muon_twin(config, params, inputs):
+@reference_for("muon")
+def muon_reference(config, params, inputs):
     rate, decay = config["learning_rate"], config["weight_decay"]
     adamw = [name for name in params if not (name.startswith("slot_encoder.") and name.endswith(".weight"))]
     after = adamw_twin(

@@ -3,7 +3,7 @@
 use super::super::say_shrunk;
 use globalsplat::error::{Error, Result};
 use globalsplat::io::{
-    Film, InputFiles, Mosaic, check_regular, check_writable_dir, check_writable_file, is_png_name,
+    InputFiles, Mosaic, VideoWriter, check_regular, check_writable_dir, check_writable_file, is_png_name,
     tile_horizontally, write_png,
 };
 use globalsplat::scene::ImageSize;
@@ -22,7 +22,7 @@ pub enum Output<'a> {
     },
     /// One PNG of all images side by side.
     Row(&'a Path, Mosaic),
-    Film(&'a Path, Film),
+    Film(&'a Path, VideoWriter),
 }
 
 impl<'a> Output<'a> {
@@ -38,7 +38,7 @@ impl<'a> Output<'a> {
         match kind {
             Kind::Folder => return Ok(check_writable_dir(path)?),
             Kind::Row => {}
-            Kind::Film => Film::check(path, frames_per_second.unwrap_or(1))?,
+            Kind::Film => VideoWriter::check(path, frames_per_second.unwrap_or(1))?,
         }
         Ok(check_writable_file(path)?)
     }
@@ -69,7 +69,7 @@ impl<'a> Output<'a> {
                 Output::Folder { files, written: 0 }
             }
             Kind::Row => Output::Row(path, Mosaic::row(names.len())),
-            Kind::Film => Output::Film(path, Film::begin(path, size, frames_per_second)?),
+            Kind::Film => Output::Film(path, VideoWriter::begin(path, size, frames_per_second)?),
         })
     }
 
@@ -130,7 +130,7 @@ enum Kind {
 
 /// Returns the kind of output that the file extension selects.
 fn kind(path: &Path) -> Kind {
-    if Film::is_name(path) {
+    if VideoWriter::has_video_extension(path) {
         Kind::Film
     } else if is_png_name(path) {
         Kind::Row

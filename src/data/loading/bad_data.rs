@@ -1,6 +1,6 @@
 //! Bookkeeping of scenes that can't be trained on. They are counted and skipped; too many of them are an error.
 
-use super::order::Place;
+use super::order::SceneIndex;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -65,9 +65,9 @@ impl fmt::Display for BadData {
 
 /// Bad scenes found together, sent to other processes to be counted there.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct News {
+pub(crate) struct BadSceneReport {
     fault: Fault,
-    places: Vec<Place>,
+    scene_indices: Vec<SceneIndex>,
     why: String,
 }
 
@@ -81,11 +81,11 @@ pub(super) struct BadDataLog {
 #[derive(Debug, Default)]
 struct Entries {
     counts: BadData,
-    seen: BTreeSet<Place>,
+    seen: BTreeSet<SceneIndex>,
     /// Error of the most recent bad scene.
     last: Option<String>,
     /// Bad scenes found by this process since the last [`BadDataLog::take_bad_scene_reports`].
-    news: Vec<News>,
+    reports: Vec<BadSceneReport>,
 }
 
 /// Formats the counts and the last error in one line.
@@ -107,38 +107,43 @@ impl BadDataLog {
         BadDataLog { largest_share, entries: Mutex::new(Entries { counts, ..Default::default() }) }
     }
 
-    /// Counts `places` as bad, once each.
+    /// Counts `scene_indices` as bad, once each.
     ///
     /// # Errors
     /// Fails if too many scenes are bad.
     pub fn add(
         &self,
         fault: Fault,
-        places: impl Iterator<Item = Place>,
+        scene_indices: impl Iterator<Item = SceneIndex>,
         why: impl fmt::Display,
     ) -> Result<()> {
         let mut entries = self.entries.lock().expect("no thread panics here");
-        let places: Vec<Place> = places.filter(|place| !entries.seen.contains(place)).collect();
-        if places.is_empty() {
+        let scene_indices: Vec<SceneIndex> =
+            scene_indices.filter(|scene_index| !entries.seen.contains(scene_index)).collect();
+        if scene_indices.is_empty() {
             return Ok(());
         }
         // Decoders' messages contain line breaks.
-        let news = News { fault, places, why: why.to_string().replace('\n', " ") };
-        entries.news.push(news.clone());
-        self.count(&mut entries, news)
+        let report = BadSceneReport { fault, scene_indices, why: why.to_string().replace('\n', " ") };
+        entries.reports.push(report.clone());
+        self.count(&mut entries, report)
     }
 
     /// Counts scenes that another process found.
     ///
     /// # Errors
     /// Fails if too many scenes are bad.
-    pub fn hear(&self, news: News) -> Result<()> {
-        self.count(&mut self.entries.lock().expect("no thread panics here"), news)
+    pub fn record_report(&self, report: BadSceneReport) -> Result<()> {
+        self.count(&mut self.entries.lock().expect("no thread panics here"), report)
     }
 
-    fn count(&self, entries: &mut Entries, News { fault, places, why }: News) -> Result<()> {
+    fn count(
+        &self,
+        entries: &mut Entries,
+        BadSceneReport { fault, scene_indices, why }: BadSceneReport,
+    ) -> Result<()> {
         let Entries { counts, seen, last, .. } = entries;
-        let new = places.into_iter().filter(|&place| seen.insert(place)).count() as u64;
+        let new = scene_indices.into_iter().filter(|&scene_index| seen.insert(scene_index)).count() as u64;
         if new == 0 {
             return Ok(());
         }
@@ -160,11 +165,11 @@ impl BadDataLog {
     }
 
     pub fn has_bad_scene_reports(&self) -> bool {
-        !self.entries.lock().expect("no thread panics here").news.is_empty()
+        !self.entries.lock().expect("no thread panics here").reports.is_empty()
     }
 
-    pub fn take_bad_scene_reports(&self) -> Vec<News> {
-        std::mem::take(&mut self.entries.lock().expect("no thread panics here").news)
+    pub fn take_bad_scene_reports(&self) -> Vec<BadSceneReport> {
+        std::mem::take(&mut self.entries.lock().expect("no thread panics here").reports)
     }
 
     /// Returns the error for the case that no usable scene is left.

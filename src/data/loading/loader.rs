@@ -1,14 +1,14 @@
-//! Loader threads that read, decode, resize and augment samples ahead of training. Sample i depends on the seed and i alone. Each
+//! DataLoader threads that read, decode, resize and augment samples ahead of training. The i-th sample depends on the seed and i alone. Each
 //! of T threads produces every T-th sample, and samples are taken from the threads in turn.
 
-use super::bad_data::{BadData, BadDataLog, Fault, News};
-use super::open_groups::{OpenGroups, Opened};
-use super::order::{Order, Place};
-use super::part::Part;
-use super::sample::{PendingSample, Sample};
+use super::bad_data::{BadData, BadDataLog, BadSceneReport, Fault};
+use super::group_cache::{CachedGroup, GroupCache};
+use super::order::{Order, SceneIndex};
+use super::sample::{Batch, PendingBatch};
 use super::sampler::{choose_views, context_views};
 use super::scene::{LoadTimes, LoadedScene};
 use super::scenes::SceneGroups;
+use super::shard::BatchShard;
 use crate::data::augment::Augmentation;
 use crate::data::config::DataConfig;
 use crate::device::Upload;
@@ -34,30 +34,30 @@ const FAR: f64 = 4. * 10.;
 
 /// Source of training samples, delivered in order.
 #[derive(Debug)]
-pub struct Loader {
+pub struct DataLoader {
     shared: Arc<Shared>,
     receivers: Vec<Receiver<Result<LoadedScene>>>,
     threads: Vec<JoinHandle<()>>,
-    part: Part,
+    shard: BatchShard,
     /// Index of the first sample.
     first: u64,
     /// Number of samples taken from the threads.
     taken: u64,
     upload: Option<Upload>,
-    ahead: Option<Ahead>,
+    prefetched: Option<PrefetchedBatch>,
 }
 
 /// A prefetched batch.
 #[derive(Debug)]
-struct Ahead {
+struct PrefetchedBatch {
     /// Index of its first sample.
     first: u64,
-    /// Sample that is being copied, or the loading error to return when the batch is requested.
-    sample: Result<PendingSample>,
+    /// Batch that is being copied, or the loading error to return when the batch is requested.
+    sample: Result<PendingBatch>,
 }
 
 /// Decoded photos by scene and view.
-type DecodedPhotos = HashMap<(Place, usize), Arc<RgbImage>>;
+type DecodedPhotos = HashMap<(SceneIndex, usize), Arc<RgbImage>>;
 
 /// State shared by all threads.
 #[derive(Debug)]
@@ -65,7 +65,7 @@ struct Shared {
     config: DataConfig,
     seed: u64,
     order: Order,
-    groups: OpenGroups,
+    groups: GroupCache,
     bad_data_log: BadDataLog,
     /// Photo cache, if there is memory for all photos.
     photos: Option<Mutex<DecodedPhotos>>,
@@ -80,8 +80,8 @@ struct Tools {
     times: LoadTimes,
 }
 
-impl Loader {
-    /// Starts to load the samples of `scenes` that belong to `part` of every step. A number as `part` stands for whole steps of
+impl DataLoader {
+    /// Starts to load the samples of `scenes` that belong to `shard` of every step. A number as `shard` stands for whole steps of
     /// that many samples. The first step begins with sample `first`.
     ///
     /// # Errors
@@ -90,10 +90,10 @@ impl Loader {
         config: &DataConfig,
         seed: u64,
         scenes: Arc<dyn SceneGroups>,
-        part: impl Into<Part>,
+        shard: impl Into<BatchShard>,
         first: u64,
     ) -> Result<Self> {
-        let part = part.into();
+        let shard = shard.into();
         let sizes = scenes.sizes();
         if sizes.iter().all(|&size| size == 0) {
             return Err(Error::request("there are no scenes to train on"));
@@ -107,7 +107,7 @@ impl Loader {
             seed,
             bad_data_log: BadDataLog::new(order.scenes(), config.max_bad_share),
             order,
-            groups: OpenGroups::new(scenes),
+            groups: GroupCache::new(scenes),
             photos: fits.then(Default::default),
             stopped: AtomicBool::new(false),
         });
@@ -116,8 +116,16 @@ impl Loader {
             threads => threads,
         };
         let (receivers, spawned) = (vec![], vec![]);
-        let mut loader =
-            Loader { shared, receivers, threads: spawned, part, first, taken: 0, upload: None, ahead: None };
+        let mut loader = DataLoader {
+            shared,
+            receivers,
+            threads: spawned,
+            shard,
+            first,
+            taken: 0,
+            upload: None,
+            prefetched: None,
+        };
         // A thread holds one more sample while its queue is full.
         let queue = config.prefetch.div_ceil(threads).saturating_sub(1).max(1);
         for thread in 0..threads as u64 {
@@ -125,7 +133,7 @@ impl Loader {
             let shared = loader.shared.clone();
             let turns = (thread..)
                 .step_by(threads)
-                .map(move |turn| (part.sample(first, turn), part.step(first, turn)));
+                .map(move |turn| (shard.sample(first, turn), shard.step(first, turn)));
             let work = move || {
                 let mut tools = Tools::default();
                 for (sample, step) in turns {
@@ -136,7 +144,7 @@ impl Loader {
                     let load = AssertUnwindSafe(|| shared.load(sample, step, &mut tools));
                     let scene = catch_unwind(load).unwrap_or_else(|panic| {
                         let why = panic_message(&*panic);
-                        Err(Error::failed(format!("loading sample {sample} failed inside: {why}")))
+                        Err(Error::failed(format!("internal error while loading sample {sample}: {why}")))
                     });
                     if sender.send(scene).is_err() {
                         return;
@@ -159,12 +167,12 @@ impl Loader {
 
     /// Returns the index of the next sample. A prefetched batch counts as not delivered.
     pub fn position(&self) -> u64 {
-        self.ahead.as_ref().map_or(self.next(), |ahead| ahead.first)
+        self.prefetched.as_ref().map_or(self.next(), |batch| batch.first)
     }
 
     /// Returns the index of the sample that the threads deliver next.
     fn next(&self) -> u64 {
-        self.part.sample(self.first, self.taken)
+        self.shard.sample(self.first, self.taken)
     }
 
     /// Returns the next sample.
@@ -173,9 +181,9 @@ impl Loader {
     /// Fails if there is more bad data than the configuration allows.
     ///
     /// # Panics
-    /// Panics if the next samples were prefetched for [`Loader::next_batch`].
+    /// Panics if the next samples were prefetched for [`DataLoader::next_batch`].
     pub fn next_scene(&mut self) -> Result<LoadedScene> {
-        assert!(self.ahead.is_none(), "the next samples were sent ahead");
+        assert!(self.prefetched.is_none(), "the next samples were prefetched");
         // Thread t produced the t-th sample, whatever its index.
         let turn = self.receivers.len();
         let receiver = &self.receivers[0];
@@ -188,26 +196,28 @@ impl Loader {
     /// Returns the next `batch` samples as one batch: the prefetched ones, if any.
     ///
     /// # Errors
-    /// Fails like [`Loader::next_scene`].
-    pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Sample> {
-        match self.ahead.take() {
-            Some(ahead) => Ok(ahead.sample?.wait()),
+    /// Fails like [`DataLoader::next_scene`].
+    pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Batch> {
+        match self.prefetched.take() {
+            Some(batch) => Ok(batch.sample?.wait()),
             None => {
                 let scenes = self.next_scenes(batch)?;
-                Ok(Sample::by(&scenes, self.upload.get_or_insert_with(|| Upload::to(device))))
+                Ok(Batch::from_scenes_with(&scenes, self.upload.get_or_insert_with(|| Upload::new(device))))
             }
         }
     }
 
-    /// Starts to copy the next `batch` samples to `device`, for the next [`Loader::next_batch`], which must get the same arguments.
+    /// Starts to copy the next `batch` samples to `device`, for the next [`DataLoader::next_batch`], which must get the same arguments.
     /// A GPU copies them while it computes. On the CPU nothing has to be copied.
     pub fn prefetch_to_device(&mut self, batch: usize, device: Device) {
-        if self.ahead.is_none() {
+        if self.prefetched.is_none() {
             let first = self.next();
             let scenes = self.next_scenes(batch);
-            let upload = self.upload.get_or_insert_with(|| Upload::to(device));
-            self.ahead =
-                Some(Ahead { first, sample: scenes.map(|scenes| PendingSample::begin(&scenes, upload)) });
+            let upload = self.upload.get_or_insert_with(|| Upload::new(device));
+            self.prefetched = Some(PrefetchedBatch {
+                first,
+                sample: scenes.map(|scenes| PendingBatch::begin(&scenes, upload)),
+            });
         }
     }
 
@@ -221,11 +231,11 @@ impl Loader {
     }
 
     /// Returns the bad scenes found since the last call, for the processes that load other parts of the same steps.
-    pub(crate) fn take_bad_scene_reports(&self) -> Vec<News> {
+    pub(crate) fn take_bad_scene_reports(&self) -> Vec<BadSceneReport> {
         self.shared.bad_data_log.take_bad_scene_reports()
     }
 
-    /// Returns `true` if [`Loader::take_bad_scene_reports`] would return anything.
+    /// Returns `true` if [`DataLoader::take_bad_scene_reports`] would return anything.
     pub(crate) fn has_bad_scene_reports(&self) -> bool {
         self.shared.bad_data_log.has_bad_scene_reports()
     }
@@ -234,12 +244,12 @@ impl Loader {
     ///
     /// # Errors
     /// Fails if there is more bad data, including theirs, than the configuration allows.
-    pub(crate) fn hear(&self, news: Vec<News>) -> Result<()> {
-        news.into_iter().try_for_each(|news| self.shared.bad_data_log.hear(news))
+    pub(crate) fn record_reports(&self, reports: Vec<BadSceneReport>) -> Result<()> {
+        reports.into_iter().try_for_each(|report| self.shared.bad_data_log.record_report(report))
     }
 }
 
-impl Drop for Loader {
+impl Drop for DataLoader {
     fn drop(&mut self) {
         self.shared.stopped.store(true, Ordering::Relaxed);
         self.receivers.clear();
@@ -264,10 +274,10 @@ impl Shared {
             let opened = self.groups.open(group);
             tools.times.read += start.elapsed().as_secs_f64();
             let scenes: &[Result<Capture>] = match &*opened {
-                Opened::Scenes(scenes) => scenes,
-                Opened::Broken(why) => {
-                    let places = (0..self.order.size(group)).map(|scene| Place { group, scene });
-                    self.bad_data_log.add(Fault::Group, places, why)?;
+                CachedGroup::Scenes(scenes) => scenes,
+                CachedGroup::Broken(why) => {
+                    let scene_indices = (0..self.order.size(group)).map(|scene| SceneIndex { group, scene });
+                    self.bad_data_log.add(Fault::Group, scene_indices, why)?;
                     continue;
                 }
             };
@@ -283,10 +293,10 @@ impl Shared {
                     turns[turn..].shuffle(&mut random);
                     shuffled = usize::MAX;
                 }
-                let place = Place { group, scene: turns[turn] };
-                match self.load_scene(place, scenes.get(place.scene), views, &mut random, tools) {
+                let scene_index = SceneIndex { group, scene: turns[turn] };
+                match self.load_scene(scene_index, scenes.get(scene_index.scene), views, &mut random, tools) {
                     Ok(scene) => return Ok(scene),
-                    Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(place), why)?,
+                    Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(scene_index), why)?,
                 }
             }
         }
@@ -295,7 +305,7 @@ impl Shared {
 
     fn load_scene(
         &self,
-        place: Place,
+        scene_index: SceneIndex,
         capture: Option<&Result<Capture>>,
         context: usize,
         random: &mut impl Rng,
@@ -313,7 +323,7 @@ impl Shared {
         let (shown, _) = capture.split(config.holdout);
         let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
         let views = choose_views(config, context, &centres, random).ok_or_else(|| {
-            let why = format!("{} views to show, expected {} or more", shown.len(), config.window[0]);
+            let why = format!("{} training views, expected {} or more", shown.len(), config.window[0]);
             (Fault::Short, format!("{}: {why} (data.window)", capture.file().display()))
         })?;
         let augmentation = Augmentation::draw(config, random);
@@ -335,8 +345,9 @@ impl Shared {
         let mut images = vec![0; chosen.len() * image_bytes];
         for ((planes, region), &view) in images.chunks_exact_mut(image_bytes).zip(regions).zip(&chosen) {
             let start = Instant::now();
-            let photo =
-                self.photo(place, capture, shown[view]).map_err(|why| (Fault::Image, why.to_string()))?;
+            let photo = self
+                .photo(scene_index, capture, shown[view])
+                .map_err(|why| (Fault::Image, why.to_string()))?;
             let decoded = Instant::now();
             augmentation.show(&mut tools.resampler, &photo, region, size, planes);
             let resized = Instant::now();
@@ -352,14 +363,14 @@ impl Shared {
         Ok(LoadedScene { name, images, size, cameras, context, target, far, times })
     }
 
-    fn photo(&self, place: Place, capture: &Capture, view: usize) -> Result<Arc<RgbImage>> {
+    fn photo(&self, scene_index: SceneIndex, capture: &Capture, view: usize) -> Result<Arc<RgbImage>> {
         let Some(photos) = &self.photos else { return Ok(Arc::new(capture.photo(view)?)) };
-        let kept = photos.lock().expect("no thread panics here").get(&(place, view)).cloned();
+        let kept = photos.lock().expect("no thread panics here").get(&(scene_index, view)).cloned();
         if let Some(photo) = kept {
             return Ok(photo);
         }
         let photo = Arc::new(capture.photo(view)?);
-        photos.lock().expect("no thread panics here").insert((place, view), photo.clone());
+        photos.lock().expect("no thread panics here").insert((scene_index, view), photo.clone());
         Ok(photo)
     }
 }

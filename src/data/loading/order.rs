@@ -11,7 +11,7 @@ const ORDER_KEY: u64 = 0x6f72_6465_725f_6f66;
 
 /// Location of a scene in the data: the index of its group, and its index in that group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Place {
+pub struct SceneIndex {
     /// Index of the group.
     pub group: usize,
     /// Index of the scene in the group.
@@ -40,7 +40,7 @@ impl Order {
     }
 
     /// Returns the scene of `sample`, and the groups of its epoch from there on, each of them once.
-    pub fn turn(&self, sample: u64) -> (Place, Vec<usize>) {
+    pub fn turn(&self, sample: u64) -> (SceneIndex, Vec<usize>) {
         let (epoch, mut position) = (sample / self.scenes, (sample % self.scenes) as usize);
         let mut groups = self.shuffled(self.sizes.len(), epoch, 0);
         let mut turn = 0;
@@ -51,7 +51,7 @@ impl Order {
         groups.rotate_left(turn);
         let group = groups[0];
         let scene = self.shuffled(self.sizes[group], epoch, group as u64 + 1)[position];
-        (Place { group, scene }, groups)
+        (SceneIndex { group, scene }, groups)
     }
 
     /// Returns the number of scenes of the group.

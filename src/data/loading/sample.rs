@@ -11,7 +11,7 @@ const LEVELS: f32 = 255.;
 
 /// Views of one training step for B scenes.
 #[derive(Debug)]
-pub struct Sample {
+pub struct Batch {
     /// Names of the B scenes.
     pub names: Vec<String>,
     /// Context views, the input of the model.
@@ -24,17 +24,17 @@ pub struct Sample {
     pub paired: bool,
 }
 
-impl Sample {
+impl Batch {
     /// Builds a batch of `scenes`, which must have equally many views of one size.
-    pub fn of(scenes: &[LoadedScene], device: Device) -> Self {
-        Sample::by(scenes, &Upload::to(device))
+    pub fn from_scenes(scenes: &[LoadedScene], device: Device) -> Self {
+        Batch::from_scenes_with(scenes, &Upload::new(device))
     }
 
-    /// Builds a batch like [`Sample::of`], reusing an existing [`Upload`].
-    pub(crate) fn by(scenes: &[LoadedScene], upload: &Upload) -> Self {
+    /// Builds a batch like [`Batch::from_scenes`], reusing an existing [`Upload`].
+    pub(crate) fn from_scenes_with(scenes: &[LoadedScene], upload: &Upload) -> Self {
         match upload.device() {
-            Device::Cpu => Sample::on_host(scenes, floats),
-            _ => PendingSample::begin(scenes, upload).wait(),
+            Device::Cpu => Batch::on_host(scenes, floats),
+            _ => PendingBatch::begin(scenes, upload).wait(),
         }
     }
 
@@ -49,7 +49,7 @@ impl Sample {
             let (chosen, shape) = chosen_images(scenes, chosen);
             ViewBatch::with_images(images(&chosen, &shape), &matrices.collect::<Vec<_>>())
         };
-        Sample {
+        Batch {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
             context: batch(|scene| &scene.context),
             target: batch(|scene| &scene.target),
@@ -61,7 +61,7 @@ impl Sample {
     /// Returns every scene twice, along the batch dimension: first with the context views `subsets[0]`, then with `subsets[1]`.
     pub fn paired(&self, subsets: &[Vec<usize>; 2]) -> Self {
         let twice = |batch: &ViewBatch| ViewBatch::stack(&[batch, batch]);
-        Sample {
+        Batch {
             names: [&self.names[..], &self.names].concat(),
             context: ViewBatch::stack(&[self.context.select(&subsets[0]), self.context.select(&subsets[1])]),
             target: twice(&self.target),
@@ -80,7 +80,7 @@ impl Sample {
         let count = count.min(self.scenes() - first);
         let names = self.names[first..first + count].to_vec();
         let (first, count) = (first as i64, count as i64);
-        Sample {
+        Batch {
             names,
             context: self.context.scenes(first, count),
             target: self.target.scenes(first, count),
@@ -99,31 +99,31 @@ impl Sample {
 ///
 /// Images are copied as bytes and converted to floats on the device.
 #[derive(Debug)]
-pub(super) struct PendingSample {
+pub(super) struct PendingBatch {
     names: Vec<String>,
     tensors: PendingCopy<9>,
 }
 
-impl PendingSample {
-    /// Starts to copy the batch that [`Sample::of`] builds from `scenes`.
+impl PendingBatch {
+    /// Starts to copy the batch that [`Batch::from_scenes`] builds from `scenes`.
     pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Self {
-        let Sample { names, context, target, far, .. } =
-            Sample::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
+        let Batch { names, context, target, far, .. } =
+            Batch::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
         let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
-        PendingSample { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
+        PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
     }
 
     /// Waits for the copies and returns the sample on the device.
-    pub fn wait(self) -> Sample {
+    pub fn wait(self) -> Batch {
         let [a, b, c, d, e, f, g, h, far] = self.tensors.wait();
         let in_floats = |bytes: Tensor| {
             let mut floats = bytes.to_kind(Kind::Float);
             let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
             floats
         };
-        let context = ViewBatch::of_tensors([in_floats(a), b, c, d]);
-        let target = ViewBatch::of_tensors([in_floats(e), f, g, h]);
-        Sample { names: self.names, context, target, far, paired: false }
+        let context = ViewBatch::from_tensors([in_floats(a), b, c, d]);
+        let target = ViewBatch::from_tensors([in_floats(e), f, g, h]);
+        Batch { names: self.names, context, target, far, paired: false }
     }
 }
 

@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_draw_how_many_views_are_seen() {
+    fn context_view_counts_are_drawn_per_step() {
         let config = DataConfig { context_views: 12, min_context_views: 4, ..Default::default() };
         let counts: Vec<usize> = (0..2000).map(|step| context_views(&config, 0, step)).collect();
         for count in 4..=12 {

@@ -2,7 +2,7 @@
 
 use super::super::tensorboard::event_files;
 use crate::error::Result;
-use crate::io::{EventReader, read_picture};
+use crate::io::{EventReader, read_event_image};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 
@@ -38,7 +38,7 @@ impl Events {
     /// # Errors
     /// Returns an error if a file can't be read.
     pub fn read(&mut self, run: &Path) -> Result<()> {
-        if self.readers.values().any(EventReader::is_void) {
+        if self.readers.values().any(EventReader::is_stale) {
             *self = Events::default();
         }
         for file in event_files(run) {
@@ -51,7 +51,7 @@ impl Events {
                     self.resumed.extend((event.step > 0).then_some(event.step));
                     continue;
                 }
-                if let Some(at) = event.picture {
+                if let Some(at) = event.image_offset {
                     self.pictures.push_back(Picture { step: event.step, file: file.clone(), at });
                 }
                 if self.marks.back().is_none_or(|mark| mark.0 < event.step) {
@@ -75,7 +75,7 @@ impl Events {
     /// Returns an error if the file can't be read.
     pub fn picture(&self, step: u64) -> Result<Option<Vec<u8>>> {
         match self.pictures.iter().find(|picture| picture.step == step) {
-            Some(picture) => read_picture(&picture.file, picture.at),
+            Some(picture) => read_event_image(&picture.file, picture.at),
             None => Ok(None),
         }
     }

@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_pixel_sees_does_not_change() {
+    fn augmentation_keeps_the_rays_of_pixels() {
         // A bright dot on black keeps its ray. The dot's position in the fitted image is its centroid.
         let (x, y) = (300u32, 200u32);
         let mut image = RgbImage::new(640, 360);

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from .areas import CASES
-from .close_calls import settled
+from .close_calls import resolve_close_calls
 from .compare import compare
 from .disturb import undetected
 from .evaluate import Evaluation
@@ -31,9 +31,9 @@ class Result:
     doubtful: int  # number of pixels excluded from the comparison
     seconds: float  # time of the reference
     large: bool = False  # whether the reference computed in float32, too
-    turned: int = 0  # number of close calls that the program decided differently
+    flipped: int = 0  # number of close calls that the program decided differently
     tried: int = 0  # number of perturbed results
-    blind: list = field(default_factory=list)  # perturbed results that pass
+    missed: list = field(default_factory=list)  # perturbed results that pass
 
     @property
     def passed(self):
@@ -41,7 +41,7 @@ class Result:
 
 
 @dataclass
-class Question:
+class PreparedCase:
     """A draw with its request and the reference's result."""
 
     case: str
@@ -50,14 +50,14 @@ class Question:
     expected: dict
     seconds: float
 
-    def settled(self, answer):
+    def resolve_close_calls(self, answer):
         """Returns the expected tensors with the program's choice of close calls, and the number that differ."""
 
-        def turned(calls):
+        def flipped(calls):
             evaluation = Evaluation(self.request, torch.float64, calls)
             return evaluation.gradient_arrays(self.request.cotangents)
 
-        return settled(answer, self.expected, self.drawn.close_calls(), turned)
+        return resolve_close_calls(answer, self.expected, self.drawn.close_calls(), flipped)
 
 
 def generator(seed, case):
@@ -65,7 +65,7 @@ def generator(seed, case):
     return np.random.default_rng([seed, zlib.crc32(case.encode())])
 
 
-def questions(names, seed):
+def prepare_cases(names, seed):
     """Yields the draws of the named cases with the reference's results."""
     for name in names:
         rng = generator(seed, name)
@@ -80,7 +80,7 @@ def questions(names, seed):
             if drawn.gradients:
                 request.cotangents = cotangents(rng, request, expected, drawn.doubtful)
                 expected |= evaluation.gradient_arrays(request.cotangents)
-            yield Question(name, drawn, request, expected, time.perf_counter() - started)
+            yield PreparedCase(name, drawn, request, expected, time.perf_counter() - started)
 
 
 def cotangents(rng, request, outputs, doubtful):
@@ -97,33 +97,33 @@ def cotangents(rng, request, outputs, doubtful):
     return drawn
 
 
-def hold(names, seed, answerer, self_test=False, on_progress=lambda text: None, on_gpu=False):
+def run_cases(names, seed, answerer, self_test=False, on_progress=lambda text: None, on_gpu=False):
     """Yields a Result for every draw of the named cases."""
-    drawn_questions = []
-    for question in questions(names, seed):
-        drawn_questions.append(question)
-        on_progress(f"reference, {len(drawn_questions)} draws: {question.case}, {question.drawn.label}")
+    prepared = []
+    for question in prepare_cases(names, seed):
+        prepared.append(question)
+        on_progress(f"reference, {len(prepared)} draws: {question.case}, {question.drawn.label}")
 
     def on_answers(done):
-        at = drawn_questions[min(done, len(drawn_questions) - 1)]
-        on_progress(f"program, {done} of {len(drawn_questions)} draws: {at.case}, {at.drawn.label}")
+        at = prepared[min(done, len(prepared) - 1)]
+        on_progress(f"program, {done} of {len(prepared)} draws: {at.case}, {at.drawn.label}")
 
-    answers = exchange([question.request for question in drawn_questions], answerer, on_answers)
-    for done, (question, answer) in enumerate(zip(drawn_questions, answers), start=1):
+    answers = exchange([question.request for question in prepared], answerer, on_answers)
+    for done, (question, answer) in enumerate(zip(prepared, answers), start=1):
         drawn = question.drawn
-        on_progress(f"comparison, {done} of {len(drawn_questions)} draws: {question.case}, {drawn.label}")
+        on_progress(f"comparison, {done} of {len(prepared)} draws: {question.case}, {drawn.label}")
         tolerance = (on_gpu and drawn.on_gpu) or drawn.tolerance
-        expected, turned = question.expected, 0
+        expected, flipped = question.expected, 0
         findings = compare(answer, expected, tolerance, drawn.doubtful)
         failed = [finding for finding in findings if not finding.passed]
         # Only a gradient that has its shape may be on the other side of a threshold.
         if on_gpu and failed and all(f.tensor.startswith("grad.") and not f.problem for f in failed):
-            expected, turned = question.settled(answer)
+            expected, flipped = question.resolve_close_calls(answer)
             findings = compare(answer, expected, tolerance, drawn.doubtful)
         doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
         result = Result(
-            question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds, drawn.large, turned
+            question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds, drawn.large, flipped
         )
         if self_test and result.passed:
-            result.tried, result.blind = undetected(answer, expected, tolerance, drawn.doubtful)
+            result.tried, result.missed = undetected(answer, expected, tolerance, drawn.doubtful)
         yield result

@@ -13,7 +13,7 @@ use std::thread::JoinHandle;
 use tch::Tensor;
 
 /// A video that is being written. It appears at its path when it is finished; a video that is dropped earlier leaves no file.
-pub struct Film {
+pub struct VideoWriter {
     path: PathBuf,
     size: ImageSize,
     frames: u32,
@@ -29,7 +29,7 @@ enum Format {
 }
 
 impl Format {
-    fn of(path: &Path) -> Option<Self> {
+    fn from_path(path: &Path) -> Option<Self> {
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gif" => Some(Format::Gif),
             "mp4" => Some(Format::Mp4),
@@ -43,37 +43,37 @@ enum Encoder {
     Mp4(Mp4),
 }
 
-impl Film {
+impl VideoWriter {
     /// Checks that a video could be written at `path`, `.gif` or `.mp4`. Call it before the work starts.
     ///
     /// # Errors
     /// Returns an error for another extension, for more frames per second than the format supports, or if there is no ffmpeg with libx264
     /// for `.mp4`.
     pub fn check(path: &Path, frames_per_second: u32) -> Result<()> {
-        match Format::of(path) {
+        match Format::from_path(path) {
             Some(Format::Gif) => Gif::check(path, frames_per_second),
             Some(Format::Mp4) => Mp4::check(path),
-            None => Err(Error::input(path, "the film's ending", path.display(), ".gif or .mp4")),
+            None => Err(Error::input(path, "the video's file extension", path.display(), ".gif or .mp4")),
         }
     }
 
     /// Returns `true` if `path` has the extension of a video.
-    pub fn is_name(path: &Path) -> bool {
-        Format::of(path).is_some()
+    pub fn has_video_extension(path: &Path) -> bool {
+        Format::from_path(path).is_some()
     }
 
     /// Starts a video of `size`. An MP4 has even sides: the last row or column is cropped if their number is odd.
     ///
     /// # Errors
-    /// Returns the errors of [`Film::check`], and an error if the format doesn't support the size or the file can't be written.
+    /// Returns the errors of [`VideoWriter::check`], and an error if the format doesn't support the size or the file can't be written.
     pub fn begin(path: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         Self::check(path, frames_per_second)?;
         let partial = PartialFile::create(path)?;
-        let encoder = match Format::of(path) {
+        let encoder = match Format::from_path(path) {
             Some(Format::Gif) => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
             _ => Encoder::Mp4(Mp4::begin(path, &partial.place, size, frames_per_second)?),
         };
-        Ok(Film { path: path.to_owned(), size, frames: 0, encoder, partial })
+        Ok(VideoWriter { path: path.to_owned(), size, frames: 0, encoder, partial })
     }
 
     /// Adds a frame [3, H, W] in [0, 1], with a white margin if it is smaller than the video.
@@ -96,9 +96,9 @@ impl Film {
     /// # Errors
     /// Returns an error if the video has no frame, or if it can't be encoded or written.
     pub fn finish(self) -> Result<()> {
-        let Film { path, frames, encoder, partial, .. } = self;
+        let VideoWriter { path, frames, encoder, partial, .. } = self;
         if frames == 0 {
-            return Err(Error::request(format!("{}: a film needs a frame", path.display())));
+            return Err(Error::request(format!("{}: a video needs at least one frame", path.display())));
         }
         match encoder {
             Encoder::Gif(gif) => gif.finish(&path)?,
@@ -128,7 +128,7 @@ impl Gif {
         let ImageSize { height, width } = size;
         let (Ok(sixteen_wide), Ok(sixteen_high)) = (u16::try_from(width), u16::try_from(height)) else {
             let found = format!("{width}×{height} pixels");
-            return Err(Error::input(path, "the film's size", found, "65535 or less a side in a .gif"));
+            return Err(Error::input(path, "the video's size", found, "65535 or less a side in a .gif"));
         };
         let writer = BufWriter::new(file.try_clone().map_err(Error::write(path))?);
         let encoder = gif::Encoder::new(writer, sixteen_wide, sixteen_high, &[]);
@@ -158,7 +158,7 @@ impl Gif {
 fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
     move |e| match e {
         gif::EncodingError::Io(e) => Error::write(path)(e),
-        e => Error::failed(format!("{}: the film can't be encoded: {e}", path.display())),
+        e => Error::failed(format!("{}: the video can't be encoded: {e}", path.display())),
     }
 }
 
@@ -220,7 +220,7 @@ impl Mp4 {
         let ImageSize { height, width } = size;
         if height < 2 || width < 2 {
             let found = format!("{width}×{height} pixels");
-            return Err(Error::input(path, "the film's size", found, "2 pixels or more a side in an .mp4"));
+            return Err(Error::input(path, "the video's size", found, "2 pixels or more a side in an .mp4"));
         }
         let even = "crop=trunc(iw/2)*2:trunc(ih/2)*2";
         let to_yuv = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=bicubic+accurate_rnd+full_chroma_int";
@@ -262,7 +262,7 @@ impl Mp4 {
     }
 
     fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
-        match self.input.as_mut().expect("the film goes on").write_all(frame) {
+        match self.input.as_mut().expect("an open pipe to ffmpeg").write_all(frame) {
             Ok(()) => Ok(()),
             // The message of ffmpeg is more helpful than the broken pipe.
             Err(_) => {

@@ -6,7 +6,7 @@ use std::str::FromStr;
 
 /// Position of a process among the processes that were started together.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Place {
+pub struct DistributedEnv {
     /// Number of this process among all processes on all machines, from 0.
     pub rank: usize,
     /// Number of processes on all machines.
@@ -22,19 +22,19 @@ pub struct Place {
     /// Port of the store.
     pub port: u16,
     /// `true` if `torchrun` hosts the store; otherwise the first rank hosts it.
-    pub store_is_kept: bool,
+    pub is_agent_store: bool,
 }
 
-impl Place {
+impl DistributedEnv {
     /// Reads this process's position from the environment. Returns `None` if the process was started alone.
     ///
     /// # Errors
     /// Returns an error if a variable is missing or has a value that `torchrun` doesn't set.
     pub fn from_env() -> Result<Option<Self>> {
-        Place::told_by(|name| env::var(name).ok())
+        DistributedEnv::from_variables(|name| env::var(name).ok())
     }
 
-    fn told_by(variable: impl Fn(&str) -> Option<String>) -> Result<Option<Self>> {
+    fn from_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Option<Self>> {
         if variable("WORLD_SIZE").is_none() {
             return Ok(None);
         }
@@ -51,7 +51,7 @@ impl Place {
                 format!("less than WORLD_SIZE, {ranks}"),
             ));
         }
-        Ok(Some(Place {
+        Ok(Some(DistributedEnv {
             rank,
             ranks,
             local_rank: variable.number("LOCAL_RANK", Some(0))?,
@@ -59,7 +59,7 @@ impl Place {
             restarts: variable.number("TORCHELASTIC_RESTART_COUNT", Some(0))?,
             host: variable.text("MASTER_ADDR")?,
             port: variable.number("MASTER_PORT", None)?,
-            store_is_kept: (variable.0)("TORCHELASTIC_USE_AGENT_STORE").as_deref() == Some("True"),
+            is_agent_store: (variable.0)("TORCHELASTIC_USE_AGENT_STORE").as_deref() == Some("True"),
         }))
     }
 }
@@ -69,11 +69,12 @@ struct Variables<F>(F);
 
 impl<F: Fn(&str) -> Option<String>> Variables<F> {
     fn text(&self, name: &str) -> Result<String> {
-        let absent = || {
-            let expected = "what torchrun sets beside WORLD_SIZE (unset WORLD_SIZE to work alone)";
+        let missing = || {
+            let expected =
+                "the value that torchrun sets with WORLD_SIZE (unset WORLD_SIZE to run a single process)";
             Error::setting(format!("the environment's {name}"), "absent", expected)
         };
-        (self.0)(name).ok_or_else(absent)
+        (self.0)(name).ok_or_else(missing)
     }
 
     /// Parses the variable `name`. If it is missing, returns `otherwise`, or an error if that is `None`.
@@ -81,7 +82,7 @@ impl<F: Fn(&str) -> Option<String>> Variables<F> {
         let text = match (self.text(name), otherwise) {
             (Ok(text), _) => text,
             (Err(_), Some(otherwise)) => return Ok(otherwise),
-            (Err(absent), None) => return Err(absent),
+            (Err(missing), None) => return Err(missing),
         };
         let wrong = |_| Error::setting(format!("the environment's {name}"), &text, "a whole number");
         text.parse().map_err(wrong)
@@ -92,10 +93,10 @@ impl<F: Fn(&str) -> Option<String>> Variables<F> {
 mod tests {
     use super::*;
 
-    fn place(variables: &[(&str, &str)]) -> Result<Option<Place>> {
+    fn dist_env(variables: &[(&str, &str)]) -> Result<Option<DistributedEnv>> {
         let find =
             |name: &str| variables.iter().find(|(of, _)| *of == name).map(|(_, value)| value.to_string());
-        Place::told_by(find)
+        DistributedEnv::from_variables(find)
     }
 
     const ALL: [(&str, &str); 8] = [
@@ -111,9 +112,9 @@ mod tests {
 
     #[test]
     fn torchrun_is_understood() {
-        let found = place(&ALL).unwrap().unwrap();
+        let found = dist_env(&ALL).unwrap().unwrap();
         let host = "node-0".to_string();
-        let expected = Place {
+        let expected = DistributedEnv {
             rank: 5,
             ranks: 8,
             local_rank: 1,
@@ -121,28 +122,28 @@ mod tests {
             restarts: 2,
             host,
             port: 29500,
-            store_is_kept: true,
+            is_agent_store: true,
         };
         assert_eq!(found, expected);
         // Other launchers set at least these variables.
-        let others = place(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap().unwrap();
-        assert_eq!((others.local_rank, others.local_world_size, others.store_is_kept), (0, 1, false));
+        let others = dist_env(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap().unwrap();
+        assert_eq!((others.local_rank, others.local_world_size, others.is_agent_store), (0, 1, false));
     }
 
     #[test]
-    fn who_is_alone_needs_nothing() {
-        assert_eq!(place(&[]).unwrap(), None);
-        assert_eq!(place(&[("RANK", "0")]).unwrap(), None);
-        assert_eq!(place(&[("WORLD_SIZE", "1"), ("RANK", "0")]).unwrap(), None);
+    fn single_process_needs_no_variables() {
+        assert_eq!(dist_env(&[]).unwrap(), None);
+        assert_eq!(dist_env(&[("RANK", "0")]).unwrap(), None);
+        assert_eq!(dist_env(&[("WORLD_SIZE", "1"), ("RANK", "0")]).unwrap(), None);
     }
 
     #[test]
     fn a_broken_environment_is_one_sentence() {
-        let error = |variables: &[(&str, &str)]| place(variables).unwrap_err().to_string();
-        let absent = error(&ALL[..5]);
+        let error = |variables: &[(&str, &str)]| dist_env(variables).unwrap_err().to_string();
+        let missing = error(&ALL[..5]);
         assert!(
-            absent.starts_with("the environment's MASTER_PORT is absent, expected what torchrun"),
-            "{absent}"
+            missing.starts_with("the environment's MASTER_PORT is absent, expected the value that torchrun"),
+            "{missing}"
         );
         let wrong = |name: &str, value: &'static str| {
             error(&ALL.map(|(of, kept)| (of, if of == name { value } else { kept })))

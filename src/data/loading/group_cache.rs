@@ -10,28 +10,28 @@ const KEPT: usize = 3;
 
 /// A group, or the reason why it can't be opened.
 #[derive(Debug)]
-pub(super) enum Opened {
+pub(super) enum CachedGroup {
     Scenes(Vec<Result<Capture>>),
     Broken(String),
 }
 
 /// Holds the most recently used groups.
 #[derive(Debug)]
-pub(super) struct OpenGroups {
+pub(super) struct GroupCache {
     source: Arc<dyn SceneGroups>,
     /// Groups ordered by last use, the most recent one last.
     kept: Mutex<Vec<(usize, Slot)>>,
 }
 
 /// Slot that the first thread fills while the others wait.
-type Slot = Arc<OnceLock<Arc<Opened>>>;
+type Slot = Arc<OnceLock<Arc<CachedGroup>>>;
 
-impl OpenGroups {
+impl GroupCache {
     pub fn new(source: Arc<dyn SceneGroups>) -> Self {
-        OpenGroups { source, kept: Mutex::default() }
+        GroupCache { source, kept: Mutex::default() }
     }
 
-    pub fn open(&self, group: usize) -> Arc<Opened> {
+    pub fn open(&self, group: usize) -> Arc<CachedGroup> {
         let slot = {
             let mut kept = self.kept.lock().expect("no thread panics here");
             let position = kept.iter().position(|(kept, _)| *kept == group);
@@ -44,8 +44,8 @@ impl OpenGroups {
         };
         let opened = slot.get_or_init(|| {
             Arc::new(match self.source.open(group) {
-                Ok(scenes) => Opened::Scenes(scenes),
-                Err(why) => Opened::Broken(why.to_string()),
+                Ok(scenes) => CachedGroup::Scenes(scenes),
+                Err(why) => CachedGroup::Broken(why.to_string()),
             })
         });
         opened.clone()

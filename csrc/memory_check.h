@@ -7,6 +7,6 @@ namespace globalsplat {
 
 // Throws std::bad_alloc unless the system can still allocate `bytes`, plus the memory that oneDNN's compiler needs in one call. If the
 // allocation for a product's code fails, oneDNN writes out of bounds or frees an uninitialized pointer.
-void expect_room_for_code(int64_t bytes);
+void ensure_memory_for_code(int64_t bytes);
 
 }  // namespace globalsplat

@@ -5,9 +5,9 @@ pub use ffi::*;
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
-        include!("room.h");
+        include!("memory_check.h");
 
-        /// Returns an error unless there is memory for generated code; see `csrc/room.h`.
-        fn expect_room_for_code(bytes: i64) -> Result<()>;
+        /// Returns an error unless there is memory for generated code; see `csrc/memory_check.h`.
+        fn ensure_memory_for_code(bytes: i64) -> Result<()>;
     }
 }
