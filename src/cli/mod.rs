@@ -277,4 +277,93 @@ mod tests {
             }
         }
     }
+
+    /// Splits a line of a shell script into words. A comment ends the line.
+    fn shell_words(line: &str) -> Vec<String> {
+        let (mut words, mut word, mut quote) = (vec![], None::<String>, None);
+        for c in line.chars() {
+            match (quote, c) {
+                (Some(open), _) if c == open => quote = None,
+                (Some(_), _) => word.get_or_insert_default().push(c),
+                (None, '\'' | '"') => {
+                    quote = Some(c);
+                    word.get_or_insert_default();
+                }
+                (None, '#') if word.is_none() => break,
+                (None, _) if c.is_whitespace() => words.extend(word.take()),
+                (None, _) => word.get_or_insert_default().push(c),
+            }
+        }
+        words.extend(word);
+        words
+    }
+
+    /// Every command of the documentation's shell blocks exists: `globalsplat` with options that it takes, targets of the Makefile,
+    /// scripts of the repository.
+    #[test]
+    fn documented_commands_exist() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let read =
+            |file: &Path| std::fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
+        let makefile = read(&root.join("Makefile"));
+        let pages = std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path());
+        let pages = pages.filter(|path| path.extension().is_some_and(|extension| extension == "md"));
+        let others = ["README.md", "CONTRIBUTING.md", "models/README.md", "csrc/README.md"]
+            .map(|file| root.join(file));
+        let (mut checked, mut wrong) = (0, vec![]);
+        for page in pages.chain(others) {
+            let text = read(&page);
+            let blocks = text.split("```sh\n").skip(1).filter_map(|rest| rest.split("```").next());
+            for line in blocks
+                .flat_map(|block| block.replace("\\\n", " ").lines().map(String::from).collect::<Vec<_>>())
+            {
+                let words = shell_words(&line);
+                let end = words
+                    .iter()
+                    .position(|word| ["|", "&&", ">", "&", ";"].contains(&word.as_str()))
+                    .unwrap_or(words.len());
+                let words = &words[..end];
+                let program =
+                    words.iter().position(|word| word == "globalsplat" || word.ends_with("/globalsplat"));
+                let problem = match (program, words.first().map(String::as_str)) {
+                    (Some(at), _) => {
+                        let parsed = Cli::try_parse_from(
+                            std::iter::once("globalsplat".to_string()).chain(words[at + 1..].iter().cloned()),
+                        );
+                        parsed.err().filter(|e| e.use_stderr()).map(|e| e.to_string())
+                    }
+                    (None, Some("make")) => {
+                        let is_missing = |target: &&String| {
+                            !makefile.lines().any(|line| {
+                                line.split(':')
+                                    .next()
+                                    .unwrap_or("")
+                                    .split_whitespace()
+                                    .any(|name| name == *target)
+                            })
+                        };
+                        words[1..]
+                            .iter()
+                            .filter(|word| !word.contains('='))
+                            .find(is_missing)
+                            .map(|target| format!("no target {target}"))
+                    }
+                    (None, Some(_)) => {
+                        let scripts = words
+                            .iter()
+                            .filter(|word| word.starts_with("scripts/") || word.starts_with("parity/"));
+                        scripts
+                            .filter(|script| script.ends_with(".sh") || script.ends_with(".py"))
+                            .find(|script| !root.join(script).is_file())
+                            .map(|script| format!("no {script}"))
+                    }
+                    (None, None) => continue,
+                };
+                checked += 1;
+                wrong.extend(problem.map(|problem| format!("{}: {line}\n{problem}", page.display())));
+            }
+        }
+        assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+        assert!(checked > 80, "{checked} commands");
+    }
 }

@@ -112,7 +112,7 @@ pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<us
     Ok((context, held_out))
 }
 
-/// DataLoader of the scenes of an index. It runs on another thread than the evaluation.
+/// Loader of the scenes of an index. It runs on another thread than the evaluation.
 pub(super) struct SceneLoader<'a> {
     pub index: &'a EvaluationIndex,
     /// Size of the target views.

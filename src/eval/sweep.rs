@@ -91,7 +91,7 @@ pub struct DatasetEvaluation<'a> {
     pub device: Device,
     /// Output folder, which holds `scenes/`.
     pub out: &'a Path,
-    /// ProcessGroup of processes that divide the scenes among themselves. All of them have access to `out`.
+    /// Process group whose ranks divide the scenes among themselves. All of them have access to `out`.
     pub group: &'a ProcessGroup,
 }
 

@@ -31,7 +31,7 @@ use crate::model::Decoded;
 use crate::render::RenderOutput;
 use tch::Tensor;
 
-/// Computes the loss terms of `decoded`, whose `rendered` were rendered from the sample's target cameras. All terms are means over equally
+/// Computes the loss terms of `decoded`, which was rendered from the target cameras to `rendered`. All terms are means over equally
 /// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. The losses of all shares of a step add up to the step's loss.
 pub(crate) fn losses(
     config: &LossConfig,

@@ -15,7 +15,7 @@ use tch::{Device, Tensor};
 /// milliseconds fits into 32 bits.
 pub(super) const COLLECTIVE_TIMEOUT_SECONDS: i64 = 20 * 24 * 60 * 60;
 
-/// ProcessGroup of all ranks, as seen by one of them.
+/// Process group of all ranks, as seen by one of them.
 pub struct ProcessGroup {
     /// C++ implementation, or `None` if the group has only one rank.
     inner: Option<UniquePtr<ffi::ProcessGroup>>,

@@ -21,7 +21,7 @@ pub(super) struct ForwardBackward<'a> {
     pub model: &'a GlobalSplat,
     pub perceptual: Option<&'a PerceptualLoss>,
     pub stage: Stage,
-    /// ProcessGroup of the ranks that make the step together.
+    /// Process group of the ranks that make the step together.
     pub group: &'a ProcessGroup,
 }
 

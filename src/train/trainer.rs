@@ -68,7 +68,7 @@ pub struct Trainer {
     scenes: Arc<dyn SceneGroups>,
     /// DataLoader of the samples, started by the first step that is done.
     loader: Option<DataLoader>,
-    /// ProcessGroup of the ranks that make every step together, each with its own samples.
+    /// Process group of the ranks that make every step together, each with its own samples.
     pub(super) group: ProcessGroup,
     buckets: Buckets,
     /// `true` if each rank has only the moments of its share of the parameters.

@@ -112,6 +112,18 @@ pub fn limits_of(path: &Path) -> Result<ShLimits> {
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
 /// length 0 are left out, and counted in [`Splat::warnings`].
 ///
+/// ```no_run
+/// use globalsplat_splat_file::{read_splat, write_splat};
+/// use std::path::Path;
+///
+/// # fn main() -> globalsplat_splat_file::Result<()> {
+/// let splat = read_splat(Path::new("room.ply"))?;
+/// println!("{} Gaussians of SH degree {}", splat.len(), splat.sh_degree);
+/// write_splat(Path::new("room.spz"), &splat)?;
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// Returns an error for an unknown extension, or if the file can't be read or violates its format, a Gaussian has a value that isn't finite
 /// or is out of range, or no Gaussian can be drawn.

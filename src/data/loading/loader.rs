@@ -1,4 +1,4 @@
-//! DataLoader threads that read, decode, resize and augment samples ahead of training. The i-th sample depends on the seed and i alone. Each
+//! Worker threads that read, decode, resize and augment samples ahead of training. The i-th sample depends on the seed and i alone. Each
 //! of T threads produces every T-th sample, and samples are taken from the threads in turn.
 
 use super::bad_data::{BadData, BadDataLog, BadSceneReport, Fault};

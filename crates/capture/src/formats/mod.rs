@@ -67,6 +67,19 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
 ///
 /// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
 ///
+/// ```no_run
+/// use globalsplat_capture::open_capture;
+/// use std::path::Path;
+///
+/// # fn main() -> globalsplat_capture::Result<()> {
+/// let capture = open_capture(Path::new("captures/room"))?;
+/// for (name, camera) in capture.names().zip(capture.cameras()) {
+///     println!("{name}: {}×{} pixels at {}", camera.width, camera.height, camera.c2w.w_axis);
+/// }
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// Fails if nothing of a known format is at `path`, or if a capture violates its format.
 pub fn open_capture(path: &Path) -> Result<Capture> {
