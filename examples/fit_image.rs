@@ -47,7 +47,7 @@ fn main() -> Result<()> {
         let loss: Tensor = mse(&picture, &photo) + (1. - ssim(&picture, &photo)) * SSIM_FACTOR;
         optimizer.zero_grad();
         loss.backward();
-        optimizer.step();
+        optimizer.step()?;
     }
     let after = draw()?.detach();
     println!("PSNR {:.2} dB, after {steps} steps {:.2} dB", psnr(&before, &photo), psnr(&after, &photo));

@@ -71,7 +71,7 @@ pub fn bench_attention(
     let mut times = vec![(vec![], vec![]); ways.len()];
     // The first round warms up caches and threads.
     for round in 0..=repeats {
-        let one_product = peak.time();
+        let one_product = peak.time()?;
         let mut measured = vec![];
         for (_, call, inputs, gradient) in ways {
             let mut watch = Stopwatch::default();
@@ -79,7 +79,8 @@ pub fn bench_attention(
             let leaves = inputs.each_ref().map(|t| t.detach().set_requires_grad(true));
             let objective = (call(leaves.each_ref()) * gradient).sum(Kind::Float);
             watch.time("backward", || objective.backward());
-            measured.push([0, 1].map(|section| 1e3 * watch.sections()[section].1.as_secs_f64()));
+            let sections = watch.sections()?;
+            measured.push([0, 1].map(|section| 1e3 * sections[section].1.as_secs_f64()));
         }
         if round > 0 {
             product.push(one_product);

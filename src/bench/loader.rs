@@ -78,7 +78,7 @@ pub fn bench_loader(config: &DataConfig, scenes: Arc<dyn SceneGroups>, samples: 
         let start = Instant::now();
         let views = (scene.context.len() + scene.target.len()) as u64;
         let (photos, times) = (scene.cameras.len() as u64, scene.times);
-        drop(Batch::from_scenes(&[scene], Device::Cpu));
+        drop(Batch::from_scenes(&[scene], Device::Cpu)?);
         Ok((views, photos, times, start.elapsed().as_secs_f64()))
     };
     for _ in 0..WARM_UP {

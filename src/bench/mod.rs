@@ -7,6 +7,7 @@ mod parts;
 mod peak_throughput;
 mod raster;
 mod refine;
+mod spans;
 mod synth;
 mod train;
 mod video;
@@ -21,6 +22,7 @@ pub use synth::{SynthReport, bench_synth};
 pub use train::{DistributedCost, TrainReport, bench_train};
 
 use crate::device::Stopwatch;
+use crate::error::Result;
 use serde::Serialize;
 use std::borrow::Cow;
 
@@ -53,10 +55,11 @@ struct Measured {
 
 impl Measured {
     /// Adds the times that `watch` recorded for one run.
-    fn add(&mut self, watch: &mut Stopwatch) {
-        let times = watch.sections().iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
+    fn add(&mut self, watch: &mut Stopwatch) -> Result<()> {
+        let times = watch.sections()?.iter().map(|(name, time)| (*name, 1e3 * time.as_secs_f64()));
         self.whole.push(times.clone().map(|(_, milliseconds)| milliseconds).sum());
         times.for_each(|(name, milliseconds)| self.add_section(name.into(), milliseconds));
+        Ok(())
     }
 
     /// Adds the time of a single section.

@@ -44,7 +44,7 @@ pub struct ModelReport {
 /// Times `repeats` passes (at least one) of the model that `config` describes, up to its final stage, over photos of random noise.
 ///
 /// # Errors
-/// Fails if the model can't be built.
+/// Fails if the model can't be built or a GPU fails.
 pub fn bench_model(
     config: &Config,
     precision: Precision,
@@ -61,25 +61,25 @@ pub fn bench_model(
     if device != Device::Cpu {
         model.fold_weights();
     }
-    let context = Batch::from_scenes(&[synthetic_scene(config, 0)], device).context;
+    let context = Batch::from_scenes(&[synthetic_scene(config, 0)], device)?.context;
     let stage = config.curriculum.final_stage();
     let peak = PeakThroughput::new(precision, device);
     let ViewBatch { images, c2w, intrinsics, .. } = &context;
-    let forward = || {
+    let forward = || -> Result<f64> {
         let mut watch = Stopwatch::new(device);
         drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
-        1e3 * watch.sections()[0].1.as_secs_f64()
+        Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     };
     let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
     // The first pass warms up caches, threads and the GPU's libraries.
-    forward();
+    forward()?;
     reset_peak_memory(device);
     for _ in 0..repeats {
-        products.push(peak.time());
+        products.push(peak.time()?);
         // Events around every part slow down a GPU that runs kernels faster than the host launches them, so time a GPU's pass without them.
-        let untold = (device != Device::Cpu).then(forward);
-        let told = parts.watch(device, forward);
-        passes.push(untold.unwrap_or(told));
+        let unwatched = (device != Device::Cpu).then(forward).transpose()?;
+        let watched = parts.watch(device, forward)?;
+        passes.push(unwatched.unwrap_or(watched));
     }
     let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);
     Ok(ModelReport {
@@ -90,7 +90,7 @@ pub fn bench_model(
         threads: tch::get_num_threads(),
         repeats,
         milliseconds: TimingStats::from_milliseconds(passes),
-        parts: parts.told(peak_gflops),
+        parts: parts.into_stats(peak_gflops),
         peak_gflops,
         peak_bytes: peak_memory_bytes_on(device),
     })

@@ -1,11 +1,9 @@
 //! Parts of a model's pass: the time, the floating-point operations and the memory traffic of each.
 
 use super::TimingStats;
-use crate::device::DeviceEvent;
-use crate::model::{Event, told};
+use super::spans::record_spans;
+use crate::error::Result;
 use serde::Serialize;
-use std::cell::RefCell;
-use std::rc::Rc;
 use tch::Device;
 
 /// Statistics of a part of a pass.
@@ -25,16 +23,6 @@ pub struct Part {
     pub share_of_peak: f64,
 }
 
-/// One execution of a part in one pass.
-struct Piece {
-    name: &'static str,
-    begins: DeviceEvent,
-    ends: Option<DeviceEvent>,
-    flops: f64,
-    backward_flops: f64,
-    bytes: f64,
-}
-
 /// Statistics of the parts over all watched passes.
 #[derive(Default)]
 pub(super) struct Parts {
@@ -52,37 +40,23 @@ struct Sum {
 
 impl Parts {
     /// Runs `pass` and adds the statistics of its parts, timed by the clock of `device`.
-    pub fn watch<T>(&mut self, device: Device, pass: impl FnOnce() -> T) -> T {
-        let pieces = Rc::new(RefCell::new(Vec::<Piece>::new()));
-        let heard = pieces.clone();
-        let listener = move |event| {
-            let mut pieces = heard.borrow_mut();
-            match (event, pieces.last_mut()) {
-                (Event::Begins(name), _) => {
-                    let begins = DeviceEvent::now(device);
-                    pieces.push(Piece { name, begins, ends: None, flops: 0., backward_flops: 0., bytes: 0. });
-                }
-                (Event::Ends, Some(piece)) => piece.ends = Some(DeviceEvent::now(device)),
-                (Event::Flops { flops, backward_flops, bytes }, Some(piece)) => {
-                    piece.flops += flops;
-                    piece.backward_flops += backward_flops;
-                    piece.bytes += bytes;
-                }
-                (_, None) => unreachable!("a part begins before all else"),
-            }
-        };
-        let result = told(listener, pass);
+    ///
+    /// # Errors
+    /// Returns the error of `pass`, or an error if a GPU is missing or fails.
+    pub fn watch<T>(&mut self, device: Device, pass: impl FnOnce() -> Result<T>) -> Result<T> {
+        let (result, spans) = record_spans(device, pass);
+        let result = result?;
         let mut sums: Vec<Sum> = vec![];
-        for piece in pieces.take() {
-            let elapsed = piece.ends.expect("a part that is over").since(&piece.begins);
-            let known = sums.iter().position(|sum| sum.name == piece.name).unwrap_or_else(|| {
-                sums.push(Sum { name: piece.name, milliseconds: vec![0.], ..Default::default() });
+        for span in spans {
+            let elapsed = span.elapsed?;
+            let known = sums.iter().position(|sum| sum.name == span.name).unwrap_or_else(|| {
+                sums.push(Sum { name: span.name, milliseconds: vec![0.], ..Default::default() });
                 sums.len() - 1
             });
             sums[known].milliseconds[0] += 1e3 * elapsed.as_secs_f64();
-            sums[known].flops += piece.flops;
-            sums[known].backward_flops += piece.backward_flops;
-            sums[known].bytes += piece.bytes;
+            sums[known].flops += span.flops;
+            sums[known].backward_flops += span.backward_flops;
+            sums[known].bytes += span.bytes;
         }
         match self.parts.is_empty() {
             true => self.parts = sums,
@@ -93,11 +67,11 @@ impl Parts {
                 .zip(sums)
                 .for_each(|(all, one)| all.milliseconds.extend(one.milliseconds)),
         }
-        result
+        Ok(result)
     }
 
     /// Returns the statistics. `peak_gflops` is the throughput of a product of large matrices, which [`Part::share_of_peak`] refers to.
-    pub fn told(self, peak_gflops: f64) -> Vec<Part> {
+    pub fn into_stats(self, peak_gflops: f64) -> Vec<Part> {
         let part = |sum: Sum| {
             let milliseconds = TimingStats::from_milliseconds(sum.milliseconds);
             let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;

@@ -1,6 +1,7 @@
 //! Peak throughput of a device: a product of large square matrices, which all other products are compared with.
 
 use crate::device::Stopwatch;
+use crate::error::Result;
 use crate::model::Precision;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 
@@ -21,10 +22,13 @@ impl PeakThroughput {
     }
 
     /// Returns the time of one product, in milliseconds.
-    pub fn time(&self) -> f64 {
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    pub fn time(&self) -> Result<f64> {
         let mut watch = Stopwatch::new(self.matrix.device());
         no_grad(|| watch.time("product", || drop(self.precision.linear(&self.layer, &self.matrix))));
-        1e3 * watch.sections()[0].1.as_secs_f64()
+        Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     }
 
     /// Returns the throughput in GFLOP/s of a product that takes `milliseconds`.

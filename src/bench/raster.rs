@@ -126,7 +126,8 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         let objective = sum_of_pictures(&pictures);
         watch.time("with gradients", || objective.backward());
         if round > 0 {
-            let [without, with] = [0, 1].map(|section| watch.sections()[section].1.as_secs_f64());
+            let sections = watch.sections()?;
+            let [without, with] = [0, 1].map(|section| sections[section].1.as_secs_f64());
             forward.push(per_view(without));
             forward_backward.push(per_view(with));
             stages.push(stage_times());

@@ -73,7 +73,7 @@ pub fn bench_refine(
     })?;
     let mean = |seconds: f64| 1e3 * seconds / steps as f64;
     let mut sections = vec![];
-    for &(name, time) in stopwatch.sections() {
+    for &(name, time) in stopwatch.sections()? {
         let time = time.as_secs_f64();
         match name {
             "backward" if device == Device::Cpu => {

@@ -112,7 +112,7 @@ pub fn bench_train(
     let seeds = (rank * config.train.batch_size) as u64..;
     let scenes: Vec<LoadedScene> =
         seeds.take(config.train.batch_size).map(|seed| synthetic_scene(&config, seed)).collect();
-    let upload = Upload::new(device);
+    let upload = Upload::new(device)?;
     let mut parts = Parts::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
@@ -120,9 +120,9 @@ pub fn bench_train(
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
     let peak = PeakThroughput::new(precision, device);
     tch::set_num_threads(threads / slices_at_once as i32);
-    let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect();
+    let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect::<Result<Vec<_>>>();
     tch::set_num_threads(threads);
-    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);
+    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products?).least);
     let (milliseconds, sections) = measured.told();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
@@ -141,7 +141,7 @@ pub fn bench_train(
         steps,
         milliseconds,
         sections,
-        parts: parts.told(peak_gflops),
+        parts: parts.into_stats(peak_gflops),
         precision,
         peak_gflops,
         peak_bytes,
@@ -160,14 +160,14 @@ fn measure(
     let mut measured = Measured::default();
     for step in 0..=steps {
         let mut watch = Stopwatch::new(upload.device());
-        let sample = watch.time("data", || Batch::from_scenes_with(scenes, upload));
+        let sample = watch.time("data", || Batch::from_scenes_with(scenes, upload))?;
         let mut learn = || trainer.learn(&sample, &mut watch, &mut || true);
         match step {
             0 => learn()?,
             _ => parts.watch(upload.device(), learn)?,
         };
         if step > 0 {
-            measured.add(&mut watch);
+            measured.add(&mut watch)?;
         }
     }
     Ok(measured)
@@ -188,7 +188,7 @@ fn together(
         let mut watch = Stopwatch::new(upload.device());
         watch.time(COMMUNICATION, || trainer.add_gradients_up())?;
         if step > 0 {
-            communication.add(&mut watch);
+            communication.add(&mut watch)?;
         }
     }
     let communication = communication.told().0;
@@ -260,7 +260,7 @@ mod tests {
         let ((), found) = peak_tensor_bytes(|| {
             let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
             let scenes: Vec<_> = (0..2).map(|seed| synthetic_scene(&config, seed)).collect();
-            let sample = Batch::from_scenes_with(&scenes, &Upload::new(Device::Cpu));
+            let sample = Batch::from_scenes(&scenes, Device::Cpu).unwrap();
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
         });
         MemoryEstimate::of(&config, Device::Cpu).unwrap().total() as f64 / found as f64

@@ -115,7 +115,7 @@ impl Reconstruct {
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))
             .into_iter()
-            .chain(watch.sections().iter().copied())
+            .chain(watch.sections()?.iter().copied())
             .map(|(name, time)| (name.into(), json!(time.as_secs_f64())))
             .collect();
         let from_start = process_age().map(|age| age.as_secs_f64());

@@ -10,6 +10,7 @@ pub(crate) use memory::{
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 pub use stopwatch::Stopwatch;
 
+use crate::error::Result;
 use crate::ffi::take_outputs;
 use cxx::UniquePtr;
 use globalsplat_csrc::device as ffi;
@@ -35,23 +36,31 @@ pub(crate) enum DeviceEvent {
 
 impl DeviceEvent {
     /// Records an event now, without waiting for the GPU.
-    pub fn now(device: Device) -> Self {
-        match gpu(device) {
-            Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu).expect("a GPU that works")),
+    ///
+    /// # Errors
+    /// Returns an error if the GPU is missing or fails.
+    pub fn now(device: Device) -> Result<Self> {
+        Ok(match gpu(device) {
+            Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu)?),
             None => DeviceEvent::Host(Instant::now()),
-        }
+        })
     }
 
     /// Returns the time elapsed since `earlier`, an event of the same device. Waits until the GPU has reached both events.
-    pub fn since(&self, earlier: &DeviceEvent) -> Duration {
-        match (self, earlier) {
+    ///
+    /// # Errors
+    /// Returns an error if the GPU's work has failed.
+    ///
+    /// # Panics
+    /// Panics if the events are of different devices.
+    pub fn since(&self, earlier: &DeviceEvent) -> Result<Duration> {
+        Ok(match (self, earlier) {
             (DeviceEvent::Gpu(event), DeviceEvent::Gpu(earlier)) => {
-                let milliseconds = event.since(earlier).expect("a GPU that works");
-                Duration::from_secs_f64(1e-3 * milliseconds.max(0.))
+                Duration::from_secs_f64(1e-3 * event.since(earlier)?.max(0.))
             }
             (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
             _ => panic!("events of two devices"),
-        }
+        })
     }
 }
 
@@ -69,9 +78,12 @@ pub(crate) struct Upload {
 
 impl Upload {
     /// Creates an upload to `device`, to be reused for all copies to it.
-    pub fn new(device: Device) -> Self {
-        let stream = gpu(device).map(|gpu| ffi::copy_stream(gpu).expect("a GPU that works"));
-        Upload { device, stream }
+    ///
+    /// # Errors
+    /// Returns an error if the GPU is missing or fails.
+    pub fn new(device: Device) -> Result<Self> {
+        let stream = gpu(device).map(ffi::copy_stream).transpose()?;
+        Ok(Upload { device, stream })
     }
 
     /// Returns the destination device.
@@ -81,26 +93,31 @@ impl Upload {
 
     /// Returns uninitialized bytes on the host, in page-locked memory if the device is a GPU, so that they are copied without
     /// an intermediate buffer.
-    pub fn bytes(&self, shape: &[i64]) -> Tensor {
+    ///
+    /// # Errors
+    /// Returns an error if the system has no page-locked memory left.
+    pub fn bytes(&self, shape: &[i64]) -> Result<Tensor> {
         if self.stream.is_none() {
-            return Tensor::empty(shape, (Kind::Uint8, Device::Cpu));
+            return Ok(Tensor::empty(shape, (Kind::Uint8, Device::Cpu)));
         }
         // SAFETY: on success the C++ side has stored a new tensor in `out`.
-        let done = unsafe { take_outputs(|out| ffi::page_locked_bytes(shape, out)) };
-        let [bytes] = done.expect("memory");
-        bytes
+        let [bytes] = unsafe { take_outputs(|out| ffi::page_locked_bytes(shape, out)) }?;
+        Ok(bytes)
     }
 
     /// Starts copying `tensors` from the host; the caller may drop them immediately.
-    pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> PendingCopy<N> {
-        match &self.stream {
+    ///
+    /// # Errors
+    /// Returns an error if the GPU fails, or if memory runs out there or on the host.
+    pub fn begin<const N: usize>(&self, tensors: [&Tensor; N]) -> Result<PendingCopy<N>> {
+        Ok(match &self.stream {
             Some(stream) => {
                 let addresses = tensors.map(|t| t.as_ptr() as usize);
                 // SAFETY: the tensors outlive the call.
-                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }.expect("memory"))
+                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }?)
             }
             None => PendingCopy::Done(tensors.map(|t| t.to_device(self.device))),
-        }
+        })
     }
 }
 
@@ -118,14 +135,14 @@ pub(crate) enum PendingCopy<const N: usize> {
 
 impl<const N: usize> PendingCopy<N> {
     /// Returns the tensors on the device. Work queued on the device from now on waits for the copy; the host doesn't.
-    pub fn wait(self) -> [Tensor; N] {
+    ///
+    /// # Errors
+    /// Returns an error if the GPU fails.
+    pub fn wait(self) -> Result<[Tensor; N]> {
         match self {
-            PendingCopy::Done(tensors) => tensors,
-            PendingCopy::Gpu(copies) => {
-                // SAFETY: on success the C++ side has stored new tensors in `out`.
-                let done = unsafe { take_outputs(|out| copies.take_tensors(out)) };
-                done.expect("a GPU that works")
-            }
+            PendingCopy::Done(tensors) => Ok(tensors),
+            // SAFETY: on success the C++ side has stored new tensors in `out`.
+            PendingCopy::Gpu(copies) => Ok(unsafe { take_outputs(|out| copies.take_tensors(out)) }?),
         }
     }
 }

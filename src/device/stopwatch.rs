@@ -1,6 +1,7 @@
 //! Measurement of the time that sections of some work take.
 
 use super::DeviceEvent;
+use crate::error::Result;
 use std::time::Duration;
 use tch::Device;
 
@@ -9,9 +10,9 @@ use tch::Device;
 pub struct Stopwatch {
     device: Device,
     sections: Vec<(&'static str, Duration)>,
-    /// Starts and ends of sections that are not added up yet. A GPU's events are read only when the times are requested: reading them waits
+    /// Starts and ends of sections on a GPU that are not added up yet. They are read only when the times are requested: reading them waits
     /// for the GPU.
-    parts: Vec<(&'static str, DeviceEvent, DeviceEvent)>,
+    pending: Vec<(&'static str, Result<DeviceEvent>, Result<DeviceEvent>)>,
 }
 
 impl Default for Stopwatch {
@@ -25,33 +26,36 @@ impl Stopwatch {
     /// Returns a stopwatch on the clock of `device`. A section lasts from when the device has finished all earlier work to when it has
     /// finished the section.
     pub fn new(device: Device) -> Self {
-        Stopwatch { device, sections: vec![], parts: vec![] }
+        Stopwatch { device, sections: vec![], pending: vec![] }
     }
 
-    /// Runs `work` and adds its time to `section`.
+    /// Runs `work` and adds its time to `section`. [`Stopwatch::sections`] returns the error of a GPU that fails meanwhile.
     pub fn time<T>(&mut self, section: &'static str, work: impl FnOnce() -> T) -> T {
         let start = DeviceEvent::now(self.device);
         let result = work();
-        self.parts.push((section, start, DeviceEvent::now(self.device)));
-        if self.device == Device::Cpu {
-            self.add_up();
+        match (start, DeviceEvent::now(self.device)) {
+            (Ok(DeviceEvent::Host(start)), Ok(DeviceEvent::Host(end))) => self.add(section, end - start),
+            (start, end) => self.pending.push((section, start, end)),
         }
         result
     }
 
     /// Returns every section and its time, in the order in which they were first entered. Waits for a GPU to finish.
-    pub fn sections(&mut self) -> &[(&'static str, Duration)] {
-        self.add_up();
-        &self.sections
+    ///
+    /// # Errors
+    /// Returns an error if the GPU is missing or its work has failed.
+    pub fn sections(&mut self) -> Result<&[(&'static str, Duration)]> {
+        for (section, start, end) in std::mem::take(&mut self.pending) {
+            let elapsed = end?.since(&start?)?;
+            self.add(section, elapsed);
+        }
+        Ok(&self.sections)
     }
 
-    fn add_up(&mut self) {
-        for (section, start, end) in self.parts.drain(..) {
-            let elapsed = end.since(&start);
-            match self.sections.iter_mut().find(|(name, _)| *name == section) {
-                Some((_, sum)) => *sum += elapsed,
-                None => self.sections.push((section, elapsed)),
-            }
+    fn add(&mut self, section: &'static str, elapsed: Duration) {
+        match self.sections.iter_mut().find(|(name, _)| *name == section) {
+            Some((_, sum)) => *sum += elapsed,
+            None => self.sections.push((section, elapsed)),
         }
     }
 }
@@ -59,6 +63,7 @@ impl Stopwatch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::device::Upload;
     use std::thread::sleep;
 
     #[test]
@@ -68,8 +73,18 @@ mod tests {
         for section in ["b", "a", "b"] {
             assert_eq!(stopwatch.time(section, || sleep(nap)), ());
         }
-        let sections = stopwatch.sections();
+        let sections = stopwatch.sections().unwrap();
         assert_eq!(sections.iter().map(|(name, _)| *name).collect::<Vec<_>>(), ["b", "a"]);
         assert!(sections[0].1 >= 2 * nap && sections[1].1 >= nap, "{sections:?}");
+    }
+
+    /// A GPU that doesn't exist is an error, not a panic, and the work is done all the same.
+    #[test]
+    fn a_missing_gpu_is_an_error() {
+        let missing = Device::Cuda(tch::Cuda::device_count() as usize);
+        let mut stopwatch = Stopwatch::new(missing);
+        assert_eq!(stopwatch.time("a", || 4), 4);
+        assert!(stopwatch.sections().is_err());
+        assert!(Upload::new(missing).is_err());
     }
 }

@@ -5,10 +5,11 @@ use super::lpips::{Lpips, LpipsNetwork};
 use super::vgg19::Vgg19;
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
-use crate::model::{Precision, part, tracks_grad};
+use crate::model::{Precision, tracks_grad};
 use crate::scene::ImageSize;
 use std::path::PathBuf;
 use tch::{Device, Kind, Tensor};
+use tracing::trace_span;
 
 /// Number of 256×256 images that go through the network together on a GPU. VGG-19 keeps 0.2 GB in float32 for each.
 const GPU_CHUNK_SIZE: i64 = 16;
@@ -147,11 +148,14 @@ impl PerceptualLoss {
             let length = chunk_size.min(count - first);
             let share = length as f64 / (count * repeats) as f64;
             let ground_truth = ground_truth.narrow(0, first, length);
-            let ground_truth = part("L_perc", || tch::no_grad(|| self.features(&ground_truth)));
+            let ground_truth =
+                trace_span!("L_perc").in_scope(|| tch::no_grad(|| self.features(&ground_truth)));
             for turn in 0..repeats {
                 let place = |of: &Tensor| of.select(0, turn).narrow(0, first, length);
                 let image = place(&images).detach().set_requires_grad(gradient.is_some());
-                let loss = part("L_perc", || self.compare(&self.features(&image), &ground_truth)) * share;
+                let loss = trace_span!("L_perc")
+                    .in_scope(|| self.compare(&self.features(&image), &ground_truth))
+                    * share;
                 if let Some(gradient) = &gradient {
                     loss.backward();
                     place(gradient).copy_(&image.grad());

@@ -1,6 +1,6 @@
 //! Attention (spec 4.2) by our own kernel where it is fastest, and by libtorch's kernels elsewhere.
 
-use super::parts::record_flops;
+use super::flops::record_flops;
 use globalsplat_csrc::attention as ours;
 use globalsplat_csrc::processor::{Bf16Support, bf16_of_cpu};
 use tch::{Device, Kind, Tensor};

@@ -5,10 +5,10 @@ use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, layer_norm, linear, normalize, randn};
 use super::memory::Memory;
 use super::mixer::Mixer;
-use super::parts::part;
 use super::precision::Precision;
 use super::stream::{REGISTERS, StreamRound};
 use tch::{Tensor, nn};
+use tracing::trace_span;
 
 /// Number of auxiliary query tokens before the scene tokens; they are not decoded.
 const AUXILIARIES: i64 = 4;
@@ -119,11 +119,13 @@ impl Encoder {
         Memory::from_views(&self.memory_registers, views, view, self.precision)
     }
 
-    /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`].
-    pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory) -> EncodedTokens {
+    /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`]. Calls `after_layers` each time that some of the weights
+    /// have been used.
+    pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory, after_layers: &dyn Fn()) -> EncodedTokens {
         let mut slots = self.start(scene_tokens, memory.common.size()[0]);
+        after_layers();
         for round in 0..self.rounds() {
-            slots = self.round(round, &slots, memory);
+            slots = self.round(round, &slots, memory, after_layers);
         }
         self.decoded(&slots)
     }
@@ -138,14 +140,22 @@ impl Encoder {
         }
     }
 
-    /// Runs one round: each stream by itself, then the mixer.
-    pub(super) fn round(&self, round: usize, slots: &Slots, memory: &Memory) -> Slots {
-        let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory, self.precision);
+    /// Runs one round: each stream by itself, then the mixer. Calls `after_layers` each time that some of the weights have been used.
+    pub(super) fn round(
+        &self,
+        round: usize,
+        slots: &Slots,
+        memory: &Memory,
+        after_layers: &dyn Fn(),
+    ) -> Slots {
+        let precision = self.precision;
+        let geometry = self.geometry_rounds[round].forward(&slots.geometry, memory, precision, after_layers);
         match (&self.appearance, &slots.appearance) {
             (Some(branch), Some(appearance)) => {
-                let appearance = branch.rounds[round].forward(appearance, memory, self.precision);
+                let appearance = branch.rounds[round].forward(appearance, memory, precision, after_layers);
                 let mixer = &branch.mixers[round];
-                let (geometry, appearance) = mixer.forward(&geometry, &appearance, self.precision);
+                let (geometry, appearance) = mixer.forward(&geometry, &appearance, precision);
+                after_layers();
                 Slots { geometry, appearance: Some(appearance) }
             }
             _ => Slots { geometry, appearance: None },
@@ -200,6 +210,6 @@ impl StreamStart {
 
     fn forward(&self, slots: &Tensor) -> Tensor {
         let normed = normalize(&self.norm, slots);
-        part("queries and outputs", || Precision::F32.linear(&self.project, &normed))
+        trace_span!("queries and outputs").in_scope(|| Precision::F32.linear(&self.project, &normed))
     }
 }

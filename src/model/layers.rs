@@ -1,10 +1,11 @@
 //! Layers that streams and mixers are built from, with the initializations of spec 4.4.
 
-use super::parts::{part, record_flops};
+use super::flops::record_flops;
 use super::precision::Precision;
 use globalsplat_csrc::memory_check::ensure_memory_for_code;
 use std::cell::Cell;
 use tch::{Device, Tensor, nn, nn::Module};
+use tracing::trace_span;
 
 /// Standard deviation of the initial weights of the encoder's linear layers and of learned tokens.
 pub(super) const ENCODER_STD: f64 = 0.02;
@@ -56,7 +57,7 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 
 /// Applies `norm` to `xs`.
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
-    part("norms", || {
+    trace_span!("norms").in_scope(|| {
         let out = norm.forward(xs);
         record_flops(0, 0, &[xs, &out]);
         out
@@ -76,7 +77,7 @@ impl LayerScale {
 
     /// Returns xs + γ ⊙ `change`.
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
-        part("residual sums", || {
+        trace_span!("residual sums").in_scope(|| {
             let out = xs.addcmul(change, &self.gamma);
             record_flops(0, 0, &[xs, change, &out]);
             out
@@ -106,7 +107,7 @@ impl Mlp {
     }
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
-        part("MLPs", || {
+        trace_span!("MLPs").in_scope(|| {
             let hidden = gelu(precision.linear(&self.expand, xs));
             record_flops(0, 0, &[&hidden, &hidden]);
             precision.linear(&self.contract, &hidden)

@@ -1,10 +1,11 @@
 //! The memory that slots attend to: learned tokens and the image tokens of all views, normalized (spec 4.1), without their common part.
 
 use super::autograd::leaf;
+use super::flops::record_flops;
 use super::layers::LAYER_NORM_EPS;
-use super::parts::{part, record_flops};
 use super::precision::Precision;
 use tch::{Kind, Tensor};
+use tracing::trace_span;
 
 /// Maximum number of views from which the common part is estimated if views are computed one by one, where using all of them costs time.
 const VIEWS_OF_MEAN: usize = 4;
@@ -25,7 +26,7 @@ impl Memory {
     /// Builds the memory from `tokens` [B, m, token width] in float32. The gradients of all rounds flow back to them and are accumulated in
     /// float32.
     pub(crate) fn new(tokens: &Tensor) -> Self {
-        part("norms", || {
+        trace_span!("norms").in_scope(|| {
             let tokens = normalized(tokens);
             let common = tokens.detach().mean_dim(1, true, None);
             Memory { tokens: tokens - &common, common }
@@ -43,7 +44,7 @@ impl Memory {
     ) -> Self {
         let view = |n| normalized(&view(n));
         let few = (0..views).step_by((views as usize).div_ceil(VIEWS_OF_MEAN)).map(view);
-        let mean = |t: &Tensor| part("norms", || t.mean_dim(1, false, None));
+        let mean = |t: &Tensor| trace_span!("norms").in_scope(|| t.mean_dim(1, false, None));
         let (sizes, means): (Vec<_>, Vec<_>) = few.map(|t| (t.size(), mean(&t))).unzip();
         let common = Tensor::stack(&means, 1).mean_dim(1, true, None);
 
@@ -52,7 +53,7 @@ impl Memory {
         let size = [batch, learned + views * patches, width];
         let tokens = Tensor::empty(size, (precision.kind(), common.device()));
         let put = |first, of: Tensor| {
-            part("norms", || tokens.narrow(1, first, of.size()[1]).copy_(&(of - &common)));
+            trace_span!("norms").in_scope(|| tokens.narrow(1, first, of.size()[1]).copy_(&(of - &common)));
         };
         put(0, normalized(registers));
         (0..views).for_each(|n| put(learned + n * patches, view(n)));
@@ -72,7 +73,7 @@ impl Memory {
 
 /// Normalizes `tokens` without γ and β: the part that the memory norms of all rounds share.
 fn normalized(tokens: &Tensor) -> Tensor {
-    part("norms", || {
+    trace_span!("norms").in_scope(|| {
         let out =
             tokens.layer_norm([tokens.size()[2]], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
         record_flops(0, 0, &[tokens, &out]);

@@ -1,9 +1,9 @@
 //! The mixer, which exchanges information between the two streams once per round (spec 4.3).
 
 use super::layers::{LayerScale, Mlp, layer_norm, normalize};
-use super::parts::part;
 use super::precision::Precision;
 use tch::{Tensor, nn};
+use tracing::trace_span;
 
 const MIXER_LAYER_SCALE: f64 = 1e-3;
 
@@ -35,7 +35,7 @@ impl Mixer {
 
     /// Mixes the two streams, [B, S, d] each; the results have the same shape.
     pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
-        part("mixer", || {
+        trace_span!("mixer").in_scope(|| {
             let both =
                 [normalize(&self.geometry_norm, geometry), normalize(&self.appearance_norm, appearance)];
             let mixed = self.mlp.forward(&Tensor::cat(&both, -1), precision).chunk(2, -1);

@@ -10,12 +10,12 @@ mod config;
 mod decoder;
 mod denormals;
 mod encoder;
+mod flops;
 mod growth;
 mod layers;
 mod memory;
 mod merge;
 mod mixer;
-mod parts;
 mod precision;
 mod recompute;
 mod rotation;
@@ -29,8 +29,6 @@ pub use denormals::{are_denormals_flushed, flush_denormals};
 pub use encoder::EncodedTokens;
 pub use memory::Memory;
 pub use merge::Stage;
-pub(crate) use parts::part;
-pub use parts::{Event, told};
 pub use precision::Precision;
 pub(crate) use precision::convolve;
 pub use shapes::MODULES;
@@ -56,6 +54,7 @@ use crate::error::Result;
 use layers::{ENCODER_STD, init_or_zeros, randn, without_random_init};
 use std::collections::HashSet;
 use tch::{Device, Kind, Tensor, nn};
+use tracing::trace_span;
 
 /// The complete model: tokenizer, encoder and decoder.
 #[derive(Debug)]
@@ -115,7 +114,7 @@ impl GlobalSplat {
 
     /// Computes the image tokens, [B, V, P, ray width + RGB width]: the first part of [`GlobalSplat::forward`].
     pub fn tokens(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
-        part("tokens", || self.tokenizer.forward(images, c2w, intrinsics))
+        trace_span!("tokens").in_scope(|| self.tokenizer.forward(images, c2w, intrinsics))
     }
 
     /// Encodes image tokens into scene tokens that have attended to every view: the second part of [`GlobalSplat::forward`].
@@ -146,7 +145,13 @@ impl GlobalSplat {
 
     /// Encodes the memory into scene tokens: [`GlobalSplat::encode`] without the computation of the memory.
     pub fn encode_memory(&self, memory: &Memory) -> EncodedTokens {
-        self.encoder.forward(&self.scene_tokens, memory)
+        self.encode_memory_with(memory, &|| ())
+    }
+
+    /// Runs [`GlobalSplat::encode_memory`] and calls `after_layers` after every few layers. All but a few weights are used exactly once, so
+    /// the caller can release the memory of those that were used so far.
+    pub fn encode_memory_with(&self, memory: &Memory, after_layers: &dyn Fn()) -> EncodedTokens {
+        self.encoder.forward(&self.scene_tokens, memory, after_layers)
     }
 
     /// Runs [`GlobalSplat::encode`] with activation checkpointing: the backward pass recomputes every round.
@@ -156,7 +161,7 @@ impl GlobalSplat {
 
     /// Decodes scene tokens into the Gaussians of `stage`: the last part of [`GlobalSplat::forward`].
     pub fn decode(&self, encoded: &EncodedTokens, stage: Stage) -> Decoded {
-        part("heads", || self.decoder.forward(encoded, stage))
+        trace_span!("heads").in_scope(|| self.decoder.forward(encoded, stage))
     }
 
     /// Sets the precision of matrix products; the default is float32.
@@ -196,6 +201,35 @@ pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
 mod tests {
     use super::*;
     use globalsplat_csrc::ops::{computing, record_outermost_ops, without_own_linear_layers};
+    use std::cell::Cell;
+
+    /// A pass that releases the memory of weights after every few layers holds few weights at a time.
+    #[test]
+    fn encoding_reports_after_every_few_layers() {
+        let config = ModelConfig {
+            latents: 4,
+            width: 16,
+            heads: 2,
+            rgb_width: 8,
+            ray_width: 8,
+            rounds: 3,
+            self_attention_blocks: 2,
+            ..Default::default()
+        };
+        let vs = nn::VarStore::new(Device::Cpu);
+        let model = GlobalSplat::new(&vs.root(), &config).unwrap();
+        let calls = Cell::new(0);
+        tch::no_grad(|| {
+            let tokens = Tensor::rand([1, 2, 5, config.token_width()], (Kind::Float, Device::Cpu));
+            let memory = model.memory_of(&tokens);
+            let encoded = model.encode_memory_with(&memory, &|| calls.set(calls.get() + 1));
+            assert!(encoded.geometry.equal(&model.encode_memory(&memory).geometry));
+        });
+        // Queries, twice keys and values, their common part, outputs and the MLP, then three for each block.
+        let of_stream = 6 + 3 * 2;
+        // The projection of the slots, and in each round both streams and the mixer.
+        assert_eq!(calls.get(), 1 + 3 * (2 * of_stream + 1));
+    }
 
     /// A pass launches a bounded number of kernels, whatever the number of photos. On a GPU, a pass of the main model takes about as long
     /// as the host needs to launch its kernels.

@@ -1,6 +1,6 @@
 //! Precision of matrix products (spec 1.3).
 
-use super::parts::record_flops;
+use super::flops::record_flops;
 use globalsplat_csrc::linear::linear;
 use globalsplat_csrc::processor::{Bf16Support, bf16_of_cpu, gpu_has_bf16};
 use serde::{Deserialize, Serialize};

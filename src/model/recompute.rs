@@ -29,7 +29,7 @@ impl Encoder {
         let memory_leaf = memory.leaf();
         let mut between = vec![slots.map(leaf)];
         for round in 0..self.rounds() {
-            let after = no_grad(|| self.round(round, &between[round], &memory_leaf));
+            let after = no_grad(|| self.round(round, &between[round], &memory_leaf, &|| ()));
             between.push(after.map(leaf));
         }
         let encoded = self.decoded(between.last().expect("one more than rounds"));
@@ -42,7 +42,7 @@ impl CheckpointedRounds<'_> {
     pub fn backward(mut self) {
         for round in (0..self.encoder.rounds()).rev() {
             let after = self.between.pop().expect("one more than rounds");
-            let again = self.encoder.round(round, &self.between[round], &self.memory_leaf);
+            let again = self.encoder.round(round, &self.between[round], &self.memory_leaf, &|| ());
             backward_from_grads(&again.zip_tensors(&after));
         }
         let mut start = self.slots.zip_tensors(&self.between[0]);

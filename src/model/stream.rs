@@ -2,11 +2,12 @@
 
 use super::attention::attention;
 use super::config::ModelConfig;
+use super::flops::record_flops;
 use super::layers::{ENCODER_STD, LayerScale, Mlp, layer_norm, linear, normalize};
 use super::memory::Memory;
-use super::parts::{part, record_flops};
 use super::precision::Precision;
 use tch::{Device, Tensor, nn};
+use tracing::trace_span;
 
 /// Number of registers, the last of the slots. They skip cross-attention and the first MLP.
 pub(super) const REGISTERS: i64 = 4;
@@ -79,23 +80,34 @@ impl StreamRound {
         own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::linear_layers))
     }
 
-    /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d].
-    pub fn forward(&self, slots: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
+    /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d]. Calls `after_layers` each time that some of
+    /// the weights have been used.
+    pub fn forward(
+        &self,
+        slots: &Tensor,
+        memory: &Memory,
+        precision: Precision,
+        after_layers: &dyn Fn(),
+    ) -> Tensor {
         // Registers change only in self-attention and in the mixer.
         let reading = slots.size()[1] - REGISTERS;
         let registers = slots.narrow(1, reading, REGISTERS);
         let slots = slots.narrow(1, 0, reading);
 
         let normed = normalize(&self.slots_norm, &slots);
-        let query = part("queries and outputs", || precision.linear(&self.query, &normed));
-        let attn_out = self.cross_attention(&query, memory, precision);
-        let attn_out = part("queries and outputs", || precision.linear(&self.output, &attn_out));
+        let query = trace_span!("queries and outputs").in_scope(|| precision.linear(&self.query, &normed));
+        after_layers();
+        let attn_out = self.cross_attention(&query, memory, precision, after_layers);
+        let attn_out =
+            trace_span!("queries and outputs").in_scope(|| precision.linear(&self.output, &attn_out));
+        after_layers();
         let slots = self.attention_scale.add(&slots, &attn_out);
         let mlp_out = self.mlp.forward(&normalize(&self.mlp_norm, &slots), precision);
+        after_layers();
         let slots = self.mlp_scale.add(&slots, &mlp_out);
 
         let slots = Tensor::cat(&[slots, registers], 1);
-        self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision))
+        self.blocks.iter().fold(slots, |slots, block| block.forward(&slots, precision, after_layers))
     }
 
     /// Computes cross-attention of `query` [B, n, d] to the memory. On a CPU without gradients, groups of heads are processed one after the
@@ -104,7 +116,13 @@ impl StreamRound {
     /// The memory is γ ⊙ (y + c) + β, where y is what tokens differ by and c what they have in common (spec 4.2). Softmax is invariant to a
     /// constant added to all keys, and attention weights sum to 1. So keys are W_k (γ ⊙ y) and values W_v (γ ⊙ y), and the contribution of
     /// c, β and the values' bias is added after attention. The keys' own bias has no effect.
-    fn cross_attention(&self, query: &Tensor, memory: &Memory, precision: Precision) -> Tensor {
+    fn cross_attention(
+        &self,
+        query: &Tensor,
+        memory: &Memory,
+        precision: Precision,
+        after_layers: &dyn Fn(),
+    ) -> Tensor {
         let is_for_all =
             query.requires_grad() || query.device() != Device::Cpu || self.heads % HEAD_GROUPS != 0;
         let groups = if is_for_all { 1 } else { HEAD_GROUPS };
@@ -112,23 +130,26 @@ impl StreamRound {
         let attn_out: Vec<Tensor> = (0..groups)
             .map(|group| {
                 let query = query.narrow(-1, group * width, width);
-                let read = part("keys and values", || match &self.folded {
+                let read = trace_span!("keys and values").in_scope(|| match &self.folded {
                     Some(folded) if groups == 1 => precision.linear(&folded.keys_and_values, &memory.tokens),
                     _ => precision.linear(&self.keys_and_values(group * width, width), &memory.tokens),
                 });
+                after_layers();
                 let read = read.chunk(2, -1);
-                part("cross-attention", || attention(&query, &read[0], &read[1], self.heads / groups))
+                trace_span!("cross-attention")
+                    .in_scope(|| attention(&query, &read[0], &read[1], self.heads / groups))
             })
             .collect();
-        let by_all = part("keys and values", || match &self.folded {
+        let by_all = trace_span!("keys and values").in_scope(|| match &self.folded {
             Some(folded) => Precision::F32.linear(&folded.common_value, &memory.common),
             None => self.value_offset(memory),
         });
+        after_layers();
         let attn_out = match &attn_out[..] {
             [attn_out] => attn_out.shallow_clone(),
             several => Tensor::cat(several, -1),
         };
-        part("residual sums", || {
+        trace_span!("residual sums").in_scope(|| {
             let out = &attn_out + &by_all;
             record_flops(0, 0, &[&attn_out, &out]);
             out
@@ -199,14 +220,19 @@ impl SelfAttentionBlock {
         [&self.qkv, &self.project].into_iter().chain(self.mlp.linear_layers())
     }
 
-    /// Applies the block to `xs` [B, S, d]; the result has the same shape.
-    pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
+    /// Applies the block to `xs` [B, S, d]; the result has the same shape. Calls `after_layers` as [`StreamRound::forward`] does.
+    pub fn forward(&self, xs: &Tensor, precision: Precision, after_layers: &dyn Fn()) -> Tensor {
         let normed = normalize(&self.attention_norm, xs);
-        let qkv = part("queries and outputs", || precision.linear(&self.qkv, &normed)).chunk(3, -1);
-        let mixed = part("self-attention", || attention(&qkv[0], &qkv[1], &qkv[2], self.heads));
-        let mixed = part("queries and outputs", || precision.linear(&self.project, &mixed));
+        let qkv =
+            trace_span!("queries and outputs").in_scope(|| precision.linear(&self.qkv, &normed)).chunk(3, -1);
+        after_layers();
+        let mixed =
+            trace_span!("self-attention").in_scope(|| attention(&qkv[0], &qkv[1], &qkv[2], self.heads));
+        let mixed = trace_span!("queries and outputs").in_scope(|| precision.linear(&self.project, &mixed));
+        after_layers();
         let xs = self.attention_scale.add(xs, &mixed);
         let mlp_out = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
+        after_layers();
         self.mlp_scale.add(&xs, &mlp_out)
     }
 }
@@ -233,9 +259,9 @@ mod tests {
         for (precision, most) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
             let (query, memory) = (query.to_kind(precision.kind()), memory.to_kind(precision.kind()));
             round.folded = None;
-            let expected = no_grad(|| round.cross_attention(&query, &memory, precision));
+            let expected = no_grad(|| round.cross_attention(&query, &memory, precision, &|| ()));
             no_grad(|| round.fold_weights(precision));
-            let found = no_grad(|| round.cross_attention(&query, &memory, precision));
+            let found = no_grad(|| round.cross_attention(&query, &memory, precision, &|| ()));
             let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
             assert!(error < most, "{precision}: {error:.1e}");
         }
@@ -258,7 +284,7 @@ mod tests {
         let whole = Memory { tokens: &memory.tokens + &memory.common, common: memory.common.zeros_like() };
         let attn_out = |memory: &Memory, precision: Precision| {
             let query = query.to_kind(precision.kind());
-            no_grad(|| round.cross_attention(&query, memory, precision))
+            no_grad(|| round.cross_attention(&query, memory, precision, &|| ()))
         };
         let exact = attn_out(&memory, Precision::F32);
         let size = (&exact - exact.mean_dim(1, true, None)).norm(); // norm of the differences among queries

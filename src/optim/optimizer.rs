@@ -193,36 +193,45 @@ impl Optimizer {
     }
 
     /// Returns the norm of all gradients together, a scalar on their device.
-    pub fn gradient_norm(&self) -> Tensor {
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    pub fn gradient_norm(&self) -> Result<Tensor> {
         let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
         // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor at `out`.
-        let done = unsafe { take_outputs(|out| norm(&addresses(&gradients), out)) };
-        let [norm] = done.expect("gradients of one device");
-        norm
+        let [norm] = unsafe { take_outputs(|out| norm(&addresses(&gradients), out)) }?;
+        Ok(norm)
     }
 
     /// Scales the gradients, whose total norm is `norm`, so that the norm is at most `largest`.
-    pub fn clip_gradients(&self, norm: f64, largest: f64) {
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    pub fn clip_gradients(&self, norm: f64, largest: f64) -> Result<()> {
         if norm > largest {
             let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
             // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-            let done = unsafe { scale(&addresses(&gradients), largest / (norm + CLIP_EPS)) };
-            done.expect("gradients of one device");
+            unsafe { scale(&addresses(&gradients), largest / (norm + CLIP_EPS)) }?;
         }
+        Ok(())
     }
 
     /// Updates the parameters from their gradients, by the groups' rules and learning rates. On the CPU, AdamW takes one pass over memory;
     /// on a GPU, one launch updates many parameters.
-    pub fn step(&mut self) {
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    pub fn step(&mut self) -> Result<()> {
         self.steps += 1;
         let is_here = self.parameters.iter().all(|p| p.value.device() == Device::Cpu);
         for group in 0..self.groups.len() {
             match self.groups[group].rule {
                 Rule::AdamW if is_here => self.update_on_the_cpu(group),
-                Rule::AdamW => self.update_fused(group),
+                Rule::AdamW => self.update_fused(group)?,
                 Rule::Muon { parts } => self.update_matrices(group, parts),
             }
         }
+        Ok(())
     }
 
     /// Returns the parameters of a group that this shard updates and that have gradients, and these gradients.
@@ -246,7 +255,7 @@ impl Optimizer {
     }
 
     /// Updates a group by libtorch's fused AdamW kernel.
-    fn update_fused(&self, group: usize) {
+    fn update_fused(&self, group: usize) -> Result<()> {
         let Settings { learning_rate, weight_decay, .. } = self.groups[group];
         let (parameters, gradients) = self.with_gradients(group);
         let values = addresses(parameters.iter().map(|p| &p.value));
@@ -261,8 +270,7 @@ impl Optimizer {
             epsilon: self.epsilon,
         };
         // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-        let done = unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) };
-        done.expect("parameters, their gradients and their moments are alike");
+        Ok(unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) }?)
     }
 
     /// Updates a group of matrices by Muon.
@@ -348,9 +356,9 @@ mod tests {
     }
 
     /// Two implementations of a step: [`Optimizer::step`], which uses our own kernel for tensors on the CPU, and libtorch's fused kernel.
-    const WAYS: [fn(&mut Optimizer); 2] = [Optimizer::step, |adamw| {
+    const WAYS: [fn(&mut Optimizer) -> Result<()>; 2] = [Optimizer::step, |adamw| {
         adamw.steps += 1;
-        (0..adamw.groups.len()).for_each(|group| adamw.update_fused(group));
+        (0..adamw.groups.len()).try_for_each(|group| adamw.update_fused(group))
     }];
 
     #[test]
@@ -360,7 +368,7 @@ mod tests {
         }
     }
 
-    fn steps_follow_the_equations(step: fn(&mut Optimizer)) {
+    fn steps_follow_the_equations(step: fn(&mut Optimizer) -> Result<()>) {
         let (weight, bias) = (leaf(&[2.]), leaf(&[2.]));
         let groups = vec![group(&[("weight", &weight)], 1e-2, 0.1), group(&[("bias", &bias)], 3e-2, 0.)];
         let mut adamw = Optimizer::new(groups);
@@ -368,7 +376,7 @@ mod tests {
         for (i, gradient) in [0.5f64, -1.5, 0.25].into_iter().enumerate() {
             adamw.zero_grad();
             ((&weight + &bias).sum(Kind::Float) * gradient).backward();
-            step(&mut adamw);
+            step(&mut adamw).unwrap();
             let t = i as i32 + 1;
             (m, v) = (0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient * gradient);
             let update = (m / (1. - 0.9f64.powi(t))) / ((v / (1. - 0.999f64.powi(t))).sqrt() + 1e-8);
@@ -395,8 +403,8 @@ mod tests {
                 let seen = if i < 2 { &named[..3] } else { &named[..] };
                 let objective = seen.iter().map(|(_, t)| (*t * (t.detach() + i).cos()).sum(Kind::Float));
                 objective.reduce(|a, b| a + b).expect("some").backward();
-                adamw.clip_gradients(adamw.gradient_norm().double_value(&[]), 2.);
-                step(&mut adamw);
+                adamw.clip_gradients(adamw.gradient_norm().unwrap().double_value(&[]), 2.).unwrap();
+                step(&mut adamw).unwrap();
             }
             let mut state = adamw.state();
             state.extend(leaves.map(|(name, value)| (name.to_string(), value.detach())));
@@ -419,7 +427,8 @@ mod tests {
         let named: Vec<(&str, &Tensor)> = named.iter().map(|(name, t)| (name.as_str(), *t)).collect();
         let mut adamw = Optimizer::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
         leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
-        let (_, mut ops) = record_ops(|| WAYS[1](&mut adamw));
+        let (done, mut ops) = record_ops(|| WAYS[1](&mut adamw));
+        done.unwrap();
         // On the CPU, the op itself reads the number of steps of each parameter.
         ops.retain(|op| op != "aten::item" && op != "aten::_local_scalar_dense");
         let fused = ops.iter().filter(|op| *op == "aten::_fused_adamw_").count();
@@ -431,11 +440,11 @@ mod tests {
         let (a, b) = (leaf(&[0.]), leaf(&[0.]));
         let adamw = Optimizer::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
         (&a * 3. + &b * 4.).sum(Kind::Float).backward();
-        let norm = adamw.gradient_norm().double_value(&[]);
+        let norm = adamw.gradient_norm().unwrap().double_value(&[]);
         assert!((norm - 5.).abs() < 1e-6);
-        adamw.clip_gradients(norm, 10.);
+        adamw.clip_gradients(norm, 10.).unwrap();
         assert_eq!(a.grad().double_value(&[0]), 3.);
-        adamw.clip_gradients(norm, 1.);
+        adamw.clip_gradients(norm, 1.).unwrap();
         assert!((a.grad().double_value(&[0]) - 0.6).abs() < 1e-5);
     }
 
@@ -448,8 +457,8 @@ mod tests {
             // In place, like an all-reduce.
             let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
         }
-        assert!((adamw.gradient_norm().double_value(&[]) - 2.).abs() < 1e-6);
-        adamw.step();
+        assert!((adamw.gradient_norm().unwrap().double_value(&[]) - 2.).abs() < 1e-6);
+        adamw.step().unwrap();
         assert_eq!(a.double_value(&[0]), 1.);
         assert!((b.double_value(&[0]) - 0.9).abs() < 1e-6);
     }

@@ -212,14 +212,14 @@ fn stream_round(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
     let (slots, memory) = (request.input("slots")?, model::Memory::new(request.input("memory")?));
-    with_params([("slots", module.forward(slots, &memory, Precision::F32))], params)
+    with_params([("slots", module.forward(slots, &memory, Precision::F32, &|| ()))], params)
 }
 
 fn self_attention_block(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) =
         request.build(|vs| model::SelfAttentionBlock::new(vs, config.width, config.heads))?;
-    with_params([("slots", module.forward(request.input("slots")?, Precision::F32))], params)
+    with_params([("slots", module.forward(request.input("slots")?, Precision::F32, &|| ()))], params)
 }
 
 fn mixer(request: &Request) -> Result<Answer> {
@@ -237,7 +237,7 @@ fn encoder(request: &Request) -> Result<Answer> {
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
     let memory = encoder.memory(request.input("tokens")?);
-    let encoded = encoder.forward(&scene_tokens, &memory);
+    let encoded = encoder.forward(&scene_tokens, &memory, &|| ());
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
 
@@ -500,7 +500,7 @@ fn steps_of(optimizer: OptimizerKind, request: &Request) -> Result<Answer> {
             objective = &objective + (variable * gradients(name)?.get(step)).sum(Kind::Float);
         }
         objective.backward();
-        optimizer.step();
+        optimizer.step()?;
     }
     let outputs = variables.into_iter().map(|(name, value)| (name, value.detach())).collect();
     Ok(Answer { outputs, params: Tensors::new() })

@@ -21,7 +21,7 @@ use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
-use crate::model::{EncodedTokens, Event, GlobalSplat, Stage, told};
+use crate::model::{EncodedTokens, GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
@@ -146,25 +146,20 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(EncodedTo
     let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
     let ViewBatch { images, c2w, intrinsics, .. } = view_batch(&views, &poses, device);
     config.model.check_image(images.size()[3], images.size()[4])?;
-    let pass = || {
+    // A pass reads nearly every weight exactly once, so pages of weights can be released as soon as their layers are done.
+    let release_pages = || {
+        if let Some(mapped) = &mapped {
+            mapped.release_pages();
+        }
+    };
+    let (encoded, decoded) = tch::no_grad(|| {
         let memory = network.memory(&images, &c2w, &intrinsics);
         drop(images);
-        let encoded = network.encode_memory(&memory);
+        release_pages();
+        let encoded = network.encode_memory_with(&memory, &release_pages);
         drop(memory);
         let decoded = network.decode(&encoded, stage);
         (encoded, decoded)
-    };
-    let (encoded, decoded) = tch::no_grad(|| match mapped {
-        // A pass reads nearly every weight exactly once, so pages of weights can be released when the next part begins.
-        Some(mapped) => told(
-            move |event| {
-                if let Event::Begins(_) = event {
-                    mapped.release_pages()
-                }
-            },
-            pass,
-        ),
-        None => pass(),
     });
     Ok((encoded, decoded.gaussians))
 }

@@ -3,6 +3,7 @@
 
 use super::config::RefineConfig;
 use crate::data::{View, ViewBatch};
+use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
@@ -96,11 +97,14 @@ impl Corrections {
     }
 
     /// Updates the corrections by their gradients. `progress` goes from 0 to 1.
-    pub(super) fn step(&mut self, progress: f64) {
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    pub(super) fn step(&mut self, progress: f64) -> Result<()> {
         let left = self.rates_end.powf(progress);
         let rates: Vec<f64> = self.rates.iter().map(|rate| rate * left).collect();
         self.optimizer.set_learning_rates(&rates);
-        self.optimizer.step();
+        self.optimizer.step()
     }
 
     /// Returns photo `index`, or a crop of it, with the corrected camera and with the exposure of the splat.

@@ -121,9 +121,9 @@ pub(crate) fn refine_timed(
             loss.backward();
         });
         stopwatch.time("optimizer", || {
-            space.step(progress, step, &mut random);
-            corrections.step(progress);
-        });
+            space.step(progress, step, &mut random)?;
+            corrections.step(progress)
+        })?;
         last = start.elapsed();
         elapsed += last;
         if !watch(&RefineStep { step: step + 1, progress, elapsed, space }) {

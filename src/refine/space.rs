@@ -3,6 +3,7 @@
 use super::config::RefineConfig;
 use super::gaussian_params::GaussianParams;
 use super::relocate::relocate;
+use crate::error::Result;
 use crate::model::{EncodedTokens, GlobalSplat, Stage};
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use crate::scene::{Gaussians, RawGaussians};
@@ -21,7 +22,10 @@ pub trait Space {
     fn zero_grad(&mut self);
 
     /// Updates the parameters by their gradients; `step` is the number of earlier updates.
-    fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng);
+    ///
+    /// # Errors
+    /// Returns an error if a GPU fails.
+    fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) -> Result<()>;
 }
 
 /// Parameter space of individual Gaussians.
@@ -62,7 +66,7 @@ impl Space for GaussianSpace {
         self.optimizer.zero_grad();
     }
 
-    fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) {
+    fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) -> Result<()> {
         let config = &self.config;
         let (means, others) = (config.means_end.powf(progress), config.lr_final_factor.powf(progress));
         // The order is that of `GaussianParams::named_parameters`.
@@ -74,7 +78,7 @@ impl Space for GaussianSpace {
             config.colours * others,
             config.colours * config.harmonics * others,
         ]);
-        self.optimizer.step();
+        self.optimizer.step()?;
         let due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         if due && progress < config.relocate_until {
             let changed = relocate(&self.leaves, config.prune_opacity, random);
@@ -83,6 +87,7 @@ impl Space for GaussianSpace {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
         }
+        Ok(())
     }
 }
 
@@ -120,8 +125,8 @@ impl Space for TokenSpace<'_> {
         self.optimizer.zero_grad();
     }
 
-    fn step(&mut self, _: f64, _: u64, _: &mut ChaCha8Rng) {
+    fn step(&mut self, _: f64, _: u64, _: &mut ChaCha8Rng) -> Result<()> {
         self.optimizer.set_learning_rate(self.learning_rate);
-        self.optimizer.step();
+        self.optimizer.step()
     }
 }

@@ -14,6 +14,7 @@ mod run;
 mod schedule;
 mod side_by_side;
 mod step_report;
+mod step_sync;
 #[cfg(test)]
 mod step_tests;
 mod subsets;

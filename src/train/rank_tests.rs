@@ -37,7 +37,7 @@ fn trained_on(
     let step = |step: usize| {
         let mut scenes = scenes(SCENES);
         disturb(step, &mut scenes);
-        let sample = Batch::from_scenes(&scenes[rank * share..][..share], Device::Cpu);
+        let sample = Batch::from_scenes(&scenes[rank * share..][..share], Device::Cpu).unwrap();
         trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step")
     };
     let reports = (0..STEPS).map(step).collect();
@@ -189,7 +189,7 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
             }
             trainer.broadcast_state().expect("the first rank");
             for _ in 0..3 {
-                let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu);
+                let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu).unwrap();
                 trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             }
             let moments: usize = trainer.optimizer.moments().map(Tensor::numel).sum();
@@ -215,7 +215,7 @@ fn ranks_stop_run_on_ranks() {
     let found = run_on_ranks(3, |group| {
         let rank = group.rank();
         let mut trainer = far_from_the_start(&config).with_ranks(group);
-        let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu);
+        let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu).unwrap();
         let step = |step: usize| {
             let asked = rank == 1 && step == 2;
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || !asked).expect("a step").go_on
@@ -235,7 +235,7 @@ fn ranks_follow_the_first() {
     let found = run_on_ranks(2, |group| {
         let mut trainer = far_from_the_start(&config);
         if group.is_main_process() {
-            let sample = Batch::from_scenes(&scenes(1), Device::Cpu);
+            let sample = Batch::from_scenes(&scenes(1), Device::Cpu).unwrap();
             trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             trainer.samples = 7;
             // Weights from elsewhere may have another value here.

@@ -21,7 +21,7 @@ const STAGE: Stage = Stage { index: 2, mix: 0.4 };
 
 /// Returns a sample of three scenes.
 fn sample() -> Batch {
-    Batch::from_scenes(&scenes(3), Device::Cpu)
+    Batch::from_scenes(&scenes(3), Device::Cpu).unwrap()
 }
 
 /// Returns scenes of five context and two target views, with noise as images.
@@ -282,7 +282,7 @@ fn a_step_takes_few_kernels() {
     let model =
         ModelConfig { latents: 16, width: 24, heads: 3, rgb_width: 16, ray_width: 8, ..Default::default() };
     let mut trainer = far_from_the_start(&config(model, TrainConfig::default()));
-    let (network, sample) = (&trainer.model, Batch::from_scenes(&scenes(2), Device::Cpu));
+    let (network, sample) = (&trainer.model, Batch::from_scenes(&scenes(2), Device::Cpu).unwrap());
     let sample = Batch { paired: true, ..sample };
     let with_gradient = |t: &Tensor| {
         let leaf = leaf(t);

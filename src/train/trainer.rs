@@ -8,6 +8,7 @@ use super::preview::preview;
 use super::schedule::learning_rate;
 use super::side_by_side::{ModelReplica, gradients_in_parallel};
 use super::step_report::StepReport;
+use super::step_sync::{StepSums, StepSync};
 use super::subsets::subsets;
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
@@ -73,28 +74,6 @@ pub struct Trainer {
     buckets: Buckets,
     /// `true` if each rank has only the moments of its share of the parameters.
     shards_optimizer: bool,
-}
-
-/// Values that ranks exchange in every step in addition to gradients. They are summed over all ranks.
-struct StepSync {
-    /// Number of ranks that were asked to stop.
-    asked_to_stop: f64,
-    /// Number of ranks that found bad data.
-    found_bad_data: f64,
-    /// Number of gradients, and its square. Their sums show whether all ranks have the same number of gradients.
-    gradients: [f64; 2],
-}
-
-impl StepSync {
-    const COUNT: usize = 4;
-
-    fn packed(&self) -> [f64; Self::COUNT] {
-        [self.asked_to_stop, self.found_bad_data, self.gradients[0], self.gradients[1]]
-    }
-
-    fn unpacked([asked_to_stop, found_bad_data, sum, squares]: [f64; Self::COUNT]) -> Self {
-        StepSync { asked_to_stop, found_bad_data, gradients: [sum, squares] }
-    }
 }
 
 impl Trainer {
@@ -234,34 +213,34 @@ impl Trainer {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
         let losses = self.gradients(sample, stage, watch)?;
-        let told = match self.group.world_size() {
-            1 => self.add_up(losses, go_on)?,
-            _ => watch.time(COMMUNICATION, || self.add_up(losses, go_on))?,
+        let sums = match self.group.world_size() {
+            1 => self.all_reduce(losses, go_on)?,
+            _ => watch.time(COMMUNICATION, || self.all_reduce(losses, go_on))?,
         };
         // The GPU is still busy with this step. The next samples are copied meanwhile.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
             loader.prefetch_to_device(self.config.train.batch_size, device);
         }
-        let (losses, word, gradient_norm, skipped) = watch.time("optimizer", || {
-            let (losses, word, gradient_norm) = read(&told, &self.optimizer.gradient_norm());
-            let skipped = !(losses.total.is_finite() && gradient_norm.is_finite());
+        let (sums, skipped) = watch.time("optimizer", || -> Result<_> {
+            let sums = StepSums::from_tensors(&sums, &self.optimizer.gradient_norm()?);
+            let skipped = !(sums.losses.total.is_finite() && sums.gradient_norm.is_finite());
             if !skipped {
-                self.optimizer.clip_gradients(gradient_norm, self.config.train.gradient_clip);
+                self.optimizer.clip_gradients(sums.gradient_norm, self.config.train.gradient_clip)?;
                 self.optimizer.set_learning_rate(learning_rate);
-                self.optimizer.step();
+                self.optimizer.step()?;
             }
-            (losses, word, gradient_norm, skipped)
-        });
+            Ok((sums, skipped))
+        })?;
+        let StepSums { losses, sync, gradient_norm } = sums;
         if !skipped && self.optimizer.is_sharded() {
             watch.time("parameters", || self.spread_parameters())?;
         }
-        let [gradients, squares] = word.gradients;
-        if gradients * gradients != squares * self.group.world_size() as f64 {
+        if !sync.has_equal_gradients(self.group.world_size()) {
             return Err(Error::failed(
                 "ranks have different parameters: were they started with the same program?",
             ));
         }
-        if word.found_bad_data > 0. {
+        if sync.has_bad_data() {
             self.tell_bad_data()?;
         }
         let scenes = match skipped {
@@ -277,26 +256,20 @@ impl Trainer {
             skipped,
             scenes,
             picture: None,
-            go_on: word.asked_to_stop == 0.,
+            go_on: !sync.is_asked_to_stop(),
         };
         self.step += 1;
         Ok(report)
     }
 
-    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the values of [`StepSync`] over all ranks,
-    /// packed.
-    fn add_up(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
-        let gradients = self.buckets.finish()? as f64;
-        let word = StepSync {
-            asked_to_stop: f64::from(!go_on()),
-            found_bad_data: f64::from(self.loader.as_ref().is_some_and(DataLoader::has_bad_scene_reports)),
-            gradients: [gradients, gradients * gradients],
-        };
-        // Filling a new tensor on a GPU doesn't wait for the GPU.
-        let numbers = word.packed().map(|number| Tensor::full([1], number, (Kind::Double, losses.device())));
-        let told = Tensor::cat(&std::iter::once(losses).chain(numbers).collect::<Vec<_>>(), 0);
-        self.group.all_reduce(&told)?;
-        Ok(told)
+    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the ranks' [`StepSync`], packed.
+    fn all_reduce(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
+        let gradients = self.buckets.finish()?;
+        let is_asked_to_stop = !go_on();
+        let has_bad_data = self.loader.as_ref().is_some_and(DataLoader::has_bad_scene_reports);
+        let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
+        self.group.all_reduce(&sums)?;
+        Ok(sums)
     }
 
     /// Broadcasts the parameters that each rank has updated to all others.
@@ -554,14 +527,4 @@ impl Trainer {
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
         Model { network, config, stage, device, input: Input::PLAIN, mapped: None }
     }
-}
-
-/// Returns a step's packed losses, the exchanged values, and the gradient's norm (a scalar) as numbers. They are copied from a GPU
-/// together, because every copy waits for all of the GPU's work; this is the only copy of a step.
-fn read(told: &Tensor, gradient_norm: &Tensor) -> (Losses<f64>, StepSync, f64) {
-    let all = Tensor::cat(&[told, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
-    let numbers = Vec::<f64>::try_from(all.to_device(Device::Cpu)).expect("float64");
-    let (losses, others) = numbers.split_first_chunk().expect("all terms");
-    let (word, norm) = others.split_first_chunk().expect("all words");
-    (Losses::unpacked(losses), StepSync::unpacked(*word), norm[0])
 }

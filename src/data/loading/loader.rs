@@ -196,13 +196,13 @@ impl DataLoader {
     /// Returns the next `batch` samples as one batch: the prefetched ones, if any.
     ///
     /// # Errors
-    /// Fails like [`DataLoader::next_scene`].
+    /// Fails like [`DataLoader::next_scene`] and [`Batch::from_scenes`].
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Batch> {
         match self.prefetched.take() {
-            Some(batch) => Ok(batch.sample?.wait()),
+            Some(ahead) => ahead.sample?.wait(),
             None => {
                 let scenes = self.next_scenes(batch)?;
-                Ok(Batch::from_scenes_with(&scenes, self.upload.get_or_insert_with(|| Upload::new(device))))
+                Batch::from_scenes_with(&scenes, self.upload(device)?)
             }
         }
     }
@@ -213,12 +213,18 @@ impl DataLoader {
         if self.prefetched.is_none() {
             let first = self.next();
             let scenes = self.next_scenes(batch);
-            let upload = self.upload.get_or_insert_with(|| Upload::new(device));
-            self.prefetched = Some(PrefetchedBatch {
-                first,
-                sample: scenes.map(|scenes| PendingBatch::begin(&scenes, upload)),
-            });
+            let sample = scenes.and_then(|scenes| PendingBatch::begin(&scenes, self.upload(device)?));
+            self.prefetched = Some(PrefetchedBatch { first, sample });
         }
+    }
+
+    /// Returns the upload to `device`, which the first call creates.
+    fn upload(&mut self, device: Device) -> Result<&Upload> {
+        let upload = match self.upload.take() {
+            Some(upload) => upload,
+            None => Upload::new(device)?,
+        };
+        Ok(self.upload.insert(upload))
     }
 
     fn next_scenes(&mut self, count: usize) -> Result<Vec<LoadedScene>> {

@@ -3,6 +3,7 @@
 use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
 use crate::device::{PendingCopy, Upload};
+use crate::error::Result;
 use globalsplat_capture::CHANNELS;
 use tch::{Device, Kind, Tensor};
 
@@ -26,36 +27,39 @@ pub struct Batch {
 
 impl Batch {
     /// Builds a batch of `scenes`, which must have equally many views of one size.
-    pub fn from_scenes(scenes: &[LoadedScene], device: Device) -> Self {
-        Batch::from_scenes_with(scenes, &Upload::new(device))
+    ///
+    /// # Errors
+    /// Returns an error if the GPU is missing or fails, or if memory runs out.
+    pub fn from_scenes(scenes: &[LoadedScene], device: Device) -> Result<Self> {
+        Batch::from_scenes_with(scenes, &Upload::new(device)?)
     }
 
     /// Builds a batch like [`Batch::from_scenes`], reusing an existing [`Upload`].
-    pub(crate) fn from_scenes_with(scenes: &[LoadedScene], upload: &Upload) -> Self {
+    pub(crate) fn from_scenes_with(scenes: &[LoadedScene], upload: &Upload) -> Result<Self> {
         match upload.device() {
-            Device::Cpu => Batch::on_host(scenes, floats),
-            _ => PendingBatch::begin(scenes, upload).wait(),
+            Device::Cpu => Batch::on_host(scenes, |images, shape| Ok(floats(images, shape))),
+            _ => PendingBatch::begin(scenes, upload)?.wait(),
         }
     }
 
     /// Builds a batch on the CPU. `images` makes a tensor of the given shape from the pixel bytes of the chosen images.
-    fn on_host(scenes: &[LoadedScene], images: impl Fn(&[&[u8]], &[i64]) -> Tensor) -> Self {
+    fn on_host(scenes: &[LoadedScene], images: impl Fn(&[&[u8]], &[i64]) -> Result<Tensor>) -> Result<Self> {
         let far: Vec<f64> = scenes.iter().map(|scene| scene.far).collect();
-        let batch = |chosen: fn(&LoadedScene) -> &[usize]| {
+        let batch = |chosen: fn(&LoadedScene) -> &[usize]| -> Result<ViewBatch> {
             let matrices = scenes.iter().map(|scene| {
                 let cameras: Vec<_> = chosen(scene).iter().map(|&position| scene.cameras[position]).collect();
                 view_matrices(&cameras, Device::Cpu)
             });
             let (chosen, shape) = chosen_images(scenes, chosen);
-            ViewBatch::with_images(images(&chosen, &shape), &matrices.collect::<Vec<_>>())
+            Ok(ViewBatch::with_images(images(&chosen, &shape)?, &matrices.collect::<Vec<_>>()))
         };
-        Batch {
+        Ok(Batch {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
-            context: batch(|scene| &scene.context),
-            target: batch(|scene| &scene.target),
+            context: batch(|scene| &scene.context)?,
+            target: batch(|scene| &scene.target)?,
             far: Tensor::from_slice(&far).to_kind(Kind::Float),
             paired: false,
-        }
+        })
     }
 
     /// Returns every scene twice, along the batch dimension: first with the context views `subsets[0]`, then with `subsets[1]`.
@@ -106,16 +110,16 @@ pub(super) struct PendingBatch {
 
 impl PendingBatch {
     /// Starts to copy the batch that [`Batch::from_scenes`] builds from `scenes`.
-    pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Self {
+    pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Result<Self> {
         let Batch { names, context, target, far, .. } =
-            Batch::on_host(scenes, |images, shape| bytes(images, upload.bytes(shape)));
+            Batch::on_host(scenes, |images, shape| Ok(bytes(images, upload.bytes(shape)?)))?;
         let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
-        PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far]) }
+        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])? })
     }
 
     /// Waits for the copies and returns the sample on the device.
-    pub fn wait(self) -> Batch {
-        let [a, b, c, d, e, f, g, h, far] = self.tensors.wait();
+    pub fn wait(self) -> Result<Batch> {
+        let [a, b, c, d, e, f, g, h, far] = self.tensors.wait()?;
         let in_floats = |bytes: Tensor| {
             let mut floats = bytes.to_kind(Kind::Float);
             let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
@@ -123,7 +127,7 @@ impl PendingBatch {
         };
         let context = ViewBatch::from_tensors([in_floats(a), b, c, d]);
         let target = ViewBatch::from_tensors([in_floats(e), f, g, h]);
-        Batch { names: self.names, context, target, far, paired: false }
+        Ok(Batch { names: self.names, context, target, far, paired: false })
     }
 }
 
