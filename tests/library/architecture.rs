@@ -82,6 +82,28 @@ fn every_module_is_in_the_diagram_and_on_the_page() {
     }
 }
 
+/// Every static and thread-local has a line in CONTRIBUTING.md, which says why it has to be.
+#[test]
+fn statics_are_on_the_page() {
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("CONTRIBUTING.md");
+    let page = std::fs::read_to_string(&page).expect("CONTRIBUTING.md");
+    let (mut found, mut unlisted) = (0, vec![]);
+    for (module, source) in sources() {
+        for line in source.text.lines() {
+            let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("pub(crate) ");
+            let Some(name) = line.strip_prefix("static ").and_then(|rest| rest.split(':').next()) else {
+                continue;
+            };
+            found += 1;
+            if !page.contains(&format!("`{name}`")) {
+                unlisted.push(format!("{}: {name}", module.join("::")));
+            }
+        }
+    }
+    assert!(unlisted.is_empty(), "{unlisted:?}");
+    assert!(found >= 6, "{found} statics: are all of them found?");
+}
+
 /// The library has no command line: what it says names its own arguments, and `src/cli/option_names.rs` names the options.
 #[test]
 fn the_library_names_no_options() {
