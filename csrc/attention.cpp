@@ -127,8 +127,8 @@ size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t h
     TORCH_CHECK(t->device().is_cpu() && t->scalar_type() == (bf16 ? at::kBFloat16 : at::kFloat) && t->dim() == 3,
                 "queries, keys and values must be float32 on the CPU, or all of them bfloat16, of shape [B, n, d]");
   TORCH_CHECK(heads > 0 && q.size(2) % heads == 0 && supports_attention(q.size(2) / heads, bf16), "queries of shape ", q.sizes(),
-              " have ", heads, " heads, expected a width of each that is a multiple of 4, of bfloat16 of 8, at most ",
-              raster::kAttentionWidth);
+              " have ", heads, " heads, expected a head width of at most ", raster::kAttentionWidth,
+              " that is a multiple of 4 (bfloat16: of 8)");
   TORCH_CHECK(k.sizes() == v.sizes() && k.size(0) == q.size(0) && k.size(2) == q.size(2) && k.size(1) > 0, "queries have shape ",
               q.sizes(), ", keys ", k.sizes(), " and values ", v.sizes(), ", expected [B, n, d] and twice [B, m, d] with m > 0");
   // Makes the op visible to profilers, like libtorch's own.

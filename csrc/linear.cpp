@@ -152,10 +152,10 @@ size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
   const at::ScalarType kind = xs.scalar_type();
   TORCH_CHECK(kind == at::kFloat || kind == at::kBFloat16, "linear layers are of float32 or bfloat16, not of ", kind);
   TORCH_CHECK(is_on_cpu(xs, kind) && is_on_cpu(weights, kind) && (!bias || is_on_cpu(*bias, kind)),
-              "linear layers must be on the CPU, and of one kind of numbers");
+              "linear layers must be on the CPU and of one dtype");
   TORCH_CHECK(weights.dim() == 2 && xs.dim() > 0 && xs.size(-1) == weights.size(1) && xs.numel() > 0 && weights.numel() > 0 &&
                   (!bias || bias->sizes() == weights.sizes().slice(0, 1)),
-              "numbers have shape ", xs.sizes(), " and weights ", weights.sizes(), ", expected [.., k] and [n, k], and a bias [n]");
+              "inputs have shape ", xs.sizes(), " and weights ", weights.sizes(), ", expected inputs [.., k], weights [n, k] and bias [n]");
   auto size = xs.sizes().vec();
   size.back() = weights.size(0);
   const Tensor out = LinearFunction::apply(xs.reshape({-1, xs.size(-1)}), weights, bias);

@@ -74,13 +74,13 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
     std::unique_ptr<const SavedState> saved;
     const RenderOutput outputs = backend_of(means).splat(in, saved);
     save(ctx, in, {outputs.rgb, outputs.alpha, outputs.depth});
-    ctx->saved_data["kept"] = c10::IValue::make_capsule(c10::make_intrusive<SavedStateHolder>(std::move(saved)));
+    ctx->saved_data["saved_state"] = c10::IValue::make_capsule(c10::make_intrusive<SavedStateHolder>(std::move(saved)));
     return {outputs.rgb, outputs.alpha, outputs.depth};
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
-    const auto holder = c10::static_intrusive_pointer_cast<SavedStateHolder>(ctx->saved_data["kept"].toCapsule());
+    const auto holder = c10::static_intrusive_pointer_cast<SavedStateHolder>(ctx->saved_data["saved_state"].toCapsule());
     return gradients_of(backend_of(t[0])
                             .splat_backward(saved_inputs(ctx, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
                                             {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->saved,

@@ -103,17 +103,17 @@ def program(binary, views, precision):
 
 def compare(options):
     """Measures both models alternately, so that other load on the machine affects both."""
-    twin, told = Torch(options.views), {}
+    torch_model, results = Torch(options.views), {}
     for precision in options.precision:
-        twin.seconds(precision)
+        torch_model.seconds(precision)
         ours, theirs = [], []
         for _ in range(options.rounds):
             report = program(options.binary, options.views, precision)
             ours.append(report["milliseconds"]["median"] * 1e-3)
-            theirs.append(twin.seconds(precision))
+            theirs.append(torch_model.seconds(precision))
             print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
         ratios = [a / b for a, b in zip(ours, theirs)]
-        told[precision] = {
+        results[precision] = {
             "program_seconds": statistics.median(ours),
             "torch_seconds": statistics.median(theirs),
             "ratio": statistics.median(ratios),
@@ -121,7 +121,7 @@ def compare(options):
             "program_gflop": sum(part["gflop"] for part in report["parts"]),
             "program_peak_gflops": report["peak_gflops"],
         }
-    return told
+    return results
 
 
 def main():

@@ -14,7 +14,7 @@ namespace {
 constexpr int kRows = 16;       // rows per task
 constexpr double kSigma = 1.5;  // standard deviation of SSIM's window, pixels
 
-// Returns Σ of body(plane, begin, end, room) over planes and blocks of their rows, summed in order.
+// Returns Σ of body(plane, begin, end, scratch) over planes and blocks of their rows, summed in order.
 template <class T, class Body>
 double sum_over_rows(int threads, int64_t planes, int rows, int width, const Body& body) {
   const int64_t parts = (rows + kRows - 1) / kRows;

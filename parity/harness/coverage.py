@@ -15,8 +15,8 @@ CASES_OF = {
     "src/model/rotation.rs": ["rotation_matrix", "quaternion"],
     "src/model/stream.rs": ["stream_round", "self_attention_block"],
     "src/model/tokens.rs": ["patchify", "rgb_tokens", "ray_tokens", "tokens"],
-    "src/data/pixels/jitter.rs": ["jitter"],
-    "src/data/pixels/resample.rs": ["resample"],
+    "src/data/jitter.rs": ["jitter"],
+    "crates/capture/src/pixels/resample.rs": ["resample"],
     "src/loss/consistency.rs": ["consistency"],
     "src/loss/decoder_regularization.rs": ["decoder_regularization", "sh_soft_cap"],
     "src/loss/depth_smoothness.rs": ["depth_smoothness"],
@@ -26,7 +26,7 @@ CASES_OF = {
     "src/loss/perceptual.rs": ["perceptual"],
     "src/loss/photometric.rs": ["photometric", "ssim"],
     "src/loss/vgg19.rs": ["vgg19"],
-    "src/scene/normalize.rs": ["scene_normalization"],
+    "crates/capture/src/geometry/normalize.rs": ["scene_normalization"],
     "src/scene/rays.rs": ["rays"],
     "src/render/mod.rs": [
         "projection",
@@ -46,17 +46,17 @@ CASES_OF = {
 }
 
 EXCEPTED = {
-    "src/model/config.rs": "a model's numbers; every case of a module reads them",
-    "src/model/denormals.rs": "how the processor takes numbers that no result depends on, which its own test looks at",
-    "src/model/layers.rs": "what stream.rs and mixer.rs are made of, and held with them",
-    "src/model/autograd.rs": "a backward pass in parts, which src/train/step_tests.rs holds against one in one piece",
-    "src/model/memory.rs": "what encoder.rs and stream.rs read, and held with them; view by view by its own test",
-    "src/model/parts.rs": "tells what is done, and does nothing",
-    "src/model/recompute.rs": "another order of the encoder's pass, which src/train/step_tests.rs holds against the plain one",
-    "src/model/shapes.rs": "a configuration read off shapes; parity/tests/test_checkpoints.py holds it against models made here",
+    "src/model/config.rs": "the model's configuration; every case of a module uses it",
+    "src/model/denormals.rs": "sets flush-to-zero for denormals; covered by its unit test",
+    "src/model/layers.rs": "layers of stream.rs and mixer.rs; covered by their cases",
+    "src/model/autograd.rs": "a backward pass in parts; src/train/step_tests.rs compares it with one in one piece",
+    "src/model/memory.rs": "input of encoder.rs and stream.rs; covered by their cases, and view by view by its unit test",
+    "src/model/flops.rs": "records FLOPs for benchmarks; covered by its unit test",
+    "src/model/recompute.rs": "activation checkpointing of the encoder; src/train/step_tests.rs compares it with the plain pass",
+    "src/model/shapes.rs": "infers a configuration from shapes; parity/tests/test_checkpoints.py compares it with models built in PyTorch",
     "src/loss/config.rs": "factors",
-    "src/loss/terms.rs": "names of the terms, and their weighted sum, which its own test holds",
-    "src/loss/mod.rs": "what the terms look at; they are held one by one",
+    "src/loss/terms.rs": "names of the terms, and their weighted sum; covered by its unit test",
+    "src/loss/mod.rs": "inputs shared by the loss terms; each term has its own case",
 }
 
 

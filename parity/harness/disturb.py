@@ -66,7 +66,7 @@ def undetected(answer, expected, tolerance, doubtful=None):
     scale = gradient_scale(expected)
 
     def disturb(name):
-        # judge() computes in float64: convert once for all perturbations.
+        # compare_tensor() computes in float64: convert once for all perturbations.
         value = expected[name] if expected[name].dtype.kind == "i" else np.asarray(expected[name], dtype=np.float64)
         finding = compare_tensor(name, answer[name], value, tolerance, scale, doubtful)
         is_zero = finding.measure == "zero" or norm(value) == 0.0

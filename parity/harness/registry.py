@@ -3,7 +3,7 @@
 A case is a generator of draws, each a configuration, parameters and inputs. Its name is that of the function; the
 program computes `module`, by default the same name.
 
-The twin of a module calls the reference with the names of the exchange: twin(config, params, inputs) -> outputs, all
+The reference function of a module calls parity/reference with the names of the exchange: f(config, params, inputs) -> outputs, all
 torch tensors. `config` has the program's keys, and parameters have the published names relative to the module, as in a
 request.
 """

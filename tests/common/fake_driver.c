@@ -1,4 +1,4 @@
-// A driver of one GPU that isn't there, for tests of what asks for it. GLOBALSPLAT_FAKE_DRIVER names an error to fail with.
+// Fake CUDA driver that reports one GPU, for tests of code that queries the driver.
 #include <stddef.h>
 #include <stdlib.h>
 #include <string.h>

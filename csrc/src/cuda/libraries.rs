@@ -110,8 +110,8 @@ fn load_nvrtc() -> Result<Library> {
     found.or_else(|| by_name.into_iter().find_map(load)).ok_or_else(|| {
         let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
         format!(
-            "NVRTC, which compiles for GPUs, is not in {} and not on the loader's path; a torch for CUDA brings it, or `pip install \
-             nvidia-cuda-nvrtc`, or LD_LIBRARY_PATH names the folder of another",
+            "NVRTC not found in {} or on the library search path: install a CUDA build of torch or `pip install nvidia-cuda-nvrtc`, or \
+             add NVRTC's folder to LD_LIBRARY_PATH",
             folders.join(", ")
         )
     })

@@ -1,4 +1,4 @@
-"""The cases, in one module per area: each case, followed by its reference function (twin)."""
+"""The cases, in one module per area: each case, followed by its reference function."""
 
 from ..registry import CASES, REFERENCES
 
@@ -6,4 +6,4 @@ from ..registry import CASES, REFERENCES
 from . import tokens, encoder, decoder, growth, normalization, rasterizer  # noqa: F401
 from . import losses, perceptual, photos, training, model  # noqa: F401
 
-__all__ = ["CASES", "TWINS"]
+__all__ = ["CASES", "REFERENCES"]

@@ -40,7 +40,7 @@ def linear(rng):
 @case
 def linear_bf16(rng):
     """Linear layers in bfloat16. The reference gets the same bfloat16 values and computes with its usual precision."""
-    why = "what comes out has 8 bits, and so have gradients, and what they are made of: a lone number may be off by 1/256 a rounding"
+    why = "outputs, gradients and the terms of their sums are bfloat16 (8 significant bits); each rounding changes a value by up to 1/256"
     tolerance = Tolerance(4e-3, 8e-3, why=why)
     for drawn in linear(rng):
         cut_to_bf16(drawn.inputs)
@@ -109,7 +109,7 @@ def attention(rng):
 def attention_large(rng):
     """Extreme scores: about ±80, whose exponentials overflow float32; all below zero, where they would underflow; and
     one key that gets nearly all attention of half of the queries."""
-    why = "a score of 80 has 4e-6 of its last digit's rounding, which is relative in its exponential"
+    why = "float32 rounds a score of 80 by up to 4e-6, which becomes a relative error of 4e-6 in its exponential"
     tolerance = Tolerance(1e-4, 1e-3, why=why)
     yield attention_draw(attention_inputs(rng, 1, 60, 300, 64, scale=25.0), 2, tolerance=tolerance)
     inputs = attention_inputs(rng, 2, 20, 70, 32)
@@ -129,7 +129,7 @@ def attention_bf16(rng):
     The kernel processes 512 keys and 32 queries at a time, and columns in panels of 64; in the backward pass, 128 of
     both.
     """
-    why = "what comes out has 8 bits, and so have the weights that values are multiplied by, and gradients of scores"
+    why = "outputs, attention weights and gradients of scores are bfloat16 (8 significant bits)"
     tolerance = Tolerance(4e-3, 5e-3, why=why)
     for batch, queries, keys, heads, width in [
         (1, 1, 1, 1, 8),

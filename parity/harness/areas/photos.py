@@ -11,7 +11,7 @@ from ..tolerance import Tolerance
 RESAMPLE = Tolerance(
     3e-4,
     0.0,
-    why="rounded to levels, and what lies between two may become either: 3e-4 is one level in one of seven hundred values",
+    why="results are rounded to 8 bits, so a value near a rounding boundary may differ by one level; 3e-4 allows this for one value in 700",
 )
 
 

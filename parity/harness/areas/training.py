@@ -123,7 +123,7 @@ def muon(rng):
 def muon_reference(config, params, inputs):
     rate, decay = config["learning_rate"], config["weight_decay"]
     adamw = [name for name in params if not (name.startswith("slot_encoder.") and name.endswith(".weight"))]
-    after = adamw_twin(
+    after = adamw_reference(
         config, {name: params[name] for name in adamw}, {f"grad.{name}": inputs[f"grad.{name}"] for name in adamw}
     )
     for name in params.keys() - after.keys():
