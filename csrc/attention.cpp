@@ -11,7 +11,6 @@
 #include "globalsplat-csrc/src/attention.rs.h"
 #include "kernels/attend.h"
 #include "kernels/rows.h"
-#include "memory_check.h"
 #include "threads.h"
 
 namespace globalsplat {
@@ -56,11 +55,8 @@ void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int
 
 void done() { at::native::cpublas::brgemm_release(true); }
 
-// Returns the product functions. To be called once per op, because there may be no memory for their code.
-raster::Bf16Products products() {
-  ensure_memory_for_code(0);
-  return {multiply, done};
-}
+// Returns the product functions.
+raster::Bf16Products products() { return {multiply, done}; }
 
 // Returns true if bf16 products work. libtorch throws if oneDNN doesn't support them, and oneDNN if their instructions are disabled.
 bool has_bf16_products() {

@@ -6,7 +6,7 @@ use std::{
 };
 
 /// Source files with the cxx bridges between Rust and C++.
-const BRIDGES: [&str; 13] = [
+const BRIDGES: [&str; 12] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
@@ -18,7 +18,6 @@ const BRIDGES: [&str; 13] = [
     "src/processor.rs",
     "src/ranks.rs",
     "src/render.rs",
-    "src/memory_check.rs",
     "src/tensor_memory.rs",
 ];
 

@@ -14,7 +14,6 @@
 
 #include "globalsplat-csrc/src/linear.rs.h"
 #include "processor.h"
-#include "memory_check.h"
 
 namespace globalsplat {
 namespace {
@@ -66,11 +65,6 @@ Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Ten
   return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 
-// Throws std::bad_alloc unless there is memory for a product: for the result, and for a copy of the weights in oneDNN's layout.
-void ensure_memory_for_product(const Tensor& xs, const Tensor& weights) {
-  ensure_memory_for_code(int64_t(xs.element_size()) * (xs.size(0) * weights.size(0) + weights.numel()));
-}
-
 // Calls task(0) to task(count - 1), distributed over libtorch's threads. On such a thread, oneDNN and MKL use only that thread.
 void run_on_libtorch_threads(int64_t count, const std::function<void(int64_t)>& task) {
   std::atomic<int64_t> next{0};
@@ -112,7 +106,6 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
   static Tensor forward(AutogradContext* ctx, Tensor xs, Tensor weights, std::optional<Tensor> bias) {
     ctx->save_for_backward({xs, weights});
     ctx->saved_data["has_bias"] = bias.has_value();
-    ensure_memory_for_product(xs, weights);
     return multiply_in_blocks(xs, weights, bias);
   }
 
@@ -120,18 +113,13 @@ struct LinearFunction : torch::autograd::Function<LinearFunction> {
     const tensor_list kept = ctx->get_saved_variables();
     const Tensor &xs = kept[0], &weights = kept[1], g = gradients[0].contiguous();
     Tensor d_xs, d_weights, d_bias;
-    if (ctx->needs_input_grad(0)) {
-      ensure_memory_for_product(g, weights.t());
-      d_xs = multiply(g, weights.t(), {});
-    }
+    if (ctx->needs_input_grad(0)) d_xs = multiply(g, weights.t(), {});
     if (ctx->needs_input_grad(1)) {
       // A sum of bfloat16 parts would round each part again.
       const int64_t at_once = g.scalar_type() == at::kBFloat16 ? g.size(0) : kRows;
       for (int64_t first = 0; first < g.size(0); first += at_once) {
         const int64_t rows = std::min(at_once, g.size(0) - first);
-        const Tensor g_part = g.narrow(0, first, rows).t(), xs_part = xs.narrow(0, first, rows).t();
-        ensure_memory_for_product(g_part, xs_part);
-        const Tensor part = multiply(g_part, xs_part, {});
+        const Tensor part = multiply(g.narrow(0, first, rows).t(), xs.narrow(0, first, rows).t(), {});
         d_weights = d_weights.defined() ? d_weights.add_(part) : part;
       }
     }

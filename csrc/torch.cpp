@@ -13,7 +13,6 @@
 #include "optim.cpp"
 #include "processor.cpp"
 #include "ranks.cpp"
-#include "memory_check.cpp"
 #include "splat.cpp"
 #include "tensor_memory.cpp"
 #include "threads.cpp"

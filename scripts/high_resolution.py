@@ -12,7 +12,7 @@ from pathlib import Path
 
 from core_runs import row, told_once
 
-SETTINGS = {"small": "as in training", "polyphase": "polyphase", "whole": "whole", "repeated": "repeated"}
+SETTINGS = {"small": "as in training", "polyphase": "polyphase"}
 
 
 def scored(arguments, capture, setting, phase, pictures):
@@ -21,7 +21,7 @@ def scored(arguments, capture, setting, phase, pictures):
     command = ["eval", "--weights", arguments.weights, "--scene", folder, "--holdout", holdout]
     command += ["--views", str(arguments.views), "--pictures-at", str(pictures)]
     if setting != "small":
-        command += ["--views-at", str(phase * arguments.trained), "--views-as", setting]
+        command += ["--views-at", str(phase * arguments.trained)]
     return told_once(arguments.out / f"{Path(folder).name}.{setting}.{phase}.{pictures}.json", *command)
 
 

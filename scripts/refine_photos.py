@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Measures the PSNR of held-out views that `globalsplat refine` reaches with few photos.
 
-It starts from photos alone or from the shipped weights, in each optimization space (tokens, Gaussians, both).
+It starts from photos alone or from the shipped weights.
 
     .venv/bin/python scripts/refine_photos.py --capture DIR HOLDOUT [--capture …] [--photos 4 6 8 12] [--seconds 10]
         [--out OUT]
@@ -19,8 +19,6 @@ from refine_runs import refined
 WAYS = {
     "photos alone": ["--from", "nothing"],
     "weights": ["--from", "weights"],
-    "tokens": ["--space", "tokens"],
-    "tokens, then Gaussians": ["--space", "both"],
 }
 
 
@@ -39,7 +37,7 @@ def main():
         for photos in arguments.photos:
             told = {}
             for way, options in WAYS.items():
-                file = arguments.out / f"{name}.{photos}.{way.replace(', ', '_').replace(' ', '_')}.json"
+                file = arguments.out / f"{name}.{photos}.{way.replace(' ', '_')}.json"
                 told[way] = refined(file, folder, holdout, arguments.seconds, *options, "--views", str(photos))
             if any(one["photos"] < photos for one in told.values()):
                 continue  # the capture has fewer photos

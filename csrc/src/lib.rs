@@ -6,7 +6,6 @@ pub mod cuda;
 pub mod device;
 pub mod fit;
 pub mod linear;
-pub mod memory_check;
 pub mod ops;
 pub mod optim;
 pub mod processor;

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Injects faults into every writing system call of every command that writes files, and checks the files afterwards.
 
-    scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...] [--self-test]
+    .venv/bin/python scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...] [--self-test]
 
 Each operation runs without faults first, under inject.c, which records its calls. Then, for every call and every kind
 of fault, it runs again from the same state, in which older files exist where it writes. Afterwards
@@ -20,13 +20,16 @@ import random
 import re
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.tensorflow_stub.errors import DataLossError, OutOfRangeError
+from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_New
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parents[1]
@@ -85,40 +88,26 @@ def steady(value):
 # Files that an operation leaves on disk.
 
 
-def crc32c(data, table=[]):
-    if not table:
-        for byte in range(256):
-            for _ in range(8):
-                byte = byte >> 1 ^ (0x82F63B78 if byte & 1 else 0)
-            table.append(byte)
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc = crc >> 8 ^ table[(crc ^ byte) & 255]
-    crc ^= 0xFFFFFFFF
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+def events(path):
+    """Yields the step and a hash of every TensorBoard event, without times; for SessionLog.START, its step and None.
 
-
-def events(data):
-    """Yields the step and a hash of every TensorBoard event, without times; for SessionLog.START, its step and None."""
-    while data:
-        if len(data) < 16:
-            raise ValueError("ends within a record")
-        (size,) = struct.unpack("<Q", data[:8])
-        record, data = data[: 16 + size], data[16 + size :]
-        message = record[12:-4]
-        sums = (struct.unpack("<I", record[8:12])[0], struct.unpack("<I", record[-4:])[0])
-        if len(record) < 16 + size or sums != (crc32c(record[:8]), crc32c(message)):
-            raise ValueError("ends within a record, or has a damaged one")
-        assert message[0] == 9 and message[9] == 16, "not how our events begin"
-        step, at = 0, 10
-        while True:
-            step |= (message[at] & 127) << 7 * (at - 10)
-            at += 1
-            if message[at - 1] < 128:
-                break
-        body = re.sub(rb"(train/samples_per_second\x15)....", rb"\1", message[at:], flags=re.DOTALL)
-        if body != b"\x1a\x0dbrain.Event:2":
-            yield step, None if body == b"\x3a\x02\x08\x01" else hashlib.sha1(body).hexdigest()
+    Raises DataLossError if a record is truncated or damaged.
+    """
+    reader = PyRecordReader_New(str(path))
+    while True:
+        try:
+            reader.GetNext()
+        except OutOfRangeError:
+            return
+        event = Event.FromString(reader.record())
+        event.ClearField("wall_time")
+        for value in event.summary.value:
+            if value.tag == "train/samples_per_second":
+                value.ClearField("simple_value")
+        if event.HasField("session_log"):
+            yield event.step, None
+        elif not event.HasField("file_version"):
+            yield event.step, hashlib.sha1(event.SerializeToString()).hexdigest()
 
 
 class Tree:
@@ -135,9 +124,9 @@ class Tree:
                 continue
             elif path.parent.name == "tensorboard":
                 try:
-                    logged.extend(events(path.read_bytes()))
-                except ValueError as e:
-                    self.broken.append(f"{name} {e}")
+                    logged.extend(events(path))
+                except DataLossError:
+                    self.broken.append(f"{name} has a truncated or damaged record")
             elif path.name == "metrics.jsonl":
                 lines = path.read_text().split("\n")
                 if lines.pop():

@@ -4,7 +4,7 @@ use super::{TimingStats, synthetic_scene};
 use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;
-use crate::refine::{Budget, Corrections, GaussianSpace, Photos, RefineConfig, Task, refine_timed};
+use crate::refine::{Budget, Corrections, GaussianOptimizer, Photos, RefineConfig, Task, refine_timed};
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{ImageSize, RawGaussians};
@@ -57,14 +57,14 @@ pub fn bench_refine(
     let c2w = cameras.w2c.inverse();
     let photos =
         Photos::of(ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c, intrinsics: cameras.intrinsics });
-    let mut space = GaussianSpace::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
+    let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
     let mut none = Corrections::none();
     let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
-    refine_timed(&mut space, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
+    refine_timed(&mut optimizer, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 
     let mut stopwatch = Stopwatch::new(device);
     let (mut whole, mut before, mut backward) = (vec![], Duration::ZERO, 0.);
-    refine_timed(&mut space, &mut none, &task(steps), &mut stopwatch, |at| {
+    refine_timed(&mut optimizer, &mut none, &task(steps), &mut stopwatch, |at| {
         whole.push(1e3 * (at.elapsed - before).as_secs_f64());
         before = at.elapsed;
         let stages = stage_times();

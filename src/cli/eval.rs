@@ -1,6 +1,6 @@
 use super::{
-    check_views, device, model, open_capture, print_json, progress, ranks, say_shrunk, stop_flag, warn,
-    warn_of_many,
+    check_former_option, check_views, device, model, open_capture, print_json, progress, ranks, say_shrunk,
+    stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -14,7 +14,7 @@ use globalsplat::eval::{
 };
 use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png, weights_files};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{HighResMode, Input, LoadedModel, Model, context_views};
+use globalsplat::reconstruct::{Input, LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::ops::RangeInclusive;
@@ -77,10 +77,9 @@ pub struct Eval {
     /// Height of the model's input photos in pixels, a multiple of the height it was trained with
     #[arg(long, value_name = "PIXELS", conflicts_with_all = ["splat", "renders"])]
     views_at: Option<u32>,
-    /// Conversion of a photo of N times the height: N² views that share its pixels (polyphase), one larger view (whole), or N²
-    /// copies of one view of the downscaled photo (repeated)
-    #[arg(long, value_name = "HOW", requires = "views_at", default_value_t)]
-    views_as: HighResMode,
+    /// Former option. Its other values than `polyphase` are refused
+    #[arg(long, hide = true, requires = "views_at")]
+    views_as: Option<String>,
     /// Height of the scored images in pixels, in the shape of the model's images, or square; by default the size of the model's
     /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
     #[arg(long, value_name = "PIXELS")]
@@ -104,6 +103,8 @@ pub struct Eval {
 impl Eval {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
+        let why = "whole and repeated were removed, as they gained nothing: see docs/high_resolution.md";
+        check_former_option("--views-as", self.views_as.as_deref(), "polyphase", why)?;
         match &self.scene {
             Some(scene) => self.run_scene(scene, device::parse(&self.device)?),
             None => self.run_dataset(),
@@ -156,7 +157,7 @@ impl Eval {
                 let (photos, size) = (scene.context.len(), config.data.image_size);
                 object["image_size"] = json!(self.picture_size(model)?);
                 object["input"] = json!({
-                    "photos": photos, "image_size": input.photo_size(size), "views_as": input.views_as(),
+                    "photos": photos, "image_size": input.photo_size(size),
                     "views": photos * input.views_of_photo(),
                 });
                 object["forward_seconds"] = json!(made.forward_seconds);
@@ -242,7 +243,7 @@ impl Eval {
         let Some(loaded) = loaded else { return Ok(None) };
         let trained = loaded.config.data.image_size;
         let input = match self.views_at {
-            Some(height) => Input::at(height, self.views_as, trained)?,
+            Some(height) => Input::at(height, trained)?,
             None => Input::PLAIN,
         };
         if !input.is_plain() && ranks::is_main_process() {
@@ -339,7 +340,7 @@ impl Eval {
             };
             let setting = match (model, self.views_at) {
                 (Some(Model { input, .. }), Some(height)) if !input.is_plain() => {
-                    format!("{precision} {} {height}", self.views_as)
+                    format!("{precision} polyphase {height}")
                 }
                 _ => precision.into(),
             };

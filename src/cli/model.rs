@@ -3,7 +3,7 @@
 use super::ranks;
 use globalsplat::config::Config;
 use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{BUNDLED_MODEL, HighResMode, Input, LoadedModel, ModelFile};
+use globalsplat::reconstruct::{BUNDLED_MODEL, Input, LoadedModel, ModelFile};
 use globalsplat::scene::ImageSize;
 use globalsplat::{Error, Result};
 use std::path::Path;
@@ -66,13 +66,9 @@ pub fn shown_as(input: Input, trained: ImageSize) -> String {
     let pixels = |size: ImageSize| format!("{}×{} pixels", size.width, size.height);
     let (photo, trained, views) =
         (pixels(input.photo_size(trained)), pixels(trained), input.views_of_photo());
-    match input.views_as() {
-        _ if input.is_plain() => format!("the {trained} that the model sees"),
-        HighResMode::Polyphase => format!("{photo}, {views} views of the {trained} that the model sees"),
-        HighResMode::Whole => {
-            format!("{photo}, a view of more than the {trained} that the model was trained with")
-        }
-        HighResMode::Repeated => format!("the {trained} that the model sees, {views} times the same view"),
+    match input.is_plain() {
+        true => format!("the {trained} that the model sees"),
+        false => format!("{photo}, {views} views of the {trained} that the model sees"),
     }
 }
 

@@ -9,7 +9,7 @@ use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::process_age;
 use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
-use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, reconstruct};
+use globalsplat::reconstruct::{Input, Model, load_context, reconstruct};
 use globalsplat::refine::RefineOptions;
 use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
@@ -95,7 +95,7 @@ impl Reconstruct {
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {
-            Some(height) => Input::at(height, HighResMode::Polyphase, data.image_size)?,
+            Some(height) => Input::at(height, data.image_size)?,
             None => Input::PLAIN,
         };
         let count = self.views.unwrap_or(data.context_views);

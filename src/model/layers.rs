@@ -2,9 +2,8 @@
 
 use super::flops::record_flops;
 use super::precision::Precision;
-use globalsplat_csrc::memory_check::ensure_memory_for_code;
 use std::cell::Cell;
-use tch::{Device, Tensor, nn, nn::Module};
+use tch::{Tensor, nn, nn::Module};
 use tracing::trace_span;
 
 /// Standard deviation of the initial weights of the encoder's linear layers and of learned tokens.
@@ -116,12 +115,6 @@ impl Mlp {
 }
 
 /// Computes x Φ(x) with the cumulative normal distribution Φ, in place if no gradients are needed.
-///
-/// # Panics
-/// Panics if the system has no memory for oneDNN's generated code, which libtorch uses for this on a CPU.
 pub(super) fn gelu(mut xs: Tensor) -> Tensor {
-    if xs.device() == Device::Cpu {
-        ensure_memory_for_code(0).unwrap_or_else(|error| panic!("{error}"));
-    }
     if xs.requires_grad() { xs.gelu("none") } else { xs.gelu_("none") }
 }

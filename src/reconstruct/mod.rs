@@ -9,7 +9,7 @@ mod published;
 mod spread;
 
 pub use context::{context_views, load_context};
-pub use input::{HighResMode, Input};
+pub use input::Input;
 pub use model_file::{
     BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, STAGE_KEY, bundled_model, load_model,
     model_weights, save_checkpoint, save_model,
@@ -21,7 +21,7 @@ use crate::config::Config;
 use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
-use crate::model::{EncodedTokens, GlobalSplat, Stage};
+use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
@@ -56,8 +56,6 @@ impl<'a> From<&'a LoadedModel> for Model<'a> {
 /// Splat in the normalized world, and the transform to the capture's world.
 #[derive(Debug)]
 pub struct Reconstruction {
-    /// Tokens that the Gaussians were decoded from.
-    pub tokens: EncodedTokens,
     /// Gaussians of one scene, in the normalized world.
     pub gaussians: Gaussians,
     /// Placement of the cameras in the normalized world.
@@ -139,7 +137,7 @@ pub fn reconstruct<'a>(
 }
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.
-fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(EncodedTokens, Gaussians)> {
+fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<Gaussians> {
     let Model { network, config, stage, device, mapped, .. } = model;
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
@@ -152,14 +150,13 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<(EncodedTo
             mapped.release_pages();
         }
     };
-    let (encoded, decoded) = tch::no_grad(|| {
+    let decoded = tch::no_grad(|| {
         let memory = network.memory(&images, &c2w, &intrinsics);
         drop(images);
         release_pages();
         let encoded = network.encode_memory_with(&memory, &release_pages);
         drop(memory);
-        let decoded = network.decode(&encoded, stage);
-        (encoded, decoded)
+        network.decode(&encoded, stage).gaussians
     });
-    Ok((encoded, decoded.gaussians))
+    Ok(decoded)
 }

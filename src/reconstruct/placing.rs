@@ -4,7 +4,6 @@ use super::{Model, Reconstruction, pass};
 use crate::data::{View, cameras_at};
 use crate::error::Result;
 use crate::loss::mse;
-use crate::model::EncodedTokens;
 use crate::render::{RenderedView, render_views};
 use crate::scene::{Gaussians, Normalization, Placement};
 use glam::DMat4;
@@ -33,9 +32,9 @@ pub(super) fn best_placed(
     let start = Instant::now();
     let attempt = |placement: Placement| -> Result<Attempt> {
         let poses = &normalization.placed(placement).c2w[..photos.len()];
-        let (tokens, gaussians) = pass(model, views, poses)?;
+        let gaussians = pass(model, views, poses)?;
         let error = if several { error_of(&gaussians, photos, poses)? } else { 0. };
-        Ok(Attempt { error, placement, tokens, gaussians })
+        Ok(Attempt { error, placement, gaussians })
     };
 
     let mut attempts = extents.iter().map(|&extent| attempt(Placement { extent, forward: 0. }));
@@ -52,13 +51,13 @@ pub(super) fn best_placed(
             }
         }
     }
-    let Attempt { placement, tokens, gaussians, .. } = best;
+    let Attempt { placement, gaussians, .. } = best;
     // The results are written to files later. This copy waits for a GPU.
     let gaussians = gaussians.to_device(Device::Cpu);
     let forward_time = start.elapsed();
     let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
     let target_poses = c2w[photos.len()..].to_vec();
-    Ok(Reconstruction { tokens, gaussians, placement, world_from_normalized, target_poses, forward_time })
+    Ok(Reconstruction { gaussians, placement, world_from_normalized, target_poses, forward_time })
 }
 
 /// Result of one pass.
@@ -66,7 +65,6 @@ struct Attempt {
     /// Mean squared error of the rendered images against the photos; 0 if there is no other attempt.
     error: f64,
     placement: Placement,
-    tokens: EncodedTokens,
     gaussians: Gaussians,
 }
 

@@ -31,10 +31,8 @@ pub struct RefineConfig {
     pub colours: f64,
     /// Learning rate of the higher spherical harmonics, relative to that of the colours.
     pub harmonics: f64,
-    /// Final factor of all other learning rates except that of the tokens, which is constant.
+    /// Final factor of all other learning rates.
     pub lr_final_factor: f64,
-    /// Learning rate of the tokens.
-    pub tokens: f64,
     /// Learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected.
     pub poses: f64,
     /// Learning rate of the logarithms of exposures, if exposures are corrected.
@@ -70,7 +68,6 @@ impl Default for RefineConfig {
             colours: 5e-3,
             harmonics: 0.1,
             lr_final_factor: 0.2,
-            tokens: 1e-2,
             poses: 5e-4,
             exposures: 5e-3,
             ssim_weight: 0.4,
@@ -93,6 +90,9 @@ const RENAMED: [(&str, &str); 5] = [
     ("smooth", "depth_smoothness_weight"),
 ];
 
+/// Former key, the learning rate of tokens.
+const REMOVED: &str = "tokens";
+
 fn current_name(key: String) -> String {
     RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
@@ -114,6 +114,9 @@ impl RefineConfig {
             if set.len() != 1 {
                 return Err(refused("expected KEY=VALUE"));
             }
+            if set.contains_key(REMOVED) {
+                return Err(refused("only Gaussians are optimized, and no longer a model's tokens"));
+            }
             table.extend(set.into_iter().map(|(key, value)| (current_name(key), value)));
             let config: RefineConfig =
                 table.clone().try_into().map_err(|e| refused(&e.message().replace('\n', " ")))?;
@@ -134,7 +137,6 @@ impl RefineConfig {
             self.opacity_logits,
             self.colours,
             self.harmonics,
-            self.tokens,
             self.poses,
             self.exposures,
         ];
@@ -194,7 +196,8 @@ mod tests {
             ("sh_every=inf", "expected a finite number above 0"),
             ("means=-1e-3", "expected 0 to 10"),
             ("means=1e30", "expected 0 to 10"),
-            ("tokens=nan", "expected 0 to 10"),
+            ("colours=nan", "expected 0 to 10"),
+            ("tokens=0.01", "no longer a model's tokens"),
             ("means_end=0", "expected above 0, up to 1"),
             ("lr_final_factor=inf", "expected above 0, up to 1"),
             ("ssim_weight=1.5", "expected 0 to 1"),

@@ -1,28 +1,28 @@
-//! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians. It optimizes each
-//! Gaussian by itself, or all of them through the tokens that a model decodes them from. Without a splat, refinement starts from the depths
-//! on which the photos agree. [`RefineSession`] does all of it, from a capture to a splat and its scores.
+//! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians.
+//! Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a splat
+//! and its scores.
 
 mod begin;
 mod config;
 mod corrections;
+mod gaussian_optimizer;
 mod gaussian_params;
 mod options;
 mod patches;
 mod photos;
 mod relocate;
 mod session;
-mod space;
 mod sweep;
 mod view_selection;
 
 pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
-pub use options::{Budget, RefineOptions, SpaceKind};
+pub use gaussian_optimizer::GaussianOptimizer;
+pub use options::{Budget, RefineOptions};
 pub use patches::{PatchScores, Patches};
 pub use photos::{MIN_SIDE, Photos, load_photos};
 pub use session::{EvalPoint, Initial, RefineEvent, RefineResult, RefineSession};
-pub use space::{GaussianSpace, Space, TokenSpace};
 
 use crate::data::View;
 use crate::device::Stopwatch;
@@ -44,13 +44,13 @@ pub struct RefineStep<'a> {
     pub progress: f64,
     /// Time that the steps took, without the work between them.
     pub elapsed: Duration,
-    space: &'a dyn Space,
+    optimizer: &'a GaussianOptimizer,
 }
 
 impl RefineStep<'_> {
     /// Returns a copy of the current Gaussians.
     pub fn gaussians(&self) -> Gaussians {
-        tch::no_grad(|| self.space.gaussians(1.)).map(Tensor::copy)
+        tch::no_grad(|| self.optimizer.gaussians(1.)).map(Tensor::copy)
     }
 }
 
@@ -69,23 +69,23 @@ pub struct Task<'a> {
     pub seed: u64,
 }
 
-/// Optimizes `space` and the `corrections` of the photos. `watch` is called after every step and ends the work if it returns `false`.
+/// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `watch` is called after every step and ends the work if it returns `false`.
 /// Returns the final Gaussians.
 ///
 /// # Errors
 /// Fails if rendering fails.
 pub fn refine(
-    space: &mut dyn Space,
+    optimizer: &mut GaussianOptimizer,
     corrections: &mut Corrections,
     task: &Task,
     watch: impl FnMut(&RefineStep) -> bool,
 ) -> Result<Gaussians> {
-    refine_timed(space, corrections, task, &mut Stopwatch::default(), watch)
+    refine_timed(optimizer, corrections, task, &mut Stopwatch::default(), watch)
 }
 
 /// Runs [`refine`] and records the time of each part of a step in `stopwatch`.
 pub(crate) fn refine_timed(
-    space: &mut dyn Space,
+    optimizer: &mut GaussianOptimizer,
     corrections: &mut Corrections,
     task: &Task,
     stopwatch: &mut Stopwatch,
@@ -110,27 +110,27 @@ pub(crate) fn refine_timed(
         }
         let level = config.resolution_schedule.iter().filter(|&&part| progress >= part).count();
         let (which, batch) = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
-        let gaussians = stopwatch.time("activation", || space.gaussians(progress));
+        let gaussians = stopwatch.time("activation", || optimizer.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
         let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
         pictures.rgb = corrections.exposed(pictures.rgb, &which);
         let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch.images, config, depth));
         stopwatch.time("backward", || {
-            space.zero_grad();
+            optimizer.zero_grad();
             corrections.zero_grad();
             loss.backward();
         });
         stopwatch.time("optimizer", || {
-            space.step(progress, step, &mut random)?;
+            optimizer.step(progress, step, &mut random)?;
             corrections.step(progress)
         })?;
         last = start.elapsed();
         elapsed += last;
-        if !watch(&RefineStep { step: step + 1, progress, elapsed, space }) {
+        if !watch(&RefineStep { step: step + 1, progress, elapsed, optimizer }) {
             break;
         }
     }
-    Ok(tch::no_grad(|| space.gaussians(1.)))
+    Ok(tch::no_grad(|| optimizer.gaussians(1.)))
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians.
@@ -207,9 +207,10 @@ mod tests {
             seed: 0,
         };
         let steps = |count| {
-            let mut space = GaussianSpace::new(&RawGaussians::from_gaussians(&gaussians), 1., &config);
+            let mut optimizer =
+                GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config);
             let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
-            refine(&mut space, &mut corrections, &task_of(count), |_| true).unwrap();
+            refine(&mut optimizer, &mut corrections, &task_of(count), |_| true).unwrap();
         };
         let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();
         let [two, five] = [2, 5].map(|number| record_ops(|| steps(number)).1);

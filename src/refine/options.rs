@@ -17,24 +17,11 @@ pub enum Budget {
     Time(Duration),
 }
 
-/// Parameter space of the optimization.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SpaceKind {
-    /// Individual Gaussians.
-    Gaussians,
-    /// Tokens from which a model decodes the Gaussians.
-    Tokens,
-    /// Tokens first, then Gaussians.
-    Both,
-}
-
 /// Options of a session.
 #[derive(Debug, Clone)]
 pub struct RefineOptions {
     /// Hyperparameters. [`RefineConfig::from_splat`] returns those for a start from a splat.
     pub config: RefineConfig,
-    /// Parameter space of the optimization. Tokens need a start from a model.
-    pub space: SpaceKind,
     /// Number of steps, or time. A time includes reading the photos, the start, the scores, and writing the splat.
     pub budget: Budget,
     /// Start of a time budget; if it is `None`, the start of the session.
@@ -62,7 +49,6 @@ impl Default for RefineOptions {
     fn default() -> Self {
         RefineOptions {
             config: RefineConfig::default(),
-            space: SpaceKind::Gaussians,
             budget: Budget::Time(Duration::from_secs(60)),
             started: None,
             gaussians: 16_384,
@@ -78,7 +64,7 @@ impl Default for RefineOptions {
 }
 
 impl RefineOptions {
-    /// Checks that every option is in its range, and that the options are compatible.
+    /// Checks that every option is in its range.
     pub(super) fn check(&self) -> Result<()> {
         self.config.check().map_err(|expected| {
             Error::request(format!("a setting of the refinement is out of range, expected {expected}"))
@@ -91,11 +77,6 @@ impl RefineOptions {
         }
         if let Some(views @ ..2) = self.views {
             return Err(Error::setting("the number of views", views, "2 or more"));
-        }
-        if self.space == SpaceKind::Tokens && (self.correct_poses || self.correct_exposures) {
-            let why =
-                "poses and exposures are corrected only while Gaussians are optimized, not with tokens alone";
-            return Err(Error::request(why));
         }
         Ok(())
     }
@@ -117,14 +98,11 @@ mod tests {
         let default = RefineOptions::default;
         assert!(default().check().is_ok());
         let config = RefineConfig { views: 0, ..RefineConfig::default() };
-        let space = SpaceKind::Tokens;
         for (options, expected) in [
             (RefineOptions { config, ..default() }, "expected 1 or more"),
             (RefineOptions { budget: Budget::Time(Duration::ZERO), ..default() }, "expected more than 0 s"),
             (RefineOptions { gaussians: 0, ..default() }, "number of Gaussians is 0"),
             (RefineOptions { views: Some(1), ..default() }, "number of views is 1"),
-            (RefineOptions { space, correct_poses: true, ..default() }, "not with tokens alone"),
-            (RefineOptions { space, correct_exposures: true, ..default() }, "not with tokens alone"),
         ] {
             let error = options.check().unwrap_err();
             assert!(error.is_request() && error.to_string().contains(expected), "{error}");

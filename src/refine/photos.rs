@@ -114,16 +114,15 @@ impl Photos {
         Photos { levels: vec![vec![Group { indices, views }]] }
     }
 
-    /// Creates photos from `views`, at least one, at `levels` sizes, each half as wide and high as the next. `poses` (camera-to-world)
-    /// replace the views' own.
-    pub fn new(views: &[View], poses: &[DMat4], levels: usize, device: Device) -> Self {
+    /// Creates photos from `views`, at least one, at `levels` sizes, each half as wide and high as the next.
+    pub fn new(views: &[View], levels: usize, device: Device) -> Self {
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
         for (index, View { camera, .. }) in views.iter().enumerate() {
             groups.entry((camera.height, camera.width)).or_default().push(index);
         }
         let group = |indices: Vec<usize>| {
             let (views, poses): (Vec<&View>, Vec<DMat4>) =
-                indices.iter().map(|&i| (&views[i], poses[i])).unzip();
+                indices.iter().map(|&i| (&views[i], views[i].camera.c2w)).unzip();
             Group { indices, views: view_batch(&views, &poses, device) }
         };
         let whole = groups.into_values().map(group).collect();

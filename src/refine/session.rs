@@ -3,25 +3,21 @@
 
 use super::begin::gaussians_from_photos;
 use super::corrections::{Correction, Corrections};
-use super::options::{Budget, RefineOptions, SpaceKind};
+use super::gaussian_optimizer::GaussianOptimizer;
+use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
-use super::space::{GaussianSpace, Space, TokenSpace};
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, points_of};
 use crate::error::{Error, Result};
 use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::io::Splat;
-use crate::reconstruct::{LoadedModel, Reconstruction, reconstruct, spread_over_path};
-use crate::render::transform;
-use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians, Similarity};
-use glam::DMat4;
+use crate::reconstruct::{LoadedModel, reconstruct, spread_over_path};
+use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use tch::Tensor;
 
-/// Fraction of the time or steps for the tokens if Gaussians are optimized afterwards.
-const TOKENS_SHARE: f64 = 0.2;
 /// Minimum time for the optimization, however long the start took.
 const MIN_TIME: Duration = Duration::from_secs(1);
 /// Maximum fraction of the time for computing depths, beyond the first `FEW_PHOTOS` photos.
@@ -37,7 +33,7 @@ const WRITING_TIME: Duration = Duration::from_millis(200);
 const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
 /// Maximum number of photos that LPIPS compares if no views are held out.
 const LPIPS_PHOTOS: usize = 8;
-/// Fractions of a phase at which the held-out views are scored.
+/// Fractions of the optimization at which the held-out views are scored.
 const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
 /// Source of the initial Gaussians.
@@ -65,7 +61,7 @@ pub enum RefineEvent<'a> {
     Starting(usize),
     /// A step of the optimization is done.
     Optimizing {
-        /// Number of steps done in all phases.
+        /// Number of steps done.
         steps: u64,
         /// Most recent PSNR on patches of the held-out views, in dB.
         psnr: Option<f64>,
@@ -119,7 +115,7 @@ pub struct RefineResult {
 enum Start<'a> {
     Photos(RawGaussians),
     Splat(&'a Splat, RawGaussians),
-    Model(&'a LoadedModel, Box<Reconstruction>),
+    Model(Gaussians),
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
@@ -265,11 +261,6 @@ impl<'a> RefineSession<'a> {
     /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `watch` ends the work before there are Gaussians.
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
         let mut warnings = vec![];
-        if self.options.space != SpaceKind::Gaussians && !matches!(initial, Initial::Model(_)) {
-            return Err(Error::request(
-                "tokens are optimized only if a model reconstructs the initial splat",
-            ));
-        }
         let start = match initial {
             Initial::Splat(splat) => {
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
@@ -283,7 +274,7 @@ impl<'a> RefineSession<'a> {
                     .into_iter()
                     .map(|index| self.photos[index].fitted(data.image_size))
                     .collect::<Result<Vec<_>>>()?;
-                Start::Model(loaded, Box::new(reconstruct(loaded, &context, &[])?))
+                Start::Model(reconstruct(loaded, &context, &[])?.in_world().to_device(self.options.device))
             }
             Initial::Photos => {
                 if self.photos.len() < 2 {
@@ -299,7 +290,7 @@ impl<'a> RefineSession<'a> {
         };
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
-            Start::Model(_, reconstruction) => reconstruction.in_world().to_device(self.options.device),
+            Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
         };
         let depth = scene_depth(&gaussians, &self.photos)?;
         warnings.extend(self.leave_out_near_duplicates(depth));
@@ -334,7 +325,7 @@ impl<'a> RefineSession<'a> {
         let (gaussians, learned) = if self.is_stopped {
             (initial.map(Tensor::shallow_clone), Corrections::none())
         } else {
-            self.optimize(&start, &initial, depth)?
+            self.optimize(&start, depth)?
         };
         let ended = self.clock.elapsed().as_secs_f64();
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
@@ -497,59 +488,49 @@ impl<'a> RefineSession<'a> {
         Ok(made)
     }
 
-    /// Optimizes in one parameter space, or in two of them in turn. Photos are corrected only while Gaussians are optimized. `initial` are
-    /// the Gaussians of `start`, and `depth` is their depth.
-    fn optimize(
-        &mut self,
-        start: &Start,
-        initial: &Gaussians,
-        depth: f64,
-    ) -> Result<(Gaussians, Corrections)> {
-        let end = match self.options.space {
-            SpaceKind::Gaussians => 0.,
-            SpaceKind::Tokens => 1.,
-            SpaceKind::Both => TOKENS_SHARE,
-        };
-        let (raw, depth, done) = match start {
-            Start::Photos(raw) | Start::Splat(_, raw) => (raw.shallow_clone(), depth, 0.),
-            Start::Model(loaded, reconstruction) => {
-                let gaussians = if end > 0. {
-                    self.optimize_tokens(loaded, reconstruction, depth, end)?
-                } else {
-                    initial.map(Tensor::shallow_clone)
-                };
-                if end == 1. || self.is_stopped {
-                    return Ok((gaussians, Corrections::none()));
-                }
-                let raw = self.filled(&gaussians)?;
+    /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
+    fn optimize(&mut self, start: &Start, depth: f64) -> Result<(Gaussians, Corrections)> {
+        let (raw, depth) = match start {
+            Start::Photos(raw) | Start::Splat(_, raw) => (raw.shallow_clone(), depth),
+            Start::Model(gaussians) => {
+                let raw = self.filled(gaussians)?;
                 let depth = scene_depth(&raw.activate(), &self.photos)?;
-                (raw, depth, end)
+                (raw, depth)
             }
         };
-        let options = self.options;
-        let mut space = GaussianSpace::new(&raw, depth, &options.config);
-        let RefineOptions { correct_poses, correct_exposures, config, device, .. } = options;
+        let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
+        let mut optimizer = GaussianOptimizer::new(&raw, depth, config);
         let count = self.photos.len();
         let mut corrections =
             Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
-        let poses: Vec<DMat4> = self.cameras().iter().map(|camera| camera.c2w).collect();
-        Ok((self.run_phase(&mut space, &mut corrections, &poses, depth, [done, 1.], None)?, corrections))
-    }
-
-    /// Optimizes tokens until the fraction `end` of the optimization, in the normalized world that they are defined in.
-    fn optimize_tokens(
-        &mut self,
-        loaded: &LoadedModel,
-        reconstruction: &Reconstruction,
-        depth: f64,
-        end: f64,
-    ) -> Result<Gaussians> {
-        let world = &reconstruction.world_from_normalized;
-        let poses: Vec<DMat4> = self.cameras().iter().map(|camera| world.pose_before(&camera.c2w)).collect();
-        let mut space =
-            TokenSpace::new(&loaded.model, loaded.stage, &reconstruction.tokens, &self.options.config);
-        let depth = depth / world.scale;
-        self.run_phase(&mut space, &mut Corrections::none(), &poses, depth, [0., end], Some(world))
+        let photos = Photos::new(&self.photos, config.levels(), *device);
+        let budget = match self.options.budget {
+            Budget::Time(time) => {
+                let left = time.saturating_sub(self.reserve).saturating_sub(self.clock.elapsed());
+                Budget::Time(left.max(MIN_TIME.min(time)))
+            }
+            steps => steps,
+        };
+        let task = Task { photos: &photos, depth, config, budget, seed: *seed };
+        let mut marks = MARKS.iter().peekable();
+        let (mut is_due, mut failure) = (false, None);
+        let gaussians = refine(&mut optimizer, &mut corrections, &task, |at| {
+            self.steps = at.step;
+            while marks.next_if(|&&mark| at.progress >= mark).is_some() {
+                is_due = true;
+            }
+            if is_due && self.may_score() {
+                is_due = false;
+                failure = self.add_eval_point(&at.gaussians()).err();
+            }
+            let psnr = self.curve.last().map(|point| point.scores.psnr);
+            self.is_stopped |= !(self.watch)(RefineEvent::Optimizing { steps: self.steps, psnr });
+            failure.is_none() && !self.is_stopped
+        })?;
+        match failure {
+            Some(error) => Err(error),
+            None => Ok((gaussians, corrections)),
+        }
     }
 
     /// Fills up to the requested number of Gaussians with new ones at the depths on which the photos agree. They also replace Gaussians
@@ -562,53 +543,6 @@ impl<'a> RefineSession<'a> {
         // Higher spherical harmonics are added later, for all Gaussians at the same time.
         raw.sh = raw.sh.narrow(2, 0, 1);
         Ok(self.gaussians_from_photos(Some(&raw))?.unwrap_or(raw))
-    }
-
-    /// Optimizes from the fraction `from` of the optimization to the fraction `to`. `poses` are those of the photos in the world of
-    /// `space`. `world` transforms from there to the session's frame, in which the Gaussians are returned.
-    fn run_phase(
-        &mut self,
-        space: &mut dyn Space,
-        corrections: &mut Corrections,
-        poses: &[DMat4],
-        depth: f64,
-        [from, to]: [f64; 2],
-        world: Option<&Similarity>,
-    ) -> Result<Gaussians> {
-        let in_world = |gaussians: Gaussians| match world {
-            Some(world) => transform(&gaussians, world),
-            None => gaussians,
-        };
-        let RefineOptions { config, seed, device, .. } = self.options;
-        let photos = Photos::new(&self.photos, poses, config.levels(), *device);
-        let budget = match self.options.budget {
-            Budget::Steps(steps) => Budget::Steps(((to - from) * steps as f64).round() as u64),
-            Budget::Time(time) => {
-                let left = time.saturating_sub(self.reserve).saturating_sub(self.clock.elapsed());
-                Budget::Time(left.max(MIN_TIME.min(time)).mul_f64((to - from) / (1. - from)))
-            }
-        };
-        let task = Task { photos: &photos, depth, config, budget, seed: *seed };
-        let before = self.steps;
-        let mut marks = MARKS.iter().peekable();
-        let (mut is_due, mut failure) = (false, None);
-        let gaussians = refine(space, corrections, &task, |at| {
-            self.steps = before + at.step;
-            while marks.next_if(|&&mark| at.progress >= mark).is_some() {
-                is_due = true;
-            }
-            if is_due && self.may_score() {
-                is_due = false;
-                failure = self.add_eval_point(&in_world(at.gaussians())).err();
-            }
-            let psnr = self.curve.last().map(|point| point.scores.psnr);
-            self.is_stopped |= !(self.watch)(RefineEvent::Optimizing { steps: self.steps, psnr });
-            failure.is_none() && !self.is_stopped
-        })?;
-        match failure {
-            Some(error) => Err(error),
-            None => Ok(in_world(gaussians)),
-        }
     }
 
     /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.

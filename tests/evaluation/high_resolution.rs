@@ -1,9 +1,9 @@
-//! Photos of higher resolution than a model was trained with: `--views-at`, `--views-as` and `--pictures-at`.
+//! Photos of higher resolution than a model was trained with: `--views-at` and `--pictures-at`.
 
 use crate::common::program::{arg, command, rooms, tiny_weights};
 use globalsplat::data::{Capture, Holdout, open_capture};
 use globalsplat::eval::read_evaluation;
-use globalsplat::reconstruct::{HighResMode, Input, Model, load_context, load_model, reconstruct};
+use globalsplat::reconstruct::{Input, Model, load_context, load_model, reconstruct};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tch::Device;
@@ -135,19 +135,17 @@ fn one_capture_is_scored_in_every_setting() {
     let (plain, err) = set.score(&[]);
     assert!(!err.contains("photos are"), "{err}");
     assert_eq!(without_times(set.score(&["--views-at", "32"]).0), without_times(plain.clone()));
-    for (views_as, views, size) in [("polyphase", 24, 64), ("whole", 6, 64), ("repeated", 24, 32)] {
-        let (told, err) = set.score(&["--views-at", "64", "--views-as", views_as]);
-        let expected = json!({"photos": 6, "views": views, "image_size": [size, size], "views_as": views_as});
-        assert_eq!((&told["input"], &told["image_size"]), (&expected, &json!([32, 32])));
-        assert!(told["forward_seconds"].as_f64().unwrap() > 0.);
-        assert!(err.starts_with("photos are cut and resized to "), "{err}");
-        // The baselines don't depend on the setting.
-        assert_eq!(told["baselines"], plain["baselines"], "{views_as}");
-        // Scored images of another size are compared with other photos; the splat is the same.
-        let (large, _) = set.score(&["--views-at", "64", "--views-as", views_as, "--pictures-at", "64"]);
-        assert_eq!((&large["input"], &large["image_size"]), (&expected, &json!([64, 64])));
-        assert_ne!((&large["psnr"], &large["baselines"]), (&told["psnr"], &told["baselines"]));
-    }
+    let (told, err) = set.score(&["--views-at", "64", "--views-as", "polyphase"]);
+    let expected = json!({"photos": 6, "views": 24, "image_size": [64, 64]});
+    assert_eq!((&told["input"], &told["image_size"]), (&expected, &json!([32, 32])));
+    assert!(told["forward_seconds"].as_f64().unwrap() > 0.);
+    assert!(err.starts_with("photos are cut and resized to "), "{err}");
+    // The baselines don't depend on the setting.
+    assert_eq!(told["baselines"], plain["baselines"]);
+    // Scored images of another size are compared with other photos; the splat is the same.
+    let (large, _) = set.score(&["--views-at", "64", "--pictures-at", "64"]);
+    assert_eq!((&large["input"], &large["image_size"]), (&expected, &json!([64, 64])));
+    assert_ne!((&large["psnr"], &large["baselines"]), (&told["psnr"], &told["baselines"]));
     // Small input photos, large scored images.
     let (told, err) = set.score(&["--pictures-at", "128"]);
     assert_eq!((&told["input"]["views"], &told["image_size"]), (&json!(6), &json!([128, 128])));
@@ -169,39 +167,31 @@ fn an_evaluation_does_not_resume_at_another_resolution() {
     assert_eq!(set.sweep("plain", &[]).0, Some(0));
     let plain = read_evaluation(&set.path("plain")).unwrap();
     assert_eq!((plain.input, plain.image_size), (Some(Input::PLAIN), [32, 32]));
-    let scores = |out: &str| read_evaluation(&set.path(out)).unwrap().scenes[1].scores.psnr;
-    for views_as in ["polyphase", "whole", "repeated"] {
-        let options = ["--views-at", "64", "--views-as", views_as, "--pictures-at", "64"];
-        let (code, out, err) = set.sweep(views_as, &options);
-        assert_eq!(code, Some(0), "{err}");
-        let told: Value = serde_json::from_str(&out).unwrap();
-        let told = &told["evaluations"][0];
-        assert_eq!(told["input"], json!({"phase": 2, "views_as": views_as}));
-        assert_eq!((&told["image_size"], &told["context_views"]), (&json!([64, 64]), &json!(3)));
-        let found = read_evaluation(&set.path(views_as)).unwrap();
-        assert_eq!(found.method, format!("tiny {views_as} 64"));
-        let report = std::fs::read_to_string(set.path(views_as).join("report.html")).unwrap();
-        assert!(report.contains(&found.method) && report.contains("64×64 pixels"), "{views_as}");
+    let options = ["--views-at", "64", "--pictures-at", "64"];
+    let (code, out, err) = set.sweep("sharp", &options);
+    assert_eq!(code, Some(0), "{err}");
+    let told: Value = serde_json::from_str(&out).unwrap();
+    let told = &told["evaluations"][0];
+    assert_eq!(told["input"], json!({"phase": 2}));
+    assert_eq!((&told["image_size"], &told["context_views"]), (&json!([64, 64]), &json!(3)));
+    let found = read_evaluation(&set.path("sharp")).unwrap();
+    assert_eq!(found.method, "tiny polyphase 64");
+    let report = std::fs::read_to_string(set.path("sharp").join("report.html")).unwrap();
+    assert!(report.contains(&found.method) && report.contains("64×64 pixels"));
 
-        // The same command resumes; another size, of the input or of scored images, is refused.
-        assert_eq!(set.sweep(views_as, &options).0, Some(0));
-        for other in [
-            ["--views-at", "96", "--views-as", views_as, "--pictures-at", "64"],
-            ["--views-at", "64", "--views-as", views_as, "--pictures-at", "32"],
-        ] {
-            let (code, _, err) = set.sweep(views_as, &other);
-            assert!(code == Some(2) && err.contains("evaluation.json: the evaluation is of tiny"), "{err}");
-            assert!(err.contains("64×64 pixels") && err.contains("choose another --out"), "{err}");
-        }
+    // The same command resumes; another size, of the input or of scored images, is refused.
+    assert_eq!(set.sweep("sharp", &options).0, Some(0));
+    for other in [["--views-at", "96", "--pictures-at", "64"], ["--views-at", "64", "--pictures-at", "32"]] {
+        let (code, _, err) = set.sweep("sharp", &other);
+        assert!(code == Some(2) && err.contains("evaluation.json: the evaluation is of tiny"), "{err}");
+        assert!(err.contains("64×64 pixels") && err.contains("choose another --out"), "{err}");
     }
-    assert_eq!(set.sweep("whole", &["--views-at", "64", "--pictures-at", "64"]).0, Some(2));
-    assert_ne!(scores("polyphase"), scores("whole"));
-    assert_ne!(scores("polyphase"), scores("repeated"));
+    let (code, _, err) = set.sweep("small", &["--pictures-at", "64"]);
+    assert_eq!(code, Some(0), "{err}");
+    let small = read_evaluation(&set.path("small")).unwrap();
+    assert_ne!(found.scenes[1].scores.psnr, small.scenes[1].scores.psnr);
     // The model's own size counts as no setting.
-    assert_eq!(
-        set.sweep("plain", &["--views-at", "32", "--views-as", "whole", "--pictures-at", "32"]).0,
-        Some(0)
-    );
+    assert_eq!(set.sweep("plain", &["--views-at", "32", "--pictures-at", "32"]).0, Some(0));
     let (code, _, err) = set.sweep("large", &["--pictures-at", "96"]);
     assert_eq!(code, Some(0), "{err}");
     assert!(err.contains("2 of 2 scenes: smaller photos are enlarged"), "{err}");
@@ -222,9 +212,7 @@ fn normalization_does_not_depend_on_the_resolution() {
         (made.world_from_normalized.translation, made.target_poses)
     };
     let plain = world(Input::PLAIN);
-    for views_as in [HighResMode::Polyphase, HighResMode::Whole, HighResMode::Repeated] {
-        assert_eq!(world(Input::at(64, views_as, size).unwrap()), plain, "{views_as}");
-    }
+    assert_eq!(world(Input::at(64, size).unwrap()), plain);
 }
 
 #[test]
@@ -246,9 +234,11 @@ fn invalid_resolutions_are_refused() {
     for command in [&eval[..], &sweep] {
         let expected = "globalsplat: --pictures-at is 8, expected pictures with sides of 11 to 16384 pixels";
         assert_eq!(set.refused(command, &["--pictures-at", "8"]), expected);
-        assert!(set.refused(command, &["--views-as", "whole"]).contains("--views-at"));
-        let error = set.refused(command, &["--views-at", "64", "--views-as", "half"]);
-        assert!(error.contains("expected polyphase, whole or repeated"), "{error}");
+        assert!(set.refused(command, &["--views-as", "polyphase"]).contains("--views-at"));
+        for removed in ["whole", "repeated"] {
+            let error = set.refused(command, &["--views-at", "64", "--views-as", removed]);
+            assert!(error.contains("expected polyphase; whole and repeated were removed"), "{error}");
+        }
     }
     assert!(
         set.refused(&reconstruct, &["--views-at", "64", "--refine", "1s"]).contains("cannot be used with")

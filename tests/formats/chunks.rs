@@ -1,10 +1,14 @@
 //! Chunks: writing, reading back, and invalid files.
 
+#[path = "../../crates/torch-file/tests/pickles/mod.rs"]
+mod pickles;
+
 use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
 use crate::common::program::{arg, refuse, succeed};
 use crate::common::room::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
 use image::RgbImage;
+use pickles::{int, tensor_of, text};
 use serde_json::Value;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
@@ -186,37 +190,10 @@ fn assert_refused(pickle: &[u8], for_what: &str) {
     assert!(error.contains(for_what), "{error:?} lacks {for_what:?}");
 }
 
-/// Returns a BINUNICODE opcode with its argument.
-fn text(text: &str) -> Vec<u8> {
-    [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
-}
-
-/// Returns a BININT opcode with its argument.
-fn int(value: u32) -> Vec<u8> {
-    [b"J", &value.to_le_bytes()[..]].concat()
-}
-
 /// Returns a pickled tensor of `size` with `stride` at `offset` of a storage that claims to have 64 elements.
 fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
     let id = [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cpu"), int(64)];
     tensor_of(&id, offset, size, stride)
-}
-
-/// Returns a pickled tensor of the storage with a persistent id of these parts.
-fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
-    let tuple = |values: &[u32]| {
-        [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
-    };
-    [
-        b"ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
-        id.concat(),
-        b"tQ".to_vec(),
-        int(offset),
-        tuple(size),
-        tuple(stride),
-        b"\x89ccollections\nOrderedDict\n)RtR".to_vec(),
-    ]
-    .concat()
 }
 
 /// Returns the pickle of a list of one scene with one view, its fields given.

@@ -10,8 +10,8 @@ use globalsplat::render::render_views;
 use globalsplat::scene::{Camera, Gaussians, Intrinsics, RawGaussians};
 use serde_json::Value;
 use splat_files::{
-    ENDINGS, Random, assert_says, files_with_invalid_values, random_splat, small_gaussians,
-    write_changed_ply, write_ply, written,
+    ENDINGS, Random, assert_says, files_with_invalid_values, files_without_a_rotation, random_splat,
+    small_gaussians, write_changed_ply, write_ply, written,
 };
 use std::io::Write;
 
@@ -207,16 +207,7 @@ fn said(arguments: &[&str]) -> (String, String) {
 #[test]
 fn gaussians_without_a_rotation_are_left_out() {
     let folder = tempfile::tempdir().unwrap();
-    // Files of other programs: values that underflow, in a PLY; the middle of the byte range in a .splat.
-    let mut columns = small_gaussians();
-    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
-    let ply = folder.path().join("zero.ply");
-    write_ply(&ply, &columns, &[]);
-    let dot_splat = written(folder.path(), "zero.splat", &random_splat(3, 0, 1));
-    let mut bytes = std::fs::read(&dot_splat).unwrap();
-    bytes[32 + 28..64].fill(128);
-    std::fs::write(&dot_splat, bytes).unwrap();
-    for path in [&ply, &dot_splat] {
+    for path in &files_without_a_rotation(folder.path()) {
         let line = "1 of 3 Gaussians are left out, whose rotations have length 0\n";
         let expected = format!("{}: {line}", path.display());
         let to = folder.path().join("b.spz");

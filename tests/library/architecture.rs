@@ -25,46 +25,34 @@ const LAYERS: [&str; 17] = [
 ];
 const GROUND: [&str; 3] = ["scene", "error", "ffi"];
 
-/// Path of a module, as ["data", "formats", "colmap"].
-type Module = Vec<String>;
-
-struct Source {
-    /// Source code without comments and tests.
-    text: String,
-    /// `true` for a `mod.rs`, or `lib.rs`.
-    is_parent: bool,
-}
+/// Modules of a folder, by path as in "data::loading", and which others of that folder each uses, itself or in its submodules.
+type Graph = BTreeMap<String, BTreeSet<String>>;
 
 #[test]
-fn modules_use_only_lower_layers() {
+fn modules_use_lower_layers() {
     let sources = sources();
-    for module in
-        sources.keys().filter(|module| module.len() == 1 && !["error", "ffi"].contains(&module[0].as_str()))
-    {
-        assert!(LAYERS.contains(&module[0].as_str()), "{} has no layer", module[0]);
+    for module in sources.keys().map(|module| module.split("::").next().unwrap_or_default()) {
+        assert!(LAYERS.contains(&module) || GROUND.contains(&module), "{module} has no layer");
     }
-    let floor = |module: &Module| LAYERS.iter().position(|name| *name == module[0]);
-    let mut arrows = 0;
-    for (from, to) in dependencies(&sources) {
-        if from.is_empty() || from[0] == to[0] || GROUND.contains(&to[0].as_str()) {
-            continue;
-        }
-        assert!(floor(&from) < floor(&to), "{} uses {}, which is above it", from.join("::"), to.join("::"));
-        arrows += 1;
+    let graph = graph(&sources);
+    let layer = |module: &str| LAYERS.iter().position(|name| *name == module);
+    let top = graph.iter().filter(|(from, _)| !from.contains("::"));
+    let uses: Vec<(&String, &String)> =
+        top.flat_map(|(from, used)| used.iter().map(move |to| (from, to))).collect();
+    assert!(uses.len() > 60, "{uses:?}: are all of them found?");
+    for (from, to) in uses {
+        let is_lower = GROUND.contains(&to.as_str()) || layer(from).is_some() && layer(from) < layer(to);
+        assert!(is_lower, "{from} uses {to}, which is not below it");
     }
-    assert!(arrows > 100, "{arrows} arrows: are all of them found?");
 }
 
-/// No modules of one folder, each with all its submodules, use each other in a cycle, directly or indirectly. Items of a
-/// `mod.rs` are for the files below it, and these are for it.
+/// Items of a `mod.rs` are for the files below it, and these are for it. All other modules of a folder form no cycle.
 #[test]
-fn modules_have_no_dependency_cycles() {
-    let graph = siblings(dependencies(&sources()));
-    assert!(graph.keys().any(|module| module.starts_with(&["cli".to_string()])), "the program is looked at");
-    if let Some(circle) = circle(&graph) {
-        let names: Vec<String> = circle.iter().map(|module| module.join("::")).collect();
-        panic!("a circle: {}", names.join(" → "));
-    }
+fn modules_of_a_folder_form_no_cycle() {
+    let graph = graph(&sources());
+    assert!(graph.keys().any(|module| module.starts_with("cli::")), "the program is looked at");
+    let left = cycles(graph);
+    assert!(left.is_empty(), "cycles, or what uses them: {left:?}");
 }
 
 /// Every module has a box in the figure, and a line in CONTRIBUTING.md, where they come in the order of the layers.
@@ -89,14 +77,14 @@ fn statics_are_on_the_page() {
     let page = std::fs::read_to_string(&page).expect("CONTRIBUTING.md");
     let (mut found, mut unlisted) = (0, vec![]);
     for (module, source) in sources() {
-        for line in source.text.lines() {
+        for line in source.lines() {
             let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("pub(crate) ");
             let Some(name) = line.strip_prefix("static ").and_then(|rest| rest.split(':').next()) else {
                 continue;
             };
             found += 1;
             if !page.contains(&format!("`{name}`")) {
-                unlisted.push(format!("{}: {name}", module.join("::")));
+                unlisted.push(format!("{module}: {name}"));
             }
         }
     }
@@ -108,16 +96,16 @@ fn statics_are_on_the_page() {
 #[test]
 fn the_library_names_no_options() {
     let mut options = vec![];
-    for (module, source) in sources() {
-        if module.first().is_some_and(|layer| ["cli", "parity", "bench"].contains(&layer.as_str())) {
+    for (module, text) in sources() {
+        if ["cli", "parity", "bench"].contains(&module.split("::").next().unwrap_or_default()) {
             continue;
         }
-        for (at, _) in source.text.match_indices("--") {
-            let (before, after) = (&source.text[..at], &source.text[at + 2..]);
+        for (at, _) in text.match_indices("--") {
+            let (before, after) = (&text[..at], &text[at + 2..]);
             // Variables of style sheets begin with two dashes, too.
             if after.starts_with(|c: char| c.is_ascii_lowercase()) && !before.ends_with("var(") {
                 let option: String = after.chars().take_while(|&c| c.is_alphanumeric() || c == '-').collect();
-                options.push(format!("{}: --{option}", module.join("::")));
+                options.push(format!("{module}: --{option}"));
             }
         }
     }
@@ -125,205 +113,148 @@ fn the_library_names_no_options() {
 }
 
 #[test]
-fn circles_and_paths_are_found() {
-    let module = |path: &str| path.split("::").map(String::from).collect::<Module>();
-    let graph = |arrows: &[(&str, &str)]| siblings(arrows.iter().map(|(a, b)| (module(a), module(b))));
-    assert!(circle(&graph(&[("a", "b"), ("b", "c"), ("a", "c")])).is_none());
-    assert_eq!(circle(&graph(&[("a", "b"), ("b", "c"), ("c", "b")])).map(|circle| circle.len()), Some(3));
-    // A cycle may go through submodules, but parents and children may use each other.
-    assert!(circle(&graph(&[("a::b", "a::c"), ("a::c::d", "a::b"), ("a", "e")])).is_some());
-    assert!(circle(&graph(&[("a", "a::b"), ("a::b", "a::c::d"), ("a::c::d", "a")])).is_none());
-    let text = "use crate::{a::{B, c::D}, E as F};\nlet x = super::g::h();";
-    assert_eq!(paths(text), ["crate::a::B", "crate::a::c::D", "crate::E", "super::g::h"]);
+fn cycles_and_paths_are_found() {
+    let sources =
+        |modules: &[(&str, &str)]| modules.iter().map(|(a, b)| (a.to_string(), b.to_string())).collect();
+    let graph = |modules: &[(&str, &str)]| graph(&sources(modules));
+    let is_cyclic = |modules: &[(&str, &str)]| !cycles(graph(modules)).is_empty();
+    let (b, c) = (("b", "use crate::c::C;"), ("c", "fn f() { super::b::g() }"));
+    assert!(!is_cyclic(&[("a", "use crate::{b::B, c::C as D};"), b, ("c", "")]));
+    assert!(is_cyclic(&[("a", ""), b, c]));
+    // A cycle may go through submodules and re-exports, but parents and children may use each other.
+    assert!(is_cyclic(&[("b", "use crate::c::d::D;"), ("c", ""), ("c::d", "use super::super::{b};")]));
+    assert!(is_cyclic(&[
+        ("a", "pub use b::B; pub use c::C;"),
+        ("a::b", "use super::C;"),
+        ("a::c", "use super::B;")
+    ]));
+    assert!(!is_cyclic(&[("a", "use b::B; struct A;"), ("a::b", "use super::A;")]));
+    let found = paths("use crate::{a::{B, c::D}, E as F};\nlet x = super::g::h();");
+    for path in ["crate::a::B", "crate::a::c::D", "crate::E", "super::g::h"] {
+        assert!(found.iter().any(|found| found == path), "{path}: {found:?}");
+    }
     assert_eq!(
-        code("a; // crate::b\n/// crate::c\nd(\"//\");\n#[cfg(test)]\nmod tests { crate::e }"),
-        "a; \n\nd(\"//\");\n"
+        code("a; // crate::b\n/// crate::c\nd(\"a://\");\n#[cfg(test)]\nmod tests { crate::e }"),
+        "a;\n\nd(\"a://\");\n"
     );
 }
 
-/// Returns pairs (user, used), where `used` is the file that defines the item.
-fn dependencies(sources: &BTreeMap<Module, Source>) -> BTreeSet<(Module, Module)> {
-    let mut arrows = BTreeSet::new();
-    for (module, source) in sources {
-        for path in paths(&source.text) {
-            let path: Vec<&str> = path.split("::").collect();
-            if let Some(used) =
-                resolve(sources, module, &path).filter(|used| used != module && !used.is_empty())
-            {
-                arrows.insert((module.clone(), used));
-            }
+/// Removes modules that use none of the others, again and again. Returns what is left: cycles, and what uses them.
+fn cycles(mut graph: Graph) -> Graph {
+    loop {
+        let all: BTreeSet<String> = graph.keys().cloned().collect();
+        graph.retain(|_, used| !used.is_disjoint(&all));
+        if graph.len() == all.len() {
+            return graph;
         }
     }
-    arrows
 }
 
-/// Returns the file that defines the item that `path` names in `module`; re-exports are followed.
-fn resolve(sources: &BTreeMap<Module, Source>, module: &Module, path: &[&str]) -> Option<Module> {
-    let mut at = match path[0] {
-        // `globalsplat` is the library's name in the program.
-        "crate" | "globalsplat" => vec![],
-        "super" | "self" => module.clone(),
-        child => [module.clone(), vec![child.to_string()]].concat(),
-    };
-    let mut rest = &path[1..];
-    if path[0] == "super" {
-        at.pop();
-    }
-    while let Some((&first, others)) = rest.split_first() {
-        let below = [at.clone(), vec![first.to_string()]].concat();
-        match first {
-            "super" => drop(at.pop()),
-            _ if sources.contains_key(&below) => at = below,
-            item => return re_exported(sources, &at, item).or(Some(at)),
-        }
-        rest = others;
-    }
-    sources.contains_key(&at).then_some(at)
-}
-
-/// Returns the module that defines `item`, if `module` is a parent that only re-exports it.
-fn re_exported(sources: &BTreeMap<Module, Source>, module: &Module, item: &str) -> Option<Module> {
-    let source = sources.get(module).filter(|source| source.is_parent)?;
-    let exports = paths(&source.text).into_iter().filter(|path| path.ends_with(&format!("::{item}")));
-    exports.into_iter().find_map(|path| {
-        let path: Vec<&str> = path.split("::").collect();
-        let own_child = [module.clone(), vec![path[0].to_string()]].concat();
-        sources.contains_key(&own_child).then(|| resolve(sources, module, &path)).flatten()
-    })
-}
-
-/// Returns which modules of a folder use which others of that folder, for themselves or for their submodules.
-fn siblings(arrows: impl IntoIterator<Item = (Module, Module)>) -> BTreeMap<Module, BTreeSet<Module>> {
-    let mut graph: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
-    for (from, to) in arrows {
+fn graph(sources: &BTreeMap<String, String>) -> Graph {
+    let paths: BTreeMap<&str, Vec<String>> =
+        sources.iter().map(|(name, text)| (name.as_str(), paths(text))).collect();
+    let mut graph = Graph::new();
+    for (module, used) in paths.iter().flat_map(|(module, used)| used.iter().map(move |path| (module, path)))
+    {
+        let from: Vec<&str> = module.split("::").collect();
+        let to = resolve(&paths, module, used).unwrap_or_default();
+        let to: Vec<&str> = to.split("::").collect();
         let shared = from.iter().zip(&to).take_while(|(a, b)| a == b).count();
-        if shared < from.len().min(to.len()) {
-            graph.entry(from[..=shared].to_vec()).or_default().insert(to[..=shared].to_vec());
+        if shared < from.len().min(to.len()) && from != [""] && to != [""] {
+            graph.entry(from[..=shared].join("::")).or_default().insert(to[..=shared].join("::"));
         }
     }
     graph
 }
 
-/// Returns a cycle of modules, each of which uses the next, and the last the first.
-fn circle(graph: &BTreeMap<Module, BTreeSet<Module>>) -> Option<Vec<Module>> {
-    fn visit(
-        graph: &BTreeMap<Module, BTreeSet<Module>>,
-        at: &Module,
-        path: &mut Vec<Module>,
-        done: &mut BTreeSet<Module>,
-    ) -> Option<Vec<Module>> {
-        if let Some(start) = path.iter().position(|module| module == at) {
-            return Some([&path[start..], std::slice::from_ref(at)].concat());
-        }
-        if done.contains(at) {
-            return None;
-        }
-        path.push(at.clone());
-        let found = graph.get(at).into_iter().flatten().find_map(|next| visit(graph, next, path, done));
-        path.pop();
-        done.insert(at.clone());
-        found
-    }
-    let mut done = BTreeSet::new();
-    graph.keys().find_map(|start| visit(graph, start, &mut vec![], &mut done))
-}
-
-/// Returns all `use`d paths, with braces expanded, and all paths in the code that begin with `crate`, `super` or `globalsplat`.
-fn paths(text: &str) -> Vec<String> {
-    let mut found = vec![];
-    let mut rest = text;
-    while let Some((start, is_use)) = next_path(rest) {
-        rest = &rest[start..];
-        let is_end = |c: char| match is_use {
-            true => c == ';',
-            false => !(c.is_alphanumeric() || c == '_' || c == ':'),
-        };
-        let end = rest.find(is_end).unwrap_or(rest.len());
-        expand("", rest[..end].trim(), &mut found);
-        rest = &rest[end..];
-    }
-    found
-}
-
-/// Returns the offset of the next path, and `true` if it is a `use`.
-fn next_path(text: &str) -> Option<(usize, bool)> {
-    let inline = ["crate::", "super::", "globalsplat::"].iter().filter_map(|start| text.find(start)).min();
-    let used = text.find("use ").map(|at| at + "use ".len());
-    match (used, inline) {
-        (Some(used), Some(inline)) if inline < used => Some((inline, false)),
-        (Some(used), _) => Some((used, true)),
-        (None, inline) => inline.map(|at| (at, false)),
-    }
-}
-
-/// Expands `a::{b, c::{d, e}}` to `a::b`, `a::c::d`, `a::c::e`, each prefixed with `prefix`.
-fn expand(prefix: &str, tree: &str, into: &mut Vec<String>) {
-    let tree = tree.trim();
-    match tree.split_once('{') {
-        None => {
-            let name = tree.split(" as ").next().unwrap_or_default().trim_end_matches(':').trim();
-            if !name.is_empty() {
-                into.push(format!("{prefix}{name}"));
-            }
-        }
-        Some((head, inside)) => {
-            let inside = inside.trim_end().strip_suffix('}').unwrap_or(inside);
-            let (mut depth, mut start) = (0, 0);
-            for (i, c) in inside.char_indices().chain([(inside.len(), ',')]) {
-                match c {
-                    '{' => depth += 1,
-                    '}' => depth -= 1,
-                    ',' if depth == 0 => {
-                        expand(&format!("{prefix}{head}"), &inside[start..i], into);
-                        start = i + 1;
-                    }
-                    _ => {}
+/// Returns the file that defines the item that `path` names in `module`; re-exports by a parent are followed.
+fn resolve(paths: &BTreeMap<&str, Vec<String>>, module: &str, path: &str) -> Option<String> {
+    let mut at: Vec<&str> = module.split("::").filter(|name| !name.is_empty()).collect();
+    for (index, name) in path.split("::").enumerate() {
+        match name {
+            // `globalsplat` is the library's name in the program.
+            "crate" | "globalsplat" if index == 0 => at.clear(),
+            "self" => {}
+            "super" => drop(at.pop()),
+            _ => {
+                let parent = at.join("::");
+                at.push(name);
+                if !paths.contains_key(at.join("::").as_str()) {
+                    let is_child = |path: &str| {
+                        let first = path.split("::").next().unwrap_or_default();
+                        paths.contains_key([&parent, "::", first].concat().as_str())
+                    };
+                    let exports = paths.get(parent.as_str()).into_iter().flatten();
+                    let export = exports
+                        .filter(|path| path.rsplit("::").next() == Some(name))
+                        .find(|path| is_child(path));
+                    let defined = export.and_then(|path| resolve(paths, &parent, path));
+                    return defined.or((index > 0).then_some(parent));
                 }
             }
         }
     }
+    Some(at.join("::"))
+}
+
+/// Returns all `use`d paths, with braces expanded, and all paths in the code that begin with `crate`, `super` or `globalsplat`.
+fn paths(code: &str) -> Vec<String> {
+    let is_path = |c: char| c.is_alphanumeric() || c == '_' || c == ':';
+    let is_ours =
+        |word: &&str| ["crate::", "super::", "globalsplat::"].iter().any(|start| word.starts_with(start));
+    let inline = code.split(|c| !is_path(c)).filter(is_ours);
+    let mut found: Vec<String> = inline.map(String::from).collect();
+    for (at, _) in code.match_indices("use ") {
+        let (mut prefixes, mut name) = (vec![String::new()], String::new());
+        for c in code[at + "use ".len()..].chars().take_while(|&c| c != ';').chain([' ']) {
+            if is_path(c) {
+                name.push(c);
+                continue;
+            }
+            let path = prefixes.last().cloned().unwrap_or_default() + &std::mem::take(&mut name);
+            match c {
+                '{' => prefixes.push(path),
+                _ => found.push(path),
+            }
+            if c == '}' {
+                prefixes.pop();
+            }
+        }
+    }
+    found.into_iter().map(|path| path.trim_end_matches(':').to_string()).collect()
 }
 
 /// Returns the source without comments and without tests, which may use anything.
 fn code(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
     let without = |line: &str| {
-        let quoted = |at: usize| line[..at].matches('"').count() % 2 == 1;
-        let comment = line.match_indices("//").map(|(at, _)| at).find(|&at| !quoted(at));
-        line[..comment.unwrap_or(line.len())].to_string() + "\n"
+        let is_comment = |at: usize| line[..at].trim_end().len() < at || at == 0;
+        let comment = line.match_indices("//").map(|(at, _)| at).find(|&at| is_comment(at));
+        line[..comment.unwrap_or(line.len())].trim_end().to_string() + "\n"
     };
     text.lines().map(without).collect()
 }
 
-/// Returns the source files of the library and of the program.
-fn sources() -> BTreeMap<Module, Source> {
+/// Returns the files in `place`, or `place` itself if it is a file. Skips hidden files, Python's caches and third-party modules.
+pub fn files(place: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(place) else { return vec![place.to_owned()] };
+    let entries = entries.map(|entry| entry.expect("a readable entry").path());
+    let is_ours = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        !name.starts_with('.') && name != "__pycache__" && name != "node_modules"
+    };
+    entries.filter(is_ours).flat_map(|path| files(&path)).collect()
+}
+
+/// Returns the code of each module of the library and of the program, by path. Tests may use anything.
+fn sources() -> BTreeMap<String, String> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut files: Vec<PathBuf> = vec![];
-    let mut folders = vec![root.clone()];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).expect("a folder") {
-            let path = entry.expect("an entry").path();
-            match path.is_dir() {
-                true => folders.push(path),
-                false => files.push(path),
-            }
-        }
-    }
-    let mut sources = BTreeMap::new();
-    for file in files.iter().filter(|file| file.extension().is_some_and(|ending| ending == "rs")) {
-        let inside = file.strip_prefix(&root).expect("a file in src").with_extension("");
-        let mut module: Module = inside.iter().map(|part| part.to_string_lossy().into_owned()).collect();
-        let name = module.last().cloned().unwrap_or_default();
-        // Tests may use anything.
-        if module[0] == "main" || name.ends_with("_tests") {
-            continue;
-        }
-        let is_parent = name == "mod" || name == "lib";
-        if is_parent {
-            module.pop();
-        }
-        let text = code(&std::fs::read_to_string(file).expect("a file"));
-        sources.insert(module, Source { text, is_parent });
-    }
-    sources
+    let of = |file: PathBuf| {
+        let name = file.strip_prefix(&root).ok()?.to_str()?.strip_suffix(".rs")?.replace('/', "::");
+        let module = name.strip_suffix("::mod").unwrap_or(&name).to_string();
+        let text = std::fs::read_to_string(&file).expect("a file");
+        let is_checked = !["lib", "main"].contains(&module.as_str()) && !module.ends_with("_tests");
+        is_checked.then(|| (module, code(&text)))
+    };
+    files(&root).into_iter().filter_map(of).collect()
 }

@@ -3,8 +3,8 @@
 mod common;
 
 use common::{
-    assert_says, body_of_ply, endings, files_with_invalid_values, random_splat, refused, refused_file, set,
-    small_gaussians, write_changed_ply, write_ply, written,
+    assert_says, body_of_ply, endings, files_with_invalid_values, files_without_a_rotation, random_splat,
+    refused, refused_file, set, small_gaussians, write_changed_ply, write_ply, written,
 };
 use globalsplat_splat_file::{read_splat, read_splat_without_invalid, write_splat};
 
@@ -132,16 +132,7 @@ fn gaussians_without_a_rotation_are_left_out() {
         let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
         assert_eq!((copy.len(), copy.warnings.len()), (250, 0), "{ending}");
     }
-    // Files of other programs: zeros, and values that underflow, in a PLY; the middle of the byte range in a .splat.
-    let mut columns = small_gaussians();
-    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
-    let ply = folder.path().join("zero.ply");
-    write_ply(&ply, &columns, &[]);
-    let dot_splat = written(folder.path(), "zero.splat", &random_splat(3, 0, 1));
-    let mut bytes = std::fs::read(&dot_splat).unwrap();
-    bytes[32 + 28..64].fill(128);
-    std::fs::write(&dot_splat, bytes).unwrap();
-    for path in [&ply, &dot_splat] {
+    for path in &files_without_a_rotation(folder.path()) {
         let splat = read_splat(path).unwrap();
         assert_eq!(splat.len(), 2);
         let told = "1 of 3 Gaussians are left out, whose rotations have length 0";

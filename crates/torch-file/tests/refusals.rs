@@ -1,6 +1,9 @@
 //! Pickles and archives that are refused.
 
+mod pickles;
+
 use globalsplat_torch_file::{Archive, Array, TorchFile, UnknownGlobals, Value, unpickle};
+use pickles::{int, tensor_of, text};
 use std::io::{Cursor, Write};
 use std::path::Path;
 use zip::CompressionMethod;
@@ -28,31 +31,9 @@ const REFUSE: &[UnknownGlobals] = &[UnknownGlobals::Refuse];
 const KEEP: &[UnknownGlobals] = &[UnknownGlobals::Keep];
 const BOTH: &[UnknownGlobals] = &[UnknownGlobals::Refuse, UnknownGlobals::Keep];
 
-/// Returns a BINUNICODE opcode with its argument.
-fn text(text: &str) -> Vec<u8> {
-    [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
-}
-
-/// Returns a BININT opcode with its argument.
-fn int(value: u32) -> Vec<u8> {
-    [b"J", &value.to_le_bytes()[..]].concat()
-}
-
 /// Returns the pickle of a tensor of the storage with a persistent id of these parts.
-fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
-    let tuple = |values: &[u32]| {
-        [b"(".to_vec(), values.iter().flat_map(|&v| int(v)).collect(), b"t".to_vec()].concat()
-    };
-    [
-        b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
-        id.concat(),
-        b"tQ".to_vec(),
-        int(offset),
-        tuple(size),
-        tuple(stride),
-        b"\x89ccollections\nOrderedDict\n)RtR.".to_vec(),
-    ]
-    .concat()
+fn pickle_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
+    [b"\x80\x02", &tensor_of(id, offset, size, stride)[..], b"."].concat()
 }
 
 fn float() -> Vec<u8> {
@@ -133,12 +114,12 @@ fn only_storages_are_storages() {
         vec![text("storage"), float(), text("0"), text("cpu")],
         vec![],
     ] {
-        assert_refused(&tensor_of(&id, 0, &[1], &[1]), BOTH, "a persistent id that is no storage");
+        assert_refused(&pickle_of(&id, 0, &[1], &[1]), BOTH, "a persistent id that is no storage");
     }
     // The last item of the format before torch 1.6 names the storage that this one is a part of. It must be None.
     let with = |last: &[u8]| {
         let id = [text("storage"), float(), text("0"), text("cpu"), int(64), last.to_vec()];
-        tensor_of(&id, 0, &[1], &[1])
+        pickle_of(&id, 0, &[1], &[1])
     };
     assert_refused(&with(b"N"), REFUSE, "a persistent id that is no storage");
     assert!(unpickle(&mut with(b"N").as_slice(), UnknownGlobals::Keep).is_ok());
@@ -164,7 +145,7 @@ fn only_storages_are_storages() {
 fn tensors_stay_inside_their_storages() {
     let locate = |key: &str, offset: u32, size: &[u32], stride: &[u32]| {
         let id = [text("storage"), float(), text(key), text("cpu"), int(64)];
-        let pickle = tensor_of(&id, offset, size, stride);
+        let pickle = pickle_of(&id, offset, size, stride);
         let values = unpickle(&mut pickle.as_slice(), UnknownGlobals::Refuse).unwrap();
         let storages = [("0".to_string(), 100..164)].into();
         Array::locate(&values, &storages, values.get(values.root))

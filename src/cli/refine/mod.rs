@@ -5,12 +5,12 @@ mod report;
 
 pub use job::{InitialFile, RefineJob};
 
-use super::{check_views, device, parse_size};
+use super::{check_former_option, check_views, device, parse_size};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::data::Holdout;
 use globalsplat::error::Error;
-use globalsplat::refine::{Budget, MIN_SIDE, RefineConfig, RefineOptions, SpaceKind};
+use globalsplat::refine::{Budget, MIN_SIDE, RefineConfig, RefineOptions};
 use globalsplat::scene::ImageSize;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -37,9 +37,9 @@ pub struct Refine {
     /// Weights of the initial model, as `globalsplat export` writes them; by default the weights embedded in this program
     #[arg(long, value_name = "FILE", conflicts_with = "splat")]
     weights: Option<PathBuf>,
-    /// Optimized parameters: Gaussians, the tokens that a model decodes them from, or both: first tokens, then Gaussians
-    #[arg(long, value_enum, default_value_t = SpaceName::Gaussians, conflicts_with = "splat")]
-    space: SpaceName,
+    /// Former option. Its other values than `gaussians` are refused
+    #[arg(long, hide = true)]
+    space: Option<String>,
     /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
@@ -104,27 +104,15 @@ enum From {
     Weights,
 }
 
-/// Parameters that are optimized.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum SpaceName {
-    /// Each Gaussian by itself
-    Gaussians,
-    /// Tokens of a model
-    Tokens,
-    /// Tokens first, then Gaussians
-    Both,
-}
-
 impl Refine {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
         let options = self.options(holdout)?;
         let needs_model = self.needs_model()?;
-        if self.space == SpaceName::Tokens && (self.correct_poses || self.correct_exposures) {
-            let why = "--space tokens corrects no photos; --correct-poses and --correct-exposures go with gaussians or both";
-            return Err(Error::request(why).into());
-        }
+        let why =
+            "tokens and both were removed, as they gained nothing over gaussians: see docs/lab_refinement.md";
+        check_former_option("--space", self.space.as_deref(), "gaussians", why)?;
         let initial = match self.splat {
             Some(splat) => InitialFile::Splat(splat),
             None if needs_model => InitialFile::Model(self.weights),
@@ -135,12 +123,11 @@ impl Refine {
     }
 
     fn needs_model(&self) -> Result<bool> {
-        let needs_model = self.weights.is_some() || self.space != SpaceName::Gaussians;
-        if self.from == Some(From::Nothing) && needs_model {
-            let why = "--from nothing has neither weights nor tokens; --from weights has";
+        if self.from == Some(From::Nothing) && self.weights.is_some() {
+            let why = "--from nothing uses no weights; --from weights does";
             return Err(Error::request(why).into());
         }
-        Ok(needs_model || self.from == Some(From::Weights))
+        Ok(self.weights.is_some() || self.from == Some(From::Weights))
     }
 
     fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
@@ -154,11 +141,6 @@ impl Refine {
         let time = parse_time(self.seconds)?;
         Ok(RefineOptions {
             config: RefineConfig::with(&self.set, self.splat.is_some())?,
-            space: match self.space {
-                SpaceName::Gaussians => SpaceKind::Gaussians,
-                SpaceName::Tokens => SpaceKind::Tokens,
-                SpaceName::Both => SpaceKind::Both,
-            },
             budget: self.steps.map_or(time, Budget::Steps),
             gaussians: self.gaussians as usize,
             seed: self.seed,

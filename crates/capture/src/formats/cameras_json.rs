@@ -82,7 +82,7 @@ pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) ->
     });
     let image_shape = cameras.first().map_or([0, 0], |camera| [camera.height, camera.width]);
     let contents = File { image_shape, views: views.collect() };
-    Ok(write_json(file, &contents)?)
+    write_json(file, &contents)
 }
 
 fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {

@@ -177,6 +177,20 @@ pub fn files_with_invalid_values(folder: &Path) -> Vec<(PathBuf, &'static str, &
     cases
 }
 
+/// Writes files as of other programs in which the second of three Gaussians has a rotation of length 0: values that underflow, in a PLY; the
+/// middle of the byte range, in a .splat.
+pub fn files_without_a_rotation(folder: &Path) -> [PathBuf; 2] {
+    let ply = folder.join("zero.ply");
+    let mut columns = small_gaussians();
+    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
+    write_ply(&ply, &columns, &[]);
+    let dot_splat = written(folder, "zero.splat", &random_splat(3, 0, 1));
+    let mut bytes = std::fs::read(&dot_splat).unwrap();
+    bytes[32 + 28..64].fill(128);
+    std::fs::write(&dot_splat, bytes).unwrap();
+    [ply, dot_splat]
+}
+
 /// Writes a PLY of [`small_gaussians`] with spherical harmonics of degree 1, after `change`.
 pub fn write_changed_ply(folder: &Path, name: &str, change: impl FnOnce(&mut Columns)) -> PathBuf {
     const REST: [&str; 9] = [
