@@ -61,7 +61,9 @@ $(filter-out check-crates,$(CHECKS)): venv
 CRATES := $(addprefix -p globalsplat-,files torch-file capture splat-file synth)
 check-crates:
 	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
-# Packages these crates as for crates.io, and builds each package by itself.
+	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
+	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
+# Packages these crates as for crates.io, and builds each package by itself. Needs cargo 1.90 for packages that depend on each other.
 .PHONY: check-packages
 check-packages:
 	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
@@ -85,7 +87,9 @@ PARITY := parity-pytest parity-self-test parity-kernels
 parity: $(PARITY)
 $(PARITY): venv build
 
+# Its tests use captures that an example of the library writes.
 parity-pytest:
+	$(CARGO) build --release --locked --example make_rooms
 	.venv/bin/python -m pytest -q parity
 parity-self-test:
 	.venv/bin/python parity/run.py --self-test

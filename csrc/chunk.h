@@ -1,5 +1,5 @@
 // RealEstate10K-style chunks: a torch.save file with a list of scenes, written by libtorch's pickler. They are read without torch by
-// src/data/formats/chunk.
+// crates/capture/src/formats/chunk.
 #pragma once
 
 #include <cstdint>

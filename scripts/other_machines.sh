@@ -26,17 +26,21 @@ trap end EXIT
 # The tests given by name, or all if none is given: a file tests/*/NAME.rs, or lib and main, the unit tests of the library and the program.
 chosen=("${@:2}")
 for name in "${chosen[@]}"; do
-    [[ " lib main " == *" $name "* ]] || compgen -G "tests/*/$name.rs" >/dev/null || {
+    [[ " lib main " == *" $name "* ]] || compgen -G "tests/*/$name.rs" >/dev/null || compgen -G "crates/*/tests/$name.rs" >/dev/null || {
         echo "other_machines: there is no test $name, expected lib, main or the name of a file in a folder of tests/" >&2
         exit 2
     }
 done
-built="$("${CARGO:-cargo}" test --release --locked --no-run -p globalsplat 2>&1)" || {
+built="$("${CARGO:-cargo}" test --release --locked --no-run 2>&1)" || {
     echo "$built" >&2
     exit 1
 }
-# One line per test binary: its name (lib, main or the name of a folder in tests/) and its path.
-tests="$(sed -nE 's#^ *Executable (unittests src/(lib|main)\.rs|tests/([a-z]+)/main\.rs) \((.*)\)$#\2\3 \4#p' <<<"$built")"
+# One line per test binary: its name (lib and main for unit tests, the name of a folder in tests/, or file: and the name of a file in the
+# tests/ of a crate) and its path.
+tests="$(sed -nE \
+    -e 's#^ *Executable unittests src/(lib|main)\.rs \((.*)\)$#\1 \2#p' \
+    -e 's#^ *Executable tests/([a-z]+)/main\.rs \((.*)\)$#\1 \2#p' \
+    -e 's#^ *Executable tests/([a-z_]+)\.rs \((.*)\)$#file:\1 \2#p' <<<"$built")"
 
 # Tests that do not depend on these conditions and are slow or only check text: output of compilers and other programs, reductions across
 # processes, out of memory. They run here only if given by name.
@@ -45,16 +49,16 @@ alike=(architecture citations cuda distributed refused_memory viewers)
 failed=()
 # Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.
 run() {
-    local as=$1 name binary filters
+    local as=$1 name binary filters ran=false
     shift
     : >"$GLOBALSPLAT_SKIPPED"
     chmod a+rw "$GLOBALSPLAT_SKIPPED"
     while read -r name binary; do
         filters=()
         case "$name" in
-        lib | main)
-            [[ $# -eq 0 || " $* " == *" $name "* ]] || continue
-            [[ ${#chosen[@]} -eq 0 || " ${chosen[*]} " == *" $name "* ]] || continue
+        lib | main | file:*)
+            [[ $# -eq 0 || " $* " == *" ${name#file:} "* ]] || continue
+            [[ ${#chosen[@]} -eq 0 || " ${chosen[*]} " == *" ${name#file:} "* ]] || continue
             ;;
         *)
             local file module
@@ -74,8 +78,13 @@ run() {
         esac
         [ "${binary:0:1}" = / ] || binary="$repository/$binary"
         echo "$as: $name ${filters[*]}"
+        ran=true
         "$as" "$binary" --quiet "${filters[@]}" </dev/null || failed+=("$as: $name")
     done <<<"$tests"
+    $ran || {
+        echo "other_machines: $as has no test named ${chosen[*]}" >&2
+        exit 2
+    }
     [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rooms import make_rooms
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -214,7 +215,7 @@ def test_every_kind_of_model_is_told_by_its_shapes(tmp_path, change):
 
 
 def test_commands_take_checkpoints(weights, tmp_path):
-    run("synth", "--gaussians", "--out", tmp_path, "--frames", 6, "--size", 32)
+    make_rooms(tmp_path, 1, 6, 32)
     torch.save(lightning(weights), tmp_path / "last.ckpt")
     imported(tmp_path / "last.ckpt", tmp_path / "model.safetensors")
     room, splats = tmp_path / "room_000", []

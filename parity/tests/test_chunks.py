@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rooms import make_rooms
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = REPOSITORY / "target/release/globalsplat"
@@ -20,7 +21,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("captures")
-    assert run("synth", "--gaussians", "--out", folder, "--frames", 5, "--size", 24).returncode == 0
+    make_rooms(folder, 1, 5, 24)
     return folder / "room_000"
 
 

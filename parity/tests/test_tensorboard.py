@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rooms import make_rooms
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
@@ -42,7 +43,7 @@ def run(*arguments):
 def trained(tmp_path_factory):
     """Returns a run that was killed after step 10, and then resumed from the checkpoint before step 8."""
     folder = tmp_path_factory.mktemp("tensorboard")
-    run("synth", "--gaussians", "--out", folder / "captures", "--frames", 9, "--size", 40)
+    make_rooms(folder / "captures", 1, 9, 40)
     (folder / "config.toml").write_text(CONFIG.replace("CAPTURES", str(folder / "captures")))
     train = ["train", "--config", folder / "config.toml", "--out", folder / "run"]
     run(*train, "--set", "train.steps=11", "--set", "train.checkpoint_every=4")

@@ -3,10 +3,16 @@
 use super::FAILED;
 use globalsplat::config::TrainConfig;
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 /// Global allocator that ends the process if an allocation fails: Rust's default is to abort, with a core dump. Files are
 /// written so that ending this way loses nothing.
 struct OrEnd;
+
+/// `true` once a thread has printed that memory is out: others that run out of it at the same time stay silent.
+static IS_REPORTED: AtomicBool = AtomicBool::new(false);
 
 #[global_allocator]
 static ALLOCATOR: OrEnd = OrEnd;
@@ -104,10 +110,18 @@ pub fn keep_during<T>(work: impl FnOnce() -> T) -> T {
 /// Prints the out-of-memory message, and ends the process. Neither needs to allocate.
 #[cold]
 fn end(bytes: Option<usize>) -> ! {
-    match bytes {
-        Some(bytes) => eprintln!("globalsplat: out of memory: an allocation of {bytes} bytes failed"),
-        None => eprintln!("globalsplat: out of memory"),
+    while IS_REPORTED.swap(true, Ordering::Relaxed) {
+        // Another thread is printing, and then ends the process.
+        std::thread::sleep(Duration::from_secs(1));
     }
+    // Standard error may be closed.
+    let mut stderr = std::io::stderr();
+    let _ = match bytes {
+        Some(bytes) => {
+            writeln!(stderr, "globalsplat: out of memory: an allocation of {bytes} bytes failed")
+        }
+        None => writeln!(stderr, "globalsplat: out of memory"),
+    };
     // SAFETY: nothing else runs in this process.
     unsafe { libc::_exit(FAILED.into()) }
 }

@@ -137,9 +137,10 @@ pub fn main() -> ExitCode {
     let _guard = oversubscription::start_guard();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
     // RUST_BACKTRACE=1 a backtrace.
-    panic::set_hook(Box::new(|_| {
+    panic::set_hook(Box::new(|panic| {
         let backtrace = Backtrace::capture();
-        if backtrace.status() == BacktraceStatus::Captured {
+        let is_internal = !panic_message(panic.payload()).contains(PRINTING);
+        if is_internal && backtrace.status() == BacktraceStatus::Captured {
             eprintln!("{backtrace}");
         }
     }));
@@ -168,10 +169,12 @@ pub fn main() -> ExitCode {
     ExitCode::from(code)
 }
 
+/// Start of the message of `println!`'s panic if standard output can't be written.
+const PRINTING: &str = "failed printing to stdout: ";
+
 /// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
 fn tell(message: &str, others_are_lost: bool) {
     let Some(message) = ranks::what_to_tell(message, others_are_lost) else { return };
-    const PRINTING: &str = "failed printing to stdout: ";
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {

@@ -4,6 +4,7 @@ use crate::error::Result;
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
 use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, fit};
+use rayon::prelude::*;
 use tch::{Kind, Tensor};
 
 /// A photo and its camera.
@@ -44,7 +45,7 @@ impl View {
 /// # Errors
 /// Fails like [`Capture::load`].
 pub fn load_views(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<View>> {
-    Ok(capture.load(indices, size)?.into_iter().map(View::from).collect())
+    Ok(capture.load(indices, size)?.into_par_iter().map(View::from).collect())
 }
 
 /// Reads every view of `capture` like [`load_views`].
@@ -52,7 +53,7 @@ pub fn load_views(capture: &Capture, indices: &[usize], size: Option<ImageSize>)
 /// # Errors
 /// Fails like [`Capture::load`].
 pub fn load_all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Vec<View>> {
-    Ok(capture.load_all(size)?.into_iter().map(View::from).collect())
+    Ok(capture.load_all(size)?.into_par_iter().map(View::from).collect())
 }
 
 /// Converts an image to a float tensor, `[3, H, W]`, values in [0, 1].

@@ -200,7 +200,10 @@ mod tests {
         let said = refused(&of(3, 16), &of(4, 16), &of(5, 16), 2);
         assert!(said.contains("keys [1, 4, 16] and values [1, 5, 16], expected"), "{said}");
         let said = refused(&of(3, 18), &of(4, 18), &of(4, 18), 2);
-        assert!(said.contains("have 2 heads, expected a width of each that is a multiple of 4"), "{said}");
+        assert!(
+            said.contains("have 2 heads, expected a head width of at most 128 that is a multiple of 4"),
+            "{said}"
+        );
         let double = of(3, 16).to_kind(Kind::Double);
         let said = refused(&double, &double, &double, 2);
         assert!(said.contains("must be float32 on the CPU"), "{said}");

@@ -139,15 +139,15 @@ impl Optimizer {
         }
     }
 
-    /// Makes this optimizer shard `shard_index` of `parts`: it updates its share of the parameters and drops the moments of the others. Parameters
-    /// are not split. They are assigned in descending order of their moments' size, each to the shard that has least so far (ZeRO stage 1,
-    /// Rajbhandari et al. 2020, by tensors).
-    pub fn shard(&mut self, shard_index: usize, parts: usize) {
+    /// Makes this optimizer shard `shard_index` of `num_shards`: it updates the parameters that are assigned to it, and drops the moments
+    /// of the others. Parameters are not split. They are assigned in descending order of their moments' size, each to the shard that has
+    /// least so far (ZeRO stage 1, Rajbhandari et al. 2020, by tensors).
+    pub fn shard(&mut self, shard_index: usize, num_shards: usize) {
         self.shard_index = shard_index;
         let mut order: Vec<usize> = (0..self.parameters.len()).collect();
         let size = |p: &Parameter| p.moments().map(|(_, moment)| moment.numel()).sum::<usize>();
         order.sort_by_key(|&i| std::cmp::Reverse(size(&self.parameters[i])));
-        let mut sizes = vec![0; parts];
+        let mut sizes = vec![0; num_shards];
         for i in order {
             let least = (0..parts).min_by_key(|&shard_index| sizes[shard_index]).expect("a shard");
             let p = &mut self.parameters[i];

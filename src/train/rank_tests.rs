@@ -207,7 +207,7 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
 }
 
 #[test]
-fn ranks_stop_run_on_ranks() {
+fn ranks_stop_together() {
     if !can_meet() {
         return;
     }

@@ -67,7 +67,7 @@ pub struct Trainer {
     /// Number of samples drawn, which is the position in the data.
     pub(super) samples: u64,
     scenes: Arc<dyn SceneGroups>,
-    /// DataLoader of the samples, started by the first step that is done.
+    /// Loader of the samples, started by the first step that is done.
     loader: Option<DataLoader>,
     /// Process group of the ranks that make every step together, each with its own samples.
     pub(super) group: ProcessGroup,

@@ -89,7 +89,7 @@ fn statics_are_on_the_page() {
         }
     }
     assert!(unlisted.is_empty(), "{unlisted:?}");
-    assert!(found >= 6, "{found} statics: are all of them found?");
+    assert!(found >= 4, "{found} statics: are all of them found?");
 }
 
 /// The library has no command line: what it says names its own arguments, and `src/cli/option_names.rs` names the options.

@@ -394,7 +394,7 @@ fn instruction_sets_agree() {
     for level in ["avx512", "avx2", "neon", "portable"] {
         let out = folder.path().join(level);
         let status = Command::new(std::env::current_exe().expect("this test's path"))
-            .args(["--exact", "instruction_sets_agree"])
+            .args(["--exact", "splat::instruction_sets_agree"])
             .env("GLOBALSPLAT_SIMD", level)
             .env(OUT, &out)
             .stdout(Stdio::null())
@@ -460,7 +460,7 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
     for order in ["1", "2"] {
         let out = folder.path().join(order);
         let passed = Command::new(std::env::current_exe().expect("this test's path"))
-            .args(["--exact", "kernels_for_gpus_draw_the_cpus_bits"])
+            .args(["--exact", "splat::kernels_for_gpus_draw_the_cpus_bits"])
             .env("GLOBALSPLAT_CUDA_ON_CPU", order)
             .env(OUT, &out)
             .stdout(Stdio::null())

@@ -3,7 +3,7 @@
 use crate::common::program::{
     arg, command, fail, globalsplat, room, rooms, succeed, tiny_config, tiny_weights,
 };
-use crate::common::{again, has_lpips, skip};
+use crate::common::{has_lpips, skip};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -123,27 +123,6 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
     assert!(report["pairs"]["contributing"].as_f64().unwrap() > 1e7, "an empty picture proves nothing");
     let bytes = report["working_bytes"].as_u64().unwrap();
     assert!((100_000_000..1_000_000_000).contains(&bytes), "{bytes} bytes of working memory");
-}
-
-/// The memory of a process includes that of the tests that run beside this one, so it runs by itself.
-#[test]
-fn memory_before_is_not_counted() {
-    const ALONE: &str = "GLOBALSPLAT_ALONE";
-    if std::env::var_os(ALONE).is_none() {
-        let name = "commands::memory_before_is_not_counted";
-        assert!(again(name, &[(ALONE, Path::new("1"))]).0);
-        return;
-    }
-    let (large, small) = (100_000, 1_000);
-    let working = |gaussians: usize| {
-        let (gaussians, cameras) = globalsplat::bench::synthetic_scene(gaussians, 1, [256, 256].into());
-        globalsplat::bench::bench_raster(&gaussians, &cameras, 1).expect("a measurement").working_bytes
-    };
-    // Both in one process, the large one first.
-    let (first, second) = (working(large), working(small));
-    if cfg!(target_os = "linux") {
-        assert!(first > 20_000_000 && second < first / 2, "{first} {second}");
-    }
 }
 
 #[test]

@@ -1,4 +1,4 @@
-// Renders a splat with Spark (sparkjs.dev), on three.js, as its quick start shows, for tests/viewers.rs.
+// Renders a splat with Spark (sparkjs.dev), on three.js, as its quick start shows, for tests/viewers/viewers.rs.
 
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
