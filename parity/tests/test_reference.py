@@ -33,7 +33,7 @@ DTYPES = [torch.float32, torch.float64]
 
 def golden(name):
     if not GOLDEN.is_dir():
-        pytest.skip(f"golden tensors: {GOLDEN} is not there; set GLOBALSPLAT_GOLDEN")
+        pytest.skip(f"golden tensors: {GOLDEN} is missing; set GLOBALSPLAT_GOLDEN")
     return GOLDEN / name
 
 

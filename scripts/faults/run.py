@@ -55,8 +55,8 @@ SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
 TIMEOUT = 30
 # Lines on standard error that are not error messages.
 NOTICE = re.compile(
-    "training paused: .* when there is disk space$|disk space is available again: training resumes$|.*the checkpoint before it is taken$"
-    "|.*the best checkpoint is looked for anew$|left out: lpips_|.* pixels that the model sees$"
+    "training paused: .* when there is disk space$|disk space is available again: training resumes$|.*the previous checkpoint is used$"
+    "|.*the best checkpoint is determined again$|left out: lpips_|.* pixels that the model sees$"
 )
 # Names of temporary files and folders.
 TEMPORARY = re.compile(r"(^|/)\.[^/]+\.globalsplat-(partial(-\d+)?|old)(/|$)")

@@ -55,8 +55,12 @@ pub fn bench_refine(
     let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
     let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
     let c2w = cameras.w2c.inverse();
-    let photos =
-        Photos::of(ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c, intrinsics: cameras.intrinsics });
+    let photos = Photos::from_batch(ViewBatch {
+        images: pictures.rgb,
+        c2w,
+        w2c: cameras.w2c,
+        intrinsics: cameras.intrinsics,
+    });
     let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
     let mut none = Corrections::none();
     let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };

@@ -105,8 +105,8 @@ pub fn bench_train(
     let (rank, ranks) = (group.rank(), group.world_size());
     let trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
     let mut trainer = match shards_optimizer {
-        true => trainer.with_ranks(group).with_sharded_optimizer(),
-        false => trainer.with_ranks(group),
+        true => trainer.with_group(group).with_sharded_optimizer(),
+        false => trainer.with_group(group),
     };
     trainer.broadcast_state()?;
     let seeds = (rank * config.train.batch_size) as u64..;
@@ -161,10 +161,10 @@ fn measure(
     for step in 0..=steps {
         let mut watch = Stopwatch::new(upload.device());
         let sample = watch.time("data", || Batch::from_scenes_with(scenes, upload))?;
-        let mut learn = || trainer.learn(&sample, &mut watch, &mut || true);
+        let mut train_step = || trainer.train_step(&sample, &mut watch, &mut || true);
         match step {
-            0 => learn()?,
-            _ => parts.watch(upload.device(), learn)?,
+            0 => train_step()?,
+            _ => parts.watch(upload.device(), train_step)?,
         };
         if step > 0 {
             measured.add(&mut watch)?;
@@ -194,7 +194,7 @@ fn together(
     let communication = communication.told().0;
     let gradient_bytes = trainer.gradient_bytes();
     trainer.group().leave()?;
-    let mut apart = trainer.with_ranks(ProcessGroup::single());
+    let mut apart = trainer.with_group(ProcessGroup::single());
     Ok(DistributedCost {
         ranks,
         scenes_per_second,
@@ -261,9 +261,9 @@ mod tests {
             let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), Device::Cpu).unwrap();
             let scenes: Vec<_> = (0..2).map(|seed| synthetic_scene(&config, seed)).collect();
             let sample = Batch::from_scenes(&scenes, Device::Cpu).unwrap();
-            trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
+            trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).unwrap();
         });
-        MemoryEstimate::of(&config, Device::Cpu).unwrap().total() as f64 / found as f64
+        MemoryEstimate::new(&config, Device::Cpu).unwrap().total() as f64 / found as f64
     }
 
     #[test]

@@ -331,7 +331,7 @@ impl Synth {
             "{:.1} views/s on one core, {:.2} 10^6 rays/s",
             report.views_per_second, report.megarays_per_second
         );
-        println!("{:.2} s until a world can be looked at, all cores", report.seconds_per_world);
+        println!("{:.2} s to build a scene, all cores", report.seconds_per_world);
         Ok(())
     }
 }

@@ -51,7 +51,7 @@ impl Attention {
             .into());
         }
         let sizes = [self.queries.into(), self.keys.into(), self.width.into(), self.heads.into()];
-        let asked = model::asked_precision(&self.precision)?;
+        let asked = model::parse_precision(&self.precision)?;
         let precision = model::precision(asked, Device::Cpu, self.width.into());
         let report = bench_attention(sizes, precision, self.repeats as usize)?;
         if self.json {

@@ -39,7 +39,7 @@ pub struct Model {
 impl Model {
     pub fn run(self) -> Result<()> {
         let device = device::parse(&self.device)?;
-        let asked = model::asked_precision(&self.precision)?;
+        let asked = model::parse_precision(&self.precision)?;
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         let precision = model::precision(asked, device, config.model.width);
         config.data.context_views = self.views.into();

@@ -7,7 +7,7 @@ use globalsplat::config::Config;
 use globalsplat::device::total_memory_bytes;
 use globalsplat::error::{Error, panic_message};
 use globalsplat::ranks::ProcessGroup;
-use globalsplat::train::batch_within;
+use globalsplat::train::largest_fitting_batch;
 use serde_json::json;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
@@ -99,7 +99,7 @@ impl Train {
     fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<TrainReport> {
         let wanted = config.train.batch_size;
         let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
-        let (fits, refused) = batch_within(&config, bytes, device)?;
+        let (fits, refused) = largest_fitting_batch(&config, bytes, device)?;
         if let Some(refused) = refused {
             let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
             eprintln!(

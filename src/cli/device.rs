@@ -33,5 +33,5 @@ pub fn load_cuda() -> std::result::Result<(), String> {
     }
     // SAFETY: dlerror returns a terminated string, and nothing else calls it before the string is copied.
     let words = unsafe { CStr::from_ptr(libc::dlerror()) };
-    Err(format!("its half for CUDA can't be loaded: {}", words.to_string_lossy()))
+    Err(format!("libtorch's CUDA library can't be loaded: {}", words.to_string_lossy()))
 }

@@ -218,8 +218,8 @@ fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str)
 /// Prints the memory of a training step, a column for each kind of device, and whether it fits into the devices of this
 /// machine.
 fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()> {
-    let cpu = MemoryEstimate::of(config, Device::Cpu)?;
-    let gpu = MemoryEstimate::of(config, Device::Cuda(0))?;
+    let cpu = MemoryEstimate::new(config, Device::Cpu)?;
+    let gpu = MemoryEstimate::new(config, Device::Cuda(0))?;
     let driver = Driver::find();
     let gpus = driver.iter().flat_map(|driver| &driver.gpus);
     let machine = total_memory_bytes(Device::Cpu).map(|bytes| ("this machine".to_string(), bytes, cpu));

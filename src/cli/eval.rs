@@ -1,6 +1,6 @@
 use super::{
-    check_former_option, check_views, device, model, open_capture, print_json, progress, ranks, say_shrunk,
-    stop_flag, warn, warn_of_many,
+    check_former_option, check_views, device, model, open_capture, print_json, progress, ranks,
+    report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -9,8 +9,8 @@ use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::{
     Baselines, CaptureScores, ContactSheet, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex,
-    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, judge, machine, weights_fingerprint,
-    write_csv, write_evaluation, write_report,
+    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, machine, score_output,
+    weights_fingerprint, write_csv, write_evaluation, write_report,
 };
 use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png, weights_files};
 use globalsplat::model::Precision;
@@ -132,22 +132,22 @@ impl Eval {
         if self.chooses_size() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let mut made = self.method(model).render_targets(scene, device)?;
-        warn(&made.warnings);
+        let mut output = self.method(model).render_targets(scene, device)?;
+        warn(&output.warnings);
         let peak_memory = peak_memory_bytes(); // of the method, without the networks of the metrics
         let perceptual = Perceptual::find(device)?;
-        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(made.scene.target.len()));
-        let scores = judge(&mut made, &perceptual, |ground_truth, picture, _| {
+        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(output.scene.target.len()));
+        let scores = score_output(&mut output, &perceptual, |ground_truth, picture, _| {
             let row = sheet.as_mut().zip(picture.rendered.as_ref());
             row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image, rendered))
         })?;
-        let scene = &made.scene;
+        let scene = &output.scene;
         // For a model, also score the trivial baselines that use only the input photos.
         let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
         if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
-            say_shrunk(path, sheet.write(path)?);
+            report_downscaling(path, sheet.write(path)?);
         }
-        if let Some(line) = perceptual.why_absent(&scores) {
+        if let Some(line) = perceptual.explain_missing(&scores) {
             eprintln!("{line}");
         }
         if self.json {
@@ -155,12 +155,12 @@ impl Eval {
             object["peak_memory_bytes"] = peak_memory.into();
             if let Some(Model { input, config, .. }) = model {
                 let (photos, size) = (scene.context.len(), config.data.image_size);
-                object["image_size"] = json!(self.picture_size(model)?);
+                object["image_size"] = json!(self.target_size(model)?);
                 object["input"] = json!({
                     "photos": photos, "image_size": input.photo_size(size),
                     "views": photos * input.views_of_photo(),
                 });
-                object["forward_seconds"] = json!(made.forward_seconds);
+                object["forward_seconds"] = json!(output.forward_seconds);
             }
             if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
                 let means = |scores: &CaptureScores| json!({ "psnr": scores.psnr, "ssim": scores.ssim });
@@ -183,25 +183,25 @@ impl Eval {
 
     /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
-        let picture_size = self.picture_size(model)?;
+        let target_size = self.target_size(model)?;
         let Some(model) = model else {
-            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| picture_size)));
+            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| target_size)));
         };
         let photo_size = model.input.photo_size(model.config.data.image_size);
-        Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, picture_size)?)
+        Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, target_size)?)
     }
 
     /// Scores the baselines that use only the input photos of `scene`, at the size of the scored images.
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
-        let size = self.picture_size(Some(model))?;
+        let size = self.target_size(Some(model))?;
         let photos = match size == model.input.photo_size(model.config.data.image_size) {
             true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
             false => {
                 let shown = context_views(capture, self.holdout(model)?, self.views);
-                LazyPhotos::of(capture, &shown, Some(size))
+                LazyPhotos::from_capture(capture, &shown, Some(size))
             }
         };
-        Ok(Baselines::of(&scene.name, &photos, &scene.target)?)
+        Ok(Baselines::compute(&scene.name, &photos, &scene.target)?)
     }
 
     fn holdout(&self, model: Model) -> Result<Holdout> {
@@ -217,7 +217,7 @@ impl Eval {
     }
 
     /// Returns the size of the scored images.
-    fn picture_size(&self, model: Option<Model>) -> Result<ImageSize> {
+    fn target_size(&self, model: Option<Model>) -> Result<ImageSize> {
         let default = model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size);
         let Some(height) = self.pictures_at else { return Ok(default) };
         let aspect = f64::from(default.width) / f64::from(default.height);
@@ -233,8 +233,8 @@ impl Eval {
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
-        let asked = model::asked_precision(&self.precision)?;
-        let load = |path: &PathBuf| model::load(Some(path), asked, device);
+        let requested = model::parse_precision(&self.precision)?;
+        let load = |path: &PathBuf| model::load(Some(path), requested, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 
@@ -243,11 +243,11 @@ impl Eval {
         let Some(loaded) = loaded else { return Ok(None) };
         let trained = loaded.config.data.image_size;
         let input = match self.views_at {
-            Some(height) => Input::at(height, trained)?,
+            Some(height) => Input::with_height(height, trained)?,
             None => Input::PLAIN,
         };
         if !input.is_plain() && ranks::is_main_process() {
-            eprintln!("photos are cut and resized to {}", model::shown_as(input, trained));
+            eprintln!("photos are cut and resized to {}", model::describe_input(input, trained));
         }
         Ok(Some(Model { input, ..loaded.into() }))
     }
@@ -327,7 +327,7 @@ impl Eval {
         self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = self.model(loaded.as_ref())?;
-        let picture_size = self.picture_size(model)?;
+        let target_size = self.target_size(model)?;
         let fingerprint = self.fingerprint()?;
         let stop = stop_flag()?;
 
@@ -352,13 +352,13 @@ impl Eval {
                 root: data,
                 dataset_name,
                 index,
-                picture_size,
+                target_size,
                 machine: machine(device)?,
                 device,
                 out: &folder,
                 group: &group,
             };
-            let bar = progress::of_first(group.is_main_process(), 0, "scenes");
+            let bar = progress::bar_on_first_rank(group.is_main_process(), 0, "scenes");
             let evaluation = sweep.run(
                 || Perceptual::find(device),
                 |done, of| {
@@ -373,7 +373,8 @@ impl Eval {
             }
             if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
                 let perceptual = Perceptual::find(device)?;
-                let why = evaluation.scenes.iter().find_map(|scene| perceptual.why_absent(&scene.scores));
+                let why =
+                    evaluation.scenes.iter().find_map(|scene| perceptual.explain_missing(&scene.scores));
                 why.iter().for_each(|line| eprintln!("{line}"));
             }
             let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();

@@ -41,7 +41,7 @@ impl Inspect {
             _ => {
                 std::fs::metadata(&self.path).map_err(Error::read(&self.path))?;
                 let expected = "a splat (.ply, .compressed.ply, .spz or .splat), a .safetensors, a .ckpt, a .torch or a capture";
-                return Err(Error::input(&self.path, "the path", "none that inspect knows", expected).into());
+                return Err(Error::input(&self.path, "the path", "of an unknown type", expected).into());
             }
         };
         if self.json {
@@ -100,7 +100,7 @@ fn weights(path: &Path) -> Result<Value> {
     let bytes = std::fs::metadata(weights.path())?.len();
     let [configuration, stage] = [CONFIG_KEY, STAGE_KEY].map(|key| weights.metadata().get(key).cloned());
     // For weights without a configuration, infer it from the shapes.
-    let model = ModelFile::of(weights, &[]).ok();
+    let model = ModelFile::from_weights(weights, &[]).ok();
     let configuration = configuration.or(model.as_ref().map(|model| model.config.to_toml()));
     Ok(json!({
         "kind": "weights",

@@ -9,29 +9,29 @@ use std::time::Duration;
 
 /// Global allocator that ends the process if an allocation fails: Rust's default is to abort, with a core dump. Files are
 /// written so that ending this way loses nothing.
-struct OrEnd;
+struct ExitOnFailedAllocation;
 
 /// `true` once a thread has printed that memory is out: others that run out of it at the same time stay silent.
 static IS_REPORTED: AtomicBool = AtomicBool::new(false);
 
 #[global_allocator]
-static ALLOCATOR: OrEnd = OrEnd;
+static ALLOCATOR: ExitOnFailedAllocation = ExitOnFailedAllocation;
 
 // SAFETY: it is the system's allocator, except for what follows a failed allocation.
-unsafe impl GlobalAlloc for OrEnd {
+unsafe impl GlobalAlloc for ExitOnFailedAllocation {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         // SAFETY: the caller upholds the contract of the system's allocator.
-        or_end(unsafe { System.alloc(layout) }, layout.size())
+        exit_if_null(unsafe { System.alloc(layout) }, layout.size())
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         // SAFETY: as in `alloc`.
-        or_end(unsafe { System.alloc_zeroed(layout) }, layout.size())
+        exit_if_null(unsafe { System.alloc_zeroed(layout) }, layout.size())
     }
 
     unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         // SAFETY: as in `alloc`.
-        or_end(unsafe { System.realloc(memory, layout, size) }, size)
+        exit_if_null(unsafe { System.realloc(memory, layout, size) }, size)
     }
 
     unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
@@ -40,7 +40,7 @@ unsafe impl GlobalAlloc for OrEnd {
     }
 }
 
-fn or_end(memory: *mut u8, bytes: usize) -> *mut u8 {
+fn exit_if_null(memory: *mut u8, bytes: usize) -> *mut u8 {
     if memory.is_null() {
         end(Some(bytes));
     }
@@ -48,7 +48,7 @@ fn or_end(memory: *mut u8, bytes: usize) -> *mut u8 {
 }
 
 /// Makes the process end with exit code 1 if C++'s `new` can't allocate, or if a library aborts.
-pub fn end_as_failed() {
+pub fn install_failure_handlers() {
     extern "C" fn end_quietly(_: libc::c_int) {
         // SAFETY: `_exit` ends the process, which is allowed in a signal handler.
         unsafe { libc::_exit(FAILED.into()) }

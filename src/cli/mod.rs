@@ -130,7 +130,7 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    memory::end_as_failed();
+    memory::install_failure_handlers();
     // This must precede the start of other threads.
     globalsplat::model::flush_denormals();
     #[cfg(target_os = "linux")]
@@ -174,7 +174,7 @@ const PRINTING: &str = "failed printing to stdout: ";
 
 /// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
 fn tell(message: &str, others_are_lost: bool) {
-    let Some(message) = ranks::what_to_tell(message, others_are_lost) else { return };
+    let Some(message) = ranks::message_to_print(message, others_are_lost) else { return };
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
@@ -254,7 +254,7 @@ fn print_json(value: &serde_json::Value) {
 }
 
 /// Reports that the photos in the file at `path` are downscaled, if the sides of the largest are divided by more than 1.
-fn say_shrunk(path: &Path, by: i64) {
+fn report_downscaling(path: &Path, by: i64) {
     if by > 1 {
         eprintln!(
             "{}: pictures are shrunk to 1/{by} of their sides, to 64 million pixels at most in all",

@@ -10,20 +10,20 @@ use std::path::Path;
 use tch::Device;
 
 /// Parses `--precision`; `auto` gives `None`.
-pub fn asked_precision(asked: &str) -> Result<Option<Precision>> {
-    if asked == "auto" {
+pub fn parse_precision(requested: &str) -> Result<Option<Precision>> {
+    if requested == "auto" {
         return Ok(None);
     }
-    let precision = asked.parse().map_err(|_| {
-        Error::request(format!("--precision: {asked} is no precision, expected auto, f32 or bf16"))
+    let precision = requested.parse().map_err(|_| {
+        Error::request(format!("--precision: {requested} is no precision, expected auto, f32 or bf16"))
     })?;
     Ok(Some(precision))
 }
 
-/// Returns the precision `asked`, or [`Precision::best_on`] `device` for tokens of `width` elements. Warns if bf16 is the
+/// Returns the precision `requested`, or [`Precision::best_on`] `device` for tokens of `width` elements. Warns if bf16 is the
 /// slower one.
-pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precision {
-    let precision = asked.unwrap_or_else(|| Precision::best_on(device, width));
+pub fn precision(requested: Option<Precision>, device: Device, width: i64) -> Precision {
+    let precision = requested.unwrap_or_else(|| Precision::best_on(device, width));
     if precision == Precision::Bf16
         && Precision::fastest_on(device) == Precision::F32
         && ranks::is_main_process()
@@ -34,12 +34,12 @@ pub fn precision(asked: Option<Precision>, device: Device, width: i64) -> Precis
 }
 
 /// Loads the model in `weights`, or the one embedded in this program, to compute in [`precision`].
-pub fn load(weights: Option<&Path>, asked: Option<Precision>, device: Device) -> Result<LoadedModel> {
+pub fn load(weights: Option<&Path>, requested: Option<Precision>, device: Device) -> Result<LoadedModel> {
     let file = match weights {
         Some(weights) => ModelFile::open(weights, &[])?,
-        None => ModelFile::shipped()?,
+        None => ModelFile::open_bundled()?,
     };
-    let precision = precision(asked, device, file.config.model.width);
+    let precision = precision(requested, device, file.config.model.width);
     let loaded = file.load_mmap(device, precision)?;
     if !ranks::is_main_process() {
         return Ok(loaded);
@@ -62,7 +62,7 @@ pub fn name(weights: Option<&Path>) -> &Path {
 pub const ENLARGED: &str = "smaller photos are enlarged, which shows no more of the scene";
 
 /// Describes the size to which photos are resized for a model that was trained with images of `trained`.
-pub fn shown_as(input: Input, trained: ImageSize) -> String {
+pub fn describe_input(input: Input, trained: ImageSize) -> String {
     let pixels = |size: ImageSize| format!("{}×{} pixels", size.width, size.height);
     let (photo, trained, views) =
         (pixels(input.photo_size(trained)), pixels(trained), input.views_of_photo());

@@ -16,27 +16,27 @@ use tch::{Device, Kind, Tensor};
 const INTERVAL: Duration = Duration::from_millis(200);
 
 /// Fraction of a core that other processes may take before threads stop spinning, and the fraction below which they spin again.
-const CROWDED: f64 = 0.25;
-const QUIET: f64 = 0.1;
+const START_THRESHOLD: f64 = 0.25;
+const STOP_THRESHOLD: f64 = 0.1;
 
 /// Starts the guard, which runs until the returned value is dropped. If the CPU time of other processes can't be measured,
 /// threads wait as usual.
 pub fn start_guard() -> Option<Background> {
     // Without the guard's thread, the program runs as if no other process used the cores.
     Background::start("oversub", |until: Receiver<()>| {
-        let mut crowds = Vec::new();
+        let mut idle_teams = Vec::new();
         let mut before = Times::now();
         while until.recv_timeout(INTERVAL) == Err(RecvTimeoutError::Timeout) {
             let now = Times::now();
             let (Some(then), Some(later)) = (&before, &now) else { return };
             let threads = tch::get_num_threads() as usize;
             let missing = threads as f64 + later.others_since(then) - later.cores as f64;
-            if threads < 2 || missing < QUIET {
-                crowds.clear();
-            } else if missing > CROWDED && crowds.is_empty() {
+            if threads < 2 || missing < STOP_THRESHOLD {
+                idle_teams.clear();
+            } else if missing > START_THRESHOLD && idle_teams.is_empty() {
                 // More threads than cores are needed: one team is enough unless the user asked for fewer threads.
                 let teams = (later.cores + 1).saturating_sub(threads).div_ceil(threads - 1);
-                crowds.extend((0..teams).map_while(|_| crowd()));
+                idle_teams.extend((0..teams).map_while(|_| start_idle_team()));
             }
             before = now;
         }
@@ -44,8 +44,8 @@ pub fn start_guard() -> Option<Background> {
 }
 
 /// Starts an additional, sleeping team of libgomp threads that lives until the returned value is dropped.
-fn crowd() -> Option<Background> {
-    Background::start("crowd", |until: Receiver<()>| {
+fn start_idle_team() -> Option<Background> {
+    Background::start("idle_team", |until: Receiver<()>| {
         // Large enough for libtorch to split across threads: a thread that libgomp didn't start gets a team of its own, and
         // keeps it until it ends.
         let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
@@ -165,16 +165,16 @@ mod tests {
     }
 
     #[test]
-    fn a_crowd_is_there_while_it_is_held() {
+    fn idle_team_lives_until_dropped() {
         tch::set_num_threads(3);
-        let crowd = crowd().unwrap();
-        assert!(becomes("crowd", 3), "{}", called("crowd"));
+        let crowd = start_idle_team().unwrap();
+        assert!(becomes("idle_team", 3), "{}", called("idle_team"));
         drop(crowd);
-        assert!(becomes("crowd", 0), "{}", called("crowd"));
+        assert!(becomes("idle_team", 0), "{}", called("idle_team"));
     }
 
     #[test]
-    fn nobody_watches_once_the_program_ends() {
+    fn guard_thread_ends_when_dropped() {
         let guard = start_guard();
         assert!(becomes("oversub", 1), "{}", called("oversub"));
         drop(guard);

@@ -32,7 +32,7 @@ pub fn bar(length: u64, unit: &'static str) -> Progress {
 }
 
 /// Creates a progress bar over a time budget: its position is the number of seconds elapsed.
-pub fn seconds_of(time: Duration) -> Progress {
+pub fn time_bar(time: Duration) -> Progress {
     progress(time.as_secs_f64().ceil() as u64, "{bar:30} {pos}/{len} s {msg}", Unit::Seconds)
 }
 
@@ -45,7 +45,7 @@ fn progress(length: u64, template: &str, unit: Unit) -> Progress {
 }
 
 /// Creates a [`bar`] in the first of the processes that share the work, and a hidden one in the others.
-pub fn of_first(is_main_process: bool, length: u64, unit: &'static str) -> Progress {
+pub fn bar_on_first_rank(is_main_process: bool, length: u64, unit: &'static str) -> Progress {
     match is_main_process {
         true => bar(length, unit),
         false => Progress { bar: ProgressBar::hidden(), _lines: None },
@@ -124,7 +124,7 @@ mod tests {
 
     /// The time left of a fixed budget is independent of the rate of the work.
     #[test]
-    fn time_that_is_given_is_what_is_left() {
+    fn a_time_budget_shows_the_exact_time_left() {
         let bar = ProgressBar::hidden();
         bar.set_length(60);
         assert_eq!(line(&bar, Unit::Seconds), "0 of 60 seconds, 60 seconds left");
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn work_that_stands_still_has_no_end() {
+    fn stalled_work_has_no_estimate() {
         assert_eq!(rate(2., Duration::from_secs(5)), ", 2.0 a second, 5 seconds left");
         assert_eq!(rate(1e-9, Duration::from_secs(1 << 40)), ", none for a while");
     }

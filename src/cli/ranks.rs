@@ -63,7 +63,7 @@ pub fn refuse() -> Result<()> {
 }
 
 /// Returns the error message that this process should print, or `None` if another process reports it.
-pub fn what_to_tell(message: &str, others_are_lost: bool) -> Option<String> {
+pub fn message_to_print(message: &str, others_are_lost: bool) -> Option<String> {
     match WATCH.get() {
         Some(watch) => watch.message_to_print(message, others_are_lost),
         None => Some(message.into()),

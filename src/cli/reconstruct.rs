@@ -84,30 +84,30 @@ impl Reconstruct {
         let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
-        let asked = model::asked_precision(&self.precision)?;
+        let asked = model::parse_precision(&self.precision)?;
         let started = process_age();
-        let mut watch = Stopwatch::default();
-        let loaded = watch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
-        let capture = watch.time("photos", || open_capture(&self.scene))?;
+        let mut stopwatch = Stopwatch::default();
+        let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
+        let capture = stopwatch.time("photos", || open_capture(&self.scene))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {
-            Some(height) => Input::at(height, data.image_size)?,
+            Some(height) => Input::with_height(height, data.image_size)?,
             None => Input::PLAIN,
         };
         let count = self.views.unwrap_or(data.context_views);
         let size = input.photo_size(data.image_size);
-        let photos =
-            watch.time("photos", || keep_during(|| load_context(&capture, holdout, Some(count), size)))?;
+        let photos = stopwatch
+            .time("photos", || keep_during(|| load_context(&capture, holdout, Some(count), size)))?;
         if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
             eprintln!("{line}");
         }
         let model = Model { input, ..Model::from(&loaded) };
-        let reconstruction = watch.time("network", || reconstruct(model, &photos, &[]))?;
-        watch.time("splat", || {
+        let reconstruction = stopwatch.time("network", || reconstruct(model, &photos, &[]))?;
+        stopwatch.time("splat", || {
             let (splat, cameras) = (reconstruction.to_splat()?, capture.cameras());
             let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
             splat_out::write_for(&self.out, &splat, &cameras, origin)
@@ -115,7 +115,7 @@ impl Reconstruct {
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))
             .into_iter()
-            .chain(watch.sections()?.iter().copied())
+            .chain(stopwatch.sections()?.iter().copied())
             .map(|(name, time)| (name.into(), json!(time.as_secs_f64())))
             .collect();
         let from_start = process_age().map(|age| age.as_secs_f64());
@@ -172,7 +172,7 @@ fn fitting(capture: &Capture, shown: usize, input: Input, trained: ImageSize) ->
     let sizes: BTreeSet<(u32, u32)> = capture.cameras().iter().map(|c| (c.width, c.height)).collect();
     let chosen = (shown < capture.len())
         .then(|| format!("{shown} of {} photos are shown, spread over the camera's path", capture.len()));
-    let model = model::shown_as(input, trained);
+    let model = model::describe_input(input, trained);
     let fitted = match sizes.first() {
         Some((width, height)) if sizes.len() == 1 => ((*width, *height) != (size.width, size.height))
             .then(|| format!("{width}×{height} pixels are cut and resized to {model}")),

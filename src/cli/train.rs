@@ -79,7 +79,7 @@ impl Train {
                 &self.config,
                 "data.captures",
                 "empty",
-                "a capture, a folder of captures, or a data set",
+                "a capture, a folder of captures, or a dataset",
             )
             .into());
         }
@@ -101,7 +101,7 @@ impl Train {
             trainer = trainer.with_weights(weights);
         }
 
-        let mut trainer = trainer.with_ranks(group);
+        let mut trainer = trainer.with_group(group);
         if self.shard_optimizer {
             trainer = trainer.with_sharded_optimizer();
         }
@@ -158,26 +158,26 @@ impl Train {
         stop: &AtomicBool,
     ) -> Result<Outcome> {
         let is_main_process = trainer.group().is_main_process();
-        let bar = progress::of_first(is_main_process, config.train.steps, "steps");
+        let bar = progress::bar_on_first_rank(is_main_process, config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut validation = String::new();
         let mut first = true;
         let validator = (!held_out.is_empty()).then_some(held_out as &mut dyn Validator);
         let outcome = run(trainer, &self.out, resume, validator, |event| {
-            let go_on = !stop.load(Ordering::Relaxed);
+            let should_continue = !stop.load(Ordering::Relaxed);
             let (report, samples_per_second) = match event {
                 Event::Step { report, samples_per_second } => (report, samples_per_second),
                 Event::Validation(score) => {
                     validation = format!(" held out {:.2} dB (stage {})", score.psnr, score.stage.index);
-                    return go_on;
+                    return should_continue;
                 }
                 Event::Notice(text) => {
                     if is_main_process {
                         bar.suspend(|| eprintln!("{text}"));
                     }
-                    return go_on;
+                    return should_continue;
                 }
-                Event::Waiting => return go_on,
+                Event::Waiting => return should_continue,
             };
             if first {
                 bar.set_position(report.step);
@@ -197,7 +197,7 @@ impl Train {
                 report.stage.mix,
                 report.learning_rate
             ));
-            go_on
+            should_continue
         })?;
         bar.abandon();
         Ok(outcome)
@@ -216,13 +216,13 @@ impl Train {
         };
         let curves = self.out.join(CURVES_FILE);
         let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr));
-        let mut observe = |event: Event| {
+        let mut on_event = |event: Event| {
             if let Event::Notice(text) = event {
                 eprintln!("{text}");
             }
             !stop.load(Ordering::Relaxed)
         };
-        retry_on_disk_full(&mut observe, || write_curves(&curves, &self.out, nearest))?;
+        retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest))?;
         if self.json {
             let mut object = json!({
                 "checkpoint": outcome.checkpoint.to_string_lossy(),
@@ -244,7 +244,7 @@ impl Train {
             return Ok(());
         }
         println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
-        println!("{}: how it went", curves.display());
+        println!("{}: training curves", curves.display());
         if !validation.is_empty() {
             println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
             for v in validation {

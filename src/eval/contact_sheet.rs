@@ -41,9 +41,9 @@ impl ContactSheet {
         let factor = self.0.factor(3, ground_truth);
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
         let [ground_truth, rgb] =
-            [ground_truth, &rendered.rgb.clamp(0., 1.)].map(|picture| shrink(picture, factor));
-        let pictures = [ground_truth, rgb, colourize_depth(&depth, &alpha)];
-        self.0.add_shrunk(&pictures.map(|picture| enlarge(&picture, HEIGHT)))
+            [ground_truth, &rendered.rgb.clamp(0., 1.)].map(|image| shrink(image, factor));
+        let images = [ground_truth, rgb, colourize_depth(&depth, &alpha)];
+        self.0.add_shrunk(&images.map(|image| enlarge(&image, HEIGHT)))
     }
 
     /// Writes the sheet as a PNG. Returns the factor by which the sides of the largest images were divided: 1 if nothing was shrunk.

@@ -130,7 +130,7 @@ pub struct Failure {
 
 impl Summary {
     /// Computes the means over `scenes`, at least one. An LPIPS or a number of Gaussians that any scene lacks has no mean.
-    pub fn of(scenes: &[SceneScores]) -> Self {
+    pub fn from_scenes(scenes: &[SceneScores]) -> Self {
         let mean = |value: &dyn Fn(&CaptureScores) -> Option<f64>| {
             let values: Option<Vec<f64>> = scenes.iter().map(|scene| value(&scene.scores)).collect();
             values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
@@ -147,7 +147,7 @@ impl Summary {
 
 impl Efficiency {
     /// Computes the cost from the scenes that a model was run on; `None` if there are none.
-    pub(super) fn of(scenes: &[SceneScores]) -> Option<Self> {
+    pub(super) fn from_scenes(scenes: &[SceneScores]) -> Option<Self> {
         let time = |scene: &SceneScores| scene.forward_seconds;
         let mut times: Vec<f64> = scenes.iter().filter(|scene| !scene.warm_up).filter_map(time).collect();
         if times.is_empty() {

@@ -70,16 +70,16 @@ impl HeldOut {
             groups.extend_from_slice(dataset.groups());
             warnings.extend_from_slice(dataset.warnings());
         }
-        let (trained, mut trained_on) = (places(training), vec![]);
+        let (trained, mut trained_on) = (scene_ids(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
             let capture = group.open()?.capture(&key)?;
             split_scene(&capture, config)?;
             warnings.extend_from_slice(capture.warnings());
-            let place = match group.is_folder() {
-                true => place(capture.file(), None),
-                false => place(group.path(), Some(&key)),
+            let scene_id = match group.is_folder() {
+                true => scene_id(capture.file(), None),
+                false => scene_id(group.path(), Some(&key)),
             };
-            if trained.contains(&place) {
+            if trained.contains(&scene_id) {
                 trained_on.push(capture.name.clone());
             }
             scenes.push(HeldOutScene::Whole(group, key));
@@ -144,7 +144,7 @@ impl HeldOutScene {
 
 /// Results of a rank for its share of the scenes, each with the index of its scene.
 #[derive(Debug, Default, Serialize, Deserialize)]
-struct Found {
+struct RankResults {
     scores: Vec<(usize, HeldOutScores)>,
     /// Error messages of the scenes that can't be used.
     unusable: Vec<(usize, String)>,
@@ -156,10 +156,14 @@ struct Found {
 
 impl HeldOut {
     /// Evaluates this rank's share of the scenes: every n-th of them for n ranks.
-    fn judge_share(&self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Found {
-        let (mut found, group) = (Found::default(), trainer.group());
+    fn score_assigned_scenes(
+        &self,
+        trainer: &Trainer,
+        should_continue: &mut dyn FnMut() -> bool,
+    ) -> RankResults {
+        let (mut found, group) = (RankResults::default(), trainer.group());
         for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.world_size()) {
-            if !go_on() {
+            if !should_continue() {
                 found.stopped = true;
                 break;
             }
@@ -170,7 +174,7 @@ impl HeldOut {
                     continue;
                 }
             };
-            match judge_views(trainer, &name, context, target) {
+            match score_scene(trainer, &name, context, target) {
                 Ok(scores) => found.scores.push((i, scores)),
                 Err(e) => {
                     found.failed = Some(e.to_string());
@@ -183,7 +187,7 @@ impl HeldOut {
 }
 
 /// Reconstructs scene `name` from the views `context` and scores the renders against `target`.
-fn judge_views(
+fn score_scene(
     trainer: &Trainer,
     name: &str,
     context: Vec<View>,
@@ -205,10 +209,16 @@ impl Validator for HeldOut {
         self.scenes.len()
     }
 
-    fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>> {
+    fn validate(
+        &mut self,
+        trainer: &Trainer,
+        should_continue: &mut dyn FnMut() -> bool,
+    ) -> Result<Option<Score>> {
         self.scores.clear();
         let (mut scores, mut unusable) = (vec![], vec![]);
-        for found in trainer.group().all_gather_object(self.judge_share(trainer, go_on))? {
+        for found in
+            trainer.group().all_gather_object(self.score_assigned_scenes(trainer, should_continue))?
+        {
             if let Some(why) = found.failed {
                 return Err(Error::failed(why));
             }
@@ -239,17 +249,17 @@ impl Validator for HeldOut {
 }
 
 /// Identity of a scene: its file, and its key in that file.
-type Place = (PathBuf, Option<String>);
+type SceneId = (PathBuf, Option<String>);
 
-fn place(file: &Path, key: Option<&String>) -> Place {
+fn scene_id(file: &Path, key: Option<&String>) -> SceneId {
     (file.canonicalize().unwrap_or(file.to_owned()), key.cloned())
 }
 
 /// Returns the identities of all scenes of `training`.
-fn places(training: &TrainingScenes) -> BTreeSet<Place> {
-    let captures = training.captures().iter().map(|capture| place(capture.file(), None));
+fn scene_ids(training: &TrainingScenes) -> BTreeSet<SceneId> {
+    let captures = training.captures().iter().map(|capture| scene_id(capture.file(), None));
     let others = training.others().iter();
-    let others = others.flat_map(|group| group.keys.iter().map(|key| place(group.path(), Some(key))));
+    let others = others.flat_map(|group| group.keys.iter().map(|key| scene_id(group.path(), Some(key))));
     captures.chain(others).collect()
 }
 

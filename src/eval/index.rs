@@ -31,7 +31,7 @@ impl SceneFrames {
     }
 
     /// Returns the file names of the target images without their extensions: six-digit frame numbers, as chunks name frames.
-    pub(super) fn picture_names(&self) -> Vec<String> {
+    pub(super) fn render_names(&self) -> Vec<String> {
         self.target.iter().map(|frame| format!("{frame:06}")).collect()
     }
 }

@@ -22,7 +22,7 @@ pub(super) struct Identity {
 
 /// Scores of a scene as they are stored on disk.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Kept {
+pub(super) struct StoredScores {
     #[serde(flatten)]
     pub scores: SceneScores,
     /// Checksums of the files that were scored, by which replaced files are detected.
@@ -31,7 +31,7 @@ pub(super) struct Kept {
 
 /// Returns the paths of the files that an evaluation of the scenes `keys` writes into the folder `out`.
 pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a String>) -> Vec<PathBuf> {
-    let journal = Journal::of(out);
+    let journal = Journal::new(out);
     let of_scene = |key: &'a String| [journal.file(key), comparison_path(out, key)];
     let of_all = [IDENTITY, SCORES, TABLE].map(|name| out.join(name));
     keys.into_iter().flat_map(of_scene).chain(of_all).collect()
@@ -61,7 +61,7 @@ impl Journal {
                 "a folder of its own (choose another output folder)",
             ));
         }
-        let journal = Journal::of(out);
+        let journal = Journal::new(out);
         std::fs::create_dir_all(&journal.scenes).map_err(Error::write(&journal.scenes))?;
         // If no scene has been scored yet, different settings do no harm.
         let mut entries = std::fs::read_dir(&journal.scenes).map_err(Error::read(&journal.scenes))?;
@@ -91,13 +91,13 @@ impl Journal {
     }
 
     /// Returns the journal in the folder `out`, without accessing the disk.
-    pub fn of(out: &Path) -> Self {
+    pub fn new(out: &Path) -> Self {
         Journal { scenes: out.join("scenes") }
     }
 
     /// Returns the stored scores of scene `key`. Returns `None` if there are none, or if they can't be read.
-    pub fn kept(&self, key: &str) -> Option<Kept> {
-        let kept: Kept = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
+    pub fn read_scores(&self, key: &str) -> Option<StoredScores> {
+        let kept: StoredScores = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
         (kept.scores.scores.scene == key).then_some(kept)
     }
 
@@ -106,7 +106,7 @@ impl Journal {
     /// # Errors
     /// Fails if the file can't be written.
     pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
-        Ok(write_json(&self.file(key), &Kept { scores: scores.clone(), files: Some(files) })?)
+        Ok(write_json(&self.file(key), &StoredScores { scores: scores.clone(), files: Some(files) })?)
     }
 
     fn file(&self, key: &str) -> PathBuf {

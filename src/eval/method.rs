@@ -24,18 +24,18 @@ pub enum Method<'a> {
     Model(Model<'a>),
     /// A splat in the capture's own world coordinates.
     Splat(PathBuf),
-    /// A folder of images named like the photos ([`crate::data::Capture::picture_names`]).
+    /// A folder of images named like the photos ([`crate::data::Capture::render_names`]).
     Renders(PathBuf),
 }
 
-/// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`judge`] needs them.
+/// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`score_output`] needs them.
 #[derive(Debug)]
 pub struct MethodOutput {
     /// Scene with its context and target views.
     pub scene: EvalScene,
-    source: PictureSource,
-    /// Photo and image of the first target view, until [`judge`] takes them.
-    first: Option<(View, Picture)>,
+    source: EvalImageSource,
+    /// Photo and image of the first target view, until [`score_output`] takes them.
+    first: Option<(View, EvalImage)>,
     /// Number of Gaussians of the splat; `None` if there is no splat.
     pub gaussians: Option<i64>,
     /// Size in bytes of the splat as a PLY, whatever its format; `None` if there is no splat.
@@ -48,7 +48,7 @@ pub struct MethodOutput {
 
 /// Source of the images of the target views.
 #[derive(Debug)]
-enum PictureSource {
+enum EvalImageSource {
     /// A splat, rendered from these poses (camera-to-world, in the splat's world coordinates).
     Splat(SplatRenderer, Vec<DMat4>),
     /// A folder of images.
@@ -57,7 +57,7 @@ enum PictureSource {
 
 /// An image of a target view.
 #[derive(Debug)]
-pub struct Picture {
+pub struct EvalImage {
     /// Colours, `[3, H, W]`.
     pub rgb: Tensor,
     /// Render with depth, if the image was rendered from a splat here.
@@ -92,23 +92,23 @@ impl Method<'_> {
     pub fn render_targets(&self, scene: EvalScene, device: Device) -> Result<MethodOutput> {
         let (source, splat, forward_seconds) = match self {
             Method::Model(model) => {
-                let made = reconstruct(*model, &scene.context, &scene.target.poses())?;
-                let splat = made.gaussians.to_splat(DVec3::ZERO)?;
+                let output = reconstruct(*model, &scene.context, &scene.target.poses())?;
+                let splat = output.gaussians.to_splat(DVec3::ZERO)?;
                 // The normalized world is already a local frame.
                 let frame = LocalFrame { origin: DVec3::ZERO, scale: 1. };
-                let renderer = SplatRenderer::new(&made.gaussians, DVec3::ZERO, frame);
-                let source = PictureSource::Splat(renderer.to_device(device), made.target_poses);
-                (source, Some(splat), Some(made.forward_time.as_secs_f64()))
+                let renderer = SplatRenderer::new(&output.gaussians, DVec3::ZERO, frame);
+                let source = EvalImageSource::Splat(renderer.to_device(device), output.target_poses);
+                (source, Some(splat), Some(output.forward_time.as_secs_f64()))
             }
             Method::Splat(file) => {
                 let splat = read_splat(file)?;
                 let renderer = SplatRenderer::from_splat(&splat).to_device(device);
-                (PictureSource::Splat(renderer, scene.target.poses()), Some(splat), None)
+                (EvalImageSource::Splat(renderer, scene.target.poses()), Some(splat), None)
             }
-            Method::Renders(folder) => (PictureSource::Folder(folder.clone()), None, None),
+            Method::Renders(folder) => (EvalImageSource::Folder(folder.clone()), None, None),
         };
         Ok(MethodOutput {
-            first: Some(source.picture(&scene, 0)?),
+            first: Some(source.load_target(&scene, 0)?),
             scene,
             source,
             gaussians: splat.as_ref().map(|splat| splat.len() as i64),
@@ -124,8 +124,8 @@ impl Method<'_> {
             Method::Model(_) => {}
             Method::Splat(file) => inputs.add_all(splat_files(file)),
             Method::Renders(folder) => {
-                let pictures = std::fs::read_dir(folder).into_iter().flatten().flatten();
-                pictures.for_each(|picture| inputs.add_photo(&picture.path()));
+                let images = std::fs::read_dir(folder).into_iter().flatten().flatten();
+                images.for_each(|image| inputs.add_photo(&image.path()));
             }
         }
     }
@@ -170,29 +170,29 @@ impl Method<'_> {
                 Ok(checksum([file].into_iter().chain(&origin)).map(Some)?)
             }
             Method::Renders(folder) => {
-                let files = names.iter().map(|name| find_picture(folder, name));
+                let files = names.iter().map(|name| find_image(folder, name));
                 Ok(checksum(files.collect::<Result<Vec<_>>>()?).map(Some)?)
             }
         }
     }
 }
 
-impl PictureSource {
+impl EvalImageSource {
     /// Produces the image of target view `i` of `scene`, and loads its photo.
-    fn picture(&self, scene: &EvalScene, i: usize) -> Result<(View, Picture)> {
+    fn load_target(&self, scene: &EvalScene, i: usize) -> Result<(View, EvalImage)> {
         let ground_truth = scene.target.load(i)?;
-        let picture = match self {
-            PictureSource::Splat(renderer, poses) => {
+        let image = match self {
+            EvalImageSource::Splat(renderer, poses) => {
                 let camera = Camera { c2w: poses[i], ..ground_truth.camera };
                 let rendered = renderer.render(&[camera])?.remove(0);
-                Picture { rgb: rendered.rgb.shallow_clone(), rendered: Some(rendered) }
+                EvalImage { rgb: rendered.rgb.shallow_clone(), rendered: Some(rendered) }
             }
-            PictureSource::Folder(folder) => {
-                let file = find_picture(folder, &scene.picture_names[i])?;
-                Picture { rgb: tensor_from_rgb(&read_image(&file)?), rendered: None }
+            EvalImageSource::Folder(folder) => {
+                let file = find_image(folder, &scene.render_names[i])?;
+                EvalImage { rgb: tensor_from_rgb(&read_image(&file)?), rendered: None }
             }
         };
-        Ok((ground_truth, picture))
+        Ok((ground_truth, image))
     }
 }
 
@@ -200,20 +200,20 @@ impl PictureSource {
 ///
 /// # Errors
 /// Fails if a photo or an image can't be read, if an image differs in size from its view, or if `see` fails.
-pub fn judge(
-    made: &mut MethodOutput,
+pub fn score_output(
+    output: &mut MethodOutput,
     perceptual: &Perceptual,
-    mut see: impl FnMut(&View, &Picture, &ViewScore) -> Result<()>,
+    mut see: impl FnMut(&View, &EvalImage, &ViewScore) -> Result<()>,
 ) -> Result<CaptureScores> {
-    let MethodOutput { scene, source, first, gaussians, .. } = made;
+    let MethodOutput { scene, source, first, gaussians, .. } = output;
     let mut scores = vec![];
     for i in 0..scene.target.len() {
-        let (ground_truth, picture) = first.take().map_or_else(|| source.picture(scene, i), Ok)?;
-        let score = perceptual.add_to(score_view(&picture.rgb, &ground_truth)?, &picture.rgb, &ground_truth);
-        see(&ground_truth, &picture, &score)?;
+        let (ground_truth, image) = first.take().map_or_else(|| source.load_target(scene, i), Ok)?;
+        let score = perceptual.add_to(score_view(&image.rgb, &ground_truth)?, &image.rgb, &ground_truth);
+        see(&ground_truth, &image, &score)?;
         scores.push(score);
     }
-    Ok(CaptureScores::of(&scene.name, scores, *gaussians))
+    Ok(CaptureScores::from_views(&scene.name, scores, *gaussians))
 }
 
 /// Scores images of the views `ground_truth`, including LPIPS.
@@ -222,23 +222,23 @@ pub fn judge(
 /// Fails if an image differs in size from its view.
 pub fn score_with_lpips(
     scene: &str,
-    pictures: &[Tensor],
+    images: &[Tensor],
     ground_truth: &[View],
     gaussians: Option<i64>,
     perceptual: &Perceptual,
 ) -> Result<CaptureScores> {
     let score =
-        |(picture, view): (&Tensor, &View)| Ok(perceptual.add_to(score_view(picture, view)?, picture, view));
-    let scores = pictures.iter().zip(ground_truth).map(score).collect::<Result<_>>()?;
-    Ok(CaptureScores::of(scene, scores, gaussians))
+        |(image, view): (&Tensor, &View)| Ok(perceptual.add_to(score_view(image, view)?, image, view));
+    let scores = images.iter().zip(ground_truth).map(score).collect::<Result<_>>()?;
+    Ok(CaptureScores::from_views(scene, scores, gaussians))
 }
 
 /// Finds the image `name` in `folder`, with any of the known extensions.
-fn find_picture(folder: &Path, name: &str) -> Result<PathBuf> {
+fn find_image(folder: &Path, name: &str) -> Result<PathBuf> {
     let candidates = PHOTO_EXTENSIONS.map(|ending| folder.join(format!("{name}.{ending}")));
     let found = candidates.iter().find(|path| path.is_file()).cloned();
     found.ok_or_else(|| {
         let expected = candidates[0].display().to_string();
-        Error::input(folder, format!("the picture for {name}"), "absent", expected)
+        Error::input(folder, format!("the image for {name}"), "missing", expected)
     })
 }

@@ -12,8 +12,8 @@ pub(super) const SSIM_WINDOW: i64 = 11;
 const SSIM_OVERLAP: i64 = SSIM_WINDOW - 1;
 
 /// Returns rows `first` to `first + count` of an image `[3, H, W]` in float64, clamped to [0, 1], on the CPU.
-fn band(picture: &Tensor, first: i64, count: i64) -> Tensor {
-    let rows = picture.detach().narrow(-2, first, count);
+fn band(image: &Tensor, first: i64, count: i64) -> Tensor {
+    let rows = image.detach().narrow(-2, first, count);
     rows.to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
 }
 
@@ -24,10 +24,10 @@ fn bands(rows: i64, width: i64) -> impl Iterator<Item = (i64, i64)> {
 }
 
 /// Returns the sum of squared differences of two images `[3, H, W]`, with values clamped to [0, 1].
-pub(super) fn squared_error(picture: &Tensor, ground_truth: &Tensor) -> f64 {
-    let size = picture.size();
+pub(super) fn squared_error(image: &Tensor, ground_truth: &Tensor) -> f64 {
+    let size = image.size();
     let error = |(first, count)| {
-        (band(picture, first, count) - band(ground_truth, first, count))
+        (band(image, first, count) - band(ground_truth, first, count))
             .square()
             .sum(Kind::Double)
             .double_value(&[])
@@ -36,18 +36,18 @@ pub(super) fn squared_error(picture: &Tensor, ground_truth: &Tensor) -> f64 {
 }
 
 /// Returns the peak signal-to-noise ratio in dB of two images of the same shape, `[3, H, W]`.
-pub fn psnr(picture: &Tensor, ground_truth: &Tensor) -> f64 {
-    psnr_of_mse(squared_error(picture, ground_truth) / picture.numel() as f64)
+pub fn psnr(image: &Tensor, ground_truth: &Tensor) -> f64 {
+    psnr_of_mse(squared_error(image, ground_truth) / image.numel() as f64)
 }
 
 /// Returns the structural similarity of two images `[3, H, W]`. H and W are at least 11.
-pub fn ssim(picture: &Tensor, ground_truth: &Tensor) -> f64 {
-    let size = picture.size();
+pub fn ssim(image: &Tensor, ground_truth: &Tensor) -> f64 {
+    let size = image.size();
     // Number of rows of windows that lie inside the image.
     let rows = size[1] - SSIM_OVERLAP;
     let weighted = |(first, count)| {
-        let band = |picture| band(picture, first, count + SSIM_OVERLAP);
-        loss::ssim(&band(picture), &band(ground_truth)).double_value(&[]) * count as f64
+        let band = |image| band(image, first, count + SSIM_OVERLAP);
+        loss::ssim(&band(image), &band(ground_truth)).double_value(&[]) * count as f64
     };
     bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64
 }
@@ -79,8 +79,8 @@ mod tests {
         tch::manual_seed(1);
         // Three bands, the last of them a single row.
         let height = 2 * BAND_PIXELS / 40_000 + 1;
-        let picture = |rows: i64| Tensor::rand([3, rows, 40_000], (Kind::Double, Device::Cpu));
-        let (a, b) = (picture(height + SSIM_OVERLAP), picture(height + SSIM_OVERLAP));
+        let image = |rows: i64| Tensor::rand([3, rows, 40_000], (Kind::Double, Device::Cpu));
+        let (a, b) = (image(height + SSIM_OVERLAP), image(height + SSIM_OVERLAP));
         assert_eq!(bands(height, 40_000).count(), 3);
         let mse = (&a - &b).square().mean(Kind::Double).double_value(&[]);
         assert!((psnr(&a, &b) - psnr_of_mse(mse)).abs() < 1e-10);

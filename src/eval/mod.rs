@@ -30,7 +30,7 @@ pub use held_out::{HeldOut, HeldOutScores};
 pub use index::{EvaluationIndex, SceneFrames};
 pub use journal::evaluation_files;
 pub use machine::machine;
-pub use method::{Method, MethodOutput, Picture, judge, score_with_lpips};
+pub use method::{EvalImage, Method, MethodOutput, score_output, score_with_lpips};
 pub use metrics::{psnr, ssim};
 pub use perceptual::Perceptual;
 pub use photo_source::LazyPhotos;

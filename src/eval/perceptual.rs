@@ -29,10 +29,10 @@ impl Perceptual {
 
     /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`. A distance is
     /// `None` if its network is missing or the view is too small for it.
-    pub(super) fn add_to(&self, score: ViewScore, picture: &Tensor, ground_truth: &View) -> ViewScore {
+    pub(super) fn add_to(&self, score: ViewScore, image: &Tensor, ground_truth: &View) -> ViewScore {
         ViewScore {
-            lpips_vgg: distance(self.vgg.as_ref(), picture, &ground_truth.image),
-            lpips_alex: distance(self.alex.as_ref(), picture, &ground_truth.image),
+            lpips_vgg: distance(self.vgg.as_ref(), image, &ground_truth.image),
+            lpips_alex: distance(self.alex.as_ref(), image, &ground_truth.image),
             ..score
         }
     }
@@ -49,7 +49,7 @@ impl Perceptual {
     }
 
     /// Explains why `scores`, to which the available distances have been added, lack a distance. Returns `None` if they lack none.
-    pub fn why_absent(&self, scores: &CaptureScores) -> Option<String> {
+    pub fn explain_missing(&self, scores: &CaptureScores) -> Option<String> {
         let networks = [
             (LpipsNetwork::Vgg16, &self.vgg, scores.lpips_vgg),
             (LpipsNetwork::AlexNet, &self.alex, scores.lpips_alex),
@@ -65,20 +65,20 @@ impl Perceptual {
                 let path = pretrained_folders()[0].join(network.file_name());
                 let path = path.display();
                 format!(
-                    "left out: {names}; {path} is absent (make weights makes it, {WEIGHTS_VARIABLE} names its folder)"
+                    "left out: {names}; {path} is missing (make weights makes it, {WEIGHTS_VARIABLE} names its folder)"
                 )
             }
         })
     }
 }
 
-fn distance(lpips: Option<&Lpips>, picture: &Tensor, ground_truth: &Tensor) -> Option<f64> {
+fn distance(lpips: Option<&Lpips>, image: &Tensor, ground_truth: &Tensor) -> Option<f64> {
     let lpips = lpips?;
-    let size = picture.size();
+    let size = image.size();
     let smallest = lpips.network().smallest_side();
     if size[1] < smallest || size[2] < smallest {
         return None;
     }
-    let prepare = |picture: &Tensor| picture.to_device(lpips.device()).clamp(0., 1.);
-    Some(tch::no_grad(|| lpips.distance(&prepare(picture), &prepare(ground_truth))).double_value(&[]))
+    let prepare = |image: &Tensor| image.to_device(lpips.device()).clamp(0., 1.);
+    Some(tch::no_grad(|| lpips.distance(&prepare(image), &prepare(ground_truth))).double_value(&[]))
 }

@@ -25,7 +25,7 @@ pub enum LazyPhotos {
 
 impl LazyPhotos {
     /// Creates a source of the photos `indices` of `capture`, under their names in the capture, fitted to `size`.
-    pub fn of(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Self {
+    pub fn from_capture(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Self {
         let all: Vec<&str> = capture.names().collect();
         let names = indices.iter().map(|&index| all[index].to_string()).collect();
         LazyPhotos::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }

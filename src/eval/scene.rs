@@ -18,7 +18,7 @@ pub struct EvalScene {
     /// Target photos, loaded one by one.
     pub target: LazyPhotos,
     /// File names of the target images, without their extensions.
-    pub picture_names: Vec<String>,
+    pub render_names: Vec<String>,
     /// Positions of the context and target photos in the capture; `None` without an index.
     pub frames: Option<SceneFrames>,
     /// Checksum of the photos and cameras that the index names; 0 without an index.
@@ -31,12 +31,12 @@ impl EvalScene {
     /// Creates a scene for splats and images. Its targets are all photos of `capture`, or those of its own test part if it has one, fitted
     /// to `size` if given.
     pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Self {
-        let (views, names) = (capture.scored_views(), capture.picture_names());
+        let (views, names) = (capture.scored_views(), capture.render_names());
         EvalScene {
             name: capture.name.clone(),
             context: vec![],
-            target: LazyPhotos::of(capture, &views, size),
-            picture_names: views.into_iter().map(|view| names[view].clone()).collect(),
+            target: LazyPhotos::from_capture(capture, &views, size),
+            render_names: views.into_iter().map(|view| names[view].clone()).collect(),
             frames: None,
             checksum: 0,
             enlarged: size.is_some_and(|size| capture.has_smaller(size)),
@@ -44,7 +44,7 @@ impl EvalScene {
     }
 
     /// Creates a scene for a model. The context consists of the photos that `holdout` leaves, or of `views` of them, spread over the
-    /// camera's path, and is fitted to `photo_size`. The targets are the held-out photos, fitted to `picture_size`.
+    /// camera's path, and is fitted to `photo_size`. The targets are the held-out photos, fitted to `target_size`.
     ///
     /// # Errors
     /// Fails if nothing is held out, if fewer than two photos are left, or if photos can't be read.
@@ -53,18 +53,18 @@ impl EvalScene {
         holdout: Holdout,
         views: Option<usize>,
         photo_size: ImageSize,
-        picture_size: ImageSize,
+        target_size: ImageSize,
     ) -> Result<Self> {
         let (_, held_out) = split_views(capture, holdout)?;
-        let all = capture.picture_names();
+        let all = capture.render_names();
         Ok(EvalScene {
             name: capture.name.clone(),
             context: load_context(capture, holdout, views, photo_size)?,
-            target: LazyPhotos::of(capture, &held_out, Some(picture_size)),
-            picture_names: held_out.iter().map(|&view| all[view].clone()).collect(),
+            target: LazyPhotos::from_capture(capture, &held_out, Some(target_size)),
+            render_names: held_out.iter().map(|&view| all[view].clone()).collect(),
             frames: None,
             checksum: 0,
-            enlarged: [photo_size, picture_size].into_iter().any(|size| capture.has_smaller(size)),
+            enlarged: [photo_size, target_size].into_iter().any(|size| capture.has_smaller(size)),
         })
     }
 
@@ -79,21 +79,21 @@ impl EvalScene {
             Some(size) => load_views(capture, &frames.context, Some(size))?,
             None => vec![],
         };
-        let picture_names = frames.picture_names();
+        let render_names = frames.render_names();
         let target = LazyPhotos::OnDisk {
             capture: capture.clone(),
             indices: frames.target.clone(),
-            names: picture_names.clone(),
-            size: Some(loader.picture_size),
+            names: render_names.clone(),
+            size: Some(loader.target_size),
         };
-        let mut sizes = loader.photo_size.into_iter().chain([loader.picture_size]);
+        let mut sizes = loader.photo_size.into_iter().chain([loader.target_size]);
         let enlarged = sizes.any(|size| capture.has_smaller(size));
         let checksum = frames.checksum(capture)?;
         Ok(EvalScene {
             name: key.into(),
             context,
             target,
-            picture_names,
+            render_names,
             frames: Some(frames),
             checksum,
             enlarged,
@@ -116,7 +116,7 @@ pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<us
 pub(super) struct SceneLoader<'a> {
     pub index: &'a EvaluationIndex,
     /// Size of the target views.
-    pub picture_size: ImageSize,
+    pub target_size: ImageSize,
     /// Size of the context views; `None` if no model is evaluated.
     pub photo_size: Option<ImageSize>,
 }

@@ -8,7 +8,7 @@ use crate::error::Result;
 use crate::render::render_views;
 use crate::scene::Gaussians;
 
-/// Scores a splat on `views`, including LPIPS if `perceptual` is given. `go_on` is called before each view with the number of finished
+/// Scores a splat on `views`, including LPIPS if `perceptual` is given. `should_continue` is called before each view with the number of finished
 /// views. If it returns `false`, the means are over the finished views. Returns `None` if no view is finished.
 ///
 /// # Errors
@@ -18,20 +18,20 @@ pub fn score_views(
     gaussians: &Gaussians,
     views: &[View],
     perceptual: Option<&Perceptual>,
-    mut go_on: impl FnMut(usize) -> bool,
+    mut should_continue: impl FnMut(usize) -> bool,
 ) -> Result<Option<CaptureScores>> {
     let mut done = vec![];
     for view in views {
-        if !go_on(done.len()) {
+        if !should_continue(done.len()) {
             break;
         }
-        let pictures = [render_views(gaussians, &[view.camera])?.remove(0).rgb];
+        let images = [render_views(gaussians, &[view.camera])?.remove(0).rgb];
         let ground_truth = [view.shallow_clone()];
         let scores = match perceptual {
-            Some(perceptual) => score_with_lpips(scene, &pictures, &ground_truth, None, perceptual),
-            None => score(scene, &pictures, &ground_truth, None),
+            Some(perceptual) => score_with_lpips(scene, &images, &ground_truth, None, perceptual),
+            None => score(scene, &images, &ground_truth, None),
         };
         done.extend(scores?.views);
     }
-    Ok((!done.is_empty()).then(|| CaptureScores::of(scene, done, Some(gaussians.count()))))
+    Ok((!done.is_empty()).then(|| CaptureScores::from_views(scene, done, Some(gaussians.count()))))
 }

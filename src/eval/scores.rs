@@ -53,38 +53,38 @@ pub struct CaptureScores {
 /// Fails if an image differs in size from its view or is too small for SSIM.
 pub fn score(
     scene: &str,
-    pictures: &[Tensor],
+    images: &[Tensor],
     ground_truth: &[View],
     gaussians: Option<i64>,
 ) -> Result<CaptureScores> {
-    let scores = pictures.iter().zip(ground_truth).map(|(picture, view)| score_view(picture, view));
-    Ok(CaptureScores::of(scene, scores.collect::<Result<_>>()?, gaussians))
+    let scores = images.iter().zip(ground_truth).map(|(image, view)| score_view(image, view));
+    Ok(CaptureScores::from_views(scene, scores.collect::<Result<_>>()?, gaussians))
 }
 
 /// Scores an image `[3, H, W]` against a view of the same size, without LPIPS.
 ///
 /// # Errors
 /// Fails if the image differs in size from the view or is too small for SSIM.
-pub(super) fn score_view(picture: &Tensor, view: &View) -> Result<ViewScore> {
-    let (found, expected) = (picture.size(), view.image.size());
+pub(super) fn score_view(image: &Tensor, view: &View) -> Result<ViewScore> {
+    let (found, expected) = (image.size(), view.image.size());
     if found != expected {
-        let why = format!("the picture for {} has shape {found:?}, expected {expected:?}", view.name);
+        let why = format!("the image for {} has shape {found:?}, expected {expected:?}", view.name);
         return Err(Error::request(why));
     }
     if found[1].min(found[2]) < SSIM_WINDOW {
         let (height, width) = (found[1], found[2]);
         return Err(Error::request(format!(
-            "the picture for {} is {width}×{height} pixels, expected sides of {SSIM_WINDOW} or more, as SSIM needs",
+            "the image for {} is {width}×{height} pixels, expected sides of {SSIM_WINDOW} or more, as SSIM needs",
             view.name
         )));
     }
-    let (psnr, ssim) = (psnr(picture, &view.image), ssim(picture, &view.image));
+    let (psnr, ssim) = (psnr(image, &view.image), ssim(image, &view.image));
     Ok(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None })
 }
 
 impl CaptureScores {
     /// Computes the means over `views`, at least one.
-    pub(super) fn of(scene: &str, views: Vec<ViewScore>, gaussians: Option<i64>) -> Self {
+    pub(super) fn from_views(scene: &str, views: Vec<ViewScore>, gaussians: Option<i64>) -> Self {
         let mean = |value: fn(&ViewScore) -> Option<f64>| {
             let values: Option<Vec<f64>> = views.iter().map(value).collect();
             values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
@@ -115,7 +115,7 @@ impl Baselines {
     ///
     /// # Errors
     /// Fails if photos differ in size or can't be read.
-    pub fn of(scene: &str, context: &LazyPhotos, target: &LazyPhotos) -> Result<Self> {
+    pub fn compute(scene: &str, context: &LazyPhotos, target: &LazyPhotos) -> Result<Self> {
         let mut sum = context.load(0)?.image.copy();
         for i in 1..context.len() {
             sum += context.load(i)?.image;
@@ -127,7 +127,7 @@ impl Baselines {
         }
         Ok(Baselines {
             nearest_photo: nearest_context_baseline(scene, context, target)?,
-            mean_photo: CaptureScores::of(scene, means, None),
+            mean_photo: CaptureScores::from_views(scene, means, None),
         })
     }
 }
@@ -149,7 +149,7 @@ pub(super) fn nearest_context_baseline(
         let nearest = context.load(nearest.expect("a context view"))?;
         scores.push(score_view(&nearest.image, &target.load(i)?)?);
     }
-    Ok(CaptureScores::of(scene, scores, None))
+    Ok(CaptureScores::from_views(scene, scores, None))
 }
 
 #[cfg(test)]
@@ -169,7 +169,7 @@ mod tests {
         };
         let photos = LazyPhotos::Loaded;
         let (context, target) = (photos(vec![view(0., 0.2), view(1., 0.6)]), photos(vec![view(0.7, 0.7)]));
-        let baselines = Baselines::of("", &context, &target).unwrap();
+        let baselines = Baselines::compute("", &context, &target).unwrap();
         assert!((baselines.nearest_photo.psnr - 20.).abs() < 1e-4, "0.1 apart");
         assert!((baselines.mean_photo.psnr - 20. * (1f64 / 0.3).log10()).abs() < 1e-4, "0.3 apart");
     }

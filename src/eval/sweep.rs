@@ -5,7 +5,7 @@ use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 use super::index::EvaluationIndex;
 use super::journal::{Identity, Journal};
-use super::method::{Method, MethodOutput, judge};
+use super::method::{Method, MethodOutput, score_output};
 use super::perceptual::Perceptual;
 use super::published::known_dataset;
 use super::scene::SceneLoader;
@@ -48,7 +48,7 @@ use tch::{Device, Tensor};
 ///     root,
 ///     dataset_name: DatasetEvaluation::dataset_name(None, root, &index)?,
 ///     index: &index,
-///     picture_size: model.config.data.image_size,
+///     target_size: model.config.data.image_size,
 ///     machine: machine(device)?,
 ///     device,
 ///     out,
@@ -84,7 +84,7 @@ pub struct DatasetEvaluation<'a> {
     /// Index of the scenes' context and target frames.
     pub index: &'a EvaluationIndex,
     /// Size of the images, and of the target photos that they are compared with.
-    pub picture_size: ImageSize,
+    pub target_size: ImageSize,
     /// Processor, cores and device.
     pub machine: String,
     /// Device that splats are rendered on.
@@ -108,7 +108,7 @@ pub fn weights_fingerprint(weights: &Path) -> Result<String> {
 
 /// Results of a rank for its share of the scenes.
 #[derive(Debug, Default, Serialize, Deserialize)]
-struct Share {
+struct RankResults {
     scenes: Vec<SceneScores>,
     failures: Vec<Failure>,
     /// `true` if the caller asked to stop.
@@ -128,8 +128,8 @@ impl DatasetEvaluation<'_> {
         if let Some(name) = said {
             return Ok(known_dataset(name).unwrap_or(name).to_string());
         }
-        let folder = own_folder(root);
-        let (of_folder, of_index) = (known_words(&folder), known_words(&index.name()));
+        let folder = dataset_folder_name(root);
+        let (of_folder, of_index) = (known_datasets_in(&folder), known_datasets_in(&index.name()));
         let found = match (of_folder.as_slice(), of_index.as_slice()) {
             ([], []) => return Ok(folder),
             ([one], []) | ([], [one]) => return Ok(one.to_string()),
@@ -141,24 +141,25 @@ impl DatasetEvaluation<'_> {
                 format!("{ours} by its name and {theirs} by that of {}", root.display())
             }
         };
-        Err(Error::input(&index.file, "the data set", found, "a single one, or its name"))
+        Err(Error::input(&index.file, "the dataset", found, "a single one, or its name"))
     }
 
-    /// Scores the scenes that the index and the dataset have in common. `observe` is called with the number of finished scenes and the
-    /// total, and returns `false` to stop. `judges` loads the networks of LPIPS. With several ranks, each scores its share, and all of them
+    /// Scores the scenes that the index and the dataset have in common. `on_progress` is called with the number of finished scenes and the
+    /// total, and returns `false` to stop. `load_perceptual` loads the networks of LPIPS. With several ranks, each scores its share, and all of them
     /// return the whole.
     ///
     /// # Errors
     /// Fails if there is no scene in common, if `out` holds scores of another method, if every scene fails, if another rank is gone, or if
-    /// `observe` asked to stop. A scene that fails is recorded in [`Evaluation::failures`].
+    /// `on_progress` asked to stop. A scene that fails is recorded in [`Evaluation::failures`].
     pub fn run(
         &self,
-        judges: impl FnOnce() -> Result<Perceptual>,
-        mut observe: impl FnMut(usize, usize) -> bool,
+        load_perceptual: impl FnOnce() -> Result<Perceptual>,
+        mut on_progress: impl FnMut(usize, usize) -> bool,
     ) -> Result<Evaluation> {
         let begun = self.group.is_main_process().then(|| self.begin()).transpose()?;
         let (kept, missing) = self.group.broadcast_object(begun)?;
-        let share = self.run_share(self.share(&missing), kept.len(), judges, &mut observe)?;
+        let share =
+            self.score_own_scenes(self.share(&missing), kept.len(), load_perceptual, &mut on_progress)?;
         let (mut scenes, mut failures, mut stopped) = (kept, vec![], false);
         for share in self.group.all_gather_object(share)? {
             scenes.extend(share.scenes);
@@ -177,7 +178,7 @@ impl DatasetEvaluation<'_> {
             if !scenes.iter().any(|scene| is_it(&scene.scores.scene))
                 && !failures.iter().any(|of| is_it(&of.scene))
             {
-                let error = "the process whose turn it was doesn't have it".into();
+                let error = "the rank that it was assigned to doesn't have it".into();
                 failures.push(Failure { scene: key.clone(), error });
             }
         }
@@ -196,10 +197,10 @@ impl DatasetEvaluation<'_> {
             index: self.index.name(),
             context_views: self.index.context_views(),
             input: self.method.input(),
-            image_size: self.picture_size.into(),
+            image_size: self.target_size.into(),
             indexed_scenes: self.index.scenes.len(),
-            summary: Summary::of(&scenes),
-            efficiency: Efficiency::of(&scenes),
+            summary: Summary::from_scenes(&scenes),
+            efficiency: Efficiency::from_scenes(&scenes),
             machine: self.machine.clone(),
             scenes,
             failures,
@@ -214,7 +215,7 @@ impl DatasetEvaluation<'_> {
             let open = OnceCell::new();
             let open = || open.get_or_init(|| group.open().ok()).as_ref();
             for key in keys {
-                match self.kept(&journal, &key, open) {
+                match self.find_valid_scores(&journal, &key, open) {
                     Some(scores) => kept.push(scores),
                     None => missing.push(key),
                 }
@@ -233,45 +234,45 @@ impl DatasetEvaluation<'_> {
     }
 
     /// Scores the scenes `own`. `kept` is the number of scenes that have been scored before.
-    fn run_share(
+    fn score_own_scenes(
         &self,
         own: Vec<(&SceneGroup, Vec<String>)>,
         kept: usize,
-        judges: impl FnOnce() -> Result<Perceptual>,
-        observe: &mut impl FnMut(usize, usize) -> bool,
-    ) -> Result<Share> {
-        let journal = Journal::of(self.out);
+        load_perceptual: impl FnOnce() -> Result<Perceptual>,
+        on_progress: &mut impl FnMut(usize, usize) -> bool,
+    ) -> Result<RankResults> {
+        let journal = Journal::new(self.out);
         let total = kept + own.iter().map(|(_, keys)| keys.len()).sum::<usize>();
-        let mut share = Share::default();
-        let mut go_on = observe(kept, total);
+        let mut share = RankResults::default();
+        let mut should_continue = on_progress(kept, total);
         // The networks of LPIPS would count towards the method's memory. Load them after the first scene that images were rendered of, even
         // if scenes before it failed.
-        let (mut judges, mut perceptual, mut memory) = (Some(judges), None, None);
-        let (picture_size, photo_size) = (self.picture_size, self.method.photo_size());
-        let loader = SceneLoader { index: self.index, picture_size, photo_size };
+        let (mut load_perceptual, mut perceptual, mut memory) = (Some(load_perceptual), None, None);
+        let (target_size, photo_size) = (self.target_size, self.method.photo_size());
+        let loader = SceneLoader { index: self.index, target_size, photo_size };
         std::thread::scope(|scope| -> Result<()> {
             let (sender, receiver) = sync_channel(LOADED_AHEAD);
             scope.spawn(move || loader.send(own, &sender));
-            while go_on && let Ok((key, loaded)) = receiver.recv() {
+            while should_continue && let Ok((key, loaded)) = receiver.recv() {
                 let method = self.method.of_scene(&key);
-                let made = loaded.and_then(|scene| method.render_targets(scene, self.device));
-                let first = made.is_ok().then(|| judges.take()).flatten();
+                let output = loaded.and_then(|scene| method.render_targets(scene, self.device));
+                let first = output.is_ok().then(|| load_perceptual.take()).flatten();
                 let warm_up = first.is_some();
-                if let Some(judges) = first {
+                if let Some(load_perceptual) = first {
                     memory = method.memory();
-                    perceptual = Some(judges()?);
+                    perceptual = Some(load_perceptual()?);
                 }
-                let judged = made.and_then(|made| {
+                let scored = output.and_then(|output| {
                     let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    let content = self.content(&key, made.scene.checksum)?;
-                    let mut scores = self.judge(made, perceptual)?;
+                    let content = self.content(&key, output.scene.checksum)?;
+                    let mut scores = self.score_output(output, perceptual)?;
                     scores.warm_up = warm_up && scores.forward_seconds.is_some();
                     scores.peak_memory_bytes = memory.map(|memory| memory.host);
                     scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
                     journal.keep(&key, &scores, content)?;
                     Ok(scores)
                 });
-                match judged {
+                match scored {
                     Ok(scene) => {
                         memory = None;
                         share.scenes.push(scene);
@@ -280,11 +281,11 @@ impl DatasetEvaluation<'_> {
                     Err(e) if e.is_failed_write() => return Err(e),
                     Err(e) => share.failures.push(Failure { scene: key, error: e.to_string() }),
                 }
-                go_on = observe(kept + share.scenes.len() + share.failures.len(), total);
+                should_continue = on_progress(kept + share.scenes.len() + share.failures.len(), total);
             }
             Ok(())
         })?;
-        share.stopped = !go_on;
+        share.stopped = !should_continue;
         Ok(share)
     }
 
@@ -300,20 +301,20 @@ impl DatasetEvaluation<'_> {
             method: self.fingerprint.clone(),
             dataset: root.display().to_string() + &generator,
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
-            image_size: self.picture_size.into(),
+            image_size: self.target_size.into(),
         })
     }
 
     /// Returns the stored scores of scene `key`, which is in the group that `open` opens. Returns `None`, so that the scene is scored
     /// again, if they are of other files or lack a score that can be computed now.
-    fn kept<'a>(
+    fn find_valid_scores<'a>(
         &self,
         journal: &Journal,
         key: &str,
         open: impl FnOnce() -> Option<&'a OpenGroup>,
     ) -> Option<SceneScores> {
-        let kept = journal.kept(key)?;
-        if Perceptual::could_add_to(&kept.scores.scores, self.picture_size) {
+        let kept = journal.read_scores(key)?;
+        if Perceptual::could_add_to(&kept.scores.scores, self.target_size) {
             return None;
         }
         let capture = open()?.capture(key).ok()?;
@@ -325,9 +326,9 @@ impl DatasetEvaluation<'_> {
     /// Returns a string that identifies the files from which scene `key` is scored: checksums of the splat or the images, if these are
     /// evaluated, and `photos`, the checksum of the photos and cameras.
     fn content(&self, key: &str, photos: u32) -> Result<String> {
-        let names = self.index.scenes[key].picture_names();
-        let made = self.method.of_scene(key).checksum(&names)?.map(|made| format!("{made:08x} "));
-        Ok(format!("{}{photos:08x}", made.unwrap_or_default()))
+        let names = self.index.scenes[key].render_names();
+        let checksum = self.method.of_scene(key).checksum(&names)?.map(|checksum| format!("{checksum:08x} "));
+        Ok(format!("{}{photos:08x}", checksum.unwrap_or_default()))
     }
 
     /// Returns the groups of the dataset, each with the keys of its scenes that are in the index.
@@ -339,24 +340,24 @@ impl DatasetEvaluation<'_> {
         if wanted.iter().any(|(_, keys)| !keys.is_empty()) {
             return Ok(wanted);
         }
-        let found = format!("none of the {} in the data set {}", self.dataset.scenes(), self.dataset.name);
+        let found = format!("none of the {} in the dataset {}", self.dataset.scenes(), self.dataset.name);
         let example = self.index.scenes.keys().next().map_or("", String::as_str);
         let expected =
-            format!("scenes of the data set; the index has {} such as {example}", self.index.scenes.len());
+            format!("scenes of the dataset; the index has {} such as {example}", self.index.scenes.len());
         Err(Error::input(&self.index.file, "what the index names", found, expected))
     }
 
     /// Scores the scene, and writes the comparison image of its worst view.
-    fn judge(&self, mut made: MethodOutput, perceptual: &Perceptual) -> Result<SceneScores> {
+    fn score_output(&self, mut output: MethodOutput, perceptual: &Perceptual) -> Result<SceneScores> {
         let mut worst: Option<(f64, Tensor)> = None;
-        let scores = judge(&mut made, perceptual, |ground_truth, picture, score| {
+        let scores = score_output(&mut output, perceptual, |ground_truth, picture, score| {
             if worst.as_ref().is_none_or(|(psnr, _)| score.psnr.total_cmp(psnr).is_lt()) {
                 let image = comparison_image(&ground_truth.image, &picture.rgb, picture.rendered.as_ref());
                 worst = Some((score.psnr, image));
             }
             Ok(())
         })?;
-        let MethodOutput { scene, splat_bytes, forward_seconds, warnings, .. } = made;
+        let MethodOutput { scene, splat_bytes, forward_seconds, warnings, .. } = output;
         let (_, image) = worst.expect("a target view");
         write_jpeg(&comparison_path(self.out, &scene.name), &image)?;
         let frames = scene.frames.expect("an indexed scene");
@@ -377,7 +378,7 @@ impl DatasetEvaluation<'_> {
 
 /// Returns the name of the folder of the dataset at `root`. If that is a split (`test` or `train`), returns the name of the folder above
 /// it.
-fn own_folder(root: &Path) -> String {
+fn dataset_folder_name(root: &Path) -> String {
     let root = root.canonicalize().unwrap_or(root.to_owned());
     let folders = root.ancestors().take(3).filter_map(|folder| folder.file_name());
     let names: Vec<_> = folders.map(|name| name.to_string_lossy().into_owned()).collect();
@@ -386,7 +387,7 @@ fn own_folder(root: &Path) -> String {
 }
 
 /// Returns the known datasets that are words of `name`.
-fn known_words(name: &str) -> Vec<&'static str> {
+fn known_datasets_in(name: &str) -> Vec<&'static str> {
     let words = name.split(|c: char| !c.is_alphanumeric());
     let known: BTreeSet<_> = words.filter_map(known_dataset).collect();
     known.into_iter().collect()
@@ -403,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn data_sets_are_called_by_whole_words() {
+    fn dataset_name_matches_whole_words() {
         for (root, index, expected) in [
             ("data/re10k", "evaluation_index.json", "re10k"),
             ("data/RealEstate10K-small", "index.json", "re10k"),
@@ -434,7 +435,7 @@ mod tests {
             ("acid_re10k", "acid.json", "acid by its name and acid or re10k by that of acid_re10k,"),
         ] {
             let error = name(root, index).unwrap_err().to_string();
-            assert!(error.contains(&format!("{index}: the data set is {found}")), "{error}");
+            assert!(error.contains(&format!("{index}: the dataset is {found}")), "{error}");
             assert!(error.ends_with("expected a single one, or its name"), "{error}");
         }
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use tch::Tensor;
 
 /// Maximum number of pixels of a mosaic, chosen so that common programs can open it and people can view it.
-const MOST_PIXELS: i64 = 1 << 26;
+const MAX_PIXELS: i64 = 1 << 26;
 
 /// Images that are tiled into one, stored as 8 bits until then. If they have more pixels together than programs open, each is shrunk by an
 /// integer factor.
@@ -23,7 +23,7 @@ pub struct Mosaic {
 impl Mosaic {
     /// Creates a mosaic for a row of `count` images.
     pub fn row(count: usize) -> Self {
-        let most_pixels = MOST_PIXELS / count.max(1) as i64;
+        let most_pixels = MAX_PIXELS / count.max(1) as i64;
         Mosaic { is_column: false, most_pixels, images: vec![], shrunk_by: 1 }
     }
 
@@ -98,6 +98,6 @@ mod tests {
             assert_eq!([image.height(), image.width()], size);
             assert_eq!((image.get_pixel(0, 0).0, image.get_pixel(size[1] - 1, 0).0), ([128; 3], [128; 3]));
         }
-        assert_eq!(shrink_factor(16_000_000 * 3, MOST_PIXELS / 300), 15);
+        assert_eq!(shrink_factor(16_000_000 * 3, MAX_PIXELS / 300), 15);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::dtype::to_dtype;
 use crate::error::{Error, Result};
-use globalsplat_files::{PartialFile, write_partially};
+use globalsplat_files::{PartialFile, write_temporary};
 use globalsplat_torch_file as torch_file;
 use globalsplat_torch_file::Dtype;
 use safetensors::tensor::TensorView;
@@ -50,7 +50,7 @@ pub(super) fn write_weights_partially(
     let (header, tensors) = bytes.split_at(8 + header_length(&bytes));
     let padding = header.len().next_multiple_of(ALIGNMENT) - header.len();
     let length = (header.len() - 8 + padding) as u64;
-    write_partially(path, |writer| {
+    write_temporary(path, |writer| {
         let parts = [&length.to_le_bytes(), &header[8..], &[b' '; ALIGNMENT][..padding], tensors];
         parts.into_iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
     })

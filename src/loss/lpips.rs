@@ -16,7 +16,7 @@ const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 const EPSILON: f64 = 1e-10;
 /// Maximum number of pixels of an image that is compared as a whole. Larger images are compared in tiles: VGG-16's first features take 256
 /// bytes per pixel, several times over.
-const MOST_PIXELS: i64 = 1 << 20;
+const MAX_PIXELS: i64 = 1 << 20;
 /// Approximate side of a tile in pixels.
 const TILE: i64 = 640;
 /// Upper bound on the number of pixels beyond a tile that its features depend on: 90 for VGG-16 and 80 for AlexNet, rounded up to a
@@ -261,7 +261,7 @@ impl Lpips {
     pub fn distance(&self, image: &Tensor, ground_truth: &Tensor) -> Tensor {
         let size = image.size();
         let [.., height, width] = size[..] else { panic!("an image has shape {size:?}") };
-        let distance = match height * width <= MOST_PIXELS {
+        let distance = match height * width <= MAX_PIXELS {
             true => self.compare(self.features(image), self.features(ground_truth)),
             false => self.distance_in_tiles(image, ground_truth, TILE),
         };

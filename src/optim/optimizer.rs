@@ -149,7 +149,7 @@ impl Optimizer {
         order.sort_by_key(|&i| std::cmp::Reverse(size(&self.parameters[i])));
         let mut sizes = vec![0; num_shards];
         for i in order {
-            let least = (0..parts).min_by_key(|&shard_index| sizes[shard_index]).expect("a shard");
+            let least = (0..num_shards).min_by_key(|&shard_index| sizes[shard_index]).expect("a shard");
             let p = &mut self.parameters[i];
             sizes[least] += size(p);
             p.shard_index = least;

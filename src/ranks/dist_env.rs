@@ -72,7 +72,7 @@ impl<F: Fn(&str) -> Option<String>> Variables<F> {
         let missing = || {
             let expected =
                 "the value that torchrun sets with WORLD_SIZE (unset WORLD_SIZE to run a single process)";
-            Error::setting(format!("the environment's {name}"), "absent", expected)
+            Error::setting(format!("the environment's {name}"), "missing", expected)
         };
         (self.0)(name).ok_or_else(missing)
     }
@@ -142,7 +142,7 @@ mod tests {
         let error = |variables: &[(&str, &str)]| dist_env(variables).unwrap_err().to_string();
         let missing = error(&ALL[..5]);
         assert!(
-            missing.starts_with("the environment's MASTER_PORT is absent, expected the value that torchrun"),
+            missing.starts_with("the environment's MASTER_PORT is missing, expected the value that torchrun"),
             "{missing}"
         );
         let wrong = |name: &str, value: &'static str| {

@@ -6,7 +6,7 @@ use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
 
 /// Maximum length of a side in pixels.
-const MOST: u32 = 16_384;
+const MAX_SIDE: u32 = 16_384;
 
 /// Conversion of photos to the views that a model sees: a photo with `phase` times as many rows and columns as the images that the model was
 /// trained with becomes phase² views of the training size, which divide its pixels among themselves.
@@ -23,14 +23,14 @@ impl Input {
     ///
     /// # Errors
     /// Fails if the height isn't a multiple of the model's, or if a side would be longer than 16,384 pixels.
-    pub fn at(height: u32, trained: ImageSize) -> Result<Self> {
+    pub fn with_height(height: u32, trained: ImageSize) -> Result<Self> {
         let side = trained.height;
         let phase = height / side.max(1);
         let longest = u64::from(phase) * u64::from(side.max(trained.width));
-        if phase == 0 || phase * side != height || longest > MOST.into() {
+        if phase == 0 || phase * side != height || longest > MAX_SIDE.into() {
             let [twice, thrice] = [2, 3].map(|times| u64::from(side) * times);
             let expected = format!(
-                "a multiple of the {side} pixels that the model sees, with sides of {MOST} at most: {side}, {twice}, {thrice}, …"
+                "a multiple of the {side} pixels that the model sees, with sides of {MAX_SIDE} at most: {side}, {twice}, {thrice}, …"
             );
             return Err(Error::setting("the height of the photos", height, expected));
         }
@@ -68,11 +68,11 @@ mod tests {
     #[test]
     fn heights_are_multiples_of_the_model_s() {
         let trained = ImageSize { height: 32, width: 48 };
-        let input = Input::at(96, trained).unwrap();
+        let input = Input::with_height(96, trained).unwrap();
         assert_eq!((input.photo_size(trained), input.views_of_photo()), ([96, 144].into(), 9));
-        assert!(Input::at(32, trained).unwrap().is_plain());
+        assert!(Input::with_height(32, trained).unwrap().is_plain());
         for height in [0, 16, 48, 97, 12_288, u32::MAX] {
-            let error = Input::at(height, trained).unwrap_err().to_string();
+            let error = Input::with_height(height, trained).unwrap_err().to_string();
             assert!(
                 error.starts_with(&format!(
                     "the height of the photos is {height}, expected a multiple of the 32"

@@ -25,7 +25,7 @@ use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
-use placing::best_placed;
+use placing::search_placement;
 use std::time::Duration;
 use tch::Device;
 
@@ -133,7 +133,7 @@ pub fn reconstruct<'a>(
         photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
     let views = photos.iter().map(|photo| model.input.views(photo)).collect::<Result<Vec<_>>>()?;
-    best_placed(model, photos, &views, &normalization)
+    search_placement(model, photos, &views, &normalization)
 }
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.

@@ -94,14 +94,14 @@ pub fn save_checkpoint(path: &Path, weights: Weights) -> Result<()> {
 /// Path of the weights that are embedded in this program: the model of `configs/tiny.toml`, trained on synthetic scenes only. Its model
 /// card is `models/README.md`.
 pub const BUNDLED_MODEL: &str = "models/tiny.safetensors";
-const SHIPPED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
+const BUNDLED_BYTES: &[u8] = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/models/tiny.safetensors"));
 
 /// Loads the model that is embedded in this program, [`BUNDLED_MODEL`], in float32.
 ///
 /// # Errors
 /// Fails if the device reports an error.
 pub fn bundled_model(device: Device) -> Result<LoadedModel> {
-    ModelFile::shipped()?.load(device, Precision::F32)
+    ModelFile::open_bundled()?.load(device, Precision::F32)
 }
 
 /// Loads a model in float32 from a file that [`save_model`] wrote or that holds only weights.
@@ -132,22 +132,22 @@ impl ModelFile {
     /// # Errors
     /// Fails if the file can't be read or holds no model, or if overrides don't fit.
     pub fn open(path: &Path, overrides: &[String]) -> Result<Self> {
-        Self::of(WeightsFile::open(path)?, overrides)
+        Self::from_weights(WeightsFile::open(path)?, overrides)
     }
 
     /// Opens the weights that are embedded in this program, [`BUNDLED_MODEL`].
     ///
     /// # Errors
     /// Fails only if the embedded weights are damaged.
-    pub fn shipped() -> Result<Self> {
-        Self::of(WeightsFile::from_embedded(SHIPPED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
+    pub fn open_bundled() -> Result<Self> {
+        Self::from_weights(WeightsFile::from_embedded(BUNDLED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
     }
 
     /// Reads the configuration and the stage of an open weights file. `overrides` change its configuration, as in [`Config::read`].
     ///
     /// # Errors
     /// Fails if the file holds no model, or if overrides don't fit.
-    pub fn of(weights: WeightsFile, overrides: &[String]) -> Result<Self> {
+    pub fn from_weights(weights: WeightsFile, overrides: &[String]) -> Result<Self> {
         let path = weights.path().to_owned();
         let text = weights.metadata().get(CONFIG_KEY).cloned();
         let stage = weights.metadata().get(STAGE_KEY).cloned();

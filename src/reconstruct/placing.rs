@@ -21,7 +21,7 @@ const ROUNDS: [f64; 2] = [1., 0.5];
 ///
 /// # Errors
 /// Fails if a pass or rendering fails.
-pub(super) fn best_placed(
+pub(super) fn search_placement(
     model: Model,
     photos: &[View],
     views: &[Vec<View>],
@@ -31,7 +31,7 @@ pub(super) fn best_placed(
     let several = extents.len() > 1;
     let start = Instant::now();
     let attempt = |placement: Placement| -> Result<Attempt> {
-        let poses = &normalization.placed(placement).c2w[..photos.len()];
+        let poses = &normalization.with_placement(placement).c2w[..photos.len()];
         let gaussians = pass(model, views, poses)?;
         let error = if several { error_of(&gaussians, photos, poses)? } else { 0. };
         Ok(Attempt { error, placement, gaussians })
@@ -45,7 +45,7 @@ pub(super) fn best_placed(
     for share in ROUNDS.into_iter().filter(|_| several) {
         for nudge in SEARCH_OFFSETS {
             for way in [share, -share] {
-                if best.replace_if_better(attempt(best.placement.nudged(nudge.map(|by| way * by)))?) {
+                if best.replace_if_better(attempt(best.placement.with_offset(nudge.map(|by| way * by)))?) {
                     break;
                 }
             }
@@ -55,7 +55,7 @@ pub(super) fn best_placed(
     // The results are written to files later. This copy waits for a GPU.
     let gaussians = gaussians.to_device(Device::Cpu);
     let forward_time = start.elapsed();
-    let Normalization { c2w, world_from_normalized } = normalization.placed(placement);
+    let Normalization { c2w, world_from_normalized } = normalization.with_placement(placement);
     let target_poses = c2w[photos.len()..].to_vec();
     Ok(Reconstruction { gaussians, placement, world_from_normalized, target_poses, forward_time })
 }

@@ -64,7 +64,7 @@ pub(super) fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
 pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
     let shapes: BTreeMap<_, _> = file.shapes().into_iter().map(|(name, (_, shape))| (name, shape)).collect();
     let mut model = ModelConfig::from_shapes(&shapes, file.path())?;
-    model.heads = said_heads(file).unwrap_or_else(|| {
+    model.heads = stored_heads(file).unwrap_or_else(|| {
         let halves = std::iter::successors(Some(model.heads), |heads| Some(heads / 2));
         halves.into_iter().find(|heads| model.width % heads == 0).expect("one divides all")
     });
@@ -83,7 +83,7 @@ pub(super) fn configuration(file: &WeightsFile) -> Result<Config> {
     Ok(config)
 }
 
-fn said_heads(file: &WeightsFile) -> Option<i64> {
+fn stored_heads(file: &WeightsFile) -> Option<i64> {
     file.metadata().get("num_heads").and_then(|heads| heads.parse().ok())
 }
 
@@ -93,7 +93,8 @@ pub(super) fn assumed(file: &WeightsFile, config: &Config) -> String {
     let stage = config.curriculum.final_stage;
     let known = VARIANTS.iter().find(|&&(_, m, k, s)| (m, k, s) == (latents, candidates, stage));
     let name = known.map_or(String::new(), |(name, ..)| format!("the variant {name}: "));
-    let by_default = if said_heads(file) == Some(heads) { "" } else { ", which shapes don't tell" };
+    let by_default =
+        if stored_heads(file) == Some(heads) { "" } else { ", which the shapes don't determine" };
     format!(
         "{name}{latents} scene tokens of {candidates} candidates at stage {stage}, {} Gaussians, {heads} attention heads{by_default}",
         latents << stage

@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_as_asked_for_are_chosen_once_each() {
+    fn exactly_the_requested_number_is_selected() {
         let bunched = along(&[0., 9., 9., 9., 9., 9., 9.1]);
         for wanted in 2..7 {
             let chosen = spread_over_path(&bunched, &[0, 1, 2, 3, 4, 5, 6], wanted);

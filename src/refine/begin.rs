@@ -20,7 +20,7 @@ const POINTS_SHARE: usize = 2;
 const NEAR: f64 = 0.1;
 
 /// Isotropic Gaussian.
-struct Ball {
+struct IsotropicGaussian {
     mean: DVec3,
     scale: f64,
     colour: [f32; 3],
@@ -28,7 +28,7 @@ struct Ball {
 
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
 /// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
-/// kept. At least two views are required. `go_on` is called before each photo with the number of photos that are done. If it returns
+/// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it returns
 /// `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. Depths are computed on `device`,
 /// and the Gaussians are returned there.
 pub fn gaussians_from_photos(
@@ -38,21 +38,23 @@ pub fn gaussians_from_photos(
     count: usize,
     seed: u64,
     device: Device,
-    go_on: impl FnMut(usize) -> bool,
+    should_continue: impl FnMut(usize) -> bool,
 ) -> Option<RawGaussians> {
-    let swept = sweep(views, points, device, go_on);
-    if swept.is_empty() {
+    let depth_maps = sweep(views, points, device, should_continue);
+    if depth_maps.is_empty() {
         return None;
     }
-    let Some(known) = known else { return Some(anew(&swept, points, count, seed).to_device(device)) };
-    let kept = known.select(&supported(known, &swept)).to_device(device);
+    let Some(known) = known else {
+        return Some(sample_gaussians(&depth_maps, points, count, seed).to_device(device));
+    };
+    let kept = known.select(&supported(known, &depth_maps)).to_device(device);
     let left = count.saturating_sub(kept.means.size()[1] as usize);
-    Some(kept.concat(&anew(&swept, points, left, seed).to_device(device)))
+    Some(kept.concat(&sample_gaussians(&depth_maps, points, left, seed).to_device(device)))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
 /// least one photo must see it unoccluded or not be sure of the depth there.
-fn supported(raw: &RawGaussians, swept: &[DepthMap]) -> Vec<i64> {
+fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
     let map = |of: &DepthMap| {
@@ -60,7 +62,7 @@ fn supported(raw: &RawGaussians, swept: &[DepthMap]) -> Vec<i64> {
         let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
         (projection(&of.camera), of.camera.width as usize, depth, sure)
     };
-    let maps: Vec<_> = swept.iter().map(map).collect();
+    let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let holds = |mean: DVec3| {
         let mut shown = false;
         for (seen, width, depth, sure) in &maps {
@@ -77,31 +79,38 @@ fn supported(raw: &RawGaussians, swept: &[DepthMap]) -> Vec<i64> {
     (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
 }
 
-fn anew(swept: &[DepthMap], points: &[Point], count: usize, seed: u64) -> RawGaussians {
+fn sample_gaussians(depth_maps: &[DepthMap], points: &[Point], count: usize, seed: u64) -> RawGaussians {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let pixels: f64 = swept.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
+    let pixels: f64 = depth_maps.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
     let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
     let chosen = sample(&mut random, points.len(), points.len().min(count / POINTS_SHARE));
-    let mut balls: Vec<Ball> = chosen.iter().map(|i| at_point(&points[i], swept, spacing)).collect();
+    let mut balls: Vec<IsotropicGaussian> =
+        chosen.iter().map(|i| at_point(&points[i], depth_maps, spacing)).collect();
     let left = count - balls.len();
-    for (index, of) in swept.iter().enumerate() {
+    for (index, of) in depth_maps.iter().enumerate() {
         // Cumulative shares, so that the counts add up to `left`.
-        let share = |i: usize| left * i / swept.len();
-        in_picture(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
+        let share = |i: usize| left * i / depth_maps.len();
+        sample_pixels(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
     }
     raw(&balls)
 }
 
 /// Creates a Gaussian at a point, with the size that it would have if the nearest camera had seen it.
-fn at_point(point: &Point, swept: &[DepthMap], spacing: f64) -> Ball {
+fn at_point(point: &Point, depth_maps: &[DepthMap], spacing: f64) -> IsotropicGaussian {
     let size =
         |of: &DepthMap| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
-    let least = swept.iter().map(size).fold(f64::INFINITY, f64::min);
-    Ball { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
+    let least = depth_maps.iter().map(size).fold(f64::INFINITY, f64::min);
+    IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
 }
 
 /// Appends `count` Gaussians at random pixels of `of` to `balls`.
-fn in_picture(of: &DepthMap, count: usize, spacing: f64, random: &mut impl Rng, balls: &mut Vec<Ball>) {
+fn sample_pixels(
+    of: &DepthMap,
+    count: usize,
+    spacing: f64,
+    random: &mut impl Rng,
+    balls: &mut Vec<IsotropicGaussian>,
+) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
     let numbers = |t: &Tensor| Vec::<f32>::try_from(t.contiguous().view([-1])).expect("numbers");
     let (depth, image, k) = (numbers(&of.depth), numbers(&of.image), of.camera.intrinsics);
@@ -110,7 +119,7 @@ fn in_picture(of: &DepthMap, count: usize, spacing: f64, random: &mut impl Rng, 
         let pixel = v as usize * width + u as usize;
         let z = f64::from(depth[pixel]);
         let seen = DVec3::new((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z);
-        balls.push(Ball {
+        balls.push(IsotropicGaussian {
             mean: of.camera.c2w.transform_point3(seen),
             scale: EXTENT * spacing * z / k.fx,
             colour: [0, 1, 2].map(|channel| image[channel * width * height + pixel]),
@@ -118,7 +127,7 @@ fn in_picture(of: &DepthMap, count: usize, spacing: f64, random: &mut impl Rng, 
     }
 }
 
-fn raw(balls: &[Ball]) -> RawGaussians {
+fn raw(balls: &[IsotropicGaussian]) -> RawGaussians {
     let n = balls.len() as i64;
     let of = |values: Vec<f64>, shape: &[i64]| Tensor::from_slice(&values).to_kind(Kind::Float).view(shape);
     let colours = balls.iter().flat_map(|ball| ball.colour.map(|c| (f64::from(c) - 0.5) / SH_C0));
@@ -140,7 +149,7 @@ mod tests {
     /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its
     /// image.
     #[test]
-    fn what_photos_speak_against_does_not_stay() {
+    fn gaussians_that_contradict_photos_are_removed() {
         let camera = |x: f64| Camera {
             intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
             c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
@@ -154,7 +163,7 @@ mod tests {
             depth: Tensor::full([16, 16], 4., options),
             sure: Tensor::arange(16, options).lt(sure_columns as f64).expand([16, 16], false).contiguous(),
         };
-        let swept = [wall(0., 16), wall(0.5, 8)];
+        let depth_maps = [wall(0., 16), wall(0.5, 8)];
         let kept = |means: &[[f64; 3]]| {
             let n = means.len() as i64;
             let of = |shape: &[i64]| Tensor::zeros(shape, options);
@@ -165,7 +174,7 @@ mod tests {
                 opacity_logits: of(&[1, n]),
                 sh: of(&[1, n, 1, 3]),
             };
-            supported(&raw, &swept)
+            supported(&raw, &depth_maps)
         };
         // The Gaussians are on the wall, in front of it, behind it, and outside both images.
         assert_eq!(kept(&[[0., 0., 4.1], [0., 0., 2.], [0., 0., 9.], [30., 0., 4.]]), [0]);
@@ -175,7 +184,7 @@ mod tests {
 
     /// Known Gaussians are filled up to the requested count. Those that are kept come first, and none is dropped below that count.
     #[test]
-    fn what_is_known_is_filled_up() {
+    fn known_gaussians_are_filled_up_to_the_count() {
         let view = |x: f64| {
             let camera = Camera {
                 intrinsics: Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. },

@@ -84,7 +84,7 @@ impl Corrections {
     }
 
     /// Applies the exposures of the photos `which` to rendered images of the splat, [1, C, 3, H, W].
-    pub(super) fn exposed(&self, rgb: Tensor, which: &[i64]) -> Tensor {
+    pub(super) fn apply_exposures(&self, rgb: Tensor, which: &[i64]) -> Tensor {
         match &self.exposures {
             Some(exposures) => rgb * of(exposures, which).exp().view([1, -1, 3, 1, 1]),
             None => rgb,
@@ -119,8 +119,8 @@ impl Corrections {
     }
 
     /// Returns the learned correction of each of `photos`.
-    pub fn told(&self, photos: &[View]) -> Vec<Correction> {
-        let told = |(index, view): (usize, &View)| {
+    pub fn report(&self, photos: &[View]) -> Vec<Correction> {
+        let report = |(index, view): (usize, &View)| {
             let numbers = self.numbers(index);
             Correction {
                 photo: view.name.clone(),
@@ -129,7 +129,7 @@ impl Corrections {
                 exposure: [6, 7, 8].map(|k| numbers[k].exp()),
             }
         };
-        photos.iter().enumerate().map(told).collect()
+        photos.iter().enumerate().map(report).collect()
     }
 
     /// Returns rotation, translation and log exposure of a photo, 9 values; values that aren't learned are 0.
@@ -188,7 +188,7 @@ mod tests {
 
     /// The optimization and the reported corrections use the same cameras and colours.
     #[test]
-    fn what_is_applied_is_what_was_learned() {
+    fn applied_corrections_match_learned_ones() {
         let views = [view(0), view(1), view(2)];
         let poses: Vec<DMat4> = views.iter().map(|view| view.camera.c2w).collect();
         let batch = view_batch(&views, &poses, Device::Cpu);
@@ -204,7 +204,7 @@ mod tests {
         let applied: Vec<View> =
             views.iter().enumerate().map(|(index, view)| learned.apply(index, view)).collect();
         let w2c = learned.w2c(&batch, &[0, 1, 2]);
-        let images = learned.exposed(batch.images.ones_like() * 0.5, &[0, 1, 2]);
+        let images = learned.apply_exposures(batch.images.ones_like() * 0.5, &[0, 1, 2]);
         for (index, view) in applied.iter().enumerate() {
             let rows = Tensor::from_slice(&pose_to_rows(&view.camera.c2w.inverse())).view([4, 4]);
             let apart = (w2c.select(0, 0).select(0, index as i64) - rows).abs().max().double_value(&[]);
@@ -213,10 +213,12 @@ mod tests {
             let product = &view.image * images.select(0, 0).select(0, index as i64);
             assert!((product - 0.25).abs().max().double_value(&[]) < 1e-6);
         }
-        let told = learned.told(&views);
-        let mean: f64 = told.iter().map(|photo| photo.exposure[0].ln()).sum();
+        let report = learned.report(&views);
+        let mean: f64 = report.iter().map(|photo| photo.exposure[0].ln()).sum();
         assert!(
-            mean.abs() < 1e-6 && told[1].degrees > 10. && (told[1].exposure[1] - 0.4f64.exp()).abs() < 1e-6
+            mean.abs() < 1e-6
+                && report[1].degrees > 10.
+                && (report[1].exposure[1] - 0.4f64.exp()).abs() < 1e-6
         );
     }
 }

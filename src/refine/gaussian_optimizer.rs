@@ -28,7 +28,7 @@ impl GaussianOptimizer {
     pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
-        let leaves = GaussianParams::of(raw, degrees[1]);
+        let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees }
     }

@@ -22,7 +22,7 @@ pub struct GaussianParams {
 
 impl GaussianParams {
     /// Copies `raw` to new parameters, with spherical harmonics up to `degree`, which is at least that of `raw`.
-    pub fn of(raw: &RawGaussians, degree: i64) -> Self {
+    pub fn from_raw(raw: &RawGaussians, degree: i64) -> Self {
         let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
         let size = raw.sh.size();
         let bases = (degree + 1).pow(2);

@@ -69,7 +69,7 @@ pub struct Task<'a> {
     pub seed: u64,
 }
 
-/// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `watch` is called after every step and ends the work if it returns `false`.
+/// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it returns `false`.
 /// Returns the final Gaussians.
 ///
 /// # Errors
@@ -78,9 +78,9 @@ pub fn refine(
     optimizer: &mut GaussianOptimizer,
     corrections: &mut Corrections,
     task: &Task,
-    watch: impl FnMut(&RefineStep) -> bool,
+    on_step: impl FnMut(&RefineStep) -> bool,
 ) -> Result<Gaussians> {
-    refine_timed(optimizer, corrections, task, &mut Stopwatch::default(), watch)
+    refine_timed(optimizer, corrections, task, &mut Stopwatch::default(), on_step)
 }
 
 /// Runs [`refine`] and records the time of each part of a step in `stopwatch`.
@@ -89,7 +89,7 @@ pub(crate) fn refine_timed(
     corrections: &mut Corrections,
     task: &Task,
     stopwatch: &mut Stopwatch,
-    mut watch: impl FnMut(&RefineStep) -> bool,
+    mut on_step: impl FnMut(&RefineStep) -> bool,
 ) -> Result<Gaussians> {
     let Task { photos, depth, config, budget, seed } = *task;
     let _threads = KernelThreads::take();
@@ -113,7 +113,7 @@ pub(crate) fn refine_timed(
         let gaussians = stopwatch.time("activation", || optimizer.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
         let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
-        pictures.rgb = corrections.exposed(pictures.rgb, &which);
+        pictures.rgb = corrections.apply_exposures(pictures.rgb, &which);
         let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch.images, config, depth));
         stopwatch.time("backward", || {
             optimizer.zero_grad();
@@ -126,7 +126,7 @@ pub(crate) fn refine_timed(
         })?;
         last = start.elapsed();
         elapsed += last;
-        if !watch(&RefineStep { step: step + 1, progress, elapsed, optimizer }) {
+        if !on_step(&RefineStep { step: step + 1, progress, elapsed, optimizer }) {
             break;
         }
     }
@@ -172,7 +172,7 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
     }
     let depths = Tensor::cat(&seen, 0);
     if depths.numel() == 0 {
-        return Err(Error::request("the cameras see nothing of the splat: are both of one world?"));
+        return Err(Error::request("no camera sees the splat: are both in the same world coordinates?"));
     }
     Ok(depths.median().double_value(&[]))
 }
@@ -189,7 +189,7 @@ mod tests {
     /// A step copies nothing between devices beyond what is counted here: photos, Gaussians and corrections are on the device. It waits for
     /// the device only where memory for (splat, tile) pairs is allocated.
     #[test]
-    fn a_step_moves_nothing_but_what_is_told() {
+    fn a_step_makes_only_expected_device_copies() {
         let (gaussians, cameras) = synthetic_scene(40, 4, ImageSize { width: 32, height: 24 });
         let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
@@ -198,7 +198,7 @@ mod tests {
         let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "depth_smoothness_weight=0.1"]
             .map(String::from);
         let config = RefineConfig::with(&settings, false).unwrap();
-        let photos = Photos::of(views);
+        let photos = Photos::from_batch(views);
         let task_of = |steps| Task {
             photos: &photos,
             depth: 1.,

@@ -82,7 +82,7 @@ impl RefineOptions {
     }
 
     /// Returns the indices of the photos to match and of the held-out views.
-    pub(super) fn chosen_views(&self, capture: &Capture) -> [Vec<usize>; 2] {
+    pub(super) fn select_views(&self, capture: &Capture) -> [Vec<usize>; 2] {
         let (shown, held_out) = capture.split(self.holdout);
         let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX));
         [shown, held_out]

@@ -36,7 +36,7 @@ pub struct PatchScores {
 
 impl Patches {
     /// Cuts a patch out of each of `views`, or, if there are more than `MAX_VIEWS`, of some that are spread over all.
-    pub fn of(views: &[View]) -> Self {
+    pub fn from_views(views: &[View]) -> Self {
         let every = views.len().div_ceil(MAX_VIEWS).max(1);
         let indices: Vec<usize> = (0..views.len()).step_by(every).collect();
         let place = |number: usize| STEPS.map(|step| (0.5 + step * number as f64).fract());
@@ -105,11 +105,11 @@ mod tests {
         let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
         let view = View { name: String::new(), image, camera };
         let views: Vec<View> = (0..20).map(|_| view.shallow_clone()).collect();
-        let patches = Patches::of(&views);
+        let patches = Patches::from_views(&views);
         assert_eq!(patches.views.len(), 7);
         assert!(patches.views.iter().all(|patch| patch.image.size() == [3, 96, 96]));
         let scores = patches.score(&gaussians).unwrap().unwrap();
         assert!(scores.psnr > 90. && scores.ssim > 0.9999, "{scores:?}");
-        assert!(Patches::of(&[]).score(&gaussians).unwrap().is_none());
+        assert!(Patches::from_views(&[]).score(&gaussians).unwrap().is_none());
     }
 }

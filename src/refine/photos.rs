@@ -17,7 +17,7 @@ const LONGEST_SIDE: f64 = 512.;
 const LEAST_SIDE: u32 = 32;
 /// Minimum side of a photo in pixels: the side of the SSIM window (spec 9.4).
 pub const MIN_SIDE: u32 = 11;
-/// Number of photos that are read between two calls of `go_on`.
+/// Number of photos that are read between two calls of `should_continue`.
 const READ_AT_ONCE: usize = 8;
 /// Longer side in pixels of the downscaled images by which near duplicates are found.
 const COMPARED_SIDE: f64 = 64.;
@@ -25,16 +25,16 @@ const COMPARED_SIDE: f64 = 64.;
 const NEARLY_EQUAL: f64 = 1e-4;
 
 /// Reads the photos of `indices`, cropped and resized to `size`. If `size` is `None`, photos keep their shape, and large ones are
-/// downscaled. `go_on` is called with the number of photos read so far, and ends the work if it returns `false`.
+/// downscaled. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
 ///
 /// # Errors
-/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `go_on` ends the work before all photos
+/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before all photos
 /// are read.
 pub fn load_photos(
     capture: &Capture,
     indices: &[usize],
     size: Option<ImageSize>,
-    mut go_on: impl FnMut(usize) -> bool,
+    mut should_continue: impl FnMut(usize) -> bool,
 ) -> Result<Vec<View>> {
     let cameras = capture.cameras();
     let size_of = |index: usize| size.or_else(|| smaller(&cameras[index]));
@@ -49,7 +49,7 @@ pub fn load_photos(
     }
     let mut views = vec![];
     for some in indices.chunks(READ_AT_ONCE) {
-        if !go_on(views.len()) {
+        if !should_continue(views.len()) {
             return Err(Error::failed("stopped before all photos were read: nothing is written"));
         }
         // Photos of one size are loaded together, as they share the lens undistortion.
@@ -109,7 +109,7 @@ struct Group {
 
 impl Photos {
     /// Creates photos from `views` at their own size only.
-    pub(crate) fn of(views: ViewBatch) -> Self {
+    pub(crate) fn from_batch(views: ViewBatch) -> Self {
         let indices = (0..views.images.size()[1] as usize).collect();
         Photos { levels: vec![vec![Group { indices, views }]] }
     }

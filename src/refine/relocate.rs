@@ -7,9 +7,9 @@ use rand::prelude::Distribution;
 use tch::{Kind, Tensor};
 
 /// Maximum number of copies of one Gaussian that the correction takes into account.
-const MOST_COPIES: usize = 50;
+const MAX_COPIES: usize = 50;
 /// Minimum opacity after relocation.
-const LEAST_OPACITY: f64 = 0.005;
+const MIN_OPACITY: f64 = 0.005;
 
 /// Moves every Gaussian whose opacity is at most `dead` onto another one, drawn with probability proportional to its opacity. Changes the
 /// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Returns the indices of the
@@ -28,10 +28,10 @@ pub fn relocate(leaves: &GaussianParams, dead: f64, random: &mut impl Rng) -> Ve
     let mut changed: Vec<usize> = (0..copies.len()).filter(|&i| copies[i] > 1).collect();
     let (mut logits, mut shrink) = (vec![], vec![]);
     for &i in &changed {
-        let n = copies[i].min(MOST_COPIES);
+        let n = copies[i].min(MAX_COPIES);
         let opacity = 1. - (1. - opacities[i]).powf(1. / n as f64);
         shrink.push((opacities[i] / integral(opacity, n)).ln() as f32);
-        let opacity = opacity.clamp(LEAST_OPACITY, 1. - 1e-6);
+        let opacity = opacity.clamp(MIN_OPACITY, 1. - 1e-6);
         logits.push((opacity / (1. - opacity)).ln() as f32);
     }
     let device = leaves.means.device();
@@ -104,7 +104,7 @@ mod tests {
             opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
             sh: Tensor::zeros([1, 10, 1, 3], options),
         };
-        let leaves = GaussianParams::of(&raw, 0);
+        let leaves = GaussianParams::from_raw(&raw, 0);
         let mut changed = relocate(&leaves, 0.01, &mut ChaCha8Rng::seed_from_u64(1));
         let means: Vec<f64> = Vec::try_from(leaves.means.to_kind(Kind::Double).view([-1])).unwrap();
         for dead in 0..4 {

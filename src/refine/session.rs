@@ -8,7 +8,7 @@ use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
 use super::{Task, refine, scene_depth};
-use crate::data::{Capture, Point, View, points_of};
+use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
 use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::io::Splat;
@@ -34,7 +34,7 @@ const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
 /// Maximum number of photos that LPIPS compares if no views are held out.
 const LPIPS_PHOTOS: usize = 8;
 /// Fractions of the optimization at which the held-out views are scored.
-const MARKS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+const EVAL_FRACTIONS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
 /// Source of the initial Gaussians.
 #[derive(Debug, Clone, Copy)]
@@ -156,7 +156,7 @@ pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
     clock: Instant,
-    watch: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
+    on_event: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
     is_stopped: bool,
     frame: LocalFrame,
     photos: Vec<View>,
@@ -174,23 +174,24 @@ pub struct RefineSession<'a> {
 }
 
 impl<'a> RefineSession<'a> {
-    /// Chooses the photos and the held-out views of the capture, and reads them. `watch` receives progress events and ends the work if it
+    /// Chooses the photos and the held-out views of the capture, and reads them. `on_event` receives progress events and ends the work if it
     /// returns `false`.
     ///
     /// # Errors
-    /// Fails if an option is out of range, like [`load_photos`], and if `watch` ends the work before all photos are read.
+    /// Fails if an option is out of range, like [`load_photos`], and if `on_event` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
         options: &'a RefineOptions,
-        mut watch: impl FnMut(RefineEvent) -> bool + 'a,
+        mut on_event: impl FnMut(RefineEvent) -> bool + 'a,
     ) -> Result<Self> {
         let clock = options.started.unwrap_or_else(Instant::now);
         options.check()?;
-        let [shown, held_out] = options.chosen_views(capture);
+        let [shown, held_out] = options.select_views(capture);
         let count = shown.len() + held_out.len();
-        let mut go_on = |done: usize| watch(RefineEvent::Loading { done, count });
-        let mut photos = load_photos(capture, &shown, options.size, &mut go_on)?;
-        let mut held_out = load_photos(capture, &held_out, options.size, |done| go_on(photos.len() + done))?;
+        let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
+        let mut photos = load_photos(capture, &shown, options.size, &mut should_continue)?;
+        let mut held_out =
+            load_photos(capture, &held_out, options.size, |done| should_continue(photos.len() + done))?;
         let frame = LocalFrame::from_cameras(&capture.cameras());
         for view in photos.iter_mut().chain(&mut held_out) {
             view.camera = frame.camera_to_local(&view.camera);
@@ -199,10 +200,10 @@ impl<'a> RefineSession<'a> {
             capture,
             options,
             clock,
-            watch: Box::new(watch),
+            on_event: Box::new(on_event),
             is_stopped: false,
             frame,
-            patches_held_out: Patches::of(&held_out),
+            patches_held_out: Patches::from_views(&held_out),
             photos,
             held_out,
             scored: vec![],
@@ -227,7 +228,7 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Returns the views that represent the splat's quality, in the session's frame: the held-out views if there are any, else the photos.
-    fn judged_views(&self) -> &[View] {
+    fn representative_views(&self) -> &[View] {
         if self.held_out.is_empty() { &self.photos } else { &self.held_out }
     }
 
@@ -247,7 +248,7 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if rendering fails.
     pub fn reserve_for_contact_sheet(&mut self, gaussians: &Gaussians) -> Result<()> {
-        let views = self.judged_views();
+        let views = self.representative_views();
         let begun = Instant::now();
         let _ = ContactSheet::render(gaussians, &views[..1])?;
         let time = begun.elapsed() * views.len() as u32;
@@ -258,7 +259,7 @@ impl<'a> RefineSession<'a> {
     /// Creates the initial Gaussians, and returns them in the session's frame on its device. Near duplicates are removed from the photos.
     ///
     /// # Errors
-    /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `watch` ends the work before there are Gaussians.
+    /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `on_event` ends the work before there are Gaussians.
     pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
         let mut warnings = vec![];
         let start = match initial {
@@ -278,11 +279,11 @@ impl<'a> RefineSession<'a> {
             }
             Initial::Photos => {
                 if self.photos.len() < 2 {
-                    let why = "one photo tells no depth: two or more are expected, or a splat to begin with";
+                    let why = "one photo gives no depth: expected two or more, or an initial splat";
                     return Err(Error::request(why));
                 }
                 if self.are_in_one_place() {
-                    let line = "the photos were all taken from one place, and tell no depth: all that they show is put at one distance";
+                    let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
                     warnings.push(format!("{}: {line}", self.capture.name));
                 }
                 Start::Photos(self.gaussians_from_photos(None)?.ok_or_else(stopped)?)
@@ -316,7 +317,7 @@ impl<'a> RefineSession<'a> {
         if let Some(line) = self.late_start_warning() {
             self.warn(&line);
         }
-        let patches = Patches::of(&self.photos);
+        let patches = Patches::from_views(&self.photos);
         let before = patches.score(&initial)?.expect("photos");
         if matches!(start, Start::Model(..)) {
             self.add_eval_point(&initial)?;
@@ -331,7 +332,7 @@ impl<'a> RefineSession<'a> {
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let asked = self.options.correct_poses || self.options.correct_exposures;
-        let corrections = if asked && !is_initial { learned.told(&self.photos) } else { vec![] };
+        let corrections = if asked && !is_initial { learned.report(&self.photos) } else { vec![] };
         let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
         let splat = match start {
             Start::Splat(splat, _) if is_initial => Splat { warnings: vec![], ..splat.clone() },
@@ -352,7 +353,7 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Scores a result on whole held-out views: those that [`RefineSession::run`] scored before the optimization. With a time budget there
-    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `watch` ended the
+    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `on_event` ended the
     /// scoring.
     ///
     /// # Errors
@@ -368,17 +369,18 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Scores the initial and the final Gaussians by LPIPS, with the networks whose weights are installed: on all held-out views, or on a
-    /// few photos if no views are held out. Returns `None` if `watch` ends the scoring.
+    /// few photos if no views are held out. Returns `None` if `on_event` ends the scoring.
     ///
     /// # Errors
     /// Fails if rendering fails, or if a file of weights is invalid.
     pub fn score_lpips(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
         let perceptual = Perceptual::find(result.initial.means.device())?;
         let count = if self.held_out.is_empty() { LPIPS_PHOTOS } else { self.held_out.len() };
-        let views: Vec<View> = self.judged_views().iter().take(count).map(View::shallow_clone).collect();
+        let views: Vec<View> =
+            self.representative_views().iter().take(count).map(View::shallow_clone).collect();
         let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
         let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
-        if let Some(line) = after.as_ref().and_then(|after| perceptual.why_absent(after)) {
+        if let Some(line) = after.as_ref().and_then(|after| perceptual.explain_missing(after)) {
             self.warn(&line);
         }
         Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
@@ -389,7 +391,7 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if rendering fails.
     pub fn contact_sheet(&self, result: &RefineResult) -> Result<ContactSheet> {
-        ContactSheet::render(&result.gaussians, self.judged_views())
+        ContactSheet::render(&result.gaussians, self.representative_views())
     }
 
     /// Returns an evenly spaced subset of the held-out views that can be scored within [`MAX_WHOLE_SCORING_SHARE`] of a time budget.
@@ -410,20 +412,20 @@ impl<'a> RefineSession<'a> {
         self.scored.iter().map(View::shallow_clone).collect()
     }
 
-    /// Scores Gaussians on whole views. Returns `None` if there are no views, or if `watch` ends the scoring.
+    /// Scores Gaussians on whole views. Returns `None` if there are no views, or if `on_event` ends the scoring.
     fn score_whole(
         &mut self,
         gaussians: &Gaussians,
         views: &[View],
         perceptual: Option<&Perceptual>,
     ) -> Result<Option<CaptureScores>> {
-        let go_on = |done| (self.watch)(RefineEvent::Scoring(done));
-        let scores = score_views(&self.capture.name, gaussians, views, perceptual, go_on)?;
+        let should_continue = |done| (self.on_event)(RefineEvent::Scoring(done));
+        let scores = score_views(&self.capture.name, gaussians, views, perceptual, should_continue)?;
         Ok(scores.filter(|scores| scores.views.len() == views.len()))
     }
 
     fn warn(&mut self, line: &str) {
-        let _ = (self.watch)(RefineEvent::Warning(line));
+        let _ = (self.on_event)(RefineEvent::Warning(line));
     }
 
     /// Returns a warning if reading the photos and the start left little or no time for the optimization.
@@ -471,11 +473,11 @@ impl<'a> RefineSession<'a> {
     /// the photos. Returns `None` if the work is ended before any photo has depths.
     fn gaussians_from_photos(&mut self, known: Option<&RawGaussians>) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
-        let points: Vec<Point> = points_of(self.capture)?.into_iter().map(to_local).collect();
-        let (clock, budget, watch) = (self.clock, self.options.budget, &mut self.watch);
+        let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
+        let (clock, budget, on_event) = (self.clock, self.options.budget, &mut self.on_event);
         let mut is_stopped = false;
-        let go_on = |done: usize| {
-            is_stopped |= !watch(RefineEvent::Starting(done));
+        let should_continue = |done: usize| {
+            is_stopped |= !on_event(RefineEvent::Starting(done));
             let is_late = match budget {
                 Budget::Steps(_) => false,
                 Budget::Time(time) => done >= FEW_PHOTOS && clock.elapsed() > time.mul_f64(MAX_START_SHARE),
@@ -483,7 +485,8 @@ impl<'a> RefineSession<'a> {
             !is_stopped && !is_late
         };
         let RefineOptions { gaussians, seed, device, .. } = *self.options;
-        let made = gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, go_on);
+        let made =
+            gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, should_continue);
         self.is_stopped |= is_stopped;
         Ok(made)
     }
@@ -512,7 +515,7 @@ impl<'a> RefineSession<'a> {
             steps => steps,
         };
         let task = Task { photos: &photos, depth, config, budget, seed: *seed };
-        let mut marks = MARKS.iter().peekable();
+        let mut marks = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
         let gaussians = refine(&mut optimizer, &mut corrections, &task, |at| {
             self.steps = at.step;
@@ -524,7 +527,7 @@ impl<'a> RefineSession<'a> {
                 failure = self.add_eval_point(&at.gaussians()).err();
             }
             let psnr = self.curve.last().map(|point| point.scores.psnr);
-            self.is_stopped |= !(self.watch)(RefineEvent::Optimizing { steps: self.steps, psnr });
+            self.is_stopped |= !(self.on_event)(RefineEvent::Optimizing { steps: self.steps, psnr });
             failure.is_none() && !self.is_stopped
         })?;
         match failure {

@@ -24,13 +24,13 @@ const NEAREST: f64 = 24.;
 /// Maximum depth of a pixel, in units of the nearest plane's depth.
 const FARTHEST: f64 = 500.;
 /// Maximum number of photos whose pixels get depths. Together they cover the scene.
-const MOST: usize = 32;
+const MAX_DEPTH_MAPS: usize = 32;
 /// Number of distances that are tried for the depth of the scene: the extent of the cameras, its half, its quarter, and so on.
 const OCTAVES: i32 = 9;
 /// Minimum distance from infinity, in planes, of the median pixel for its depth to count as measured.
 const RESOLVED: f64 = 2.;
 /// Minimum fraction of the pixels that must agree on a depth.
-const LEAST_SHARE: f64 = 0.05;
+const MIN_AGREEING_FRACTION: f64 = 0.05;
 /// Side in pixels of the patches that are compared.
 const PATCH: i64 = 9;
 /// Constant that is added to variances, so that noise doesn't correlate.
@@ -44,7 +44,7 @@ const SPREADS: usize = 6;
 /// Factor of the weight of the spread depths, each time.
 const SPREAD_WEIGHT: f64 = 0.1;
 /// Minimum number of points that a view has to see. With fewer, its depths are estimated from the photos alone.
-const LEAST_POINTS: usize = 30;
+const MIN_POINTS: usize = 30;
 /// Fraction of the points that may be nearer than the nearest plane.
 const NEARER: f64 = 0.02;
 /// Ratio of the depth of the nearest remaining point to that of the nearest plane.
@@ -64,7 +64,7 @@ pub struct DepthMap {
 }
 
 /// Downscaled photo on the device of the computation.
-struct Small {
+struct SmallPhoto {
     camera: Camera,
     /// Colours, [3, h, w].
     image: Tensor,
@@ -73,21 +73,23 @@ struct Small {
 }
 
 /// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
-/// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `go_on` is called before each view with
+/// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each view with
 /// the number of views that are done. If it returns `false`, the result has only these. The work is done on `device`, and the results are
 /// there.
 pub fn sweep(
     views: &[View],
     points: &[Point],
     device: Device,
-    mut go_on: impl FnMut(usize) -> bool,
+    mut should_continue: impl FnMut(usize) -> bool,
 ) -> Vec<DepthMap> {
-    let small: Vec<Small> = views.iter().map(|view| Small::of(view, LONGEST_SIDE, device)).collect();
+    let small: Vec<SmallPhoto> =
+        views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE, device)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
-    let coarse: Vec<Small> = views.iter().map(|view| Small::of(view, COARSE_SIDE, device)).collect();
+    let coarse: Vec<SmallPhoto> =
+        views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE, device)).collect();
     let (mut depths, mut swept): (Vec<f64>, Vec<(usize, DepthMap)>) = (vec![], vec![]);
-    for index in farthest_first(&cameras, MOST) {
-        if !go_on(swept.len()) {
+    for index in farthest_first(&cameras, MAX_DEPTH_MAPS) {
+        if !should_continue(swept.len()) {
             break;
         }
         let SceneDepth { median, nearest } = SceneDepth::of(index, &coarse, points);
@@ -97,7 +99,7 @@ pub fn sweep(
             |(other, _): &(usize, DepthMap)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
         if swept.iter().all(is_new) {
             let others = neighbours(index, &cameras, depth);
-            let others: Vec<&Small> = others.into_iter().map(|other| &small[other]).collect();
+            let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &small[other]).collect();
             swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
         }
     }
@@ -105,19 +107,19 @@ pub fn sweep(
     swept.into_iter().map(|(_, swept)| swept).collect()
 }
 
-fn sweep_one(this: &Small, others: &[&Small], nearest: Option<f64>, depth: f64) -> DepthMap {
+fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
     let nearest = match (nearest, others.first()) {
         (Some(nearest), _) => nearest,
         (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
         // Without other photos no depth can be measured: all pixels get the same depth.
         (None, None) => 2. / depth,
     };
-    let (inverse, likeness) = most_alike(this, others, nearest, PLANES);
+    let (inverse, correlation) = most_alike(this, others, nearest, PLANES);
     DepthMap {
         camera: this.camera,
         image: this.image.shallow_clone(),
-        depth: filled(&inverse, &likeness).clamp_min(nearest / FARTHEST).reciprocal(),
-        sure: likeness.gt(SURE),
+        depth: filled(&inverse, &correlation).clamp_min(nearest / FARTHEST).reciprocal(),
+        sure: correlation.gt(SURE),
     }
 }
 
@@ -133,7 +135,7 @@ impl SceneDepth {
     /// Estimates the depth from the points that the photo shows, else by comparing it with one photo at each of several distances, which
     /// are the extent of all cameras times powers of ½. Photos that are too near show no parallax, and those that are too far show
     /// something else. The number of photos at a distance makes no difference.
-    fn of(index: usize, photos: &[Small], points: &[Point]) -> Self {
+    fn of(index: usize, photos: &[SmallPhoto], points: &[Point]) -> Self {
         let this = &photos[index];
         if let Some(inverse) = inverse_depths_of(points, &this.camera) {
             let median = Some(1. / inverse[inverse.len() / 2]);
@@ -142,7 +144,7 @@ impl SceneDepth {
         }
         let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
         let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
-        let agreed: Vec<Measured> = compared.filter(|of| of.share >= LEAST_SHARE).collect();
+        let agreed: Vec<Measured> = compared.filter(|of| of.share >= MIN_AGREEING_FRACTION).collect();
         let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
         // The farthest photo comes first. A scene without parallax there is at least that far away.
         let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
@@ -160,10 +162,10 @@ struct Measured {
     share: f64,
 }
 
-fn measured(this: &Small, other: &Small) -> Measured {
+fn measured(this: &SmallPhoto, other: &SmallPhoto) -> Measured {
     let nearest = nearest_of_cameras(this, other);
-    let (inverse, likeness) = most_alike(this, &[other], nearest, COARSE_PLANES);
-    let sure = inverse.masked_select(&likeness.gt(SURE));
+    let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES);
+    let sure = inverse.masked_select(&correlation.gt(SURE));
     let share = sure.numel() as f64 / inverse.numel() as f64;
     let plane = nearest / (COARSE_PLANES - 1) as f64;
     let median = if sure.numel() == 0 { 0. } else { sure.median().double_value(&[]) };
@@ -181,8 +183,8 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
     }
 }
 
-impl Small {
-    fn of(view: &View, longest_side: f64, device: Device) -> Self {
+impl SmallPhoto {
+    fn from_view(view: &View, longest_side: f64, device: Device) -> Self {
         let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
         let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
         let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
@@ -192,7 +194,7 @@ impl Small {
         let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
-        Small {
+        SmallPhoto {
             camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
             image,
             grey,
@@ -209,7 +211,7 @@ impl Small {
 }
 
 /// Returns the inverse depth of the nearest plane, chosen so that its pixels move by `LARGEST_MOVE` in the nearest photo.
-fn nearest_of_cameras(this: &Small, other: &Small) -> f64 {
+fn nearest_of_cameras(this: &SmallPhoto, other: &SmallPhoto) -> f64 {
     let baseline = other.centre().distance(this.centre());
     LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
 }
@@ -220,12 +222,12 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
     let mut inverse: Vec<f64> =
         points.iter().filter_map(|point| project(point.position)).map(|[_, _, z]| 1. / z).collect();
     inverse.sort_by(f64::total_cmp);
-    (inverse.len() >= LEAST_POINTS).then_some(inverse)
+    (inverse.len() >= MIN_POINTS).then_some(inverse)
 }
 
 /// Returns for every pixel the inverse depth at which it looks most alike in the other photos, and the correlation there, both [h, w]. The
 /// candidates are `planes` inverse depths, evenly spaced from 0 to `nearest`.
-fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Tensor, Tensor) {
+fn most_alike(this: &SmallPhoto, others: &[&SmallPhoto], nearest: f64, planes: i64) -> (Tensor, Tensor) {
     let (size, options) = (this.size(), (Kind::Float, this.grey.device()));
     if others.is_empty() {
         return (Tensor::full(size, nearest / 2., options), Tensor::zeros(size, options));
@@ -234,8 +236,8 @@ fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Te
     let planes = Tensor::linspace(0., nearest, planes, options).view([planes, 1]);
     let own = this.grey.unsqueeze(0);
     let (own_mean, own_variance) = mean_and_variance(&own);
-    let alike = |other: &&Small| {
-        let (seen, inside) = seen_by(other, this, &planes);
+    let alike = |other: &&SmallPhoto| {
+        let (seen, inside) = warp(other, this, &planes);
         let (mean, variance) = mean_and_variance(&seen);
         let covariance = around(&(&seen * &own)) - mean * &own_mean;
         (covariance / (variance * &own_variance).sqrt()).where_scalarother(&inside, -1.)
@@ -243,13 +245,13 @@ fn most_alike(this: &Small, others: &[&Small], nearest: f64, planes: i64) -> (Te
     let correlations = Tensor::stack(&others.iter().map(alike).collect::<Vec<_>>(), 0);
     let half = (others.len() as i64 / 2).max(1);
     let (best, _) = correlations.topk(half, 0, true, false);
-    let (likeness, plane) = best.mean_dim([0].as_slice(), false, Kind::Float).max_dim(0, false);
-    (plane.to_kind(Kind::Float) * step, likeness)
+    let (correlation, plane) = best.mean_dim([0].as_slice(), false, Kind::Float).max_dim(0, false);
+    (plane.to_kind(Kind::Float) * step, correlation)
 }
 
 /// Returns the values of `other` at the positions of the pixels of `this` on each of the planes, and a mask of the positions that are
 /// inside the image of `other`, both [planes, h, w].
-fn seen_by(other: &Small, this: &Small, planes: &Tensor) -> (Tensor, Tensor) {
+fn warp(other: &SmallPhoto, this: &SmallPhoto, planes: &Tensor) -> (Tensor, Tensor) {
     let [height, width] = this.size();
     let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
     let rows = to_other.transpose().to_cols_array_2d();
@@ -298,9 +300,9 @@ fn mean_and_variance(t: &Tensor) -> (Tensor, Tensor) {
 }
 
 /// Replaces inverse depths of low correlation by those of reliable pixels around them, the nearest weighted most.
-fn filled(inverse: &Tensor, likeness: &Tensor) -> Tensor {
+fn filled(inverse: &Tensor, correlation: &Tensor) -> Tensor {
     let size = inverse.size();
-    let weight = (likeness - UNSURE).clamp_min(0.).square();
+    let weight = (correlation - UNSURE).clamp_min(0.).square();
     let (mut sum, mut weights) = ((inverse * &weight).unsqueeze(0), weight.unsqueeze(0));
     let (mut total, mut total_weights, mut factor) = (sum.copy(), weights.copy(), 1.);
     for _ in 0..SPREADS {
@@ -343,8 +345,8 @@ mod tests {
         // Points show that the scene begins at depth 3, so planes are closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
-        let photos: Vec<Small> =
-            views.iter().map(|view| Small::of(view, LONGEST_SIDE, Device::Cpu)).collect();
+        let photos: Vec<SmallPhoto> =
+            views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE, Device::Cpu)).collect();
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.

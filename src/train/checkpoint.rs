@@ -116,7 +116,7 @@ pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
 
 /// Summary of a checkpoint, for display.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Kept {
+pub struct CheckpointSummary {
     /// Path of its folder, relative to the run's folder.
     pub name: String,
     /// Number of steps done.
@@ -131,11 +131,11 @@ pub struct Kept {
 }
 
 /// Returns summaries of the run's checkpoints, oldest first, and of its best one. A checkpoint that is being replaced is left out.
-pub(super) fn kept(run: &Path) -> (Vec<Kept>, Option<Kept>) {
+pub(super) fn checkpoint_summaries(run: &Path) -> (Vec<CheckpointSummary>, Option<CheckpointSummary>) {
     let told = |path: &PathBuf| {
         let state = read_state(path).ok()?;
         let saved = fs::metadata(path.join(STATE_FILE)).and_then(|file| file.modified()).ok()?;
-        Some(Kept {
+        Some(CheckpointSummary {
             name: path.strip_prefix(run).unwrap_or(path).display().to_string(),
             step: state.step,
             bytes: state.files.values().map(|(bytes, _)| bytes).sum(),
@@ -169,7 +169,7 @@ pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
     match check(&best)?.validation {
         Some(validation) if validation.settings == settings => Ok(Some(validation.psnr)),
         found => {
-            let found = found.map_or("absent".into(), |validation| format!("of {}", validation.settings));
+            let found = found.map_or("missing".into(), |validation| format!("of {}", validation.settings));
             Err(Error::input(&best, "the validation", found, format!("one of {settings}")))
         }
     }
@@ -214,7 +214,7 @@ impl Trainer {
             let (step, samples) = (self.step, self.samples);
             write_state(folder, &State { step, samples, files, validation: None })
         })?;
-        drop_surplus(run, &path, self.config.train.keep_checkpoints)?;
+        prune_checkpoints(run, &path, self.config.train.keep_checkpoints)?;
         Ok(path)
     }
 
@@ -238,10 +238,10 @@ impl Trainer {
 ///
 /// # Errors
 /// Returns an error if a folder can't be removed.
-pub(super) fn drop_surplus(run: &Path, latest: &Path, kept: usize) -> Result<()> {
+pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Result<()> {
     let mut others = list_checkpoints(run)?;
     others.retain(|other| other != latest);
-    let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| seems_whole(other));
+    let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| has_expected_sizes(other));
     let surplus = (whole.len() + 1).saturating_sub(kept);
     let useless = broken.iter().filter(|broken| broken.as_path() < latest);
     for old in whole.iter().take(surplus).chain(useless) {
@@ -268,7 +268,7 @@ pub(super) fn check(checkpoint: &Path) -> Result<State> {
 }
 
 /// Returns `true` if a checkpoint's files exist and have their original sizes. [`check`] reads the files, too.
-fn seems_whole(checkpoint: &Path) -> bool {
+fn has_expected_sizes(checkpoint: &Path) -> bool {
     let is_long = |(name, (bytes, _)): (&String, &(u64, u32))| {
         fs::metadata(checkpoint.join(name)).is_ok_and(|file| file.len() == *bytes)
     };

@@ -28,13 +28,18 @@ pub(super) struct ForwardBackward<'a> {
 impl ForwardBackward<'_> {
     /// Adds the gradient of the loss of `batch`, which is `share` of the step, to the gradients of the variables. Returns the loss and its
     /// terms, packed by [`Losses::packed`](crate::loss::Losses::packed).
-    pub fn gradients(&self, batch: &Batch, share: &StepFraction, watch: &mut Stopwatch) -> Result<Tensor> {
+    pub fn gradients(
+        &self,
+        batch: &Batch,
+        share: &StepFraction,
+        stopwatch: &mut Stopwatch,
+    ) -> Result<Tensor> {
         let context = &batch.context;
         let model = self.model;
         let tokens =
-            watch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
+            stopwatch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
         let tokens_leaf = leaf(&tokens);
-        let (encoded, kept) = watch.time("encoder", || match self.config.train.checkpoint_rounds {
+        let (encoded, kept) = stopwatch.time("encoder", || match self.config.train.checkpoint_rounds {
             true => {
                 let (encoded, kept) = model.encode_checkpointed(&tokens_leaf);
                 (encoded, Some(kept))
@@ -42,33 +47,33 @@ impl ForwardBackward<'_> {
             false => (model.encode(&tokens_leaf), None),
         });
         let encoded_leaves = encoded.map(leaf);
-        let decoded = watch.time("decoder", || model.decode(&encoded_leaves, self.stage));
+        let decoded = stopwatch.time("decoder", || model.decode(&encoded_leaves, self.stage));
         let decoded_leaves = decoded.map(leaf);
         let cameras = batch.target.cameras();
         let RenderOutput { rgb, alpha, depth } =
-            watch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
+            stopwatch.time("render", || render(&decoded_leaves.gaussians, &cameras, DEFAULT_EPS2D))?;
         let rendered = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
         let share = self.counted(batch, &rendered.alpha, share)?;
-        let losses = watch.time("losses", || {
+        let losses = stopwatch.time("losses", || {
             losses(&self.config.loss, self.perceptual, batch, &decoded_leaves, &rendered, &share)
         });
 
-        watch.time("losses backward", || losses.total.backward());
-        watch.time("render backward", || {
+        stopwatch.time("losses backward", || losses.total.backward());
+        stopwatch.time("render backward", || {
             backward_from_grads(&[
                 (&rgb, &rendered.rgb),
                 (&alpha, &rendered.alpha),
                 (&depth, &rendered.depth),
             ]);
         });
-        watch.time("decoder backward", || backward_from_grads(&decoded.zip_tensors(&decoded_leaves)));
-        watch.time("encoder backward", || {
+        stopwatch.time("decoder backward", || backward_from_grads(&decoded.zip_tensors(&decoded_leaves)));
+        stopwatch.time("encoder backward", || {
             backward_from_grads(&encoded.zip_tensors(&encoded_leaves));
             if let Some(kept) = kept {
                 kept.backward();
             }
         });
-        watch.time("tokens backward", || backward_from_grads(&[(&tokens, &tokens_leaf)]));
+        stopwatch.time("tokens backward", || backward_from_grads(&[(&tokens, &tokens_leaf)]));
         Ok(losses.packed())
     }
 

@@ -15,7 +15,7 @@ pub(super) struct RunLock {
 
 impl RunLock {
     /// Returns `true` if a run ever locked the folder `run`.
-    pub(super) fn was_taken(run: &Path) -> bool {
+    pub(super) fn was_ever_locked(run: &Path) -> bool {
         run.join(FILE).exists()
     }
 

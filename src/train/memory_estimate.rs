@@ -33,12 +33,12 @@ impl MemoryEstimate {
     ///
     /// # Errors
     /// Returns an error if the model's settings don't fit together.
-    pub fn of(config: &Config, device: Device) -> Result<Self> {
-        Ok(Self::of_learned(config, learned_numbers(&config.model)?, device))
+    pub fn new(config: &Config, device: Device) -> Result<Self> {
+        Ok(Self::with_parameters(config, count_parameters(&config.model)?, device))
     }
 
     /// Estimates the memory of a step for a model with `learned` trainable parameters.
-    fn of_learned(config: &Config, learned: f64, device: Device) -> Self {
+    fn with_parameters(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
         let (model, data) = (&config.model, &config.data);
         let (batch, precision) = (config.train.batch_size, config.train.precision);
@@ -121,13 +121,17 @@ impl MemoryEstimate {
 ///
 /// # Errors
 /// Returns an error if the model's settings don't fit together.
-pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usize, Option<MemoryEstimate>)> {
+pub fn largest_fitting_batch(
+    config: &Config,
+    bytes: u64,
+    device: Device,
+) -> Result<(usize, Option<MemoryEstimate>)> {
     let mut config = config.clone();
     config.train.micro_batch = 0;
-    let learned = learned_numbers(&config.model)?;
+    let learned = count_parameters(&config.model)?;
     let mut refused = None;
     while config.train.batch_size > 1 {
-        let estimate = MemoryEstimate::of_learned(&config, learned, device);
+        let estimate = MemoryEstimate::with_parameters(&config, learned, device);
         if estimate.fits_into(bytes) {
             break;
         }
@@ -138,7 +142,7 @@ pub fn batch_within(config: &Config, bytes: u64, device: Device) -> Result<(usiz
 }
 
 /// Returns the number of trainable parameters of a model of `config`.
-fn learned_numbers(config: &ModelConfig) -> Result<f64> {
+fn count_parameters(config: &ModelConfig) -> Result<f64> {
     let mut vs = nn::VarStore::new(Device::Cpu);
     GlobalSplat::uninitialized(&mut vs, config, Precision::F32)?;
     Ok(vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64)

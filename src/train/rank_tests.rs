@@ -31,14 +31,14 @@ fn trained_on(
     disturb: impl Fn(usize, &mut [LoadedScene]),
 ) -> (Trainer, Vec<StepReport>) {
     let (rank, share) = (group.rank(), SCENES / group.world_size());
-    let mut trainer = far_from_the_start(config).with_ranks(group);
+    let mut trainer = far_from_the_start(config).with_group(group);
     // L_perc takes most of the time. It is a mean over scenes like L_mse, so the tests don't need it.
     trainer.perceptual = None;
     let step = |step: usize| {
         let mut scenes = scenes(SCENES);
         disturb(step, &mut scenes);
         let sample = Batch::from_scenes(&scenes[rank * share..][..share], Device::Cpu).unwrap();
-        trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step")
+        trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).expect("a step")
     };
     let reports = (0..STEPS).map(step).collect();
     (trainer, reports)
@@ -151,7 +151,7 @@ fn a_loss_that_is_no_number_on_one_rank_skips_the_step_on_all() {
 }
 
 #[test]
-fn of_a_skipped_step_all_ranks_know_all_scenes() {
+fn a_skipped_step_reports_the_scenes_of_all_ranks() {
     if !can_meet() {
         return;
     }
@@ -183,14 +183,14 @@ fn sharding_changes_nothing(optimizer: OptimizerKind) {
     let trained = |sharded: bool| {
         run_on_ranks(3, |group| {
             let rank = group.rank();
-            let mut trainer = far_from_the_start(&config).with_ranks(group);
+            let mut trainer = far_from_the_start(&config).with_group(group);
             if sharded {
                 trainer = trainer.with_sharded_optimizer();
             }
             trainer.broadcast_state().expect("the first rank");
             for _ in 0..3 {
                 let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu).unwrap();
-                trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
+                trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             }
             let moments: usize = trainer.optimizer.moments().map(Tensor::numel).sum();
             (weights(&trainer), trainer.optimizer_state().expect("all moments"), moments)
@@ -214,11 +214,14 @@ fn ranks_stop_together() {
     let config = training(TrainConfig::default());
     let found = run_on_ranks(3, |group| {
         let rank = group.rank();
-        let mut trainer = far_from_the_start(&config).with_ranks(group);
+        let mut trainer = far_from_the_start(&config).with_group(group);
         let sample = Batch::from_scenes(&scenes(3)[rank..][..1], Device::Cpu).unwrap();
         let step = |step: usize| {
             let asked = rank == 1 && step == 2;
-            trainer.learn(&sample, &mut Stopwatch::default(), &mut || !asked).expect("a step").go_on
+            trainer
+                .train_step(&sample, &mut Stopwatch::default(), &mut || !asked)
+                .expect("a step")
+                .should_continue
         };
         (0..4).map(step).collect::<Vec<_>>()
     });
@@ -236,12 +239,12 @@ fn ranks_follow_the_first() {
         let mut trainer = far_from_the_start(&config);
         if group.is_main_process() {
             let sample = Batch::from_scenes(&scenes(1), Device::Cpu).unwrap();
-            trainer.learn(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
+            trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             trainer.samples = 7;
             // Weights from elsewhere may have another value here.
             let _ = trainer.vs.variables()[NOT_TRAINED].shallow_clone().fill_(0.25);
         }
-        let mut trainer = trainer.with_ranks(group);
+        let mut trainer = trainer.with_group(group);
         trainer.broadcast_state().expect("the first rank");
         let moments: Vec<Tensor> = trainer.optimizer.moments().map(Tensor::copy).collect();
         let variables: BTreeMap<_, _> =
@@ -269,7 +272,7 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
         let mut found = run_on_ranks(2, |group| {
             let config = training(TrainConfig::default());
             let trainer = if group.is_main_process() { far_from_the_start(&config) } else { second(config) };
-            trainer.with_ranks(group).broadcast_state().map_err(|e| e.to_string())
+            trainer.with_group(group).broadcast_state().map_err(|e| e.to_string())
         });
         found.remove(1).expect_err("the second rank goes on")
     };
@@ -279,10 +282,13 @@ fn ranks_of_other_configurations_or_scenes_are_refused() {
         config.data.captures = vec!["elsewhere".into()];
         far_from_the_start(&config)
     });
-    assert_eq!(other, "this rank's configuration isn't the first one's: train.learning_rate 0.00003 → 0.5");
+    assert_eq!(
+        other,
+        "this rank's configuration differs from the first rank's: train.learning_rate 0.00003 → 0.5"
+    );
     let scenes = refused(|config| {
         let scenes = TrainingScenes::find(&["synth:seed=1,scenes=3,size=32".into()]).expect("worlds");
         Trainer::new(&config, Arc::new(scenes), Device::Cpu).expect("a trainer")
     });
-    assert!(scenes.starts_with("this rank's training scenes aren't the first one's: 3 of"), "{scenes}");
+    assert!(scenes.starts_with("this rank's training scenes differ from the first rank's: 3 of"), "{scenes}");
 }

@@ -1,8 +1,8 @@
 //! Training run, from its current state to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
-    Validation, add_checkpoints, best_score, check, drop_surplus, keep_best, latest_checkpoint,
-    list_checkpoints, recover,
+    Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
+    prune_checkpoints, recover,
 };
 use super::is_due;
 use super::lock::RunLock;
@@ -60,7 +60,7 @@ pub struct Outcome {
     pub skipped: u64,
 }
 
-/// Trains into the folder `out`, which no other process may use for training at the same time. `observe` is called with every event and
+/// Trains into the folder `out`, which no other process may use for training at the same time. `on_event` is called with every event and
 /// returns whether to continue. If it returns `false`, the run saves a checkpoint and stops. `validator` scores the model at intervals and
 /// at the end.
 ///
@@ -74,10 +74,10 @@ pub fn run(
     out: &Path,
     resume: &Resume,
     validator: Option<&mut dyn Validator>,
-    mut observe: impl FnMut(Event) -> bool,
+    mut on_event: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
     let writes = trainer.group.is_main_process();
-    let begun = writes.then(|| RunLogger::open(trainer, out, resume, &mut observe)).transpose()?;
+    let begun = writes.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
     trainer.broadcast_state()?;
     let held_out = validator.as_ref().map(|validator| validator.scenes());
     let expected = trainer.group.broadcast_object(writes.then_some(held_out))?;
@@ -93,7 +93,7 @@ pub fn run(
     let saved = begun.as_ref().map(|(_, saved)| saved.clone());
     let saved = trainer.group.broadcast_object(saved)?;
     let logger = begun.map(|(logger, _)| logger);
-    Run { trainer, out, validator, observe, logger, validated, asked_to_stop: false }.train(saved)
+    Run { trainer, out, validator, on_event, logger, validated, asked_to_stop: false }.train(saved)
 }
 
 /// Adds the files of the run in the folder `run` to `inputs`: its checkpoints, and the files beside them.
@@ -104,8 +104,8 @@ pub fn add_run_inputs(run: &Path, inputs: &mut InputFiles) {
 }
 
 /// Checks that a run may write into `out`: it has done so before, or the folder has no other files of the names that a run uses.
-fn check_books(out: &Path) -> Result<()> {
-    if RunLock::was_taken(out) || !list_checkpoints(out)?.is_empty() {
+fn check_output_folder(out: &Path) -> Result<()> {
+    if RunLock::was_ever_locked(out) || !list_checkpoints(out)?.is_empty() {
         return Ok(());
     }
     match [CONFIG_FILE, METRICS_FILE].into_iter().find(|name| out.join(name).exists()) {
@@ -139,12 +139,12 @@ impl RunLogger {
         trainer: &mut Trainer,
         out: &Path,
         resume: &Resume,
-        observe: &mut impl FnMut(Event) -> bool,
+        on_event: &mut impl FnMut(Event) -> bool,
     ) -> Result<(Self, Option<PathBuf>)> {
-        check_books(out)?;
+        check_output_folder(out)?;
         let lock = RunLock::take(out)?;
         recover(out)?;
-        let begun = begin(trainer, out, resume, observe)?;
+        let begun = begin(trainer, out, resume, on_event)?;
         let config = out.join(CONFIG_FILE);
         let toml = trainer.config.to_toml();
         let changes = match std::fs::read_to_string(&config) {
@@ -153,20 +153,20 @@ impl RunLogger {
         };
         if !changes.is_empty() {
             let changes = changes.join(", ");
-            observe(Event::Notice(format!("resuming with a changed configuration: {changes}")));
+            on_event(Event::Notice(format!("resuming with a changed configuration: {changes}")));
         }
-        retry_on_disk_full(observe, || {
+        retry_on_disk_full(on_event, || {
             write_atomically(&config, |writer| {
                 writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
             })
         })?;
-        let metrics = retry_on_disk_full(observe, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
+        let metrics = retry_on_disk_full(on_event, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
         let mut tensorboard =
-            retry_on_disk_full(observe, || TensorBoard::create(out, trainer.config.train.log_every))?;
-        retry_on_disk_full(observe, || tensorboard.start(trainer.step))?;
+            retry_on_disk_full(on_event, || TensorBoard::create(out, trainer.config.train.log_every))?;
+        retry_on_disk_full(on_event, || tensorboard.start(trainer.step))?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {
-            observe(Event::Notice(format!("{e}; the best checkpoint is looked for anew")));
+            on_event(Event::Notice(format!("{e}; the best checkpoint is determined again")));
             None
         });
         Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, begun))
@@ -174,23 +174,23 @@ impl RunLogger {
 
     fn log_step(
         &mut self,
-        observe: &mut impl FnMut(Event) -> bool,
+        on_event: &mut impl FnMut(Event) -> bool,
         report: &StepReport,
         samples_per_second: f64,
     ) -> Result<()> {
-        retry_on_disk_full(observe, || self.metrics.log_step(report, samples_per_second))?;
-        retry_on_disk_full(observe, || self.tensorboard.log_step(report, samples_per_second))?;
-        retry_on_disk_full(observe, || self.tensorboard.log_picture(report))
+        retry_on_disk_full(on_event, || self.metrics.log_step(report, samples_per_second))?;
+        retry_on_disk_full(on_event, || self.tensorboard.log_step(report, samples_per_second))?;
+        retry_on_disk_full(on_event, || self.tensorboard.log_picture(report))
     }
 
     fn log_validation(
         &mut self,
-        observe: &mut impl FnMut(Event) -> bool,
+        on_event: &mut impl FnMut(Event) -> bool,
         step: u64,
         score: &Score,
     ) -> Result<()> {
-        retry_on_disk_full(observe, || self.tensorboard.log_validation(step, score))?;
-        retry_on_disk_full(observe, || self.metrics.log_validation(step, score))
+        retry_on_disk_full(on_event, || self.tensorboard.log_validation(step, score))?;
+        retry_on_disk_full(on_event, || self.metrics.log_validation(step, score))
     }
 }
 
@@ -199,7 +199,7 @@ struct Run<'a, 'v, O> {
     trainer: &'a mut Trainer,
     out: &'a Path,
     validator: Option<&'v mut dyn Validator>,
-    observe: O,
+    on_event: O,
     /// Log files, which only the first rank has.
     logger: Option<RunLogger>,
     /// Step before the last validation that was logged.
@@ -214,7 +214,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         let TrainConfig { steps, checkpoint_every, validate_every, max_nonfinite_steps, .. } =
             self.trainer.config.train;
         let batch = self.trainer.batch() as f64;
-        let (mut skipped, mut go_on) = (0, true);
+        let (mut skipped, mut should_continue) = (0, true);
         // Number of steps that were skipped since the last one that wasn't.
         let mut skipped_in_a_row = 0;
         while self.trainer.step < steps {
@@ -222,30 +222,31 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
             if validates && skipped_in_a_row == 0 && self.validated != Some(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
-                go_on = match self.validate(&checkpoint) {
+                should_continue = match self.validate(&checkpoint) {
                     // A failed write or a lost rank isn't a problem of the held-out data.
                     Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
                     Err(e) => self.tell(Event::Notice(format!("a validation is left out: {e}"))),
-                    go_on => go_on?,
+                    should_continue => should_continue?,
                 };
                 saved = Some(checkpoint);
             }
-            if !go_on {
+            if !should_continue {
                 break;
             }
 
             let start = Instant::now();
-            let Run { trainer, observe, asked_to_stop, .. } = &mut self;
+            let Run { trainer, on_event, asked_to_stop, .. } = &mut self;
             let report = trainer.step(&mut || {
-                *asked_to_stop |= !observe(Event::Waiting);
+                *asked_to_stop |= !on_event(Event::Waiting);
                 !*asked_to_stop
             })?;
             let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
             if let Some(logger) = &mut self.logger {
-                logger.log_step(&mut self.observe, &report, samples_per_second)?;
+                logger.log_step(&mut self.on_event, &report, samples_per_second)?;
             }
-            go_on = self.tell(Event::Step { report: &report, samples_per_second }) && report.go_on;
+            should_continue =
+                self.tell(Event::Step { report: &report, samples_per_second }) && report.should_continue;
             if report.skipped {
                 skipped += 1;
                 skipped_in_a_row += 1;
@@ -258,17 +259,17 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                     saved = Some(self.save()?);
                 }
             }
-            if !go_on {
+            if !should_continue {
                 break;
             }
         }
         let mut complete = self.trainer.step >= steps;
         // Skipped steps changed nothing, so this is the state before them. They are repeated when the run is resumed.
-        self.trainer.take_back(skipped_in_a_row);
+        self.trainer.rewind(skipped_in_a_row);
         let checkpoint = saved.map_or_else(|| self.save(), Ok)?;
         if self.logger.is_some() {
             // Retry to remove checkpoints that an earlier save couldn't remove.
-            drop_surplus(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
+            prune_checkpoints(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
         }
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
@@ -286,7 +287,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// Reports an event and returns whether to continue. If there are several ranks, always returns `true`: a request to stop reaches all
     /// ranks with the next step, so that they stop together.
     fn tell(&mut self, event: Event) -> bool {
-        self.asked_to_stop |= !(self.observe)(event);
+        self.asked_to_stop |= !(self.on_event)(event);
         self.trainer.group.world_size() > 1 || !self.asked_to_stop
     }
 
@@ -294,7 +295,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     fn save(&mut self) -> Result<PathBuf> {
         let optimizer = self.trainer.optimizer_state()?;
         match &self.logger {
-            Some(_) => retry_on_disk_full(&mut self.observe, || self.trainer.save(self.out, &optimizer)),
+            Some(_) => retry_on_disk_full(&mut self.on_event, || self.trainer.save(self.out, &optimizer)),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }
@@ -303,22 +304,22 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// is killed during the validation repeats all of it.
     fn validate(&mut self, checkpoint: &Path) -> Result<bool> {
         let Some(validator) = &mut self.validator else { return Ok(true) };
-        let observe = &mut self.observe;
-        let Some(score) = validator.validate(self.trainer, &mut || observe(Event::Waiting))? else {
+        let on_event = &mut self.on_event;
+        let Some(score) = validator.validate(self.trainer, &mut || on_event(Event::Waiting))? else {
             return Ok(false);
         };
         for why in &score.left_out {
-            observe(Event::Notice(format!("a held-out scene is left out: {why}")));
+            on_event(Event::Notice(format!("a held-out scene is left out: {why}")));
         }
         let step = self.trainer.step.saturating_sub(1);
         if let Some(logger) = &mut self.logger {
             if score.psnr > logger.best.unwrap_or(f64::NEG_INFINITY) {
                 let found = || Validation { psnr: score.psnr, settings: logger.settings.clone() };
-                retry_on_disk_full(observe, || keep_best(self.out, checkpoint, found()))?;
+                retry_on_disk_full(on_event, || keep_best(self.out, checkpoint, found()))?;
                 logger.best = Some(score.psnr);
             }
             if self.validated != Some(step) {
-                logger.log_validation(observe, step, &score)?;
+                logger.log_validation(on_event, step, &score)?;
             }
         }
         self.validated = Some(step);
@@ -345,7 +346,7 @@ fn begin(
     trainer: &mut Trainer,
     out: &Path,
     resume: &Resume,
-    observe: &mut impl FnMut(Event) -> bool,
+    on_event: &mut impl FnMut(Event) -> bool,
 ) -> Result<Option<PathBuf>> {
     let checkpoints = list_checkpoints(out)?;
     match resume {
@@ -364,7 +365,9 @@ fn begin(
             trainer.load(checkpoint, &state)?;
             Ok(checkpoints.into_iter().find(|of| of == checkpoint))
         }
-        Resume::Auto | Resume::Never if checkpoints.is_empty() => trainer.take_weights().map(|()| None),
+        Resume::Auto | Resume::Never if checkpoints.is_empty() => {
+            trainer.load_initial_weights().map(|()| None)
+        }
         Resume::Never => {
             let expected = "none with Resume::Never (choose another output folder)";
             Err(Error::input(out, "the run", "one with checkpoints", expected))
@@ -377,7 +380,7 @@ fn begin(
                         return Ok(Some(checkpoint.clone()));
                     }
                     Err(e) => {
-                        observe(Event::Notice(format!("{e}; the checkpoint before it is taken")));
+                        on_event(Event::Notice(format!("{e}; the previous checkpoint is used")));
                     }
                 }
             }
@@ -395,12 +398,12 @@ fn begin(
 /// Time between attempts to write to a full disk.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Calls `write`, and repeats it as long as the disk is full and `observe` returns `true`.
+/// Calls `write`, and repeats it as long as the disk is full and `on_event` returns `true`.
 ///
 /// # Errors
 /// Returns the errors of `write`.
 pub fn retry_on_disk_full<T>(
-    observe: &mut impl FnMut(Event) -> bool,
+    on_event: &mut impl FnMut(Event) -> bool,
     mut write: impl FnMut() -> Result<T>,
 ) -> Result<T> {
     let mut waited = false;
@@ -408,19 +411,19 @@ pub fn retry_on_disk_full<T>(
         match write() {
             Err(e) if e.is_disk_full() => {
                 if !waited {
-                    observe(Event::Notice(format!(
+                    on_event(Event::Notice(format!(
                         "training paused: {e}; it resumes when there is disk space"
                     )));
                     waited = true;
                 }
-                if !observe(Event::Waiting) {
+                if !on_event(Event::Waiting) {
                     return Err(e);
                 }
                 std::thread::sleep(PAUSE);
             }
             result => {
                 if waited && result.is_ok() {
-                    observe(Event::Notice("disk space is available again: training resumes".into()));
+                    on_event(Event::Notice("disk space is available again: training resumes".into()));
                 }
                 return result;
             }

@@ -29,20 +29,20 @@ impl ModelReplica {
     ///
     /// # Errors
     /// Returns an error if the model can't be built. This is not expected, because `model` was built with the same configuration.
-    pub fn of(model: &GlobalSplat, vs: &nn::VarStore) -> Result<Self> {
+    pub fn new(model: &GlobalSplat, vs: &nn::VarStore) -> Result<Self> {
         let mut own = nn::VarStore::new(vs.device());
-        let twin = GlobalSplat::uninitialized(&mut own, model.config(), model.precision())?;
+        let replica = GlobalSplat::uninitialized(&mut own, model.config(), model.precision())?;
         let variables = vs.variables();
         let leaves = own.variables().into_iter().filter_map(|(name, mut leaf)| {
             let variable = variables[&name].shallow_clone();
             no_grad(|| leaf.set_data(&variable.detach()));
             variable.requires_grad().then_some((variable, leaf))
         });
-        Ok(ModelReplica { leaves: leaves.collect(), model: twin })
+        Ok(ModelReplica { leaves: leaves.collect(), model: replica })
     }
 
     /// Adds the gradients of the copy to those of the model's own variables, and clears them.
-    fn hand_over(&self) {
+    fn accumulate_gradients(&self) {
         for (variable, leaf) in &self.leaves {
             let gradient = leaf.grad();
             if gradient.defined() {
@@ -55,7 +55,7 @@ impl ModelReplica {
 
 /// Computes [`ForwardBackward::gradients`] of all `slices` in parallel and returns the sum of their losses. The slices share libtorch's
 /// threads equally: this thread computes the first slice, and a new thread with a copy of the model each of the others. There must be at
-/// most as many slices as threads, and a copy for each slice but the first. `watch` records the time of the first slice's sections, and the
+/// most as many slices as threads, and a copy for each slice but the first. `stopwatch` records the time of the first slice's sections, and the
 /// time of waiting for the other slices.
 ///
 /// # Errors
@@ -64,7 +64,7 @@ pub(super) fn gradients_in_parallel(
     part: &ForwardBackward,
     replicas: &mut [ModelReplica],
     slices: Vec<(Batch, StepFraction)>,
-    watch: &mut Stopwatch,
+    stopwatch: &mut Stopwatch,
 ) -> Result<Tensor> {
     let threads = tch::get_num_threads();
     let each = threads / slices.len() as i32;
@@ -74,24 +74,25 @@ pub(super) fn gradients_in_parallel(
     let losses: Vec<Result<Tensor>> = thread::scope(|scope| {
         let others: Vec<_> = slices
             .zip(replicas.iter_mut())
-            .map(|((sample, share), twin)| {
+            .map(|((sample, share), replica)| {
                 scope.spawn(move || {
                     tch::set_num_threads(each);
-                    let (model, group) = (&twin.model, &ProcessGroup::single());
+                    let (model, group) = (&replica.model, &ProcessGroup::single());
                     let part = ForwardBackward { config, model, perceptual: None, stage, group };
                     part.gradients(&sample, &share, &mut Stopwatch::default())
                 })
             })
             .collect();
         tch::set_num_threads(each);
-        let first = part.gradients(&sample, &share, watch);
+        let first = part.gradients(&sample, &share, stopwatch);
         let joined = |other: ScopedJoinHandle<_>| other.join().unwrap_or_else(|panic| resume_unwind(panic));
-        watch.time("other scenes", || std::iter::once(first).chain(others.into_iter().map(joined)).collect())
+        stopwatch
+            .time("other scenes", || std::iter::once(first).chain(others.into_iter().map(joined)).collect())
     });
     // Setting the number of threads in one thread sets it for threads that start later, too.
     tch::set_num_threads(threads);
     let count = losses.len();
     let losses: Vec<Tensor> = losses.into_iter().collect::<Result<_>>()?;
-    watch.time("adding up", || replicas[..count - 1].iter().for_each(ModelReplica::hand_over));
+    stopwatch.time("adding up", || replicas[..count - 1].iter().for_each(ModelReplica::accumulate_gradients));
     Ok(Tensor::stack(&losses, 0).sum_dim_intlist(0i64, false, None::<Kind>))
 }

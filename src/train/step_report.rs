@@ -24,7 +24,7 @@ pub struct StepReport {
     /// Preview of the first scene before the step, `[3, H, W]`, at the steps that `train.log_images_every` selects.
     pub picture: Option<Tensor>,
     /// `true` if no rank was asked to stop.
-    pub go_on: bool,
+    pub should_continue: bool,
 }
 
 impl StepReport {

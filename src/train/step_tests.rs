@@ -315,7 +315,7 @@ fn a_step_takes_few_kernels() {
 }
 
 #[test]
-fn a_step_moves_nothing_but_what_is_told() {
+fn a_step_makes_only_expected_device_copies() {
     let sample = sample();
     for (micro_batch, checkpoint_rounds, precision) in
         [(0, false, Precision::F32), (2, false, Precision::Bf16), (1, true, Precision::F32)]
@@ -342,7 +342,7 @@ fn a_step_moves_nothing_but_what_is_told() {
             assert_eq!(moves(&ops), 0, "the losses");
 
             let (report, ops) =
-                record_ops(|| trainer.learn(&sample, &mut Stopwatch::default(), &mut || true));
+                record_ops(|| trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true));
             let renders = match micro_batch {
                 0 => 1,
                 // Depths are compared over all slices, so their pixels are counted in an earlier pass.

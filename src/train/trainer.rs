@@ -113,7 +113,7 @@ impl Trainer {
 
     /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with the
     /// samples of all ranks.
-    pub fn with_ranks(mut self, group: ProcessGroup) -> Self {
+    pub fn with_group(mut self, group: ProcessGroup) -> Self {
         // Parameters notify only one set of buckets, so the old one is dropped first.
         self.buckets = Buckets::new(&ProcessGroup::single(), &[]);
         let parameters: Vec<Tensor> =
@@ -140,7 +140,7 @@ impl Trainer {
     ///
     /// # Errors
     /// Returns an error if the file can't be read, or if its model has another shape. The error names the keys that differ.
-    pub(super) fn take_weights(&mut self) -> Result<()> {
+    pub(super) fn load_initial_weights(&mut self) -> Result<()> {
         let Some(path) = &self.weights else { return Ok(()) };
         let file = ModelFile::open(path, &[])?;
         let (ours, mut theirs) = (self.config.model.clone(), file.config.model.clone());
@@ -171,11 +171,11 @@ impl Trainer {
         Ok(())
     }
 
-    /// Draws a batch and updates the weights by its gradient. Calls `go_on` once; the report says whether it returned `true` on all ranks.
+    /// Draws a batch and updates the weights by its gradient. Calls `should_continue` once; the report says whether it returned `true` on all ranks.
     ///
     /// # Errors
     /// Returns an error if loading or rendering fails, or if another rank is gone.
-    pub fn step(&mut self, go_on: &mut dyn FnMut() -> bool) -> Result<StepReport> {
+    pub fn step(&mut self, should_continue: &mut dyn FnMut() -> bool) -> Result<StepReport> {
         let (batch, device) = (self.config.train.batch_size, self.vs.device());
         let sample = self.loader()?.next_batch(batch, device)?;
         self.samples += self.batch();
@@ -183,7 +183,7 @@ impl Trainer {
         let picture = (self.group.is_main_process() && is_due(self.config.train.log_images_every, self.step))
             .then(|| preview(&self.model, &sample, stage))
             .transpose()?;
-        Ok(StepReport { picture, ..self.learn(&sample, &mut Stopwatch::default(), go_on)? })
+        Ok(StepReport { picture, ..self.train_step(&sample, &mut Stopwatch::default(), should_continue)? })
     }
 
     /// Returns the number of samples in a step, on all ranks together.
@@ -200,28 +200,28 @@ impl Trainer {
     }
 
     /// Computes the loss and gradient of `sample`, which isn't paired yet, and updates the weights. Records the time of each section of the
-    /// step in `watch`.
+    /// step in `stopwatch`.
     ///
     /// # Errors
     /// Returns an error if rendering fails, or if another rank is gone.
-    pub(crate) fn learn(
+    pub(crate) fn train_step(
         &mut self,
         sample: &Batch,
-        watch: &mut Stopwatch,
-        go_on: &mut dyn FnMut() -> bool,
+        stopwatch: &mut Stopwatch,
+        should_continue: &mut dyn FnMut() -> bool,
     ) -> Result<StepReport> {
         let stage = stage_at(&self.config.curriculum, self.step);
         let learning_rate = learning_rate(&self.config.train, self.step);
-        let losses = self.gradients(sample, stage, watch)?;
+        let losses = self.gradients(sample, stage, stopwatch)?;
         let sums = match self.group.world_size() {
-            1 => self.all_reduce(losses, go_on)?,
-            _ => watch.time(COMMUNICATION, || self.all_reduce(losses, go_on))?,
+            1 => self.all_reduce(losses, should_continue)?,
+            _ => stopwatch.time(COMMUNICATION, || self.all_reduce(losses, should_continue))?,
         };
         // The GPU is still busy with this step. The next samples are copied meanwhile.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
             loader.prefetch_to_device(self.config.train.batch_size, device);
         }
-        let (sums, skipped) = watch.time("optimizer", || -> Result<_> {
+        let (sums, skipped) = stopwatch.time("optimizer", || -> Result<_> {
             let sums = StepSums::from_tensors(&sums, &self.optimizer.gradient_norm()?);
             let skipped = !(sums.losses.total.is_finite() && sums.gradient_norm.is_finite());
             if !skipped {
@@ -233,7 +233,7 @@ impl Trainer {
         })?;
         let StepSums { losses, sync, gradient_norm } = sums;
         if !skipped && self.optimizer.is_sharded() {
-            watch.time("parameters", || self.spread_parameters())?;
+            stopwatch.time("parameters", || self.broadcast_parameters())?;
         }
         if !sync.has_equal_gradients(self.group.world_size()) {
             return Err(Error::failed(
@@ -241,7 +241,7 @@ impl Trainer {
             ));
         }
         if sync.has_bad_data() {
-            self.tell_bad_data()?;
+            self.exchange_bad_data()?;
         }
         let scenes = match skipped {
             true => self.group.all_gather_object(sample.names.clone())?.concat(),
@@ -256,16 +256,16 @@ impl Trainer {
             skipped,
             scenes,
             picture: None,
-            go_on: !sync.is_asked_to_stop(),
+            should_continue: !sync.is_asked_to_stop(),
         };
         self.step += 1;
         Ok(report)
     }
 
     /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the ranks' [`StepSync`], packed.
-    fn all_reduce(&self, losses: Tensor, go_on: &mut dyn FnMut() -> bool) -> Result<Tensor> {
+    fn all_reduce(&self, losses: Tensor, should_continue: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()?;
-        let is_asked_to_stop = !go_on();
+        let is_asked_to_stop = !should_continue();
         let has_bad_data = self.loader.as_ref().is_some_and(DataLoader::has_bad_scene_reports);
         let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
         self.group.all_reduce(&sums)?;
@@ -273,7 +273,7 @@ impl Trainer {
     }
 
     /// Broadcasts the parameters that each rank has updated to all others.
-    fn spread_parameters(&self) -> Result<()> {
+    fn broadcast_parameters(&self) -> Result<()> {
         for part in 0..self.group.world_size() {
             let parameters: Vec<&Tensor> = self.optimizer.shard_parameters(part).collect();
             if parameters.is_empty() {
@@ -313,7 +313,7 @@ impl Trainer {
     }
 
     /// Exchanges the bad data that the ranks found, so that every rank counts all of it.
-    fn tell_bad_data(&self) -> Result<()> {
+    fn exchange_bad_data(&self) -> Result<()> {
         let Some(loader) = &self.loader else { return Ok(()) };
         if self.group.world_size() > 1 {
             let reports: Vec<Vec<BadSceneReport>> =
@@ -343,7 +343,7 @@ impl Trainer {
     /// # Errors
     /// Returns an error if this rank's configuration or scenes differ from the first rank's, or if another rank is gone.
     pub(crate) fn broadcast_state(&mut self) -> Result<()> {
-        self.agree_with_first()?;
+        self.check_same_as_first_rank()?;
         let position =
             self.group.is_main_process().then(|| (self.step, self.samples, self.optimizer.steps()));
         let (step, samples, updates) = self.group.broadcast_object(position)?;
@@ -360,7 +360,7 @@ impl Trainer {
     }
 
     /// Checks that this rank has the configuration and scenes of the first one. The locations of the data may differ between machines.
-    fn agree_with_first(&self) -> Result<()> {
+    fn check_same_as_first_rank(&self) -> Result<()> {
         let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
         let (config, scenes, shards) =
             self.group.broadcast_object(self.group.is_main_process().then(|| own.clone()))?;
@@ -374,13 +374,15 @@ impl Trainer {
         }
         if !changed.is_empty() {
             let changed = changed.join(", ");
-            return Err(Error::failed(format!("this rank's configuration isn't the first one's: {changed}")));
+            return Err(Error::failed(format!(
+                "this rank's configuration differs from the first rank's: {changed}"
+            )));
         }
         if scenes != own.1 {
             let count = |sizes: &[usize]| sizes.iter().sum::<usize>();
             let (own, first) = (count(&own.1), count(&scenes));
             return Err(Error::failed(format!(
-                "this rank's training scenes aren't the first one's: {own} of {} groups, expected {first} of {}",
+                "this rank's training scenes differ from the first rank's: {own} of {} groups, expected {first} of {}",
                 self.scenes.sizes().len(),
                 scenes.len()
             )));
@@ -393,14 +395,14 @@ impl Trainer {
         &mut self,
         sample: &Batch,
         stage: Stage,
-        watch: &mut Stopwatch,
+        stopwatch: &mut Stopwatch,
     ) -> Result<Tensor> {
         let pair = self.config.loss.has_consistency() && sample.context_views() >= 2;
         let halves = pair.then(|| subsets(sample.context_views(), self.step));
         let scenes = sample.scenes();
         let at_once = self.slices_at_once(scenes);
         while self.replicas.len() + 1 < at_once {
-            self.replicas.push(ModelReplica::of(&self.model, &self.vs)?);
+            self.replicas.push(ModelReplica::new(&self.model, &self.vs)?);
         }
         let perceptual = self.perceptual.as_ref();
         let group = &self.group;
@@ -422,29 +424,30 @@ impl Trainer {
         };
         let firsts = (0..scenes).step_by(count);
         if at_once > 1 {
-            watch.time("zero gradients", || self.optimizer.zero_grad());
-            let slices = watch.time("data", || firsts.map(|first| (slice(first), share(first))).collect());
-            return gradients_in_parallel(&part, &mut self.replicas, slices, watch);
+            stopwatch.time("zero gradients", || self.optimizer.zero_grad());
+            let slices =
+                stopwatch.time("data", || firsts.map(|first| (slice(first), share(first))).collect());
+            return gradients_in_parallel(&part, &mut self.replicas, slices, stopwatch);
         }
         let mut depth_pixels = None;
         if pair && self.config.loss.consistency_depth > 0. && count < scenes {
             let pixels = firsts.clone().map(|first| {
-                let slice = watch.time("data", || slice(first));
-                watch.time("depth pixels", || part.depth_pixels(&slice))
+                let slice = stopwatch.time("data", || slice(first));
+                stopwatch.time("depth pixels", || part.depth_pixels(&slice))
             });
             let pixels = Tensor::stack(&pixels.collect::<Result<Vec<_>>>()?, 0).sum(None::<Kind>);
             group.all_reduce(&pixels)?;
             depth_pixels = Some(pixels);
         }
-        watch.time("zero gradients", || self.optimizer.zero_grad());
+        stopwatch.time("zero gradients", || self.optimizer.zero_grad());
         let mut losses = Tensor::zeros([Losses::COUNT as i64], (Kind::Double, self.vs.device()));
         for first in firsts {
             if first + count >= scenes {
                 self.buckets.begin();
             }
             let depth_pixels = depth_pixels.as_ref().map(Tensor::shallow_clone);
-            let slice = watch.time("data", || slice(first));
-            losses += part.gradients(&slice, &StepFraction { depth_pixels, ..share(first) }, watch)?;
+            let slice = stopwatch.time("data", || slice(first));
+            losses += part.gradients(&slice, &StepFraction { depth_pixels, ..share(first) }, stopwatch)?;
         }
         Ok(losses)
     }
@@ -483,7 +486,7 @@ impl Trainer {
     }
 
     /// Takes back the last `steps` steps. All of them were skipped, so only the step and the position in the data have changed.
-    pub(super) fn take_back(&mut self, steps: u64) {
+    pub(super) fn rewind(&mut self, steps: u64) {
         self.step -= steps;
         self.samples -= steps * self.batch();
     }

@@ -24,9 +24,13 @@ pub trait Validator {
     /// Returns the number of scenes. Ranks compare it to check that they evaluate the same scenes.
     fn scenes(&self) -> usize;
 
-    /// Returns the score of the model as it is now, or `None` if `go_on`, which is called at intervals, returns `false`.
+    /// Returns the score of the model as it is now, or `None` if `should_continue`, which is called at intervals, returns `false`.
     ///
     /// # Errors
     /// Returns an error if no scene can be used, or if the evaluation fails.
-    fn validate(&mut self, trainer: &Trainer, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Score>>;
+    fn validate(
+        &mut self,
+        trainer: &Trainer,
+        should_continue: &mut dyn FnMut() -> bool,
+    ) -> Result<Option<Score>>;
 }

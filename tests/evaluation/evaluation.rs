@@ -436,7 +436,7 @@ fn invalid_indices_are_refused() {
     assert!(error.contains(expected), "{error}");
     set.write_index(&json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
     let error = refuse(&text(&arguments));
-    assert!(error.contains("none of the 3 in the data set chunks"), "{error}");
+    assert!(error.contains("none of the 3 in the dataset chunks"), "{error}");
     std::fs::remove_file(set.path("splats/room_000.ply")).unwrap();
     set.write_index(&json!({"room_000": {"context": [0, 3], "target": [1]}}));
     let error = fail(&text(&arguments), 1);

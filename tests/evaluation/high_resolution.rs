@@ -212,7 +212,7 @@ fn normalization_does_not_depend_on_the_resolution() {
         (made.world_from_normalized.translation, made.target_poses)
     };
     let plain = world(Input::PLAIN);
-    assert_eq!(world(Input::at(64, size).unwrap()), plain);
+    assert_eq!(world(Input::with_height(64, size).unwrap()), plain);
 }
 
 #[test]

@@ -55,7 +55,7 @@ fn evaluation(method: &str, dataset: &str, context_views: usize, scenes: Vec<Sce
         input: None,
         image_size: [256, 256],
         indexed_scenes: scenes.len(),
-        summary: Summary::of(&scenes),
+        summary: Summary::from_scenes(&scenes),
         efficiency: None,
         machine: "a machine".into(),
         scenes,

@@ -1,10 +1,10 @@
 //! Published splats of real captures, rendered from the captures' own cameras.
 
 use crate::common::program::room;
-use crate::common::{again, captures, has_lpips, skip};
+use crate::common::{captures, has_lpips, rerun_test, skip};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Capture, find_captures, open_capture};
-use globalsplat::eval::{CaptureScores, EvalScene, Method, Perceptual, judge};
+use globalsplat::eval::{CaptureScores, EvalScene, Method, Perceptual, score_output};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::render::transform;
 use globalsplat::scene::{Gaussians, Similarity};
@@ -37,7 +37,7 @@ fn published_scores(folder: &Path, capture: &Capture, perceptual: &Perceptual) -
     let mut made = Method::Splat(folder.join("reference.ply"))
         .render_targets(scene, tch::Device::Cpu)
         .expect("a picture");
-    judge(&mut made, perceptual, |_, _, _| Ok(())).expect("scores")
+    score_output(&mut made, perceptual, |_, _, _| Ok(())).expect("scores")
 }
 
 #[test]
@@ -62,7 +62,7 @@ fn published_splats_look_as_they_are_known_to() {
     let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
     for (path, capture, [vgg, alex]) in known(&PUBLISHED_LPIPS) {
         let scores = published_scores(&path, &capture, &perceptual);
-        assert!(perceptual.why_absent(&scores).is_none());
+        assert!(perceptual.explain_missing(&scores).is_none());
         let (found_vgg, found_alex) =
             (scores.lpips_vgg.expect("LPIPS-VGG"), scores.lpips_alex.expect("LPIPS-Alex"));
         assert!((found_vgg - vgg).abs() < 0.0005, "{}: LPIPS-VGG {found_vgg}", capture.name);
@@ -141,7 +141,10 @@ fn captures_that_are_not_there_are_told() {
         ("captures::a_moved_splat_looks_the_same_to_moved_cameras", empty.path(), "captures\n"),
     ] {
         let run = |strict: &str| {
-            again(name, &[("GLOBALSPLAT_CAPTURES", captures), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))])
+            rerun_test(
+                name,
+                &[("GLOBALSPLAT_CAPTURES", captures), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))],
+            )
         };
         assert_eq!(run(""), (true, what.into()), "{name}");
         assert_eq!(run("1"), (false, String::new()), "{name}");

@@ -259,7 +259,7 @@ fn storages_that_are_absent_are_named() {
         tensor_of(&[text("storage"), float, text("1"), text("cpu"), int(64)], 0, &[1, 18], &[18, 1]);
     assert_refused(
         &scene(&cameras, &good_timestamps(), &tensor("ByteStorage", 0, &[4], &[1])),
-        "cameras of scene 0 asks for data/1, which is not there",
+        "cameras of scene 0 asks for data/1, which is missing",
     );
 }
 
@@ -385,7 +385,7 @@ fn what_is_wrong_with_a_scene_is_named() {
     let chunk = chunks.join("000000.torch");
     let named = format!("{}#room_9", chunk.display());
     let error = refuse(&["inspect", &named]);
-    let expected = "the scene is \"room_9\", which is not there, expected one of its 2: room_0, room_1";
+    let expected = "the scene is \"room_9\", which is missing, expected one of its 2: room_0, room_1";
     assert!(error.contains(expected), "{error}");
     let error = open_capture(&chunk).unwrap_err().to_string();
     assert!(error.contains("it holds 2 scenes, expected") && error.contains("#KEY"), "{error}");

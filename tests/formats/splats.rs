@@ -84,7 +84,7 @@ fn pictures_are_the_same_from_other_sides() {
 fn endings_that_are_unknown() {
     let folder = tempfile::tempdir().unwrap();
     let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
-    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is absent")] {
+    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let to = folder.path().join(name);
         let all = [told, "expected .ply, .compressed.ply, .spz or .splat"];
         assert_says(&refuse(&["convert", arg(&splat), arg(&to)]), &all);

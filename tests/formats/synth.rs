@@ -290,7 +290,7 @@ fn names_of_made_up_videos_are_checked() {
         ("synth:scenes=9000000", "scenes is 9000000, expected 1 to 1000000"),
         ("synth:scenes=some", r#"scenes is "some", expected"#),
         ("synth:scenes", r#"scenes is "", expected"#),
-        ("synth:scenes=1,scenes=2", "scenes is there twice"),
+        ("synth:scenes=1,scenes=2", "scenes is repeated"),
         ("synth:scenes=1,colour=red", r#"a field is "colour", expected"#),
         ("synth:scenes=1,size=8", "size is 8, expected 16 to 8192"),
         ("synth:scenes=1,frames=2", "frames is 2, expected 3 to 10000"),

@@ -1,7 +1,7 @@
 //! The model matches tensors that an independent implementation computed: outputs within 1e-5 and gradients within 1e-4
 //! relative L2, for every case in the golden folder.
 
-use crate::common::{again, golden, largest_error, relative_error};
+use crate::common::{golden, largest_error, relative_error, rerun_test};
 use globalsplat::io::{Weights, read_weights};
 use globalsplat::loss::decoder_regularization;
 use globalsplat::model::{GlobalSplat, ModelConfig, Stage};
@@ -145,7 +145,7 @@ fn golden_tensors_that_are_not_there_are_told() {
         "golden_model::every_stage_matches_in_values_and_gradients",
     ] {
         let run = |golden: &Path, strict: &str| {
-            again(name, &[("GLOBALSPLAT_GOLDEN", golden), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))])
+            rerun_test(name, &[("GLOBALSPLAT_GOLDEN", golden), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))])
         };
         assert_eq!(run(&absent, ""), (true, "golden tensors\n".into()));
         assert_eq!(run(&absent, "1"), (false, String::new()));

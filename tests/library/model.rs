@@ -40,7 +40,7 @@ fn the_main_model_has_the_published_names_and_shapes() {
     let Some(golden) = crate::common::golden() else { return };
     let table = golden.join("../spec/state_dict_16k.tsv");
     let Ok(table) = std::fs::read_to_string(&table) else {
-        crate::common::skip("the published names", &format!("{} is not there", table.display()));
+        crate::common::skip("the published names", &format!("{} is missing", table.display()));
         return;
     };
     let expected: BTreeMap<String, Vec<i64>> = table

@@ -11,7 +11,7 @@ fn paper() -> Option<String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/paper/globalsplat.tex");
     let text = std::fs::read_to_string(&path).ok();
     if text.is_none() {
-        skip("the paper", &format!("{} is not there", path.display()));
+        skip("the paper", &format!("{} is missing", path.display()));
     }
     text
 }

@@ -41,10 +41,10 @@ fn transforms_that_are_something_else() {
         refused(Format::Transforms, "transforms.json", |bytes| *bytes = text.into(), parts);
     };
     broken("{\"frames\": [", &["the file is no JSON", "\"transform_matrix\""]);
-    broken("[]", &["frames is absent", "a list of frames"]);
+    broken("[]", &["frames is missing", "a list of frames"]);
     broken("{\"frames\": 3}", &["frames is 3", "a list of frames"]);
     broken("{\"frames\": []}", &["number of views is 0", "two or more"]);
-    broken("{\"frames\": [3]}", &["file_path of frame 0 is absent", "the path of an image"]);
+    broken("{\"frames\": [3]}", &["file_path of frame 0 is missing", "the path of an image"]);
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn transforms_without_photos() {
                 frame["file_path"] = json!("images/gone.png");
             }
         },
-        &["number of frames with an image is 1 of 9", "\"images/gone.png\" is not there", "two or more"],
+        &["number of frames with an image is 1 of 9", "\"images/gone.png\" is missing", "two or more"],
     );
 }
 
@@ -113,7 +113,7 @@ fn transforms_with_lenses_that_are_none() {
     let without_focal = |t: &mut Value| {
         t.as_object_mut().unwrap().retain(|key, _| !key.starts_with("fl_"));
     };
-    refused_transforms(without_focal, &["fl_x of frame 0 is absent", "camera_angle_x"]);
+    refused_transforms(without_focal, &["fl_x of frame 0 is missing", "camera_angle_x"]);
     refused_transforms(
         |t| {
             without_focal(t);
@@ -176,7 +176,7 @@ fn colmap_text_with_cameras_that_are_none() {
     cameras("40 40 36", "40 40 nan", &["focal length fx of camera 7 is NaN", "above 0"]);
     cameras("40 40 36 36 20", "40 40 36 36 -20", &["principal point cx of camera 7 is -20", "0 to 40"]);
     cameras("40 40 36", "40 40 36x", &["PARAMS in line 3 is \"36x\"", "a number"]);
-    cameras(" 40 40 36 36 20 20", "", &["WIDTH in line 3 is absent", "a whole number"]);
+    cameras(" 40 40 36 36 20 20", "", &["WIDTH in line 3 is missing", "a whole number"]);
     let twice = "7 PINHOLE 40 40 36 36 20 20";
     cameras(twice, &format!("{twice}\n{twice}"), &["camera ids is 7 twice", "each once"]);
     let folding = "7 SIMPLE_RADIAL 40 40 36 20 20 -9";
@@ -303,7 +303,7 @@ fn the_program_says_in_a_line_what_it_leaves_out() {
         assert!(output.status.success(), "{said}");
         let lines = said
             .lines()
-            .filter(|line| line.contains("1 of 9 photos are not there and left out: images/004.png"));
+            .filter(|line| line.contains("1 of 9 photos are missing and left out: images/004.png"));
         assert_eq!(lines.count(), 1, "{arguments:?}: {said}");
     }
     assert!(refuse(&["inspect", arg(&room.join("nowhere"))]).contains("no such file or folder"));

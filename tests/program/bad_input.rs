@@ -35,7 +35,7 @@ fn all_images_but_one_missing() {
     let (_folder, room) = room();
     (1..9).for_each(|i| std::fs::remove_file(room.join(format!("images/00{i}.png"))).unwrap());
     let expected =
-        ["the number of frames with an image is 1 of 9", "images/001.png", "not there", "two or more"];
+        ["the number of frames with an image is 1 of 9", "images/001.png", "is missing", "two or more"];
     assert_says(&refuse_room(&room), &expected);
 }
 
@@ -180,7 +180,7 @@ fn a_splat_cut_short() {
 #[test]
 fn a_splat_without_a_property() {
     let error = broken_splat(|ply| replace_in_header(ply, "property float opacity", "property float glow"));
-    assert_says(&error, &["property opacity is absent"]);
+    assert_says(&error, &["property opacity is missing"]);
 }
 
 #[test]

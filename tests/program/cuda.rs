@@ -1,6 +1,6 @@
 //! GPU kernels, as far as they can be tested without a GPU.
 
-use crate::common::{again, skip};
+use crate::common::{rerun_test, skip};
 use globalsplat::render::cuda::{Driver, Form, Nvrtc, cache_folder, prepare, usage};
 use std::path::Path;
 use std::process::Command;
@@ -108,7 +108,7 @@ fn kernels_are_compiled_once() {
             ("XDG_CACHE_HOME", cache.path()),
             (EXPECTED, Path::new(expected)),
         ];
-        assert!(again("cuda::kernels_are_compiled_once", &variables).0, "{expected}");
+        assert!(rerun_test("cuda::kernels_are_compiled_once", &variables).0, "{expected}");
     };
     run("compiled");
     run("kept");

@@ -395,7 +395,7 @@ fn a_path_without_image_sizes_needs_photos_or_size() {
     fs::remove_dir_all(room.join("images")).unwrap();
     let (splat, out) = (room.join("truth.ply"), room.join("row.png"));
     let told = refuse(&render(&splat, &out, &["--path", arg(&room)]));
-    assert!(told.contains("the size of frame 0 is absent") && told.contains("--size"), "{told}");
+    assert!(told.contains("the size of frame 0 is missing") && told.contains("--size"), "{told}");
     let found = read_camera_path(&room, Some([40, 40].into())).unwrap().cameras;
     assert_eq!((found[0].width, found[0].intrinsics), (40, cameras[0].intrinsics));
     succeed(&render(&splat, &out, &["--path", arg(&room), "--size", "40x40"]));
@@ -442,7 +442,7 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         (|json| json["camera_type"] = json!("fisheye"), &["camera_type is \"fisheye\"", "perspective"]),
         (|json| json["render_height"] = json!(0), &["render_height is 0", "a number of pixels"]),
         (|json| json["render_width"] = json!(20.5), &["render_width is 20.5", "a number of pixels"]),
-        (|json| drop(json.as_object_mut().unwrap().remove("render_width")), &["render_width is absent"]),
+        (|json| drop(json.as_object_mut().unwrap().remove("render_width")), &["render_width is missing"]),
         (|json| json["camera_path"] = json!([]), &["camera_path is a list of 0", "a list of cameras"]),
         (|json| json["camera_path"] = json!("x"), &["camera_path is \"x\"", "a list of cameras"]),
         (|json| json["camera_path"][3]["fov"] = json!(180), &["fov of camera 3 is 180", "between 0 and 180"]),

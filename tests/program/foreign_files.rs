@@ -168,5 +168,5 @@ fn photos_of_one_name_in_two_folders_have_pictures_of_their_own() {
     assert!(views.len() == 6 && views.iter().all(|view| view["psnr"].as_f64().unwrap() > 45.), "{views:?}");
     let flat = folder.path().join("out/left");
     let error = refuse(&["eval", "--renders", arg(&flat), "--scene", arg(&rig)]);
-    assert!(error.contains("the picture for left/000 is absent"), "{error}");
+    assert!(error.contains("the image for left/000 is missing"), "{error}");
 }

@@ -473,7 +473,7 @@ fn checkpoints_that_list_no_files_or_others_are_broken() {
         // The previous checkpoint is loaded.
         let output = globalsplat(&text(&train(&config, &run, &["train.steps=4"])));
         let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success() && told.contains("the checkpoint before it is taken"), "{told}");
+        assert!(output.status.success() && told.contains("the previous checkpoint is used"), "{told}");
         assert_eq!(
             serde_json::from_str::<Value>(&fs::read_to_string(&state).unwrap()).unwrap()["files"].as_object(),
             Some(&files)

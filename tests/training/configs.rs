@@ -41,7 +41,7 @@ fn steps_fit_into_the_memory_of_a_large_gpu() {
     for entry in std::fs::read_dir(folder()).expect("configs/") {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &[]).expect("a configuration");
-        let bytes = MemoryEstimate::of(&config, Device::Cuda(0)).expect("a model").total();
+        let bytes = MemoryEstimate::new(&config, Device::Cuda(0)).expect("a model").total();
         // Of 80 GB, with a margin for what the estimate doesn't include.
         assert!(bytes < 60_000_000_000, "{}: {:.1} GB", path.display(), bytes as f64 * 1e-9);
     }

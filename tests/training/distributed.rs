@@ -39,7 +39,7 @@ fn torchrun() -> Option<PathBuf> {
     if path.is_file() {
         return Some(path);
     }
-    skip("torchrun", &format!("{} is not there; run make venv, or set TORCHRUN", path.display()));
+    skip("torchrun", &format!("{} is missing; run make venv, or set TORCHRUN", path.display()));
     None
 }
 
@@ -588,10 +588,13 @@ fn ranks_that_train_something_else_are_refused() {
     let mut shards = train(&config, &run, &[]);
     shards.push("--shard-optimizer".into());
     let others = [
-        (train(&config, &run, &["train.seed=5"]), "configuration isn't the first one's: train.seed 0 → 5"),
+        (
+            train(&config, &run, &["train.seed=5"]),
+            "configuration differs from the first rank's: train.seed 0 → 5",
+        ),
         (train(&config, &run, &["data.flip=true"]), "data.flip false → true"),
         (shards, "--shard-optimizer false → true"),
-        (train(&more, &run, &[]), "this rank's training scenes aren't the first one's: 3 of 3"),
+        (train(&more, &run, &[]), "this rank's training scenes differ from the first rank's: 3 of 3"),
     ];
     let first = train(&config, &run, &[]);
     for (other, expected) in others {

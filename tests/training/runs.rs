@@ -108,7 +108,7 @@ fn a_broken_checkpoint_is_stepped_over() {
     let err = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{err}");
     assert!(err.contains("step-00000006/model.safetensors: the file is damaged"), "{err}");
-    assert!(err.contains("the checkpoint before it is taken"), "{err}");
+    assert!(err.contains("the previous checkpoint is used"), "{err}");
     assert_same_bits(&whole, &run);
 
     for step in ["step-00000004", "step-00000006"] {
@@ -344,7 +344,7 @@ fn a_changed_validation_discards_the_best_checkpoint() {
     };
     assert!(!again(&["train.steps=5"]).1, "nothing is as good");
     let (said, is_beaten) = again(&["train.steps=6", "data.holdout=every:4"]);
-    assert!(said.contains("best: the validation is of") && said.contains("looked for anew"), "{said}");
+    assert!(said.contains("best: the validation is of") && said.contains("determined again"), "{said}");
     assert!(is_beaten);
     std::fs::write(&state, "{").unwrap();
     let (said, is_beaten) = again(&["train.steps=7", "data.holdout=every:4"]);

@@ -198,7 +198,7 @@ fn appended_and_rewritten_metrics_are_followed() {
     let file = OpenOptions::new().append(true).open(&metrics).unwrap();
     file.set_modified(SystemTime::now() - Duration::from_secs(630)).unwrap();
     let state = watch.state();
-    assert!(notices(&state).starts_with("nothing was written down for 10 min"), "{}", notices(&state));
+    assert!(notices(&state).starts_with("nothing was logged for 10 min"), "{}", notices(&state));
     assert_eq!(state["steps"], 60);
 
     // A resumed run rewrites the file, which then grows past its previous length.
@@ -355,7 +355,8 @@ fn what_is_no_run_is_refused_in_a_sentence() {
     let absent = folder.path().join("absent");
     let error = refuse(&["watch", arg(&absent)]);
     assert!(
-        error.ends_with("absent: the run is absent, expected a folder that `globalsplat train --out` writes"),
+        error
+            .ends_with("absent: the run is missing, expected a folder that `globalsplat train --out` writes"),
         "{error}"
     );
     let error = refuse(&["watch", arg(folder.path())]);

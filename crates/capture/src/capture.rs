@@ -4,11 +4,11 @@ use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::pixels::{
-    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, looked_at, read_image_size,
+    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, read_image_size, source_region,
     undistort,
 };
 use glam::DMat4;
-use globalsplat_files::{Error, InputFiles, Result, files_and_keys};
+use globalsplat_files::{Error, InputFiles, Result, split_keyed_path};
 use image::RgbImage;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -87,7 +87,7 @@ pub struct Capture {
 #[derive(Debug, Default)]
 pub(crate) struct Changes {
     /// Names of missing photos.
-    pub absent: Vec<String>,
+    pub missing: Vec<String>,
     /// Names of photos whose pose contained a scaled rotation, each with the scale factor that was removed.
     pub scaled: Vec<(String, f64)>,
     /// Descriptions of other changes, one line each.
@@ -100,9 +100,9 @@ impl Changes {
     /// # Errors
     /// Fails if fewer than two photos are left and `purpose` needs photos.
     pub fn check(&self, file: &Path, present: usize, purpose: Purpose) -> Result<()> {
-        match (self.absent.first(), purpose) {
-            (Some(name), Purpose::Photos) if present < FEWEST_VIEWS => {
-                let found = format!("{present} of {}, {name:?} is not there", present + self.absent.len());
+        match (self.missing.first(), purpose) {
+            (Some(name), Purpose::Photos) if present < MIN_VIEWS => {
+                let found = format!("{present} of {}, {name:?} is missing", present + self.missing.len());
                 Err(Error::input(file, "the number of frames with an image", found, "two or more"))
             }
             _ => Ok(()),
@@ -110,7 +110,7 @@ impl Changes {
     }
 
     /// Removes the scale from `c2w`, the pose of photo `name`, if its rotation is scaled. Returns any other pose unchanged.
-    pub fn unscaled(&mut self, name: &str, c2w: DMat4) -> DMat4 {
+    pub fn remove_scale(&mut self, name: &str, c2w: DMat4) -> DMat4 {
         match nearest_rigid_of_scaled(&c2w) {
             Ok((rigid, scale)) if check_pose(&c2w).is_err() => {
                 self.scaled.push((name.to_string(), scale));
@@ -124,13 +124,13 @@ impl Changes {
     fn into_lines(self, file: &Path, present: usize) -> Vec<String> {
         let file = file.display();
         let mut lines = vec![];
-        if !self.absent.is_empty() {
-            let (count, all) = (self.absent.len(), present + self.absent.len());
-            let names = listed(self.absent.iter().map(String::as_str));
-            lines.push(format!("{file}: {count} of {all} photos are not there and left out: {names}"));
+        if !self.missing.is_empty() {
+            let (count, all) = (self.missing.len(), present + self.missing.len());
+            let names = format_names(self.missing.iter().map(String::as_str));
+            lines.push(format!("{file}: {count} of {all} photos are missing and left out: {names}"));
         }
         if let Some((_, factor)) = self.scaled.first() {
-            let names = listed(self.scaled.iter().map(|(name, _)| name.as_str()));
+            let names = format_names(self.scaled.iter().map(|(name, _)| name.as_str()));
             lines.push(format!(
                 "{file}: {} of {present} rotations are scaled, the first by {factor:.6}, which is taken out: {names}",
                 self.scaled.len()
@@ -142,10 +142,10 @@ impl Changes {
 }
 
 /// Minimum number of views that a scene can be reconstructed from.
-const FEWEST_VIEWS: usize = 2;
+const MIN_VIEWS: usize = 2;
 
 /// Formats the first few of `names` and the number of the remaining ones.
-pub(crate) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+pub(crate) fn format_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
     const SHOWN: usize = 3;
     let more = names.len().saturating_sub(SHOWN);
     let shown = names.take(SHOWN).collect::<Vec<_>>().join(", ");
@@ -182,7 +182,7 @@ impl Purpose {
             (Err(_), Purpose::Cameras(Some(ImageSize { width, height }))) => Ok((width, height)),
             (Err(_), Purpose::Cameras(None)) => {
                 let expected = "one in the file, a photo to be asked, or a size for all photos";
-                Err(Error::input(file, format!("the size of {field}"), "absent", expected))
+                Err(Error::input(file, format!("the size of {field}"), "missing", expected))
             }
             (Err(e), Purpose::Photos) => Err(e),
         }
@@ -201,14 +201,14 @@ impl Capture {
         purpose: Purpose,
     ) -> Result<Self> {
         let (least, expected) = match purpose {
-            Purpose::Photos => (FEWEST_VIEWS, "two or more"),
+            Purpose::Photos => (MIN_VIEWS, "two or more"),
             Purpose::Cameras(_) => (1, "one or more"),
         };
         changes.check(&file, frames.len(), purpose)?;
         if frames.len() < least {
             return Err(Error::input(&file, "the number of views", frames.len(), expected));
         }
-        let is_complete = changes.absent.is_empty();
+        let is_complete = changes.missing.is_empty();
         let warnings = check_frames(&file, &mut frames, changes, purpose)?;
         let train = frames.len();
         Ok(Capture { name, file, frames, train, is_complete, warnings })
@@ -243,7 +243,7 @@ impl Capture {
         changes: Changes,
         purpose: Purpose,
     ) -> Result<Self> {
-        self.is_complete &= changes.absent.is_empty();
+        self.is_complete &= changes.missing.is_empty();
         self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
         self.frames.append(&mut frames);
         Ok(self)
@@ -320,19 +320,19 @@ impl Capture {
     /// Returns a unique file name without extension for the rendered image of each view. The names are those of the photos,
     /// relative to the deepest folder that contains all of them. If the names differ only in their extensions, the extensions
     /// become part of the names. If they aren't unique even then, numbers replace them.
-    pub fn picture_names(&self) -> Vec<String> {
-        self.picture_names_with(&[""])
+    pub fn render_names(&self) -> Vec<String> {
+        self.render_names_with(&[""])
     }
 
-    /// Returns names like [`Capture::picture_names`] for several images of each view, whose names end in `suffixes`. No two of the
+    /// Returns names like [`Capture::render_names`] for several images of each view, whose names end in `suffixes`. No two of the
     /// names with suffixes are equal.
-    pub fn picture_names_with(&self, suffixes: &[&str]) -> Vec<String> {
-        picture_names(&self.names().collect::<Vec<_>>(), suffixes)
+    pub fn render_names_with(&self, suffixes: &[&str]) -> Vec<String> {
+        render_names(&self.names().collect::<Vec<_>>(), suffixes)
     }
 
     /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
     pub fn add_input_files(&self, inputs: &mut InputFiles) {
-        let described = described_in(&self.file);
+        let described = description_file(&self.file);
         inputs.add(&described);
         // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
@@ -385,12 +385,12 @@ impl Capture {
     /// lens without distortion, and for the largest photos: the lens takes 16 bytes per pixel, and the size that the capture declares
     /// isn't verified yet.
     fn shared_lens(&self, indices: &[usize], size: Option<ImageSize>) -> Option<Lens> {
-        const MOST_PIXELS: u64 = 1 << 23;
+        const MAX_PIXELS: u64 = 1 << 23;
         let Frame { camera, distortion, .. } = &self.frames[*indices.first()?];
         let is_shared = indices.len() > 1
             && *distortion != Distortion::default()
-            && u64::from(camera.width) * u64::from(camera.height) <= MOST_PIXELS;
-        is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| looked_at(camera, size))))
+            && u64::from(camera.width) * u64::from(camera.height) <= MAX_PIXELS;
+        is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| source_region(camera, size))))
     }
 
     /// Computes the CRC-32 of the views `indices`: the bytes of their photo files, and their cameras. Images that are computed
@@ -443,10 +443,10 @@ impl Capture {
             return Ok(source.image(*index));
         }
         let photo = self.decode(frame, &frame.image.read()?)?;
-        if let Some(lens) = lens.filter(|lens| lens.is_of(&frame.distortion, &frame.camera)) {
+        if let Some(lens) = lens.filter(|lens| lens.matches_camera(&frame.distortion, &frame.camera)) {
             return Ok(lens.undistort(photo.pixels));
         }
-        let window = size.map(|size| looked_at(&frame.camera, size));
+        let window = size.map(|size| source_region(&frame.camera, size));
         Ok(undistort(photo.pixels, &frame.distortion, &frame.camera, window))
     }
 
@@ -479,8 +479,8 @@ impl Capture {
 }
 
 /// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.
-fn described_in(path: &Path) -> PathBuf {
-    let files = files_and_keys(path).rev().map(|(file, _)| file);
+fn description_file(path: &Path) -> PathBuf {
+    let files = split_keyed_path(path).rev().map(|(file, _)| file);
     std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
 }
 
@@ -526,7 +526,7 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
         found.height,
         said.width,
         said.height,
-        listed(names.into_iter())
+        format_names(names.into_iter())
     ))
 }
 
@@ -550,7 +550,7 @@ fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
     Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
 }
 
-fn picture_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
+fn render_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
     let plain = |part: Component| match part {
         Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
         Component::ParentDir => Some("up".to_string()),
@@ -592,11 +592,11 @@ pub(crate) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a C
 
 #[cfg(test)]
 mod tests {
-    use super::{picture_names as names_with, scaled_to};
+    use super::{render_names as names_with, scaled_to};
     use crate::geometry::{Camera, Intrinsics};
     use glam::DMat4;
 
-    fn picture_names(names: &[&str]) -> Vec<String> {
+    fn render_names(names: &[&str]) -> Vec<String> {
         names_with(names, &[""])
     }
 
@@ -627,14 +627,14 @@ mod tests {
 
     #[test]
     fn pictures_are_named_as_photos_and_none_twice() {
-        assert_eq!(picture_names(&["images/000.png", "images/001.png"]), ["000", "001"]);
-        assert_eq!(picture_names(&["./images/left/0.png", "./images/right/0.png"]), ["left/0", "right/0"]);
-        assert_eq!(picture_names(&["left/0.png", "1.png"]), ["left/0", "1"]);
-        assert_eq!(picture_names(&["a/0.png", "a/0.jpg"]), ["0.png", "0.jpg"]);
-        assert_eq!(picture_names(&["0.v1.png", "0.v2.png"]), ["0.v1", "0.v2"]);
-        assert_eq!(picture_names(&["../a/0.png", "b/0.png"]), ["up/a/0", "b/0"]);
-        assert_eq!(picture_names(&["0.png", "0.png"]), ["000000", "000001"]);
-        assert_eq!(picture_names(&["000000", "000001"]), ["000000", "000001"]);
-        assert!(picture_names(&[]).is_empty());
+        assert_eq!(render_names(&["images/000.png", "images/001.png"]), ["000", "001"]);
+        assert_eq!(render_names(&["./images/left/0.png", "./images/right/0.png"]), ["left/0", "right/0"]);
+        assert_eq!(render_names(&["left/0.png", "1.png"]), ["left/0", "1"]);
+        assert_eq!(render_names(&["a/0.png", "a/0.jpg"]), ["0.png", "0.jpg"]);
+        assert_eq!(render_names(&["0.v1.png", "0.v2.png"]), ["0.v1", "0.v2"]);
+        assert_eq!(render_names(&["../a/0.png", "b/0.png"]), ["up/a/0", "b/0"]);
+        assert_eq!(render_names(&["0.png", "0.png"]), ["000000", "000001"]);
+        assert_eq!(render_names(&["000000", "000001"]), ["000000", "000001"]);
+        assert!(render_names(&[]).is_empty());
     }
 }

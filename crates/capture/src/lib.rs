@@ -12,7 +12,7 @@ pub use capture::{Capture, Photo};
 pub use formats::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use formats::{
     CameraPath, CaptureFolders, FoundCaptures, Point, capture_folders, find_captures, folder_name,
-    is_capture, open_capture, points_of, read_camera_path, write_cameras_json,
+    is_capture, open_capture, read_camera_path, read_points, write_cameras_json,
 };
 pub use geometry::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, check_pose, normalize,
@@ -23,5 +23,5 @@ pub use holdout::Holdout;
 pub use image_source::ImageSource;
 pub use pixels::{
     CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, encode_photo, fit,
-    looked_at, read_image, read_image_size,
+    read_image, read_image_size, source_region,
 };

@@ -321,13 +321,13 @@ fn photos_that_are_not_there_are_left_out_and_named() {
         expected.remove(2);
         assert_same_cameras(&capture, &expected);
         assert!(!capture.is_complete());
-        assert_warns(&capture, &["1 of 5 photos are not there", "left out", "002.png"]);
+        assert_warns(&capture, &["1 of 5 photos are missing", "left out", "002.png"]);
         for name in ["000", "001", "003"] {
             std::fs::remove_file(folder.path().join(format!("images/{name}.png"))).unwrap();
         }
         let error = open_capture(folder.path()).unwrap_err().to_string();
         assert!(error.contains("the number of frames with an image is 1 of 5"), "{format:?}: {error}");
-        assert!(error.contains("is not there, expected two or more"), "{error}");
+        assert!(error.contains("is missing, expected two or more"), "{error}");
     }
 }
 
@@ -365,7 +365,7 @@ fn an_unknown_folder_is_told_what_was_looked_for() {
 }
 
 #[test]
-fn what_a_frame_says_of_its_lens_comes_before_what_all_share() {
+fn per_frame_intrinsics_override_shared_ones() {
     let angle = 2. * (12f64 / 30.).atan();
     let folder = photos_alone();
     write_transforms(folder.path(), |_| ());
@@ -487,7 +487,7 @@ fn names_are_found_however_they_are_written() {
         let capture = open_capture(folder.path()).unwrap();
         assert_same_cameras(&capture, &cameras());
         assert!(capture.warnings().is_empty(), "{:?}", capture.warnings());
-        capture.picture_names()
+        capture.render_names()
     };
     assert_eq!(
         write(&|i, name| format!("images{}{name}", if i < 2 { '/' } else { '\\' })).last().unwrap(),
@@ -539,7 +539,7 @@ fn the_synthetic_layout_has_views_to_learn_from_and_views_to_hold_out() {
     std::fs::remove_dir_all(path.join("test")).unwrap();
     let capture = open_capture(path).unwrap();
     assert!(!capture.has_test_part());
-    assert_warns(&capture, &["transforms_test.json", "2 of 2 photos are not there"]);
+    assert_warns(&capture, &["transforms_test.json", "2 of 2 photos are missing"]);
 }
 
 #[test]
@@ -692,7 +692,7 @@ fn the_rational_lens_is_the_same_in_both_formats() {
 }
 
 #[test]
-fn the_search_goes_past_what_it_can_not_read_and_what_work_has_left() {
+fn find_captures_skips_unreadable_and_temporary_folders() {
     use std::os::unix::fs::PermissionsExt;
     let above = tempfile::tempdir().unwrap();
     let place = |name: &str| above.path().join(name);

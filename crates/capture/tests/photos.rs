@@ -131,7 +131,7 @@ fn load_photo(bytes: &[u8], extension: &str, width: u32, height: u32) -> Result<
 }
 
 #[test]
-fn photos_on_their_side_are_turned_where_the_capture_means_them_so() {
+fn exif_orientation_is_applied_if_the_declared_size_matches() {
     let photo = RgbImage::from_fn(24, 16, |x, y| Rgb([x as u8 * 10, y as u8 * 15, 90]));
     let stored = image::load_from_memory(&jpeg_with_orientation(&photo, 1)).unwrap().to_rgb8();
     let load = |orientation: u8, width, height| {

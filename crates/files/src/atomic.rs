@@ -28,14 +28,14 @@ pub fn write_atomically<E: From<Error>>(
     path: &Path,
     fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
 ) -> Result<(), E> {
-    Ok(write_partially(path, fill)?.keep()?)
+    Ok(write_temporary(path, fill)?.keep()?)
 }
 
 /// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
 ///
 /// # Errors
 /// Returns the errors of [`write_atomically`].
-pub fn write_partially<E: From<Error>>(
+pub fn write_temporary<E: From<Error>>(
     path: &Path,
     fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
 ) -> Result<PartialFile, E> {
@@ -55,14 +55,14 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
 }
 
-/// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `made` lists the names
+/// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `own_entries` lists the names
 /// of the entries that such a folder has; all other entries of the old folder are kept in the new one.
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a folder is at `path` or the folder can't be written.
 pub fn replace_dir<E: From<Error>>(
     path: &Path,
-    made: &[&str],
+    own_entries: &[&str],
     fill: impl FnOnce(&Path) -> Result<(), E>,
 ) -> Result<(), E> {
     let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
@@ -79,12 +79,12 @@ pub fn replace_dir<E: From<Error>>(
         if retired.is_dir() && !target.exists() {
             fs::rename(&retired, &target).map_err(Error::write(path))?;
         }
-        retire(&retired, &target, made)?;
+        retire(&retired, &target, own_entries)?;
         if target.exists() {
             fs::rename(&target, &retired).map_err(Error::write(path))?;
         }
         fs::rename(&temporary, &target).map_err(Error::write(path))?;
-        retire(&retired, &target, made)
+        retire(&retired, &target, own_entries)
     };
     let filled = fill(&temporary);
     sync_dir(&temporary);
@@ -108,33 +108,33 @@ pub fn lock_parent(path: &Path) -> Option<File> {
     parent.lock().ok().map(|()| parent)
 }
 
-/// Removes the entries `made`, which belong to the program, from the folder `retired`, after moving its other entries to the folder `heir`.
-fn retire(retired: &Path, heir: &Path, made: &[&str]) -> Result<()> {
+/// Removes the entries `own_entries`, which belong to the program, from the folder `retired`, after moving its other entries to the folder `replacement`.
+fn retire(retired: &Path, replacement: &Path, own_entries: &[&str]) -> Result<()> {
     if !retired.is_dir() {
         return Ok(());
     }
-    if heir.is_dir() {
+    if replacement.is_dir() {
         for entry in fs::read_dir(retired).map_err(Error::read(retired))? {
             let name = entry.map_err(Error::read(retired))?.file_name();
-            let to = heir.join(&name);
-            if !made.iter().any(|made| name == *made) && !to.exists() {
+            let to = replacement.join(&name);
+            if !own_entries.iter().any(|own| name == *own) && !to.exists() {
                 fs::rename(retired.join(&name), &to).map_err(Error::write(&to))?;
             }
         }
     }
-    remove_made(retired, made)
+    remove_own_entries(retired, own_entries)
 }
 
-/// Removes the folder at `path`, whose entries `made` belong to the program, in one step: if the removal fails, the folder is either
+/// Removes the folder at `path`, whose entries `own_entries` belong to the program, in one step: if the removal fails, the folder is either
 /// complete or under the name of a partial one. If it has other entries, they stay in the folder under its name.
 ///
 /// # Errors
 /// Returns an error if the folder can't be read or removed.
-pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
+pub fn remove_dir(path: &Path, own_entries: &[&str]) -> Result<()> {
     for entry in fs::read_dir(path).map_err(Error::read(path))? {
         let name = entry.map_err(Error::read(path))?.file_name();
-        if !made.iter().any(|made| name == *made) {
-            return remove_made(path, made);
+        if !own_entries.iter().any(|own| name == *own) {
+            return remove_own_entries(path, own_entries);
         }
     }
     let temporary = free_names(path).next().expect("names without end");
@@ -142,9 +142,9 @@ pub fn remove_dir(path: &Path, made: &[&str]) -> Result<()> {
     unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
 }
 
-/// Removes `made` from `folder`, and the folder itself if it has no other entries.
-fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
-    for name in made {
+/// Removes `own_entries` from `folder`, and the folder itself if it has no other entries.
+fn remove_own_entries(folder: &Path, own_entries: &[&str]) -> Result<()> {
+    for name in own_entries {
         let path = folder.join(name);
         let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
         unless_missing(removed).map_err(Error::write(&path))?;
@@ -160,7 +160,7 @@ fn remove_made(folder: &Path, made: &[&str]) -> Result<()> {
 ///
 /// # Errors
 /// Returns an error if an entry can't be read, renamed or removed.
-pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
+pub fn recover_dirs(folder: &Path, own_entries: &[&str]) -> Result<()> {
     if !folder.is_dir() {
         return Ok(());
     }
@@ -172,7 +172,7 @@ pub fn recover_dirs(folder: &Path, made: &[&str]) -> Result<()> {
             let path = folder.join(name);
             match path.exists() {
                 false => fs::rename(&left, &path).map_err(Error::write(&path))?,
-                true => retire(&left, &path, made)?,
+                true => retire(&left, &path, own_entries)?,
             }
         } else if name.contains(&format!(".{PARTIAL}")) {
             remove_abandoned(&left).map_err(Error::write(&left))?;
@@ -585,7 +585,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn what_few_may_read_stays_so() {
+    fn permissions_are_preserved() {
         use std::os::unix::fs::PermissionsExt;
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("private");

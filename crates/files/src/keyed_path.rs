@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// Returns the possible splits of `path` into a file and a key, one for each `#` in it from the first on: keys and folders may contain the
 /// sign too. Keys are text; bytes that aren't UTF-8 are replaced.
-pub fn files_and_keys(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf, String)> {
+pub fn split_keyed_path(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf, String)> {
     let bytes = path.as_os_str().as_bytes();
     let signs = (0..bytes.len()).filter(move |&at| bytes[at] == b'#');
     signs.map(move |at| {

@@ -12,11 +12,11 @@ mod text;
 pub use append::AppendFile;
 pub use atomic::{
     PartialFile, check_regular, check_writable_dir, check_writable_file, lock_parent, recover_dirs,
-    remove_dir, replace_dir, write_atomically, write_json, write_partially,
+    remove_dir, replace_dir, write_atomically, write_json, write_temporary,
 };
 pub use checksum::checksum;
 pub use environment::expand_path;
 pub use error::{Error, Result, panic_message};
 pub use inputs::InputFiles;
-pub use keyed_path::files_and_keys;
+pub use keyed_path::split_keyed_path;
 pub use text::read_text;

@@ -3,7 +3,7 @@
 
 use crate::invalid::InvalidGaussians;
 use crate::origin::{read_origin, write_with_origin};
-use crate::rotations::with_rotation;
+use crate::rotations::drop_missing_rotations;
 use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
@@ -76,7 +76,7 @@ impl Format {
 fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
-        let found = path.extension().map_or("absent".into(), |ending| format!(".{}", ending.display()));
+        let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
         Error::input(path, "the ending", found, ".ply, .compressed.ply, .spz or .splat")
     })
 }
@@ -190,7 +190,7 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
 pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
     let codec = format_of(path)?.codec(path)?;
     splat.check_lengths()?;
-    let (rotated, _) = with_rotation(splat);
+    let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
         rotated.check_finite(path)?;
         (codec.write)(path, &rotated)

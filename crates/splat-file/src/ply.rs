@@ -46,13 +46,13 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let colours = colours.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
     if let Some(colours) = colours {
         names[3..6].clone_from_slice(&owned(colours));
-        let said = format!("colours are those of {}, for want of f_dc_*", colours.join(", "));
+        let said = format!("colours are those of {}, because f_dc_* is missing", colours.join(", "));
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let is_flat = !has("scale_2") && has("scale_1");
     if is_flat {
         names.retain(|name| name != "scale_2");
-        let said = "Gaussians are flat in their third direction, for want of scale_2";
+        let said = "Gaussians are flat in their third direction, because scale_2 is missing";
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let mut values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;

@@ -23,7 +23,7 @@ pub fn columns<T>(
         body.pass(before)?;
     }
     let Some(element) = header.element(element) else {
-        return Err(Error::input(path, format!("the element {element}"), "absent", "the Gaussians"));
+        return Err(Error::input(path, format!("the element {element}"), "missing", "the Gaussians"));
     };
     // Index in `names` of each property of the element.
     let mut places: Vec<Option<usize>> = vec![None; element.properties.len()];
@@ -36,7 +36,7 @@ pub fn columns<T>(
             }
             None => {
                 let expected = "one of a 3D Gaussian splat's properties";
-                return Err(Error::input(path, format!("property {name}"), "absent", expected));
+                return Err(Error::input(path, format!("property {name}"), "missing", expected));
             }
         }
     }

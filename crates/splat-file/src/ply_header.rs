@@ -115,7 +115,7 @@ impl Header {
                         return Err(Error::input(
                             path,
                             "the line format",
-                            "absent",
+                            "missing",
                             "how numbers are written",
                         ));
                     };

@@ -8,7 +8,7 @@ const MAX_EXPONENT: f64 = 10.;
 
 /// Returns the Gaussians that have a rotation, and the number of those left out: Gaussians whose quaternion is 0 or subnormal, which the
 /// rasterizer doesn't draw (spec 6.2). Quaternions whose length is far from 1 are brought near it by a power of two.
-pub(crate) fn with_rotation(splat: &Splat) -> (Cow<'_, Splat>, usize) {
+pub(crate) fn drop_missing_rotations(splat: &Splat) -> (Cow<'_, Splat>, usize) {
     let has_rotation = |quaternion: &[f32; 4]| {
         quaternion.iter().any(|part| part.is_nan() || part.abs() >= f32::MIN_POSITIVE)
     };

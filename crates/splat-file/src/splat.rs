@@ -1,7 +1,7 @@
 //! The splat as plain arrays.
 
 use crate::ply;
-use crate::rotations::{normalized, with_rotation};
+use crate::rotations::{drop_missing_rotations, normalized};
 use crate::{Error, Result};
 use glam::DVec3;
 use std::borrow::Cow;
@@ -142,7 +142,7 @@ impl Splat {
     /// Quaternions whose length is far from 1 are brought near it by a power of two.
     pub fn without_missing_rotations(self, name: impl Display) -> Self {
         let all = self.len();
-        let (rotated, left_out) = with_rotation(&self);
+        let (rotated, left_out) = drop_missing_rotations(&self);
         let mut splat = match rotated {
             Cow::Owned(rotated) => rotated,
             Cow::Borrowed(_) => self,

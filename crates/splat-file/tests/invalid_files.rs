@@ -17,13 +17,13 @@ fn in_header(bytes: &mut Vec<u8>, from: &str, to: &str) {
 fn bad_plys() {
     let header = |from: &'static str, to: &'static str| refused("ply", |bytes| in_header(bytes, from, to));
     assert_says(&header("little", "middle"), &["the format is binary_middle_endian", "ascii"]);
-    assert_says(&header("format", "comment"), &["the line format is absent"]);
+    assert_says(&header("format", "comment"), &["the line format is missing"]);
     assert_says(
         &header("vertex 300", "vertex many"),
         &["rows of the element vertex is many", "a whole number"],
     );
     assert_says(&header("element vertex 300\n", ""), &["the property x is without an element"]);
-    assert_says(&header("element vertex", "element point"), &["the element vertex is absent"]);
+    assert_says(&header("element vertex", "element point"), &["the element vertex is missing"]);
     assert_says(&header("float opacity", "half opacity"), &["the type of opacity is half"]);
     assert_says(&header("float opacity", "float half opacity"), &["the type of opacity is \"float half\""]);
     assert_says(&header("float opacity", "list float opacity"), &["the type of opacity"]);
@@ -54,13 +54,13 @@ fn bad_plys() {
 fn bad_compressed_plys() {
     let header =
         |from: &'static str, to: &'static str| refused("compressed.ply", |bytes| in_header(bytes, from, to));
-    assert_says(&header("element chunk", "element chunks"), &["the element chunk is absent"]);
+    assert_says(&header("element chunk", "element chunks"), &["the element chunk is missing"]);
     assert_says(
         &header("element chunk 2", "element chunk 1"),
         &["the number of chunks is 1, expected 2 for 300"],
     );
     assert_says(&header("vertex 300", "vertex 4000000000"), &["the body is cut short"]);
-    assert_says(&header("float max_b", "float most_b"), &["property max_b is absent"]);
+    assert_says(&header("float max_b", "float most_b"), &["property max_b is missing"]);
     assert_says(
         &header("uint packed_scale", "int packed_scale"),
         &["the type of packed_scale is another", "uint"],
@@ -204,7 +204,7 @@ fn point_clouds_are_refused() {
         let mut columns = small_gaussians();
         columns.retain(|(name, _)| *name != absent);
         write_ply(&path, &columns, &[]);
-        assert_says(&refused_file(&path), &[&format!("property {absent} is absent")]);
+        assert_says(&refused_file(&path), &[&format!("property {absent} is missing")]);
     }
 }
 

@@ -206,7 +206,7 @@ fn files_are_recognized() {
     assert_eq!(find_splat(folder.path(), "b"), folder.path().join("b.ply"));
     assert!(is_splat_name(Path::new("A.Compressed.PLY")) && is_splat_name(Path::new("a.spz")));
     assert!(!is_splat_name(Path::new("a.obj")));
-    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is absent")] {
+    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let error = write_splat(&folder.path().join(name), &splat).unwrap_err();
         assert!(error.is_request());
         assert_says(&error.to_string(), &[told, "expected .ply, .compressed.ply, .spz or .splat"]);

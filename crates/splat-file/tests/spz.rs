@@ -161,7 +161,7 @@ fn bad_spzs_of_version_4() {
     assert_says(&plain(&|bytes| bytes[15] = 4), &["stream"]);
     assert_says(&plain(&|bytes| bytes[32..40].fill(255)), &["stream 0 is cut short"]);
     assert_says(&plain(&|bytes| bytes[8] = 2), &["stream 0 is 9 bytes or more, expected 18 bytes for 2"]);
-    assert_says(&plain(&|bytes| bytes[12] = 1), &["stream 5 is absent, expected one of 9 bytes"]);
+    assert_says(&plain(&|bytes| bytes[12] = 1), &["stream 5 is missing, expected one of 9 bytes"]);
     assert_says(&plain(&|bytes| bytes[32 + 5 * 16] = 0), &["stream 0 is damaged"]);
     assert_says(&plain(&|bytes| bytes[8..12].fill(255)), &["the number of Gaussians is 4294967295"]);
 }

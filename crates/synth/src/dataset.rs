@@ -61,7 +61,7 @@ impl SyntheticDataset {
         for field in fields.split(',') {
             let (name, value) = field.split_once('=').unwrap_or((field, ""));
             if !said.insert(name) {
-                return Err(refuse(name, "there twice"));
+                return Err(refuse(name, "repeated"));
             }
             let number = || value.parse::<u64>().map_err(|_| refuse(name, &format!("{value:?}")));
             match name {
@@ -144,7 +144,7 @@ impl ImageSource for Video {
 /// Fails if the folder doesn't exist or contains no image, or if an image can't be read.
 pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
     let files = picture_files(folder)?;
-    files.iter().map(|file| Ok(Arc::new(Texture::of_picture(&read_image(file)?)))).collect()
+    files.iter().map(|file| Ok(Arc::new(Texture::from_image(&read_image(file)?)))).collect()
 }
 
 /// Lists the image files in `folder`, at least one, sorted by name.

@@ -2,12 +2,12 @@
 
 mod dataset;
 mod light;
-mod maker;
 mod material;
 mod mesh;
 mod noise;
 mod open;
 mod room;
+mod scene_builder;
 mod sensor;
 mod shapes;
 mod texture;

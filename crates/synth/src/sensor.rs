@@ -1,7 +1,7 @@
 //! Camera sensor model from radiance to bytes: exposure, white balance, tone curve, vignetting, noise.
 
-use super::maker::Maker;
 use super::noise::Noise;
+use super::scene_builder::SceneBuilder;
 use glam::{Vec2, Vec3, vec3};
 
 /// Response of a camera to light, constant over a video except for automatic exposure.
@@ -26,24 +26,24 @@ pub(super) struct Sensor {
 
 impl Sensor {
     /// Draws a random sensor for images with the mean radiance `seen`.
-    pub fn draw(make: &mut Maker, seen: Vec3) -> Sensor {
+    pub fn draw(builder: &mut SceneBuilder, seen: Vec3) -> Sensor {
         let brightness = seen.element_sum() / 3.;
-        let target = 0.2 * make.scaled(0.6, 2.);
+        let target = 0.2 * builder.scaled(0.6, 2.);
         // Automatic white balance removes most of the light's colour.
         let neutral = brightness / seen.max(Vec3::splat(0.2 * brightness)).max(Vec3::splat(1e-6));
-        let white = Vec3::ONE.lerp(neutral, make.within(0.2..0.8));
-        let tint = vec3(make.within(0.94..1.06), 1., make.within(0.94..1.06));
-        let noisy = make.within(0. ..1f32).powi(3);
+        let white = Vec3::ONE.lerp(neutral, builder.within(0.2..0.8));
+        let tint = vec3(builder.within(0.94..1.06), 1., builder.within(0.94..1.06));
+        let noisy = builder.within(0. ..1f32).powi(3);
         Sensor {
             gain: target / brightness.max(1e-4) * white * tint,
-            shoulder: make.within(0. ..1.),
-            contrast: make.within(0.9..1.2),
-            saturation: make.within(0.7..1.25),
-            vignette: make.within(0. ..1f32).powi(2) * 0.35,
+            shoulder: builder.within(0. ..1.),
+            contrast: builder.within(0.9..1.2),
+            saturation: builder.within(0.7..1.25),
+            vignette: builder.within(0. ..1f32).powi(2) * 0.35,
             noise: (0.012 * noisy, 0.03 * noisy),
-            wandering: make.within(0. ..1f32).powi(3) * 0.25,
-            wander: make.noise(),
-            seed: make.within(0..u32::MAX),
+            wandering: builder.within(0. ..1f32).powi(3) * 0.25,
+            wander: builder.noise(),
+            seed: builder.within(0..u32::MAX),
         }
     }
 

@@ -1,8 +1,8 @@
 //! Objects made of plain shapes. Each stands on y = 0 around the origin and faces +z.
 
-use super::maker::{Maker, standing};
 use super::material::Material;
 use super::mesh::Mesh;
+use super::scene_builder::{SceneBuilder, standing};
 use super::shapes::{
     cone, cuboid, curtain, height_field, lathe, roughen, superellipsoid, taper, tube, twist,
 };
@@ -20,34 +20,34 @@ fn turned(angle: f32) -> Affine3A {
 }
 
 /// Creates a random plain shape within `size`, possibly stretched, bent and roughened, standing on y = 0.
-pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
+pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
     let half = size / 2.;
-    let mut mesh = match make.within(0..9) {
+    let mut mesh = match builder.within(0..9) {
         0 => cuboid(size, 0.),
         1 => {
-            let round = make.within(0.05..0.5) * size.min_element();
+            let round = builder.within(0.05..0.5) * size.min_element();
             cuboid(size, round)
         }
         2 => superellipsoid(size, [1., 1.], 10),
         3 => {
-            let powers = [make.within(0.2..1.6), make.within(0.2..1.6)];
+            let powers = [builder.within(0.2..1.6), builder.within(0.2..1.6)];
             superellipsoid(size, powers, 10)
         }
         4 => cone(0.5, 0.5, 1., 20).warped(|p| p * size),
         5 => {
-            let above = make.within(0. ..0.4);
+            let above = builder.within(0. ..0.4);
             cone(0.5, above, 1., 20).warped(|p| p * size)
         }
         6 => {
-            let thick = make.within(0.12..0.35f32);
+            let thick = builder.within(0.12..0.35f32);
             let ring = move |t: f32| vec3((1. - thick) * (TAU * t).cos(), 0., (1. - thick) * (TAU * t).sin());
             let flat = tube(ring, |_| thick, [24, 10]);
-            let upright = make.chance(0.5);
+            let upright = builder.chance(0.5);
             let stood = if upright { flat.warped(|p| vec3(p.x, p.z, p.y)) } else { flat };
             stood.warped(|p| p * half)
         }
         7 => {
-            let (waves, thick) = (make.within(1..5) as f32, make.within(0.06..0.2));
+            let (waves, thick) = (builder.within(1..5) as f32, builder.within(0.06..0.2));
             let knot = move |t: f32| {
                 let (a, b) = (TAU * t, TAU * t * waves);
                 vec3(0.8 * a.cos(), 0.8 * (b + 0.5).sin() * 0.5, 0.8 * a.sin() * (1. + 0.2 * b.cos()))
@@ -56,9 +56,9 @@ pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
         }
         _ => {
             let profile: Vec<Vec2> = {
-                let steps = make.within(3..8);
-                let mut radii: Vec<f32> = (0..=steps).map(|_| make.within(0.12..0.5)).collect();
-                radii[0] = make.within(0.2..0.5);
+                let steps = builder.within(3..8);
+                let mut radii: Vec<f32> = (0..=steps).map(|_| builder.within(0.12..0.5)).collect();
+                radii[0] = builder.within(0.2..0.5);
                 let rims = radii.iter().enumerate();
                 let mut rims: Vec<Vec2> = rims.map(|(i, &r)| vec2(r, i as f32 / steps as f32)).collect();
                 rims.insert(0, vec2(0., 0.));
@@ -67,14 +67,14 @@ pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
             lathe(&profile, 20).warped(|p| p * size)
         }
     };
-    if make.chance(0.2) {
-        mesh = taper(mesh, make.within(-0.6..0.6) / size.y);
+    if builder.chance(0.2) {
+        mesh = taper(mesh, builder.within(-0.6..0.6) / size.y);
     }
-    if make.chance(0.15) {
-        mesh = twist(mesh, make.within(-0.4..0.4) / size.y);
+    if builder.chance(0.15) {
+        mesh = twist(mesh, builder.within(-0.4..0.4) / size.y);
     }
-    if make.chance(0.15) {
-        let (noise, strength) = (make.noise(), make.within(0.03..0.15));
+    if builder.chance(0.15) {
+        let (noise, strength) = (builder.noise(), builder.within(0.03..0.15));
         mesh = roughen(mesh, &noise, 2.5 / size.max_element(), strength * size.min_element());
     }
     let (least, _) = mesh.bounds();
@@ -82,498 +82,530 @@ pub(super) fn plain(make: &mut Maker, size: Vec3) -> Mesh {
 }
 
 /// Adds a heap of plain shapes on and beside each other, of about `size` in metres.
-pub(super) fn heap(make: &mut Maker, size: Vec3, place: Affine3A, count: usize) {
+pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, count: usize) {
     for _ in 0..count {
-        let part = size * vec3(make.within(0.2..0.6), make.within(0.2..0.6), make.within(0.2..0.6));
-        let mesh = plain(make, part);
-        let material = make.material(Purpose::Thing);
+        let part = size * vec3(builder.within(0.2..0.6), builder.within(0.2..0.6), builder.within(0.2..0.6));
+        let mesh = plain(builder, part);
+        let material = builder.material(Purpose::Thing);
         let spot =
-            vec3(make.within(-0.4..0.4), make.within(0. ..0.6f32).powi(2), make.within(-0.4..0.4)) * size;
-        let turn = match make.chance(0.5) {
-            true => Quat::from_rotation_y(make.turn()),
-            false => Quat::from_axis_angle(make.direction(), make.turn()),
+            vec3(builder.within(-0.4..0.4), builder.within(0. ..0.6f32).powi(2), builder.within(-0.4..0.4))
+                * size;
+        let turn = match builder.chance(0.5) {
+            true => Quat::from_rotation_y(builder.turn()),
+            false => Quat::from_axis_angle(builder.direction(), builder.turn()),
         };
-        make.put(mesh, &material, place * Affine3A::from_rotation_translation(turn, spot));
+        builder.add_mesh(mesh, &material, transform * Affine3A::from_rotation_translation(turn, spot));
     }
 }
 
 /// Adds a table: a top on legs or on a central foot, with objects on it.
-pub(super) fn table(make: &mut Maker, place: Affine3A) {
-    let size = vec3(make.within(0.5..2.), make.within(0.4..0.85), make.within(0.5..1.1));
-    let (top, legs) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
-    let thick = make.within(0.02..0.07);
-    if make.chance(0.25) {
+pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec3(builder.within(0.5..2.), builder.within(0.4..0.85), builder.within(0.5..1.1));
+    let (top, legs) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let thick = builder.within(0.02..0.07);
+    if builder.chance(0.25) {
         let round = cone(0.5 * size.x, 0.5 * size.x, thick, 28);
-        make.put(round, &top, place * at(0., size.y, 0.));
+        builder.add_mesh(round, &top, transform * at(0., size.y, 0.));
         let foot = lathe(&[vec2(0.3 * size.x, 0.), vec2(0.05, 0.06), vec2(0.04, size.y)], 14);
-        make.put(foot, &legs, place);
+        builder.add_mesh(foot, &legs, transform);
     } else {
-        let round = make.one_of(&[0., 0.01, 0.02]);
-        make.put(cuboid(vec3(size.x, thick, size.z), round), &top, place * at(0., size.y, 0.));
-        let leg = make.within(0.03..0.09);
-        let slim = if make.chance(0.5) { leg } else { 0.4 * leg };
+        let round = builder.one_of(&[0., 0.01, 0.02]);
+        builder.add_mesh(cuboid(vec3(size.x, thick, size.z), round), &top, transform * at(0., size.y, 0.));
+        let leg = builder.within(0.03..0.09);
+        let slim = if builder.chance(0.5) { leg } else { 0.4 * leg };
         for (x, z) in [(-1., -1.), (-1., 1.), (1., -1.), (1., 1.)] {
             let corner = at(0.5 * x * (size.x - leg), 0., 0.5 * z * (size.z - leg));
-            make.put(cone(0.5 * slim, 0.5 * leg, size.y, 8), &legs, place * corner);
+            builder.add_mesh(cone(0.5 * slim, 0.5 * leg, size.y, 8), &legs, transform * corner);
         }
     }
-    let surface = place * at(0., size.y + thick, 0.);
-    clutter(make, vec2(0.8 * size.x, 0.8 * size.z), surface, 6);
+    let surface = transform * at(0., size.y + thick, 0.);
+    clutter(builder, vec2(0.8 * size.x, 0.8 * size.z), surface, 6);
 }
 
 /// Adds small objects on a surface of `size`: books, vessels, lamps, plain shapes.
-pub(super) fn clutter(make: &mut Maker, size: Vec2, place: Affine3A, most: usize) {
-    for _ in 0..make.within(0..=most) {
-        let spot =
-            at(make.within(-0.5..0.5) * size.x, 0., make.within(-0.5..0.5) * size.y) * turned(make.turn());
-        match make.within(0..5) {
-            0 => books(make, place * spot, 0.3),
-            1 => vessel(make, place * spot),
-            2 => lamp(make, place * spot, 0.4),
+pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3A, most: usize) {
+    for _ in 0..builder.within(0..=most) {
+        let spot = at(builder.within(-0.5..0.5) * size.x, 0., builder.within(-0.5..0.5) * size.y)
+            * turned(builder.turn());
+        match builder.within(0..5) {
+            0 => books(builder, transform * spot, 0.3),
+            1 => vessel(builder, transform * spot),
+            2 => lamp(builder, transform * spot, 0.4),
             _ => {
-                let size = vec3(make.scaled(0.05, 0.35), make.scaled(0.04, 0.35), make.scaled(0.05, 0.35));
-                let (mesh, material) = (plain(make, size), make.material(Purpose::Thing));
-                make.put(mesh, &material, place * spot);
+                let size =
+                    vec3(builder.scaled(0.05, 0.35), builder.scaled(0.04, 0.35), builder.scaled(0.05, 0.35));
+                let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
+                builder.add_mesh(mesh, &material, transform * spot);
             }
         }
     }
 }
 
 /// Adds a bowl, cup, bottle or vase, sometimes with a plant in it.
-pub(super) fn vessel(make: &mut Maker, place: Affine3A) {
-    let (radius, height) = (make.within(0.03..0.14), make.within(0.06..0.4));
-    let material = make.material(Purpose::Thing);
-    let mut rims = vec![vec2(0., 0.), vec2(radius * make.within(0.4..1.), 0.)];
+pub(super) fn vessel(builder: &mut SceneBuilder, transform: Affine3A) {
+    let (radius, height) = (builder.within(0.03..0.14), builder.within(0.06..0.4));
+    let material = builder.material(Purpose::Thing);
+    let mut rims = vec![vec2(0., 0.), vec2(radius * builder.within(0.4..1.), 0.)];
     for i in 1..=4 {
-        rims.push(vec2(radius * make.within(0.4..1.1), height * i as f32 / 4.));
+        rims.push(vec2(radius * builder.within(0.4..1.1), height * i as f32 / 4.));
     }
-    make.put(lathe(&rims, 20), &material, place);
-    if make.chance(0.35) {
-        leaves(make, place * at(0., height, 0.), 2.5 * radius, 24);
+    builder.add_mesh(lathe(&rims, 20), &material, transform);
+    if builder.chance(0.35) {
+        leaves(builder, transform * at(0., height, 0.), 2.5 * radius, 24);
     }
 }
 
 /// Adds a row or a pile of books, `length` metres long.
-pub(super) fn books(make: &mut Maker, place: Affine3A, length: f32) {
+pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32) {
     let mut reached = 0.;
-    let piled = make.chance(0.3);
+    let piled = builder.chance(0.3);
     while reached < length {
-        let thick = make.within(0.012..0.06);
-        let (height, depth) = (make.within(0.16..0.32), make.within(0.12..0.24));
-        let material = make.material(Purpose::Thing);
+        let thick = builder.within(0.012..0.06);
+        let (height, depth) = (builder.within(0.16..0.32), builder.within(0.12..0.24));
+        let material = builder.material(Purpose::Thing);
         let book = cuboid(vec3(thick, height, depth), 0.);
         let spot = match piled {
             true => {
                 at(0., reached, 0.)
-                    * turned(make.within(-0.3..0.3))
+                    * turned(builder.within(-0.3..0.3))
                     * Affine3A::from_rotation_z(FRAC_PI_2)
                     * at(0.5 * thick, -0.5 * height, 0.)
             }
             false => {
-                let lean = if make.chance(0.1) { make.within(-0.2..0.2) } else { 0. };
+                let lean = if builder.chance(0.1) { builder.within(-0.2..0.2) } else { 0. };
                 at(reached - 0.5 * length, 0., 0.) * Affine3A::from_rotation_z(lean)
             }
         };
-        make.put(book, &material, place * spot);
-        reached += thick + make.within(0. ..0.004);
-        if piled && reached > 0.4 * length || make.chance(0.05) {
+        builder.add_mesh(book, &material, transform * spot);
+        reached += thick + builder.within(0. ..0.004);
+        if piled && reached > 0.4 * length || builder.chance(0.05) {
             break;
         }
     }
 }
 
 /// Adds shelves with objects on them, a cupboard with doors, or a chest of drawers.
-pub(super) fn cabinet(make: &mut Maker, place: Affine3A) {
-    let size = vec3(make.within(0.5..2.2), make.within(0.6..2.3), make.within(0.25..0.6));
-    let (body, front) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
+pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec3(builder.within(0.5..2.2), builder.within(0.6..2.3), builder.within(0.25..0.6));
+    let (body, front) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
     let board = 0.025;
-    if make.chance(0.5) {
+    if builder.chance(0.5) {
         let side = cuboid(vec3(board, size.y, size.z), 0.);
         for x in [-0.5, 0.5] {
-            make.put(side.clone(), &body, place * at(x * (size.x - board), 0., 0.));
+            builder.add_mesh(side.clone(), &body, transform * at(x * (size.x - board), 0., 0.));
         }
-        make.put(cuboid(vec3(size.x, size.y, 0.01), 0.), &body, place * at(0., 0., -0.5 * size.z));
-        let shelves = make.within(2..7);
+        builder.add_mesh(
+            cuboid(vec3(size.x, size.y, 0.01), 0.),
+            &body,
+            transform * at(0., 0., -0.5 * size.z),
+        );
+        let shelves = builder.within(2..7);
         for i in 0..=shelves {
             let height = (size.y - board) * i as f32 / shelves as f32;
-            make.put(cuboid(vec3(size.x, board, size.z), 0.), &body, place * at(0., height, 0.));
-            if i < shelves && make.chance(0.8) {
-                let above = place * at(0., height + board, 0.);
-                match make.chance(0.5) {
+            builder.add_mesh(cuboid(vec3(size.x, board, size.z), 0.), &body, transform * at(0., height, 0.));
+            if i < shelves && builder.chance(0.8) {
+                let above = transform * at(0., height + board, 0.);
+                match builder.chance(0.5) {
                     true => {
-                        let length = size.x * make.within(0.4..0.9);
-                        books(make, above, length);
+                        let length = size.x * builder.within(0.4..0.9);
+                        books(builder, above, length);
                     }
-                    false => clutter(make, vec2(0.8 * size.x, 0.5 * size.z), above, 4),
+                    false => clutter(builder, vec2(0.8 * size.x, 0.5 * size.z), above, 4),
                 }
             }
         }
     } else {
-        make.put(cuboid(size, 0.), &body, place);
-        let (columns, rows) = (make.within(1..4), make.within(1..6));
+        builder.add_mesh(cuboid(size, 0.), &body, transform);
+        let (columns, rows) = (builder.within(1..4), builder.within(1..6));
         let cell = vec2(size.x / columns as f32, size.y / rows as f32);
         for column in 0..columns {
             for row in 0..rows {
                 let x = (column as f32 + 0.5) * cell.x - 0.5 * size.x;
-                let spot = place * at(x, (row as f32 + 0.03) * cell.y, 0.5 * size.z);
-                make.put(cuboid(vec3(0.94 * cell.x, 0.94 * cell.y, 0.02), 0.), &front, spot);
+                let spot = transform * at(x, (row as f32 + 0.03) * cell.y, 0.5 * size.z);
+                builder.add_mesh(cuboid(vec3(0.94 * cell.x, 0.94 * cell.y, 0.02), 0.), &front, spot);
                 let knob = superellipsoid(Vec3::splat(0.03), [1., 1.], 4);
-                make.put(knob, &body, spot * at(0.3 * cell.x, 0.5 * cell.y, 0.03));
+                builder.add_mesh(knob, &body, spot * at(0.3 * cell.x, 0.5 * cell.y, 0.03));
             }
         }
-        clutter(make, vec2(0.8 * size.x, 0.7 * size.z), place * at(0., size.y, 0.), 4);
+        clutter(builder, vec2(0.8 * size.x, 0.7 * size.z), transform * at(0., size.y, 0.), 4);
     }
 }
 
 /// Adds a chair or stool.
-pub(super) fn chair(make: &mut Maker, place: Affine3A) {
-    let (wide, deep, seat) = (make.within(0.38..0.6), make.within(0.38..0.6), make.within(0.38..0.5));
-    let (cloth, wood) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
-    let thick = make.within(0.02..0.12);
-    make.put(cuboid(vec3(wide, thick, deep), 0.4 * thick), &cloth, place * at(0., seat - thick, 0.));
-    let leg = make.within(0.012..0.03);
+pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
+    let (wide, deep, seat) =
+        (builder.within(0.38..0.6), builder.within(0.38..0.6), builder.within(0.38..0.5));
+    let (cloth, wood) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let thick = builder.within(0.02..0.12);
+    builder.add_mesh(
+        cuboid(vec3(wide, thick, deep), 0.4 * thick),
+        &cloth,
+        transform * at(0., seat - thick, 0.),
+    );
+    let leg = builder.within(0.012..0.03);
     for (x, z) in [(-0.45, -0.45), (-0.45, 0.45), (0.45, -0.45), (0.45, 0.45)] {
-        make.put(cone(leg, leg, seat - thick, 7), &wood, place * at(x * wide, 0., z * deep));
+        builder.add_mesh(cone(leg, leg, seat - thick, 7), &wood, transform * at(x * wide, 0., z * deep));
     }
-    if make.chance(0.85) {
-        let height = make.within(0.3..0.6);
-        let lean = Affine3A::from_rotation_x(-make.within(0. ..0.25));
-        let back = place * at(0., seat, -0.47 * deep) * lean;
-        match make.chance(0.5) {
-            true => make.put(cuboid(vec3(wide, height, 0.04), 0.015), &cloth, back),
+    if builder.chance(0.85) {
+        let height = builder.within(0.3..0.6);
+        let lean = Affine3A::from_rotation_x(-builder.within(0. ..0.25));
+        let back = transform * at(0., seat, -0.47 * deep) * lean;
+        match builder.chance(0.5) {
+            true => builder.add_mesh(cuboid(vec3(wide, height, 0.04), 0.015), &cloth, back),
             false => {
                 for i in 0..5 {
                     let bar = cone(0.01, 0.01, height, 6);
-                    make.put(bar, &wood, back * at((i as f32 / 4. - 0.5) * 0.9 * wide, 0., 0.));
+                    builder.add_mesh(bar, &wood, back * at((i as f32 / 4. - 0.5) * 0.9 * wide, 0., 0.));
                 }
-                make.put(cuboid(vec3(wide, 0.07, 0.03), 0.01), &wood, back * at(0., height - 0.05, 0.));
+                builder.add_mesh(
+                    cuboid(vec3(wide, 0.07, 0.03), 0.01),
+                    &wood,
+                    back * at(0., height - 0.05, 0.),
+                );
             }
         }
     }
 }
 
 /// Adds a sofa or armchair with cushions.
-pub(super) fn sofa(make: &mut Maker, place: Affine3A) {
-    let (wide, deep) = (make.within(0.8..2.4), make.within(0.75..1.));
-    let cloth = make.material(Purpose::Thing);
-    let (seat, back, arm) = (make.within(0.35..0.45), make.within(0.7..0.95), make.within(0.12..0.25));
-    make.put(cuboid(vec3(wide, seat, deep), 0.05), &cloth, place);
-    make.put(cuboid(vec3(wide, back, 0.22), 0.08), &cloth, place * at(0., 0., -0.5 * deep));
+pub(super) fn sofa(builder: &mut SceneBuilder, transform: Affine3A) {
+    let (wide, deep) = (builder.within(0.8..2.4), builder.within(0.75..1.));
+    let cloth = builder.material(Purpose::Thing);
+    let (seat, back, arm) =
+        (builder.within(0.35..0.45), builder.within(0.7..0.95), builder.within(0.12..0.25));
+    builder.add_mesh(cuboid(vec3(wide, seat, deep), 0.05), &cloth, transform);
+    builder.add_mesh(cuboid(vec3(wide, back, 0.22), 0.08), &cloth, transform * at(0., 0., -0.5 * deep));
     for x in [-0.5, 0.5] {
-        make.put(cuboid(vec3(arm, seat + 0.2, deep), 0.06), &cloth, place * at(x * wide, 0., 0.));
+        builder.add_mesh(cuboid(vec3(arm, seat + 0.2, deep), 0.06), &cloth, transform * at(x * wide, 0., 0.));
     }
-    for _ in 0..make.within(0..5) {
+    for _ in 0..builder.within(0..5) {
         let pillow = superellipsoid(vec3(0.45, 0.42, 0.16), [0.5, 0.5], 7);
-        let cover = make.material(Purpose::Thing);
-        let x = make.within(-0.4..0.4) * wide;
-        let lean = Affine3A::from_rotation_x(-0.3) * Affine3A::from_rotation_y(make.within(-0.5..0.5));
-        make.put(pillow, &cover, place * at(x, seat + 0.2, -0.22 * deep) * lean);
+        let cover = builder.material(Purpose::Thing);
+        let x = builder.within(-0.4..0.4) * wide;
+        let lean = Affine3A::from_rotation_x(-0.3) * Affine3A::from_rotation_y(builder.within(-0.5..0.5));
+        builder.add_mesh(pillow, &cover, transform * at(x, seat + 0.2, -0.22 * deep) * lean);
     }
 }
 
 /// Adds a bed with bedding.
-pub(super) fn bed(make: &mut Maker, place: Affine3A) {
-    let (wide, long, high) = (make.within(0.9..2.), 2.1, make.within(0.35..0.6));
-    let (wood, sheet, cover) =
-        (make.material(Purpose::Thing), make.material(Purpose::Thing), make.material(Purpose::Thing));
-    make.put(cuboid(vec3(wide + 0.06, 0.6 * high, long), 0.01), &wood, place);
-    make.put(cuboid(vec3(wide, 0.5 * high, long - 0.06), 0.08), &sheet, place * at(0., 0.6 * high, 0.));
-    let board = make.within(0.8..1.3);
-    make.put(cuboid(vec3(wide + 0.06, board, 0.06), 0.02), &wood, place * at(0., 0., -0.5 * long));
-    let noise = make.noise();
+pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
+    let (wide, long, high) = (builder.within(0.9..2.), 2.1, builder.within(0.35..0.6));
+    let (wood, sheet, cover) = (
+        builder.material(Purpose::Thing),
+        builder.material(Purpose::Thing),
+        builder.material(Purpose::Thing),
+    );
+    builder.add_mesh(cuboid(vec3(wide + 0.06, 0.6 * high, long), 0.01), &wood, transform);
+    builder.add_mesh(
+        cuboid(vec3(wide, 0.5 * high, long - 0.06), 0.08),
+        &sheet,
+        transform * at(0., 0.6 * high, 0.),
+    );
+    let board = builder.within(0.8..1.3);
+    builder.add_mesh(
+        cuboid(vec3(wide + 0.06, board, 0.06), 0.02),
+        &wood,
+        transform * at(0., 0., -0.5 * long),
+    );
+    let noise = builder.noise();
     let blanket = height_field(vec2(wide + 0.1, 0.65 * long), 16, |x, z| {
         0.06 * noise.fractal(vec3(3. * x, 0., 3. * z), 3) - 0.5 * (x.abs() - 0.5 * wide).max(0.)
     });
-    make.put(blanket, &cover, place * at(0., 1.1 * high + 0.05, 0.15 * long));
+    builder.add_mesh(blanket, &cover, transform * at(0., 1.1 * high + 0.05, 0.15 * long));
     for x in [-0.25, 0.25] {
         let pillow = superellipsoid(vec3(0.45 * wide, 0.16, 0.42), [0.6, 0.5], 8);
-        make.put(pillow, &sheet, place * at(x * wide, 1.1 * high + 0.06, -0.36 * long));
+        builder.add_mesh(pillow, &sheet, transform * at(x * wide, 1.1 * high + 0.06, -0.36 * long));
     }
 }
 
 /// Adds a lamp of `height` metres: a shade on a stand, which glows if the lamp is on.
-pub(super) fn lamp(make: &mut Maker, place: Affine3A, height: f32) {
-    let (stand, mut shade) = (make.material(Purpose::Thing), make.material(Purpose::Thing));
-    shade.glow = if make.chance(0.6) { make.within(0.5..2.5) } else { 0. };
+pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
+    let (stand, mut shade) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    shade.glow = if builder.chance(0.6) { builder.within(0.5..2.5) } else { 0. };
     shade.gloss = 0.;
-    let wide = (0.3 * height).min(0.25) * make.within(0.7..1.3);
+    let wide = (0.3 * height).min(0.25) * builder.within(0.7..1.3);
     let foot =
         [vec2(0., 0.), vec2(0.5 * wide, 0.), vec2(0.5 * wide, 0.02), vec2(0.012, 0.03), vec2(0.012, height)];
-    make.put(lathe(&foot, 14), &stand, place);
-    let narrow = make.within(0.4..1.) * wide;
+    builder.add_mesh(lathe(&foot, 14), &stand, transform);
+    let narrow = builder.within(0.4..1.) * wide;
     let rims = [vec2(wide, 0.75 * height), vec2(narrow, height)];
-    make.put(lathe(&rims, 18), &shade, place);
+    builder.add_mesh(lathe(&rims, 18), &shade, transform);
 }
 
 /// Adds leaves on arching stems, up to `reach` metres long.
-pub(super) fn leaves(make: &mut Maker, place: Affine3A, reach: f32, count: usize) {
-    let mut material = make.material(Purpose::Foliage);
+pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32, count: usize) {
+    let mut material = builder.material(Purpose::Foliage);
     material.mirror = 0.;
     let mut all = Mesh::default();
-    let slim = make.within(0.06..0.35);
-    let droop = make.within(-0.3..1.2);
+    let slim = builder.within(0.06..0.35);
+    let droop = builder.within(-0.3..1.2);
     for _ in 0..count {
-        let length = reach * make.within(0.5..1.);
+        let length = reach * builder.within(0.5..1.);
         let leaf = Mesh::grid(2, 5, vec2(slim * length, length), |u, v| {
             let wide = slim * length * (PI * v.powf(0.7)).sin();
             let rise = v - 0.5 * droop * v * v;
             vec3((u - 0.5) * wide, rise * length, 0.6 * length * v * v + 0.1 * wide * (2. * u - 1.).abs())
         });
-        let tilt = Affine3A::from_rotation_x(make.within(0. ..1.));
-        all.join(leaf.moved(turned(make.turn()) * tilt));
+        let tilt = Affine3A::from_rotation_x(builder.within(0. ..1.));
+        all.join(leaf.moved(turned(builder.turn()) * tilt));
     }
-    make.put(all, &material, place);
+    builder.add_mesh(all, &material, transform);
 }
 
 /// Adds a plant in a pot on the floor.
-pub(super) fn plant(make: &mut Maker, place: Affine3A) {
-    let (radius, height) = (make.within(0.1..0.25), make.within(0.15..0.5));
-    let pot = make.material(Purpose::Thing);
-    let slope = make.within(0.6..1.);
-    make.put(
+pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
+    let (radius, height) = (builder.within(0.1..0.25), builder.within(0.15..0.5));
+    let pot = builder.material(Purpose::Thing);
+    let slope = builder.within(0.6..1.);
+    builder.add_mesh(
         lathe(&[vec2(slope * radius, 0.), vec2(radius, height), vec2(0., 0.9 * height)], 18),
         &pot,
-        place,
+        transform,
     );
-    let (reach, count) = (make.within(0.3..1.1), make.within(12..60));
-    leaves(make, place * at(0., 0.9 * height, 0.), reach, count);
+    let (reach, count) = (builder.within(0.3..1.1), builder.within(12..60));
+    leaves(builder, transform * at(0., 0.9 * height, 0.), reach, count);
 }
 
 /// Adds a framed picture on a wall, with its back at z = 0 and its centre at the origin.
-pub(super) fn picture(make: &mut Maker, place: Affine3A) {
-    let size = vec2(make.scaled(0.2, 1.4), make.scaled(0.2, 1.2));
-    let poster = make.picture(size);
-    let frame = make.material(Purpose::Thing);
-    let edge = make.within(0.01..0.08);
+pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec2(builder.scaled(0.2, 1.4), builder.scaled(0.2, 1.2));
+    let poster = builder.picture(size);
+    let frame = builder.material(Purpose::Thing);
+    let edge = builder.within(0.01..0.08);
     let outer = size + 2. * edge;
-    make.put(cuboid(vec3(outer.x, outer.y, 0.03), 0.), &frame, place * at(0., -0.5 * outer.y, 0.015));
+    builder.add_mesh(
+        cuboid(vec3(outer.x, outer.y, 0.03), 0.),
+        &frame,
+        transform * at(0., -0.5 * outer.y, 0.015),
+    );
     let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
-    make.put(sheet, &poster, place);
+    builder.add_mesh(sheet, &poster, transform);
 }
 
 /// Adds a framed mirror, placed like a picture.
-pub(super) fn mirror(make: &mut Maker, place: Affine3A) {
-    let size = vec2(make.within(0.4..1.2), make.within(0.5..1.6));
-    let frame = make.material(Purpose::Thing);
-    make.put(
+pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec2(builder.within(0.4..1.2), builder.within(0.5..1.6));
+    let frame = builder.material(Purpose::Thing);
+    builder.add_mesh(
         cuboid(vec3(size.x + 0.08, size.y + 0.08, 0.03), 0.),
         &frame,
-        place * at(0., -0.5 * size.y - 0.04, 0.015),
+        transform * at(0., -0.5 * size.y - 0.04, 0.015),
     );
-    let mut glass = make.material(Purpose::Ceiling);
+    let mut glass = builder.material(Purpose::Ceiling);
     (glass.mirror, glass.gloss) = (0.9, 0.);
     let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
-    make.put(sheet, &glass, place);
+    builder.add_mesh(sheet, &glass, transform);
 }
 
 /// Adds curtains on both sides of a window of `size` whose centre is at the origin.
-pub(super) fn curtains(make: &mut Maker, place: Affine3A, size: Vec2) {
-    let cloth = make.material(Purpose::Thing);
-    let (wide, folds) = (size.x * make.within(0.2..0.4), make.within(3. ..7.));
-    let height = size.y + 0.3 + if make.chance(0.5) { make.within(0. ..0.6) } else { 0. };
+pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Vec2) {
+    let cloth = builder.material(Purpose::Thing);
+    let (wide, folds) = (size.x * builder.within(0.2..0.4), builder.within(3. ..7.));
+    let height = size.y + 0.3 + if builder.chance(0.5) { builder.within(0. ..0.6) } else { 0. };
     for x in [-0.5, 0.5] {
         let drape = curtain(wide, height, folds, 0.05);
-        make.put(drape, &cloth, place * at(x * size.x, 0.5 * size.y + 0.1, 0.1));
+        builder.add_mesh(drape, &cloth, transform * at(x * size.x, 0.5 * size.y + 0.1, 0.1));
     }
 }
 
 /// Adds a tree: a bent trunk, branches, and a crown of leaves or of green clouds.
-pub(super) fn tree(make: &mut Maker, place: Affine3A, height: f32) {
-    let bark = make.material(Purpose::Thing);
-    let (bend_x, bend_z) = (make.within(-0.15..0.15) * height, make.within(-0.15..0.15) * height);
+pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
+    let bark = builder.material(Purpose::Thing);
+    let (bend_x, bend_z) = (builder.within(-0.15..0.15) * height, builder.within(-0.15..0.15) * height);
     let stem = move |t: f32| vec3(bend_x * t * t, height * t, bend_z * t * t);
-    let thick = make.within(0.02..0.045) * height;
-    make.put(tube(stem, move |t| thick * (1.1 - t), [8, 8]), &bark, place);
-    let crown = make.material(Purpose::Foliage);
-    let noise = make.noise();
-    match make.within(0..3) {
+    let thick = builder.within(0.02..0.045) * height;
+    builder.add_mesh(tube(stem, move |t| thick * (1.1 - t), [8, 8]), &bark, transform);
+    let crown = builder.material(Purpose::Foliage);
+    let noise = builder.noise();
+    match builder.within(0..3) {
         0 => {
             // A conifer: skirts above each other.
-            let skirts = make.within(4..8);
+            let skirts = builder.within(4..8);
             for i in 0..skirts {
                 let share = i as f32 / skirts as f32;
                 let (wide, y) = (0.28 * height * (1.05 - share), height * (0.15 + 0.8 * share));
                 let skirt = lathe(&[vec2(wide, 0.), vec2(0.02, 0.3 * height)], 16);
                 let rough = roughen(skirt, &noise, 6. / height, 0.03 * height);
-                make.put(rough, &crown, place * at(0., y, 0.));
+                builder.add_mesh(rough, &crown, transform * at(0., y, 0.));
             }
         }
         1 => {
-            for _ in 0..make.within(5..12) {
-                let middle = stem(make.within(0.55..1.));
-                let offset = make.direction() * make.within(0. ..0.2) * height;
+            for _ in 0..builder.within(5..12) {
+                let middle = stem(builder.within(0.55..1.));
+                let offset = builder.direction() * builder.within(0. ..0.2) * height;
                 let size =
-                    vec3(make.within(0.2..0.4), make.within(0.15..0.35), make.within(0.2..0.4)) * height;
+                    vec3(builder.within(0.2..0.4), builder.within(0.15..0.35), builder.within(0.2..0.4))
+                        * height;
                 let cloud = roughen(superellipsoid(size, [1., 1.], 9), &noise, 7. / height, 0.06 * height);
-                make.put(cloud, &crown, place * Affine3A::from_translation(middle + offset));
+                builder.add_mesh(cloud, &crown, transform * Affine3A::from_translation(middle + offset));
             }
         }
         _ => {
-            for _ in 0..make.within(6..14) {
-                let middle = stem(make.within(0.5..1.));
-                let tip = middle + make.direction() * make.within(0.1..0.3) * height;
+            for _ in 0..builder.within(6..14) {
+                let middle = stem(builder.within(0.5..1.));
+                let tip = middle + builder.direction() * builder.within(0.1..0.3) * height;
                 let branch = move |t: f32| middle.lerp(tip, t);
-                make.put(tube(branch, move |_| 0.25 * thick, [3, 5]), &bark, place);
-                leaves(make, place * Affine3A::from_translation(tip), 0.18 * height, 10);
+                builder.add_mesh(tube(branch, move |_| 0.25 * thick, [3, 5]), &bark, transform);
+                leaves(builder, transform * Affine3A::from_translation(tip), 0.18 * height, 10);
             }
         }
     }
 }
 
 /// Adds a bush or a tuft of grass.
-pub(super) fn bush(make: &mut Maker, place: Affine3A) {
-    let size = vec3(make.within(0.4..1.6), make.within(0.3..1.2), make.within(0.4..1.6));
-    if make.chance(0.5) {
-        leaves(make, place, size.y, 40);
+pub(super) fn bush(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec3(builder.within(0.4..1.6), builder.within(0.3..1.2), builder.within(0.4..1.6));
+    if builder.chance(0.5) {
+        leaves(builder, transform, size.y, 40);
         return;
     }
-    let (crown, noise) = (make.material(Purpose::Foliage), make.noise());
+    let (crown, noise) = (builder.material(Purpose::Foliage), builder.noise());
     let ball = roughen(superellipsoid(size, [1., 1.], 12), &noise, 3.5, 0.18);
-    make.put(ball, &crown, place * at(0., 0.4 * size.y, 0.));
+    builder.add_mesh(ball, &crown, transform * at(0., 0.4 * size.y, 0.));
 }
 
 /// Adds a rock.
-pub(super) fn rock(make: &mut Maker, place: Affine3A, size: f32) {
-    let (stone, noise) = (make.material(Purpose::Ground), make.noise());
-    let size = size * vec3(make.within(0.6..1.4), make.within(0.4..1.), make.within(0.6..1.4));
+pub(super) fn rock(builder: &mut SceneBuilder, transform: Affine3A, size: f32) {
+    let (stone, noise) = (builder.material(Purpose::Ground), builder.noise());
+    let size = size * vec3(builder.within(0.6..1.4), builder.within(0.4..1.), builder.within(0.6..1.4));
     let ball = superellipsoid(size, [0.8, 0.8], 12);
     let rough = roughen(ball, &noise, 2. / size.max_element(), 0.25 * size.min_element());
-    make.put(rough, &stone, place * at(0., 0.3 * size.y, 0.));
+    builder.add_mesh(rough, &stone, transform * at(0., 0.3 * size.y, 0.));
 }
 
 /// Adds a house: walls with windows and doors, under a roof.
-pub(super) fn house(make: &mut Maker, place: Affine3A) {
-    let size = vec3(make.within(4. ..10.), make.within(2.6..7.), make.within(4. ..9.));
-    let (wall, roof) = (make.material(Purpose::Facade), make.material(Purpose::Facade));
-    make.put(cuboid(size, 0.), &wall, place);
-    let (over, rise) = (make.within(0.1..0.6), make.within(0. ..0.5) * size.x);
+pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
+    let size = vec3(builder.within(4. ..10.), builder.within(2.6..7.), builder.within(4. ..9.));
+    let (wall, roof) = (builder.material(Purpose::Facade), builder.material(Purpose::Facade));
+    builder.add_mesh(cuboid(size, 0.), &wall, transform);
+    let (over, rise) = (builder.within(0.1..0.6), builder.within(0. ..0.5) * size.x);
     let half = vec3(0.5 * size.x + over, 0., 0.5 * size.z + over);
     for side in [-1., 1.] {
         let eaves = vec3(side * half.x, size.y - 0.02, side * half.z);
         let sheet =
             Mesh::rectangle(eaves, vec3(0., 0., -2. * side * half.z), vec3(-side * half.x, rise, 0.), 2.);
-        make.put(sheet, &roof, place);
+        builder.add_mesh(sheet, &roof, transform);
         let gable = Mesh::grid(1, 1, vec2(size.x, rise), |u, v| {
             vec3(side * (u - 0.5) * size.x * (1. - v), size.y + rise * v, 0.5 * side * size.z)
         });
-        make.put(gable, &wall, place);
+        builder.add_mesh(gable, &wall, transform);
     }
-    let (glass, frame) = (window_glass(make), make.material(Purpose::Thing));
+    let (glass, frame) = (window_glass(builder), builder.material(Purpose::Thing));
     let floors = (size.y / 2.6).floor().max(1.) as usize;
     for (turn, wide, deep) in
         [(0., size.x, size.z), (1., size.z, size.x), (2., size.x, size.z), (3., size.z, size.x)]
     {
-        let count = (wide / make.within(1.6..3.)).floor().max(1.);
+        let count = (wide / builder.within(1.6..3.)).floor().max(1.);
         for floor in 0..floors {
             for i in 0..count as usize {
                 let x = ((i as f32 + 0.5) / count - 0.5) * wide;
-                let is_door = floor == 0 && make.chance(0.15);
+                let is_door = floor == 0 && builder.chance(0.15);
                 let pane = if is_door { vec2(0.9, 2.) } else { vec2(1.1, 1.3) };
                 let y = 2.6 * floor as f32 + if is_door { 0. } else { 0.8 };
-                let spot = place * turned(turn * FRAC_PI_2) * at(x, y, 0.5 * deep);
-                make.put(
+                let spot = transform * turned(turn * FRAC_PI_2) * at(x, y, 0.5 * deep);
+                builder.add_mesh(
                     cuboid(vec3(pane.x + 0.16, pane.y + 0.16, 0.06), 0.),
                     &frame,
                     spot * at(0., -0.08, 0.),
                 );
                 let inner = cuboid(vec3(pane.x, pane.y, 0.08), 0.);
-                make.put(inner, if is_door { &wall } else { &glass }, spot);
+                builder.add_mesh(inner, if is_door { &wall } else { &glass }, spot);
             }
         }
     }
 }
 
 /// Returns the material of window panes seen from outside: dark and reflecting.
-fn window_glass(make: &mut Maker) -> Material {
-    let mut glass = make.material(Purpose::Ceiling);
-    glass.tint = Vec3::splat(make.within(0.03..0.25));
-    glass.mirror = make.within(0.05..0.3);
+fn window_glass(builder: &mut SceneBuilder) -> Material {
+    let mut glass = builder.material(Purpose::Ceiling);
+    glass.tint = Vec3::splat(builder.within(0.03..0.25));
+    glass.mirror = builder.within(0.05..0.3);
     glass
 }
 
 /// Adds a fence of boards and rails, `length` metres along x.
-pub(super) fn fence(make: &mut Maker, place: Affine3A, length: f32) {
-    let wood = make.material(Purpose::Thing);
-    let (height, gap) = (make.within(0.7..1.8), make.within(0.08..0.5f32));
+pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32) {
+    let wood = builder.material(Purpose::Thing);
+    let (height, gap) = (builder.within(0.7..1.8), builder.within(0.08..0.5f32));
     let board = (0.5 * gap).min(0.12);
     for i in 0..(length / gap) as usize {
-        make.put(
+        builder.add_mesh(
             cuboid(vec3(board, height, 0.03), 0.),
             &wood,
-            place * at(i as f32 * gap - 0.5 * length, 0., 0.),
+            transform * at(i as f32 * gap - 0.5 * length, 0., 0.),
         );
     }
     for y in [0.3, 0.8] {
-        make.put(cuboid(vec3(length, 0.08, 0.03), 0.), &wood, place * at(0., y * height, -0.03));
+        builder.add_mesh(cuboid(vec3(length, 0.08, 0.03), 0.), &wood, transform * at(0., y * height, -0.03));
     }
 }
 
 /// Adds a single object, on the ground at `spot` or on a block there, to be viewed from all sides.
-pub(super) fn exhibit(make: &mut Maker, spot: Vec3) -> Exhibit {
-    let size = vec3(make.scaled(0.3, 1.5), make.scaled(0.3, 1.5), make.scaled(0.3, 1.5));
-    let below = if make.chance(0.3) { 0. } else { make.within(0.2..1.1) };
+pub(super) fn exhibit(builder: &mut SceneBuilder, spot: Vec3) -> Exhibit {
+    let size = vec3(builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5));
+    let below = if builder.chance(0.3) { 0. } else { builder.within(0.2..1.1) };
     if below > 0. {
         // The block reaches below the ground, which may be uneven.
-        let (foot, broad) = (0.5, make.within(0.6..1.6));
-        let material = make.material(Purpose::Thing);
-        let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), make.within(0. ..0.05));
-        make.put(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
+        let (foot, broad) = (0.5, builder.within(0.6..1.6));
+        let material = builder.material(Purpose::Thing);
+        let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), builder.within(0. ..0.05));
+        builder.add_mesh(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
     }
-    let place = standing(spot + below * Vec3::Y, make.turn());
-    to_be_looked_at(make, size, place);
+    let transform = standing(spot + below * Vec3::Y, builder.turn());
+    exhibit_object(builder, size, transform);
     Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length(), front: None }
 }
 
 /// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
-pub(super) fn hung(make: &mut Maker, spot: Vec3, front: Vec3) -> Exhibit {
-    let size = vec3(make.scaled(0.3, 1.2), make.scaled(0.2, 1.), make.scaled(0.3, 1.2));
+pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> Exhibit {
+    let size = vec3(builder.scaled(0.3, 1.2), builder.scaled(0.2, 1.), builder.scaled(0.3, 1.2));
     // The object's up axis points away from the wall.
-    let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(make.turn());
-    to_be_looked_at(make, size, Affine3A::from_rotation_translation(off_the_wall, spot));
+    let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(builder.turn());
+    exhibit_object(builder, size, Affine3A::from_rotation_translation(off_the_wall, spot));
     Exhibit { middle: spot + 0.4 * size.y * front, radius: 0.5 * size.length(), front: Some(front) }
 }
 
-/// Adds an object that merits its own video, about `size` metres large, standing at the origin of `place`.
-fn to_be_looked_at(make: &mut Maker, size: Vec3, place: Affine3A) {
-    match make.within(0..6) {
+/// Adds an object that merits its own video, about `size` metres large, standing at the origin of `transform`.
+fn exhibit_object(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
+    match builder.within(0..6) {
         0 => {
-            let (mesh, material) = (plain(make, size), make.material(Purpose::Thing));
-            make.put(mesh, &material, place);
+            let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
+            builder.add_mesh(mesh, &material, transform);
         }
         1 => {
             let largest = size.max_element();
-            rock(make, place, largest);
+            rock(builder, transform, largest);
         }
-        2 => plant(make, place),
+        2 => plant(builder, transform),
         _ => {
-            let count = make.within(3..12);
-            heap(make, size, place, count);
+            let count = builder.within(3..12);
+            heap(builder, size, transform, count);
         }
     }
 }
 
 /// Adds a random piece of furniture, for placement along a wall or in the open.
-pub(super) fn furniture(make: &mut Maker, place: Affine3A) {
-    match make.within(0..12) {
-        0 | 1 => table(make, place),
-        2 | 3 => cabinet(make, place),
-        4 | 5 => chair(make, place),
-        6 => sofa(make, place),
-        7 => bed(make, place),
+pub(super) fn furniture(builder: &mut SceneBuilder, transform: Affine3A) {
+    match builder.within(0..12) {
+        0 | 1 => table(builder, transform),
+        2 | 3 => cabinet(builder, transform),
+        4 | 5 => chair(builder, transform),
+        6 => sofa(builder, transform),
+        7 => bed(builder, transform),
         8 => {
-            let height = make.within(1.1..1.8);
-            lamp(make, place, height);
+            let height = builder.within(1.1..1.8);
+            lamp(builder, transform, height);
         }
-        9 => plant(make, place),
+        9 => plant(builder, transform),
         10 => {
-            let size = vec3(make.scaled(0.3, 1.5), make.scaled(0.3, 1.5), make.scaled(0.3, 1.5));
-            let (mesh, material) = (plain(make, size), make.material(Purpose::Thing));
-            make.put(mesh, &material, place);
+            let size = vec3(builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5));
+            let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
+            builder.add_mesh(mesh, &material, transform);
         }
         _ => {
-            let size = vec3(make.within(0.4..1.4), make.within(0.4..1.4), make.within(0.4..1.4));
-            let count = make.within(3..9);
-            heap(make, size, place, count);
+            let size = vec3(builder.within(0.4..1.4), builder.within(0.4..1.4), builder.within(0.4..1.4));
+            let count = builder.within(3..9);
+            heap(builder, size, transform, count);
         }
     }
 }

@@ -88,22 +88,22 @@ impl Tracer {
         let triangles: Vec<Triangle> = faces.iter().map(|face| face.triangle).collect();
         let (tree, places) = Tree::new(&triangles);
         // Positions without a triangle, which no ray hits, get an arbitrary face.
-        let faces = places.iter().map(|place| faces[place.unwrap_or(0)]).collect();
+        let faces = places.iter().map(|slot| faces[slot.unwrap_or(0)]).collect();
         let insides = whole.insides();
         let uvs = whole.uvs;
-        let (lamps, indirect, triangles) = (taking_turns(parts.lamps), vec![], triangles.len());
+        let (lamps, indirect, triangles) = (balance_lamps(parts.lamps), vec![], triangles.len());
         let mut tracer = Tracer { tree, triangles, faces, normals, uvs, indirect, materials, lamps, sky };
-        tracer.indirect = tracer.gathered(&insides);
+        tracer.indirect = tracer.gather_indirect(&insides);
         tracer
     }
 
     /// Returns the radiance that arrives at `origin` from `towards` (unit), for a pixel `spread` radians wide.
-    pub fn look(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> Vec3 {
+    pub fn trace(&self, origin: Vec3, towards: Vec3, spread: f32, choice: SampleChoice) -> Vec3 {
         self.radiance(origin, towards, spread, choice, DEPTH)
     }
 
     /// Returns the distance to the nearest surface in the direction `towards`, at most `limit`.
-    pub fn free(&self, origin: Vec3, towards: Vec3, limit: f32) -> f32 {
+    pub fn free_distance(&self, origin: Vec3, towards: Vec3, limit: f32) -> f32 {
         self.tree.nearest(origin, towards, limit).map_or(limit, |hit| hit.distance)
     }
 
@@ -159,7 +159,7 @@ impl Tracer {
     }
 
     fn surface(&self, origin: Vec3, towards: Vec3, hit: Hit, spread: f32) -> Surface<'_> {
-        let Face { triangle: Triangle { v0, v1, v2 }, vertices, material } = self.faces[hit.place];
+        let Face { triangle: Triangle { v0, v1, v2 }, vertices, material } = self.faces[hit.slot];
         let [a, b, c] = vertices.map(|vertex| vertex as usize);
         let point = origin + hit.distance * towards;
         let cross = Vec3::from((v1 - v0).cross(v2 - v0));
@@ -191,7 +191,7 @@ impl Tracer {
 
     /// Gathers light from the sky and from one other surface at every vertex, starting at the points `insides`. Using the same
     /// directions around each normal makes the errors smooth.
-    fn gathered(&self, insides: &[Vec3]) -> Vec<Vec3> {
+    fn gather_indirect(&self, insides: &[Vec3]) -> Vec<Vec3> {
         let directions: Vec<Vec3> = (0..GATHERED)
             .map(|i| {
                 // Cosine-weighted directions, on a spiral.
@@ -224,7 +224,7 @@ impl Tracer {
 
 /// Reduces the lamps to one, two or four, which the four samples of a pixel use equally often. The third of three lamps becomes two
 /// with half its light. Lamps beyond the fourth are dropped.
-fn taking_turns(mut lamps: Vec<Lamp>) -> Vec<Lamp> {
+fn balance_lamps(mut lamps: Vec<Lamp>) -> Vec<Lamp> {
     lamps.truncate(4);
     if lamps.len() == 3 {
         let half = lamps[2].dimmed(0.5);
@@ -253,7 +253,7 @@ mod tests {
     /// Returns a scene like [`world`], under a sky.
     fn under(sky: Sky, grey: u8, more: impl FnOnce(&mut Parts, &Material)) -> Tracer {
         let texture =
-            Arc::new(Texture::of_picture(&image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]))));
+            Arc::new(Texture::from_image(&image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]))));
         let material = Material::matte(texture);
         let mut parts = Parts::default();
         let floor = Mesh::rectangle(Vec3::new(-5., 0., 5.), Vec3::X * 10., Vec3::Z * -10., 1.);
@@ -265,8 +265,8 @@ mod tests {
     fn seen(tracer: &Tracer, at: Vec3) -> f32 {
         let choice = |turn| SampleChoice { turn, on_lamp: Vec2::splat(0.5) };
         let eye = at + Vec3::new(0.5, 3., 0.5);
-        let look = |turn| tracer.look(eye, (at - eye).normalize(), 1e-3, choice(turn)).x;
-        (0..4).map(look).sum::<f32>() / 4.
+        let trace = |turn| tracer.trace(eye, (at - eye).normalize(), 1e-3, choice(turn)).x;
+        (0..4).map(trace).sum::<f32>() / 4.
     }
 
     /// Returns the linear reflectance of an sRGB byte.
@@ -341,7 +341,7 @@ mod tests {
         let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
         // The ray goes from the mirror down to the floor.
         let mirrored =
-            tracer.look(Vec3::new(0., 1., 0.3), Vec3::new(2., -0.5, 0.).normalize(), 1e-3, choice).x;
+            tracer.trace(Vec3::new(0., 1., 0.3), Vec3::new(2., -0.5, 0.).normalize(), 1e-3, choice).x;
         let floor = seen(&tracer, Vec3::new(0., 0., 0.3));
         assert!(floor > 0.1 && (mirrored / floor - 1.).abs() < 0.02, "{mirrored} {floor}");
     }
@@ -350,7 +350,7 @@ mod tests {
     #[test]
     fn glossy_things_have_highlights() {
         let towards = Vec3::new(1., 1., 0.).normalize();
-        let look = |gloss: f32, eye: Vec3| {
+        let trace = |gloss: f32, eye: Vec3| {
             let tracer = world(0, |parts, material| {
                 parts.lamps.push(Lamp::Sun { towards, spread: 0., colour: Vec3::splat(2.) });
                 let sheet = Mesh::rectangle(Vec3::new(-1., 0.5, 1.), 2. * Vec3::X, -2. * Vec3::Z, 1.);
@@ -358,13 +358,13 @@ mod tests {
             });
             let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
             let at = Vec3::new(0.1, 0.5, 0.2);
-            tracer.look(at + eye, -eye.normalize(), 1e-3, choice).x
+            tracer.trace(at + eye, -eye.normalize(), 1e-3, choice).x
         };
         let mirrored = Vec3::new(-1., 1., 0.);
         let expected = 0.5 * 38. / (8. * PI) * towards.y * 2.;
-        let found = look(0.5, mirrored) - look(0., mirrored);
+        let found = trace(0.5, mirrored) - trace(0., mirrored);
         assert!((found / expected - 1.).abs() < 0.02, "{found}, expected {expected}");
-        assert!(look(0.5, Vec3::new(1., 1., 0.)) < 0.1 * found, "seen from the sun");
+        assert!(trace(0.5, Vec3::new(1., 1., 0.)) < 0.1 * found, "seen from the sun");
     }
 
     #[test]
@@ -379,7 +379,7 @@ mod tests {
         assert!(shadow < 0.3 * lit, "{shadow} {lit}");
         // The lower side of the ball is lit by the floor alone.
         let choice = SampleChoice { turn: 0, on_lamp: Vec2::splat(0.5) };
-        let below = tracer.look(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).x;
+        let below = tracer.trace(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, choice).x;
         assert!(below > 0.1 * lit && below < lit, "{below} {lit}");
     }
 
@@ -388,7 +388,7 @@ mod tests {
         let tracer = world(128, |_, _| {});
         for i in 0..19 * 19 {
             let (a, b) = ((i % 19) as f32 / 2. - 4.5, (i / 19) as f32 / 2. - 4.5);
-            let found = tracer.free(Vec3::new(a, 1., b), Vec3::NEG_Y, 9.);
+            let found = tracer.free_distance(Vec3::new(a, 1., b), Vec3::NEG_Y, 9.);
             assert!((found - 1.).abs() < 1e-5, "a gap at {a}, {b}");
         }
     }
@@ -396,8 +396,8 @@ mod tests {
     #[test]
     fn distances_are_those_of_the_surfaces() {
         let tracer = world(128, |_, _| {});
-        assert!((tracer.free(Vec3::new(0.2, 3., 0.1), Vec3::NEG_Y, 10.) - 3.).abs() < 1e-5);
-        assert_eq!(tracer.free(Vec3::Y, Vec3::Y, 7.), 7.);
-        assert_eq!(tracer.free(Vec3::Y, Vec3::Y, f32::INFINITY), f32::INFINITY);
+        assert!((tracer.free_distance(Vec3::new(0.2, 3., 0.1), Vec3::NEG_Y, 10.) - 3.).abs() < 1e-5);
+        assert_eq!(tracer.free_distance(Vec3::Y, Vec3::Y, 7.), 7.);
+        assert_eq!(tracer.free_distance(Vec3::Y, Vec3::Y, f32::INFINITY), f32::INFINITY);
     }
 }

@@ -26,7 +26,7 @@ pub(super) struct Tree {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hit {
     /// Position of the triangle in the tree.
-    pub place: usize,
+    pub slot: usize,
     pub distance: f32,
 }
 
@@ -72,7 +72,7 @@ impl Tree {
     /// Returns the first triangle from `origin` in the direction `towards` (unit) that is nearer than `limit`.
     pub fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
         let ray = Ray::new(origin, towards);
-        let mut found = Hit { place: usize::MAX, distance: limit };
+        let mut found = Hit { slot: usize::MAX, distance: limit };
         let mut stack = [(0., self.root); STACK];
         let mut count = 1;
         while count > 0 {
@@ -86,7 +86,7 @@ impl Tree {
                 let (distances, mask) = self.leaves[leaf].meet(&ray, found.distance);
                 for lane in lanes(mask) {
                     if distances[lane] < found.distance {
-                        found = Hit { place: WIDTH * leaf + lane, distance: distances[lane] };
+                        found = Hit { slot: WIDTH * leaf + lane, distance: distances[lane] };
                     }
                 }
                 continue;
@@ -105,7 +105,7 @@ impl Tree {
                 count += 1;
             }
         }
-        (found.place != usize::MAX).then_some(found)
+        (found.slot != usize::MAX).then_some(found)
     }
 
     /// Returns `true` if the ray hits any triangle before `limit`.
@@ -277,7 +277,7 @@ mod tests {
     /// The tree finds the same nearest hits as a search over all triangles. The triangles are random, some of them large and some flat
     /// along an axis. The rays are random, too, some of them along an axis.
     #[test]
-    fn rays_find_what_asking_every_triangle_finds() {
+    fn nearest_hit_matches_brute_force() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         for count in [0, 1, 2, 3, 5, 17, 900] {
             let triangles: Vec<Triangle> = (0..count)
@@ -320,7 +320,7 @@ mod tests {
                 assert_eq!(tree.is_blocked(origin, towards, limit), nearest.is_some());
                 if let Some(hit) = found {
                     hits += 1;
-                    let Triangle { v0, v1, v2 } = triangles[places[hit.place].expect("a triangle")];
+                    let Triangle { v0, v1, v2 } = triangles[places[hit.slot].expect("a triangle")];
                     let (point, normal) =
                         (Vec3A::from(origin + hit.distance * towards), (v1 - v0).cross(v2 - v0));
                     assert!((point - v0).dot(normal.normalize()).abs() < 1e-3, "it isn't there");

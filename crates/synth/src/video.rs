@@ -1,11 +1,11 @@
 //! A synthetic scene and a video of it.
 
 use super::light::Sky;
-use super::maker::Maker;
+use super::scene_builder::SceneBuilder;
 use super::sensor::{Hash, Sensor};
 use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
-use super::walk::{Exhibit, Place, walk};
+use super::walk::{CameraSpace, Exhibit, walk};
 use super::{open, room, things};
 use glam::{DMat4, Vec2, Vec3, vec2, vec3};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics};
@@ -60,14 +60,14 @@ impl Video {
     }
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
-        let mut make = Maker::new(random, settings.pictures.clone());
-        let (place, exhibit, sky) = world(&mut make);
-        let tracer = Tracer::new(std::mem::take(&mut make.parts), sky);
-        let poses = walk(&mut make, &tracer, place, exhibit, settings.frames)?;
-        let cameras = cameras(&mut make, poses, settings.size);
+        let mut builder = SceneBuilder::new(random, settings.pictures.clone());
+        let (place, exhibit, sky) = world(&mut builder);
+        let tracer = Tracer::new(std::mem::take(&mut builder.parts), sky);
+        let poses = walk(&mut builder, &tracer, place, exhibit, settings.frames)?;
+        let cameras = cameras(&mut builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
-        let sensor = Sensor::draw(&mut make, seen);
-        let seed = make.within(0..u32::MAX);
+        let sensor = Sensor::draw(&mut builder, seen);
+        let seed = builder.within(0..u32::MAX);
         Some(Video { tracer, sensor, cameras, seed })
     }
 
@@ -98,7 +98,7 @@ impl Video {
                 let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
                 let on_lamp = vec2(random.uniform(), random.uniform());
                 let choice = SampleChoice { turn: sample as usize, on_lamp };
-                let radiance = self.tracer.look(eye, towards(camera, at), spread, choice);
+                let radiance = self.tracer.trace(eye, towards(camera, at), spread, choice);
                 // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
                 light += radiance.min(Vec3::splat(8.));
             }
@@ -117,7 +117,7 @@ impl Video {
         let rows = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
         rows.map(|(x, y)| {
             let ray = towards(camera, vec2(x as f32 + 0.5, y as f32 + 0.5));
-            self.tracer.free(eye, ray, f32::INFINITY) * ray.dot(axis)
+            self.tracer.free_distance(eye, ray, f32::INFINITY) * ray.dot(axis)
         })
         .collect()
     }
@@ -131,29 +131,29 @@ impl fmt::Debug for Video {
 }
 
 /// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
-fn world(make: &mut Maker) -> (Place, Option<Exhibit>, Sky) {
-    let mut sky = open::sky(make);
-    let place = match make.within(0..100) {
-        0..55 => room::room(make, &mut sky),
-        55..75 => room::box_of_shapes(make, &mut sky),
-        _ => open::landscape(make, &sky),
+fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<Exhibit>, Sky) {
+    let mut sky = open::sky(builder);
+    let place = match builder.within(0..100) {
+        0..55 => room::room(builder, &mut sky),
+        55..75 => room::box_of_shapes(builder, &mut sky),
+        _ => open::landscape(builder, &sky),
     };
-    let exhibit = make.chance(EXHIBITS).then(|| match place.walls {
-        Some(behind) if make.chance(HUNG) => {
-            let (spot, front) = on_a_wall(make, place, behind);
-            things::hung(make, spot, front)
+    let exhibit = builder.chance(EXHIBITS).then(|| match place.walls {
+        Some(behind) if builder.chance(HUNG) => {
+            let (spot, front) = on_a_wall(builder, place, behind);
+            things::hung(builder, spot, front)
         }
-        _ => things::exhibit(make, (0.5 * (place.least + place.most)).with_y(0.)),
+        _ => things::exhibit(builder, (0.5 * (place.least + place.most)).with_y(0.)),
     });
     (place, exhibit, sky)
 }
 
 /// Returns a position on a wall, and the direction away from the wall.
-fn on_a_wall(make: &mut Maker, place: Place, behind: f32) -> (Vec3, Vec3) {
+fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Vec3, Vec3) {
     let (least, most) = (place.least - behind, place.most + behind);
-    let share = vec3(make.within(0.2..0.8), make.within(0.3..0.75), make.within(0.2..0.8));
+    let share = vec3(builder.within(0.2..0.8), builder.within(0.3..0.75), builder.within(0.2..0.8));
     let spot = least + share * (most - least);
-    match make.within(0..4) {
+    match builder.within(0..4) {
         0 => (spot.with_x(least.x), Vec3::X),
         1 => (spot.with_x(most.x), Vec3::NEG_X),
         2 => (spot.with_z(least.z), Vec3::Z),
@@ -161,9 +161,9 @@ fn on_a_wall(make: &mut Maker, place: Place, behind: f32) -> (Vec3, Vec3) {
     }
 }
 
-fn cameras(make: &mut Maker, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
+fn cameras(builder: &mut SceneBuilder, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
     let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = f64::from(make.scaled(0.55, 1.6)) * width.min(height);
+    let focal = f64::from(builder.scaled(0.55, 1.6)) * width.min(height);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
     let camera = |c2w| Camera { intrinsics, c2w, width: size.width, height: size.height };
     poses.into_iter().map(camera).collect()
@@ -191,7 +191,7 @@ fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
             let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
             let at = cell * vec2(camera.width as f32, camera.height as f32);
             let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
-            let radiance = tracer.look(eye, towards(camera, at), 0.05, choice);
+            let radiance = tracer.trace(eye, towards(camera, at), 0.05, choice);
             sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
         }
     }

@@ -1,7 +1,7 @@
 //! Camera paths of synthetic videos: walks, dollies, orbits and flights through free space, with the motion of a hand-held camera.
 
-use super::maker::Maker;
 use super::noise::Noise;
+use super::scene_builder::SceneBuilder;
 use super::tracer::Tracer;
 use glam::{DMat4, DVec3, DVec4, Vec3, vec3};
 
@@ -14,7 +14,7 @@ const WIDE: f32 = 1.8;
 
 /// Space where cameras may be.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct CameraSpace {
     /// Minimum corner of the bounding box; `most` is the maximum corner.
     pub least: Vec3,
     pub most: Vec3,
@@ -59,7 +59,7 @@ struct Path {
 
 impl Path {
     /// Creates a path that stays at the origin, with the shake of a hand-held camera.
-    fn by_hand(make: &mut Maker) -> Self {
+    fn by_hand(builder: &mut SceneBuilder) -> Self {
         Path {
             start: Vec3::ZERO,
             target: Vec3::ZERO,
@@ -67,10 +67,10 @@ impl Path {
             motion: Vec3::ZERO,
             orbit: 0.,
             swing: (Vec3::ZERO, 0.),
-            shake: (make.scaled(0.002, 0.04), make.within(2. ..8.)),
-            roll: (make.within(-0.04..0.04), make.within(-0.04..0.04)),
+            shake: (builder.scaled(0.002, 0.04), builder.within(2. ..8.)),
+            roll: (builder.within(-0.04..0.04), builder.within(-0.04..0.04)),
             wide: WIDE,
-            noise: make.noise(),
+            noise: builder.noise(),
         }
     }
 
@@ -93,9 +93,9 @@ impl Path {
 /// Returns camera-to-world poses of `frames` images, x right, y down, z forward, or `None` if there is no free path. If there is an
 /// exhibit, most paths orbit it.
 pub(super) fn walk(
-    make: &mut Maker,
+    builder: &mut SceneBuilder,
     tracer: &Tracer,
-    place: Place,
+    place: CameraSpace,
     exhibit: Option<Exhibit>,
     frames: usize,
 ) -> Option<Vec<DMat4>> {
@@ -103,8 +103,8 @@ pub(super) fn walk(
         // Paths get shorter with every attempt.
         let patience = 1. - attempt as f32 / TRIES as f32;
         let path = match exhibit {
-            Some(exhibit) if make.chance(0.85) => Some(around(make, exhibit, place, patience)),
-            _ => through(make, tracer, place, patience),
+            Some(exhibit) if builder.chance(0.85) => Some(around(builder, exhibit, place, patience)),
+            _ => through(builder, tracer, place, patience),
         };
         if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
             let last = frames.max(2) - 1;
@@ -115,43 +115,45 @@ pub(super) fn walk(
 }
 
 /// Creates a hand-held path around an object, from a short distance.
-fn around(make: &mut Maker, exhibit: Exhibit, place: Place, patience: f32) -> Path {
+fn around(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, patience: f32) -> Path {
     let Exhibit { middle, radius, front } = exhibit;
-    let away = 1.2 * radius + make.scaled(0.3, 2.);
-    let height = (middle.y + make.within(-0.4..0.9) * away).max(place.least.y + 0.2);
-    let side = make.one_of(&[-1., 1.]);
+    let away = 1.2 * radius + builder.scaled(0.3, 2.);
+    let height = (middle.y + builder.within(-0.4..0.9) * away).max(place.least.y + 0.2);
+    let side = builder.one_of(&[-1., 1.]);
     let (from, orbit) = match front {
         // Move from one side in front of the wall to the other.
         Some(_) => {
-            let from = make.within(0.2..1.2);
-            (side * from, -side * (from + make.within(0.2..1.2)))
+            let from = builder.within(0.2..1.2);
+            (side * from, -side * (from + builder.within(0.2..1.2)))
         }
-        None => (make.turn(), side * make.scaled(0.8, 6.)),
+        None => (builder.turn(), side * builder.scaled(0.8, 6.)),
     };
-    let wander = |make: &mut Maker| make.within(-0.3..0.3) * patience * away;
+    let wander = |builder: &mut SceneBuilder| builder.within(-0.3..0.3) * patience * away;
     Path {
         start: (middle + away * turned(front.unwrap_or(Vec3::X), from)).with_y(height),
         target: middle,
-        target_motion: 0.2 * radius * make.direction(),
-        motion: vec3(wander(make), wander(make), wander(make)),
+        target_motion: 0.2 * radius * builder.direction(),
+        motion: vec3(wander(builder), wander(builder), wander(builder)),
         orbit: patience * orbit,
         // Some paths also view the object from below and from above.
-        swing: (Vec3::Y * away * patience * make.scaled(0.02, 0.7), make.within(2. ..9.)),
+        swing: (Vec3::Y * away * patience * builder.scaled(0.02, 0.7), builder.within(2. ..9.)),
         wide: away,
-        ..Path::by_hand(make)
+        ..Path::by_hand(builder)
     }
 }
 
 /// Creates a path past the objects of the scene.
-fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Option<Path> {
+fn through(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, patience: f32) -> Option<Path> {
     // Choose the standpoint with the widest view among several, as photographers do.
-    let views: Vec<(Vec3, Vec3)> = (0..make.within(1..6)).map(|_| standpoint(make, tracer, place)).collect();
+    let views: Vec<(Vec3, Vec3)> =
+        (0..builder.within(1..6)).map(|_| standpoint(builder, tracer, place)).collect();
     let width = |&(start, towards): &(Vec3, Vec3)| {
         let (right, up) =
             (towards.cross(Vec3::Y).normalize(), towards.cross(Vec3::Y).cross(towards).normalize());
         let rays = [(0., 0.), (0.3, 0.), (-0.3, 0.), (0., -0.3), (0.3, -0.3), (-0.3, -0.3)];
-        let depth =
-            |(x, y): (f32, f32)| tracer.free(start, (towards + x * right + y * up).normalize(), 20.).ln();
+        let depth = |(x, y): (f32, f32)| {
+            tracer.free_distance(start, (towards + x * right + y * up).normalize(), 20.).ln()
+        };
         rays.map(depth).iter().sum::<f32>() / rays.len() as f32
     };
     let widths = views.iter().map(|view| (width(view), *view));
@@ -161,60 +163,61 @@ fn through(make: &mut Maker, tracer: &Tracer, place: Place, patience: f32) -> Op
         return None;
     }
     let (right, up) = (towards.cross(Vec3::Y).normalize(), Vec3::Y);
-    let length = patience * depth.min(8.) * make.scaled(0.25, 1.6);
-    let sign = make.one_of(&[-1., 1.]);
+    let length = patience * depth.min(8.) * builder.scaled(0.25, 1.6);
+    let sign = builder.one_of(&[-1., 1.]);
     let mut path = Path {
         start,
-        target: start + depth * make.within(0.6..1.2) * towards,
+        target: start + depth * builder.within(0.6..1.2) * towards,
         swing: (
-            right * length * make.within(0. ..0.12) + up * length * make.within(0. ..0.05),
-            make.within(2. ..9.),
+            right * length * builder.within(0. ..0.12) + up * length * builder.within(0. ..0.05),
+            builder.within(2. ..9.),
         ),
-        ..Path::by_hand(make)
+        ..Path::by_hand(builder)
     };
-    match make.within(0..10) {
+    match builder.within(0..10) {
         // Forwards or backwards, as in walks and real-estate videos.
         0..4 => {
-            let way = if make.chance(0.8) { towards } else { -towards };
-            path.motion = length * (way.with_y(0.2 * way.y) + make.within(-0.5..0.5) * right);
-            path.target_motion = path.motion * make.within(0.3..1.) + right * make.within(-0.3..0.3) * length;
+            let way = if builder.chance(0.8) { towards } else { -towards };
+            path.motion = length * (way.with_y(0.2 * way.y) + builder.within(-0.5..0.5) * right);
+            path.target_motion =
+                path.motion * builder.within(0.3..1.) + right * builder.within(-0.3..0.3) * length;
         }
         // Sideways, as on rails.
         4..7 => {
-            path.motion = length * (sign * right + make.within(-0.3..0.3) * towards);
-            path.target_motion = path.motion * make.within(0.2..1.1);
+            path.motion = length * (sign * right + builder.within(-0.3..0.3) * towards);
+            path.target_motion = path.motion * builder.within(0.2..1.1);
         }
         // Orbit around a point.
-        7 | 8 => path.orbit = sign * patience * make.within(0.3..2.),
+        7 | 8 => path.orbit = sign * patience * builder.within(0.3..2.),
         // Free flight in any direction.
         _ => {
             path.motion = length
-                * (make.within(-0.5..0.5) * up
-                    + make.within(-0.7..0.7) * right
-                    + make.within(-0.5..0.5) * towards);
-            path.target_motion = make.within(0. ..0.6) * path.motion;
+                * (builder.within(-0.5..0.5) * up
+                    + builder.within(-0.7..0.7) * right
+                    + builder.within(-0.5..0.5) * towards);
+            path.target_motion = builder.within(0. ..0.6) * path.motion;
         }
     }
     // Additional rotation along the path.
-    if make.chance(0.35) {
-        path.target_motion += sign * right * depth * patience * make.within(0.2..1.2);
+    if builder.chance(0.35) {
+        path.target_motion += sign * right * depth * patience * builder.within(0.2..1.2);
     }
     Some(path)
 }
 
 /// Returns the position of a standing or flying camera, and its viewing direction.
-fn standpoint(make: &mut Maker, tracer: &Tracer, place: Place) -> (Vec3, Vec3) {
-    let Place { least, most, eye, .. } = place;
-    let start = least + (most - least) * vec3(make.within(0. ..1.), 0., make.within(0. ..1.));
-    let below = tracer.free(start.with_y(most.y), Vec3::NEG_Y, 40.);
-    let is_flight = make.chance(0.12);
+fn standpoint(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace) -> (Vec3, Vec3) {
+    let CameraSpace { least, most, eye, .. } = place;
+    let start = least + (most - least) * vec3(builder.within(0. ..1.), 0., builder.within(0. ..1.));
+    let below = tracer.free_distance(start.with_y(most.y), Vec3::NEG_Y, 40.);
+    let is_flight = builder.chance(0.12);
     let height =
-        if is_flight { make.within(eye.1..most.y.max(eye.1 + 0.1)) } else { make.within(eye.0..eye.1) };
+        if is_flight { builder.within(eye.1..most.y.max(eye.1 + 0.1)) } else { builder.within(eye.0..eye.1) };
     let start = start.with_y(((most.y - below).max(0.) + height).min(most.y));
     // Look mostly towards the middle of the scene, horizontally or slightly down.
     let middle = (0.5 * (least + most) - start).with_y(0.).normalize_or(Vec3::X);
-    let turn = make.within(-1f32..1.) * make.one_of(&[0.6, 1.2, 3.1]);
-    let pitch = if is_flight { make.within(-0.8..-0.05) } else { make.within(-0.35..0.15) };
+    let turn = builder.within(-1f32..1.) * builder.one_of(&[0.6, 1.2, 3.1]);
+    let pitch = if is_flight { builder.within(-0.8..-0.05) } else { builder.within(-0.35..0.15) };
     (start, (turned(middle, turn) + pitch * Vec3::Y).normalize())
 }
 
@@ -225,7 +228,7 @@ fn turned(v: Vec3, angle: f32) -> Vec3 {
 }
 
 /// Returns `true` if nothing blocks the path and every image shows something.
-fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
+fn is_free(path: &Path, tracer: &Tracer, place: CameraSpace, patience: f32) -> bool {
     let margin = place.roomy * (0.3 + 0.7 * patience);
     let mut before: Option<Vec3> = None;
     (0..=CHECKED).all(|i| {
@@ -233,14 +236,14 @@ fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
         let towards = towards.normalize();
         let inside = at.cmpge(place.least).all() && at.cmple(place.most).all();
         let sides = [Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z];
-        let is_roomy = || sides.iter().all(|&side| tracer.free(at, side, margin) >= margin);
+        let is_roomy = || sides.iter().all(|&side| tracer.free_distance(at, side, margin) >= margin);
         let right = towards.cross(Vec3::Y).normalize_or(Vec3::X);
         let up = right.cross(towards);
         // Reject views directly in front of a surface, and images that show nothing but one.
         let sees = || {
             let depths = [(0., 0.), (0.4, 0.), (-0.4, 0.), (0., 0.4), (0., -0.4)].map(|(x, y)| {
                 let ray = (towards + x * right + y * up).normalize();
-                tracer.free(at, ray, 2. * path.wide)
+                tracer.free_distance(at, ray, 2. * path.wide)
             });
             let least = depths.into_iter().fold(f32::INFINITY, f32::min);
             least > 1.6 * margin && depths.iter().sum::<f32>() > depths.len() as f32 * patience * path.wide
@@ -248,7 +251,7 @@ fn is_free(path: &Path, tracer: &Tracer, place: Place, patience: f32) -> bool {
         let is_open = before.is_none_or(|from| {
             let way = at - from;
             let length = way.length();
-            length < 1e-6 || tracer.free(from, way / length, length) >= length
+            length < 1e-6 || tracer.free_distance(from, way / length, length) >= length
         });
         before = Some(at);
         inside && is_open && is_roomy() && sees()
@@ -273,13 +276,13 @@ mod tests {
 
     #[test]
     fn things_are_seen_from_below_and_above_and_from_before_their_wall() {
-        let mut make = Maker::new(ChaCha8Rng::seed_from_u64(1), vec![]);
+        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![]);
         let (least, most) = (Vec3::splat(-9.), Vec3::splat(9.));
-        let place = Place { least, most, eye: (1., 2.), roomy: 0.3, walls: Some(0.3) };
+        let place = CameraSpace { least, most, eye: (1., 2.), roomy: 0.3, walls: Some(0.3) };
         let (mut up_and_down, mut before) = (0, 0);
         for i in 0..400 {
             let front = (i % 2 == 0).then_some(Vec3::X);
-            let path = around(&mut make, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
+            let path = around(&mut builder, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
             let seen: Vec<(Vec3, Vec3, f32)> = (0..=16).map(|i| path.at(i as f32 / 16.)).collect();
             let pitches = seen.iter().map(|(_, towards, _)| towards.normalize().y.asin());
             let (lowest, highest) = pitches.fold((f32::MAX, f32::MIN), |(a, b), y| (a.min(y), b.max(y)));

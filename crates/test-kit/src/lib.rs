@@ -32,7 +32,7 @@ fn variable(name: &str) -> Option<OsString> {
 
 /// Runs the test `name` of the current test binary again, by itself and with the environment `variables`; returns `true` if it
 /// passes, and what it was skipped for.
-pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
+pub fn rerun_test(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
     let skipped = tempfile::NamedTempFile::new().expect("a file");
     let output = Command::new(std::env::current_exe().expect("a program"))
         .args([name, "--exact"])
@@ -48,7 +48,7 @@ pub fn again(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
 
 /// Returns the folder that `variable` names, else `../shared/<name>` beside the repository; if it doesn't exist, skips the test because `what` is
 /// missing.
-fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
+fn find_external_folder(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     let path = match std::env::var_os(variable) {
         Some(path) => PathBuf::from(path),
         None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared").join(name),
@@ -56,18 +56,18 @@ fn outside(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     if path.is_dir() {
         return Some(path);
     }
-    skip(what, &format!("{} is not there; set {variable}", path.display()));
+    skip(what, &format!("{} is missing; set {variable}", path.display()));
     None
 }
 
 /// Returns the folder of golden tensors.
 pub fn golden() -> Option<PathBuf> {
-    outside("GLOBALSPLAT_GOLDEN", "golden", "golden tensors")
+    find_external_folder("GLOBALSPLAT_GOLDEN", "golden", "golden tensors")
 }
 
 /// Returns real captures, at least one: folders with `cameras.json` and a published `reference.ply` under `re10k`.
 pub fn captures() -> Option<Vec<PathBuf>> {
-    let root = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?;
+    let root = find_external_folder("GLOBALSPLAT_CAPTURES", "data", "captures")?;
     let root = if root.join("re10k").is_dir() { root.join("re10k") } else { root };
     let mut captures: Vec<PathBuf> = std::fs::read_dir(&root)
         .expect("a readable folder")
@@ -84,10 +84,10 @@ pub fn captures() -> Option<Vec<PathBuf>> {
 
 /// Returns a real capture with a `transforms.json` and a distorting lens, under `nerfstudio`.
 pub fn fox() -> Option<PathBuf> {
-    let fox = outside("GLOBALSPLAT_CAPTURES", "data", "captures")?.join("nerfstudio/fox");
+    let fox = find_external_folder("GLOBALSPLAT_CAPTURES", "data", "captures")?.join("nerfstudio/fox");
     if fox.is_dir() {
         return Some(fox);
     }
-    skip("captures", &format!("{} is not there", fox.display()));
+    skip("captures", &format!("{} is missing", fox.display()));
     None
 }

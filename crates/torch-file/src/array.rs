@@ -31,7 +31,7 @@ impl Array {
         let plain = || "is no plain tensor".to_string();
         let &Value::Storage { dtype, key } = values.get(storage) else { return Err(plain()) };
         let storage = storages.get(key);
-        let storage = storage.ok_or_else(|| format!("asks for data/{key}, which is not there"))?;
+        let storage = storage.ok_or_else(|| format!("asks for data/{key}, which is missing"))?;
         let offset = number(values, offset).ok_or_else(plain)?;
         let shape = numbers(values, size).ok_or_else(plain)?;
         let strides = numbers(values, stride).ok_or_else(plain)?;

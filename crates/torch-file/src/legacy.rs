@@ -31,7 +31,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
     unpickle(&mut rest, UnknownGlobals::Refuse)?;
     let version = unpickle(&mut rest, UnknownGlobals::Refuse)?;
     if version.get(version.root) != &Value::Int(VERSION) {
-        return Err("of a version that nobody knows".into());
+        return Err("of an unknown version".into());
     }
     let system = unpickle(&mut rest, UnknownGlobals::Refuse)?;
     let Value::Dict(items) = system.get(system.root) else {

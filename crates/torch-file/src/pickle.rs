@@ -83,9 +83,9 @@ impl<'a> Machine<'a> {
     fn pop(&mut self) -> Result<Id, String> {
         // An instruction may not pop values below the last mark.
         if self.marks.last().is_some_and(|&mark| self.stack.len() <= mark) {
-            return Err("a pickle that takes what isn't there".into());
+            return Err("a pickle that pops from an empty stack".into());
         }
-        self.stack.pop().ok_or("a pickle that takes what isn't there".into())
+        self.stack.pop().ok_or("a pickle that pops from an empty stack".into())
     }
 
     /// Pops the values above the last mark.
@@ -125,7 +125,7 @@ impl<'a> Machine<'a> {
     }
 
     fn remember(&mut self, id: usize) -> Result<(), String> {
-        let &top = self.stack.last().ok_or("a pickle that takes what isn't there")?;
+        let &top = self.stack.last().ok_or("a pickle that pops from an empty stack")?;
         match id.cmp(&self.memo.len()) {
             std::cmp::Ordering::Less => self.memo[id] = top,
             std::cmp::Ordering::Equal => self.memo.push(top),
@@ -138,7 +138,7 @@ impl<'a> Machine<'a> {
 
     fn recall(&mut self, id: usize) -> Result<(), String> {
         let value =
-            self.memo.get(id).ok_or_else(|| format!("a pickle that recalls memo {id}, which is not there"));
+            self.memo.get(id).ok_or_else(|| format!("a pickle that recalls memo {id}, which is missing"));
         self.stack.push(*value?);
         Ok(())
     }

@@ -75,12 +75,12 @@ fn data_of_unknown_classes_are_kept() {
 #[test]
 fn unsound_pickles_are_refused() {
     assert_refused(b"\x80\x02]r\xff\xff\xff\xff.", BOTH, "memo 4294967295");
-    assert_refused(b"\x80\x02h\x00.", BOTH, "recalls memo 0, which is not there");
+    assert_refused(b"\x80\x02h\x00.", BOTH, "recalls memo 0, which is missing");
     assert_refused(b"\x80\x02}K\x01a.", BOTH, "appends to a dict");
     assert_refused(b"\x80\x02](X\x01\x00\x00\x00aNu.", BOTH, "sets items of a list");
     assert_refused(b"\x80\x02}(X\x01\x00\x00\x00au.", BOTH, "a key without a value");
-    assert_refused(b"\x80\x02a.", BOTH, "takes what isn't there");
-    assert_refused(b"\x80\x02K\x01(0.", BOTH, "takes what isn't there");
+    assert_refused(b"\x80\x02a.", BOTH, "pops from an empty stack");
+    assert_refused(b"\x80\x02K\x01(0.", BOTH, "pops from an empty stack");
     assert_refused(b"\x80\x02t.", BOTH, "without a mark");
     assert_refused(b"\x80\x02K\x01K\x02.", BOTH, "ends with 2 values");
     assert_refused(b"\x80\x02X\xff\xff\xff\x7fabc.", BOTH, "cut off");
@@ -153,7 +153,7 @@ fn tensors_stay_inside_their_storages() {
     assert_eq!(locate("0", 2, &[3, 2], &[4, 1]).unwrap().bytes, 108..148);
     assert_eq!(locate("0", 0, &[16], &[1]).unwrap().bytes, 100..164);
     for (key, offset, size, stride, found) in [
-        ("1", 0, [1].as_slice(), [1].as_slice(), "asks for data/1, which is not there"),
+        ("1", 0, [1].as_slice(), [1].as_slice(), "asks for data/1, which is missing"),
         ("0", 0, &[17], &[1], "reaches beyond its data of 64 bytes"),
         ("0", 15, &[2], &[1], "reaches beyond its data of 64 bytes"),
         ("0", 1 << 30, &[2], &[1], "reaches beyond its data of 64 bytes"),

@@ -2,7 +2,7 @@
 
 use super::super::progress::{self, Progress};
 use super::super::signals::StopRequest;
-use super::super::{memory, model, open_capture, say_shrunk, splat_out, warn};
+use super::super::{memory, model, open_capture, report_downscaling, splat_out, warn};
 use super::report::print_result;
 use anyhow::Result;
 use globalsplat::data::Capture;
@@ -70,11 +70,11 @@ impl RefineJob {
             }
         };
         let bar = Bar { bar: bar_of(&self.options.budget), budget: self.options.budget, clock };
-        let watch = |event: RefineEvent| {
+        let on_event = |event: RefineEvent| {
             bar.tell(event);
             !stop.is_requested()
         };
-        let mut session = RefineSession::load(&capture, &self.options, watch)?;
+        let mut session = RefineSession::load(&capture, &self.options, on_event)?;
         // Depths of a subset of the photos are enough for an initial splat, too.
         stop.set_ends_at_once(matches!(initial, Initial::Model(_)));
         let gaussians = session.start(initial)?;
@@ -97,7 +97,7 @@ impl RefineJob {
             if stop.is_requested() {
                 eprintln!("{}: stopped before it was written", sheet.display());
             } else {
-                say_shrunk(sheet, session.contact_sheet(&result)?.write(sheet)?);
+                report_downscaling(sheet, session.contact_sheet(&result)?.write(sheet)?);
             }
         }
         let lpips = if self.lpips { session.score_lpips(&result)? } else { None };
@@ -131,7 +131,7 @@ struct Bar {
 fn bar_of(budget: &Budget) -> Progress {
     match *budget {
         Budget::Steps(steps) => progress::bar(steps, "steps"),
-        Budget::Time(time) => progress::seconds_of(time),
+        Budget::Time(time) => progress::time_bar(time),
     }
 }
 

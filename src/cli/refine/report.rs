@@ -57,13 +57,13 @@ pub fn print_result(
     if let [Some(before), Some(after)] = distances {
         println!("LPIPS (VGG) {before:.4} before, {after:.4} after");
     }
-    if let Some(line) = told_of(corrections) {
+    if let Some(line) = describe_corrections(corrections) {
         println!("{line}");
     }
 }
 
 /// Describes the largest learned corrections in one line, or returns `None` if there are none.
-fn told_of(corrected: &[Correction]) -> Option<String> {
+fn describe_corrections(corrected: &[Correction]) -> Option<String> {
     let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
     let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);
     Some(format!(

@@ -168,10 +168,10 @@ impl Render {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         let frames = self.frames.map(|frames| frames as usize);
         let shots = match (&self.path, capture) {
-            (Some(path), _) => Shots::along(path, size, frames, renderer)?,
-            (None, Some(capture)) if self.orbit => Shots::amid(capture, size, frames, renderer)?,
-            (None, Some(capture)) => Shots::of(capture, size, frames, renderer, &self.suffixes())?,
-            (None, None) => Shots::around(gaussians, origin, size, frames),
+            (Some(path), _) => Shots::from_path(path, size, frames, renderer)?,
+            (None, Some(capture)) if self.orbit => Shots::orbit_capture(capture, size, frames, renderer)?,
+            (None, Some(capture)) => Shots::from_capture(capture, size, frames, renderer, &self.suffixes())?,
+            (None, None) => Shots::orbit_splat(gaussians, origin, size, frames),
         };
         Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }

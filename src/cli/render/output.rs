@@ -1,6 +1,6 @@
 //! Output of rendered images, one by one.
 
-use super::super::say_shrunk;
+use super::super::report_downscaling;
 use globalsplat::error::{Error, Result};
 use globalsplat::io::{
     InputFiles, Mosaic, VideoWriter, check_regular, check_writable_dir, check_writable_file, is_png_name,
@@ -95,7 +95,7 @@ impl<'a> Output<'a> {
         match self {
             Output::Folder { files, .. } => Ok(files.into_iter().flatten().collect()),
             Output::Row(path, mosaic) => {
-                say_shrunk(path, mosaic.shrunk_by());
+                report_downscaling(path, mosaic.shrunk_by());
                 mosaic.write(path)?;
                 Ok(vec![path.to_owned()])
             }

@@ -28,7 +28,7 @@ pub struct Shots {
 impl Shots {
     /// Returns the capture's cameras, or `frames` of them on a smooth path through these. Names of images stay unique with
     /// `suffixes`.
-    pub fn of(
+    pub fn from_capture(
         capture: &Capture,
         size: Option<ImageSize>,
         frames: Option<usize>,
@@ -38,13 +38,13 @@ impl Shots {
         let cameras = resized(capture.cameras(), size);
         Ok(match frames {
             Some(frames) => Shots::numbered(smoothed(&cameras, frames, renderer)?),
-            None => Shots { names: capture.picture_names_with(suffixes), ..Shots::numbered(cameras) },
+            None => Shots { names: capture.render_names_with(suffixes), ..Shots::numbered(cameras) },
         })
     }
 
     /// Returns cameras on an orbit around the mean of the capture's cameras, all looking at the point that the mean camera
     /// looks at.
-    pub fn amid(
+    pub fn orbit_capture(
         capture: &Capture,
         size: Option<ImageSize>,
         frames: Option<usize>,
@@ -57,7 +57,7 @@ impl Shots {
     }
 
     /// Returns cameras on an orbit around `gaussians`, whose means are relative to `origin`.
-    pub fn around(
+    pub fn orbit_splat(
         gaussians: &Gaussians,
         origin: DVec3,
         size: Option<ImageSize>,
@@ -68,7 +68,7 @@ impl Shots {
     }
 
     /// Returns the cameras at `path`, or `frames` of them on a smooth path through these.
-    pub fn along(
+    pub fn from_path(
         path: &Path,
         size: Option<ImageSize>,
         frames: Option<usize>,

@@ -13,13 +13,13 @@ use serde::Serialize;
 /// Maximum length of a photo's longer side, in pixels.
 const LONGEST: u32 = 640;
 /// Maximum number of photos, at about 100 KB each: a page with more would take long to load.
-const MOST_PHOTOS: usize = 100;
+const MAX_PHOTOS: usize = 100;
 /// Number and size of views on an orbit around a splat without a capture.
 const ORBIT: usize = 24;
 const SIZE: ImageSize = ImageSize { width: 640, height: 480 };
 /// Number of frames per camera on the path through the capture's cameras. The page interpolates linearly between them.
 const FRAMES_PER_CAMERA: usize = 12;
-const MOST_FRAMES: usize = 1200;
+const MAX_FRAMES: usize = 1200;
 /// Length of a camera's frustum, as a share of the distance to the scene.
 const FRUSTUM: f64 = 0.06;
 
@@ -67,7 +67,7 @@ impl Contents {
     ///
     /// # Errors
     /// Photos that can't be read.
-    pub fn of(
+    pub fn new(
         name: &str,
         gaussians: &Gaussians,
         capture: Option<&Capture>,
@@ -78,13 +78,13 @@ impl Contents {
             None => {
                 let orbit = orbit_around_gaussians(gaussians, DVec3::ZERO, SIZE, ORBIT);
                 let named =
-                    (1_usize..).zip(&orbit).map(|(i, camera)| PageCamera::of(i.to_string(), camera, None));
+                    (1_usize..).zip(&orbit).map(|(i, camera)| PageCamera::new(i.to_string(), camera, None));
                 (named.collect(), orbit)
             }
         };
         let distance = SplatRenderer::from_gaussians(gaussians, DVec3::ZERO).median_depth(&all)?;
         let path = match capture {
-            Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MOST_FRAMES))?,
+            Some(_) => smooth_path(&all, distance, (FRAMES_PER_CAMERA * all.len()).min(MAX_FRAMES))?,
             None => [&all[..], &all[..1]].concat(),
         };
         let up = -all.iter().map(|camera| camera.c2w.y_axis.truncate()).sum::<DVec3>();
@@ -101,7 +101,7 @@ impl Contents {
 }
 
 impl PageCamera {
-    fn of(name: String, camera: &Camera, photo: Option<String>) -> Self {
+    fn new(name: String, camera: &Camera, photo: Option<String>) -> Self {
         let k = camera.intrinsics;
         let Camera { width, height, .. } = *camera;
         let lens = Lens { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height };
@@ -114,15 +114,15 @@ fn rows(camera: &Camera) -> [f64; 12] {
     std::array::from_fn(|i| camera.c2w.col(i % 4)[i / 4])
 }
 
-/// Returns cameras with their photos, at most [`MOST_PHOTOS`] evenly spaced over the capture.
+/// Returns cameras with their photos, at most [`MAX_PHOTOS`] evenly spaced over the capture.
 fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>> {
-    let (count, cameras) = (capture.len().min(MOST_PHOTOS), capture.cameras());
+    let (count, cameras) = (capture.len().min(MAX_PHOTOS), capture.cameras());
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
         let view = load_views(capture, &[index], shrunk(&cameras[index]))?.remove(0);
         let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
         let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
-        Ok(PageCamera::of(view.name, &frame.camera_to_local(&view.camera), Some(photo)))
+        Ok(PageCamera::new(view.name, &frame.camera_to_local(&view.camera), Some(photo)))
     };
     indices.map(photographed).collect()
 }

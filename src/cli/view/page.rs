@@ -62,7 +62,7 @@ pub fn write_page(
 ) -> Result<()> {
     let frame = gaussians.local_frame(origin);
     let local = gaussians.to_local(&frame, origin);
-    let contents = Contents::of(name, &local, capture, &frame)?;
+    let contents = Contents::new(name, &local, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
     let text = page(&contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?)?.into_string();
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
@@ -103,7 +103,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                     input #share type="range" min="0" max="1" step="any" value="0" aria-label="Photo to the left, picture to the right";
                 }
                 p #message role="status" { "Loading the scene…" }
-                noscript { p { "This page needs JavaScript, its own alone." } }
+                noscript { p { "This page needs JavaScript; it loads none from elsewhere." } }
                 header {
                     h1 { (contents.name) }
                     nav aria-label="View" {

@@ -49,7 +49,7 @@ fn page(nonce: &str) -> Markup {
                             p.fine #progress-words {}
                         }
                     }
-                    noscript { p { "This page needs JavaScript, its own alone." } }
+                    noscript { p { "This page needs JavaScript; it loads none from elsewhere." } }
                     section.failures #notices aria-label="Notices" aria-live="polite" hidden { ul {} }
                     section.card.now aria-label="Now" { dl.tiles #tiles {} }
                     section aria-label="Curves" { div.plots #plots {} }

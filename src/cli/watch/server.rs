@@ -17,7 +17,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 /// Timeout after which an idle connection is closed.
-const PATIENCE: Duration = Duration::from_secs(30);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum number of concurrent connections; a page keeps up to six.
 const CONNECTIONS: usize = 64;
 /// Maximum number of attempts: another process may take a free port before we bind it.
@@ -40,7 +40,7 @@ pub fn serve(run: WatchedRun, port: u16) -> Result<String> {
         let run = run.clone();
         let server = Server::new(move |request| answer(request, chosen, &run))
             .bind((Ipv4Addr::LOCALHOST, chosen))
-            .with_global_timeout(PATIENCE)
+            .with_global_timeout(IDLE_TIMEOUT)
             .with_max_concurrent_connections(CONNECTIONS);
         match server.spawn() {
             Ok(_) => return Ok(format!("http://{}:{chosen}/", Ipv4Addr::LOCALHOST)),
@@ -74,7 +74,7 @@ fn answer(request: &Request<Body>, port: u16, run: &Mutex<WatchedRun>) -> Respon
             answer.headers_mut().insert(CONTENT_SECURITY_POLICY, policy);
             answer
         }
-        "/state" => match run.look().map_err(|e| e.to_string()).and_then(|state| {
+        "/state" => match run.refresh().map_err(|e| e.to_string()).and_then(|state| {
             serde_json::to_string(&state).map_err(|e| format!("can't serialize the run's state as JSON: {e}"))
         }) {
             Ok(state) => send(StatusCode::OK, "application/json", state),

@@ -4,13 +4,13 @@ mod events;
 mod new_lines;
 mod series;
 
-use super::checkpoint::{Kept, kept};
+use super::checkpoint::{CheckpointSummary, checkpoint_summaries};
 use super::lock::RunLock;
 use super::metrics::{Line, METRICS_FILE};
 use super::run::CONFIG_FILE;
 use crate::error::{Error, Result};
 use events::Events;
-use new_lines::{NewLines, News};
+use new_lines::{FileChange, NewLines};
 use serde::{Deserialize, Serialize};
 use series::Series;
 use std::collections::VecDeque;
@@ -55,9 +55,9 @@ pub struct RunState {
     /// Messages for the user, one sentence each.
     pub notices: Vec<String>,
     /// Checkpoints, oldest first.
-    pub checkpoints: Vec<Kept>,
+    pub checkpoints: Vec<CheckpointSummary>,
     /// Checkpoint with the best validation score.
-    pub best: Option<Kept>,
+    pub best: Option<CheckpointSummary>,
 }
 
 /// Curves of at most some hundred points. A point is the last of several consecutive steps, and the mean of the values of these steps.
@@ -75,7 +75,7 @@ pub struct RunCurves {
 
 /// Values collected from the lines read so far.
 #[derive(Debug, Default)]
-struct Told {
+struct MetricsHistory {
     psnr: Series,
     held_out: Series,
     loss: Series,
@@ -87,7 +87,7 @@ struct Told {
     unreadable: u64,
 }
 
-impl Told {
+impl MetricsHistory {
     fn add(&mut self, line: &[u8]) {
         let Ok(line) = serde_json::from_slice::<Line>(line) else {
             self.unreadable += 1;
@@ -127,7 +127,7 @@ impl Told {
 pub struct WatchedRun {
     folder: PathBuf,
     lines: NewLines,
-    told: Told,
+    metrics: MetricsHistory,
     events: Events,
 }
 
@@ -137,13 +137,17 @@ impl WatchedRun {
     /// # Errors
     /// Returns an error if no run ever used the folder, or if a file can't be read.
     pub fn open(run: &Path) -> Result<Self> {
-        if !RunLock::was_taken(run) && !run.join(METRICS_FILE).is_file() {
-            let found = if run.exists() { "a folder without metrics.jsonl" } else { "absent" };
+        if !RunLock::was_ever_locked(run) && !run.join(METRICS_FILE).is_file() {
+            let found = if run.exists() { "a folder without metrics.jsonl" } else { "missing" };
             return Err(Error::input(run, "the run", found, "a folder that `globalsplat train` writes"));
         }
         let lines = NewLines::new(&run.join(METRICS_FILE));
-        let mut watched =
-            WatchedRun { folder: run.to_owned(), lines, told: Told::default(), events: Events::default() };
+        let mut watched = WatchedRun {
+            folder: run.to_owned(),
+            lines,
+            metrics: MetricsHistory::default(),
+            events: Events::default(),
+        };
         watched.read()?;
         Ok(watched)
     }
@@ -152,16 +156,16 @@ impl WatchedRun {
     ///
     /// # Errors
     /// Returns an error if a file can't be read.
-    pub fn look(&mut self) -> Result<RunState> {
+    pub fn refresh(&mut self) -> Result<RunState> {
         self.read()?;
-        let WatchedRun { folder, told, events, lines } = self;
-        let last = told.last.as_ref();
+        let WatchedRun { folder, metrics, events, lines } = self;
+        let last = metrics.last.as_ref();
         let step = last.map_or(0, |line| line.step + 1);
         let steps = steps(folder);
         let left = steps.map(|steps| steps.saturating_sub(step) as f64);
         let seconds_per_step = events.seconds_per_step();
         let seconds_since = lines.written.map(|written| written.elapsed().unwrap_or_default().as_secs_f64());
-        let (checkpoints, best) = kept(folder);
+        let (checkpoints, best) = checkpoint_summaries(folder);
         let mut state = RunState {
             run: folder.to_string_lossy().into_owned(),
             step,
@@ -171,14 +175,14 @@ impl WatchedRun {
             loss: last.and_then(|line| line.loss),
             psnr: last.and_then(|line| line.psnr),
             learning_rate: last.and_then(|line| line.learning_rate),
-            samples_per_second: told.samples_per_second(),
+            samples_per_second: metrics.samples_per_second(),
             seconds_left: left.and_then(|left| Some(left * seconds_per_step?)),
             seconds_since,
             curves: RunCurves {
-                psnr: told.psnr.points(),
-                held_out: told.held_out.points(),
-                loss: told.loss.points(),
-                learning_rate: told.learning_rate.points(),
+                psnr: metrics.psnr.points(),
+                held_out: metrics.held_out.points(),
+                loss: metrics.loss.points(),
+                learning_rate: metrics.learning_rate.points(),
             },
             pictures: events.picture_steps(),
             notices: vec![],
@@ -198,10 +202,10 @@ impl WatchedRun {
     }
 
     fn read(&mut self) -> Result<()> {
-        let told = &mut self.told;
+        let metrics = &mut self.metrics;
         self.lines.read(|news| match news {
-            News::Anew => *told = Told::default(),
-            News::Line(line) => told.add(line),
+            FileChange::Replaced => *metrics = MetricsHistory::default(),
+            FileChange::Line(line) => metrics.add(line),
         })?;
         self.events.read(&self.folder)
     }
@@ -211,14 +215,14 @@ impl WatchedRun {
         let still = STILL.0.max(STILL.1 * self.events.seconds_per_step().unwrap_or(0.));
         let is_done = state.steps.is_some_and(|steps| state.step >= steps);
         match state.seconds_since {
-            None => notices.push("no step is written down yet".into()),
+            None => notices.push("no step has been logged yet".into()),
             Some(since) if since > still && !is_done => notices.push(format!(
-                "nothing was written down for {} min: the run validates, waits, or was stopped",
+                "nothing was logged for {} min: the run validates, waits, or was stopped",
                 (since / 60.).floor()
             )),
             Some(_) => {}
         }
-        if let Some(Line { step, scenes, .. }) = &self.told.last_skipped {
+        if let Some(Line { step, scenes, .. }) = &self.metrics.last_skipped {
             let short = |name: &String| name.chars().take(NAMED.1).collect::<String>();
             let mut names: Vec<String> = scenes.iter().take(NAMED.0).map(short).collect();
             if scenes.len() > NAMED.0 {
@@ -226,7 +230,7 @@ impl WatchedRun {
             }
             let shown =
                 if names.is_empty() { String::new() } else { format!(", and showed {}", names.join(", ")) };
-            let skipped = match self.told.skipped {
+            let skipped = match self.metrics.skipped {
                 1 => "1 step was skipped".into(),
                 count => format!("{count} steps were skipped"),
             };
@@ -236,8 +240,8 @@ impl WatchedRun {
         if let Some(step) = self.events.resumed.last() {
             notices.push(format!("the run was resumed at step {step}"));
         }
-        if self.told.unreadable > 0 {
-            notices.push(format!("lines of {METRICS_FILE} that no run wrote: {}", self.told.unreadable));
+        if self.metrics.unreadable > 0 {
+            notices.push(format!("lines of {METRICS_FILE} that no run wrote: {}", self.metrics.unreadable));
         }
         notices
     }

@@ -11,9 +11,9 @@ const REMEMBERED: usize = 256;
 
 /// Change of the file since the last read.
 #[derive(Debug)]
-pub(super) enum News<'a> {
+pub(super) enum FileChange<'a> {
     /// The file was replaced or removed. Its lines follow from the first one on.
-    Anew,
+    Replaced,
     /// A complete line.
     Line(&'a [u8]),
 }
@@ -41,12 +41,12 @@ impl NewLines {
     ///
     /// # Errors
     /// Returns an error if the file can't be read.
-    pub fn read(&mut self, mut tell: impl FnMut(News)) -> Result<()> {
+    pub fn read(&mut self, mut tell: impl FnMut(FileChange)) -> Result<()> {
         let file = match File::open(&self.path) {
             Err(e) if e.kind() == ErrorKind::NotFound => {
                 if self.position > 0 {
                     *self = NewLines::new(&self.path);
-                    tell(News::Anew);
+                    tell(FileChange::Replaced);
                 }
                 return Ok(());
             }
@@ -56,7 +56,7 @@ impl NewLines {
         let mut file = BufReader::new(file);
         if !self.knows(&mut file).map_err(Error::read(&self.path))? {
             (self.position, self.before) = (0, vec![]);
-            tell(News::Anew);
+            tell(FileChange::Replaced);
         }
         file.seek(SeekFrom::Start(self.position)).map_err(Error::read(&self.path))?;
         let mut line = vec![];
@@ -65,7 +65,7 @@ impl NewLines {
             self.position += line.len() as u64;
             self.before.clear();
             self.before.extend(&line[line.len().saturating_sub(REMEMBERED)..]);
-            tell(News::Line(&line));
+            tell(FileChange::Line(&line));
             line.clear();
         }
         Ok(())
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_told_once_until_the_file_is_another() {
+    fn lines_are_read_once_until_the_file_is_replaced() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lines");
         let mut lines = NewLines::new(&path);
@@ -93,8 +93,8 @@ mod tests {
             let mut told = String::new();
             lines
                 .read(|news| match news {
-                    News::Anew => told.push('!'),
-                    News::Line(line) => told += std::str::from_utf8(line).unwrap(),
+                    FileChange::Replaced => told.push('!'),
+                    FileChange::Line(line) => told += std::str::from_utf8(line).unwrap(),
                 })
                 .unwrap();
             told.replace('\n', " ")

@@ -1,9 +1,9 @@
 //! Curve of some hundred points, for a run of any length.
 
 /// Number of points at which adjacent points are merged in pairs. A page with four such curves stays below 100 KB.
-const MOST: usize = 400;
+const MAX_POINTS: usize = 400;
 
-/// Means over equally many consecutive values. There are always fewer than [`MOST`] points.
+/// Means over equally many consecutive values. There are always fewer than [`MAX_POINTS`] points.
 #[derive(Debug, Default)]
 pub(super) struct Series {
     /// Last step, sum and number of values of each point.
@@ -19,7 +19,7 @@ impl Series {
             Some(last) if last.2 < whole => *last = (step, last.1 + value, last.2 + 1),
             _ => self.points.push((step, value, 1)),
         }
-        if self.points.len() == MOST {
+        if self.points.len() == MAX_POINTS {
             let merged = self.points.chunks(2).map(|two| two.iter().copied().reduce(merge));
             self.points = merged.map(|point| point.expect("one or two")).collect();
             self.halved += 1;
@@ -47,7 +47,7 @@ mod tests {
             series.push(step, step as f64);
         }
         let points = series.points();
-        assert!((MOST / 2..MOST).contains(&points.len()), "{}", points.len());
+        assert!((MAX_POINTS / 2..MAX_POINTS).contains(&points.len()), "{}", points.len());
         assert_eq!(points.last().unwrap().0, 99_999);
         let [first, second] = [points[0], points[1]];
         let count = (first.0 + 1) as f64;

@@ -2,7 +2,7 @@
 
 use super::{file, folder, load};
 use globalsplat::config::Config;
-use globalsplat::data::{Chunk, Dataset, Split, open_capture, points_of, read_camera_path};
+use globalsplat::data::{Chunk, Dataset, Split, open_capture, read_camera_path, read_points};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
 use globalsplat::io::{
     decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights, rounding_warning,
@@ -84,7 +84,7 @@ pub fn colmap_points(bytes: &[u8]) {
         );
         model("points3D.bin", bytes);
     }
-    let _ = points_of(&open_capture(&folder).expect("a model that is right"));
+    let _ = read_points(&open_capture(&folder).expect("a model that is right"));
 }
 
 pub fn dataset_index(bytes: &[u8]) {

@@ -4,7 +4,7 @@
 //! "render_height", "render_width", and optionally "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
 
 use super::json::null_for_not_a_number;
-use super::transforms_json::{from_opengl, shown};
+use super::transforms_json::{describe_value, from_opengl};
 use super::{cameras_json, is_capture, open_for, transforms_json};
 use crate::capture::{Purpose, check_cameras};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
@@ -57,7 +57,7 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
 
 fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
     let refuse = |field: &str, found: Option<&Value>, expected: &str| {
-        Error::input(file, field, shown(found), expected)
+        Error::input(file, field, describe_value(found), expected)
     };
     let number = |of: &Value, key: &str, field: &str, expected: &str, least: f64, most: f64| {
         let value = of.get(key);

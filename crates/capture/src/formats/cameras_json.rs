@@ -3,7 +3,7 @@
 
 use super::json::null_for_not_a_number;
 use super::photos::{find_photos, portable};
-use super::{Found, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, pose_to_rows};
 use crate::pixels::Distortion;
@@ -34,7 +34,7 @@ struct ViewEntry {
 type Number = Option<f64>;
 
 /// Recognizes a folder that contains a `cameras.json`, or that file itself.
-pub(super) fn find(path: &Path) -> Option<Found> {
+pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
     let itself = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
     let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
     Some(Box::new(move |purpose| read(&file, purpose)))
@@ -54,11 +54,11 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
             (Some(photo), _) => photo,
             (None, Purpose::Cameras(_)) => root.join(name),
             (None, Purpose::Photos) => {
-                changes.absent.push(name.to_string());
+                changes.missing.push(name.to_string());
                 continue;
             }
         };
-        let camera = Camera { c2w: changes.unscaled(name, camera.c2w), ..camera };
+        let camera = Camera { c2w: changes.remove_scale(name, camera.c2w), ..camera };
         let name = portable(name);
         frames.push(Frame {
             image: ImageLocation::File(photo),

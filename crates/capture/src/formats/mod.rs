@@ -14,7 +14,7 @@ pub use camera_path::{CameraPath, read_camera_path};
 pub use cameras_json::write_cameras_json;
 #[cfg(feature = "chunks")]
 pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
-pub use colmap::{Point, points_of};
+pub use colmap::{Point, read_points};
 
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};
@@ -22,10 +22,10 @@ use natural::natural_order;
 use std::path::{Path, PathBuf};
 
 /// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.
-type Format = fn(&Path) -> Option<Found>;
+type Format = fn(&Path) -> Option<CaptureOpener>;
 
 /// Function that reads a capture that was found.
-type Found = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
+type CaptureOpener = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
 
 /// All formats in order of preference. If several match a folder, the first that can be read is used.
 const FORMATS: &[Format] = &[
@@ -37,7 +37,7 @@ const FORMATS: &[Format] = &[
 ];
 
 /// Description of the supported formats for error messages.
-const KNOWN: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
+const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
                      .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, or a \
                      CHUNK.torch#KEY";
 
@@ -101,7 +101,7 @@ fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
     }
     match refusals.len() {
         0 if !path.exists() => Err(Error::request(format!("{}: no such capture", path.display()))),
-        0 => Err(Error::input(path, "the capture", "of no known format", KNOWN)),
+        0 => Err(Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS)),
         1 => Err(refusals.remove(0)),
         _ => {
             let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
@@ -155,7 +155,7 @@ pub fn capture_folders(path: &Path) -> Result<CaptureFolders> {
     found.collect(path, DEPTH)?;
     if found.folders.is_empty() {
         let unread = found.warnings.first().map_or(String::new(), |line| format!(" ({line})"));
-        let expected = format!("{KNOWN}; or folders with such, up to {DEPTH} levels below it");
+        let expected = format!("{SUPPORTED_FORMATS}; or folders with such, up to {DEPTH} levels below it");
         return Err(Error::input(path, "the folder", format!("without captures{unread}"), expected));
     }
     found.folders.sort_by(natural_order);

@@ -11,7 +11,7 @@ const REDUCED: [u32; 3] = [2, 4, 8];
 const DEEPEST: usize = 16;
 
 /// Minimum number of photos of a capture.
-const FEWEST: usize = 2;
+const MIN_PHOTOS: usize = 2;
 
 /// Rule for turning names into paths: below `base`, without the first `skipped` folders, in a folder of smaller photos if
 /// `reduced`.
@@ -42,7 +42,7 @@ pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathB
         let is_ambiguous = photos < there().map(|(name, _)| name).collect::<BTreeSet<_>>().len();
         if photos > best.0 && !(is_ambiguous && rule.skipped > 0) {
             best = (photos, found);
-            if photos >= FEWEST {
+            if photos >= MIN_PHOTOS {
                 break;
             }
         }
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn smaller_photos_stand_for_those_that_are_not_there() {
+    fn downscaled_folders_replace_missing_photos() {
         let names = ["images/1/a.png", "images/1/b.png"];
         let reduced = ["images_8/1/a.png", "images_8/1/b.png", "images_4/1/a.png", "images_4/1/b.png"];
         assert_eq!(found(&reduced, &names), all(&reduced[2..]));

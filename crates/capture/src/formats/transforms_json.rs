@@ -6,7 +6,7 @@
 use super::json::null_for_not_a_number;
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
-use super::{Found, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, nearest_rigid_of_scaled};
 use crate::pixels::Distortion;
@@ -45,7 +45,7 @@ const FAMILIES: [&[&str]; 2] = [
 
 /// Recognizes a folder with a `transforms.json`, or with a `transforms_train.json` and optional test files, or a file
 /// `transforms….json`.
-pub(super) fn find(path: &Path) -> Option<Found> {
+pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
     let file = if itself { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
@@ -83,9 +83,9 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
         return new(frames);
     }
     let (held_out, mut rest): (Vec<_>, Vec<_>) =
-        frames.into_iter().partition(|frame| test.contains(&listed(&frame.name)));
+        frames.into_iter().partition(|frame| test.contains(&normalize_name(&frame.name)));
     let others = rest.extract_if(.., |frame| {
-        let name = listed(&frame.name);
+        let name = normalize_name(&frame.name);
         unread.contains(&name) || train.as_ref().is_some_and(|train| !train.contains(&name))
     });
     let others = others.count();
@@ -99,7 +99,7 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
 }
 
 /// Normalizes the name of a photo, which lists may write in several ways.
-fn listed(name: &str) -> String {
+fn normalize_name(name: &str) -> String {
     portable(name).trim_start_matches("./").to_owned()
 }
 
@@ -118,11 +118,11 @@ impl Lists {
         let list = |key: &str| match json.get(key) {
             None | Some(Value::Null) => Ok(None),
             Some(Value::Array(names)) => {
-                let name = |name: &Value| name.as_str().map(listed);
+                let name = |name: &Value| name.as_str().map(normalize_name);
                 let names: Option<HashSet<_>> = names.iter().map(name).collect();
                 names.map(Some).ok_or_else(|| Error::input(file, key, "no names", "a list of file_paths"))
             }
-            other => Err(Error::input(file, key, shown(other), "a list of file_paths")),
+            other => Err(Error::input(file, key, describe_value(other), "a list of file_paths")),
         };
         let [test, validation] = TEST_LISTS.map(list);
         let mut lists = [test?, validation?].into_iter().flatten();
@@ -144,7 +144,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
         .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
     let entries = match json.get("frames") {
         Some(Value::Array(entries)) => entries,
-        other => return Err(Error::input(file, "frames", shown(other), "a list of frames")),
+        other => return Err(Error::input(file, "frames", describe_value(other), "a list of frames")),
     };
     let fields: Vec<Fields> = entries
         .iter()
@@ -162,7 +162,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
             (None, Purpose::Cameras(_)) => {
                 frames.push(fields.frame(root(file).join(name), name, &mut changes)?)
             }
-            (None, Purpose::Photos) => changes.absent.push(name.to_string()),
+            (None, Purpose::Photos) => changes.missing.push(name.to_string()),
         }
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
@@ -170,9 +170,9 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
 }
 
 /// Describes a value of the file for an error message.
-pub(super) fn shown(value: Option<&Value>) -> String {
+pub(super) fn describe_value(value: Option<&Value>) -> String {
     match value {
-        None => "absent".into(),
+        None => "missing".into(),
         Some(Value::Null) => "null or NaN".into(),
         Some(Value::Array(values)) => format!("a list of {}", values.len()),
         Some(Value::Object(_)) => "an object".into(),
@@ -221,7 +221,7 @@ impl<'a> Fields<'a> {
         let Some((value, name)) = self.find(key) else { return Ok(None) };
         match value.as_f64() {
             Some(number) => Ok(Some(number)),
-            None => Err(Error::input(self.file, name, shown(Some(value)), "a number")),
+            None => Err(Error::input(self.file, name, describe_value(Some(value)), "a number")),
         }
     }
 
@@ -254,9 +254,12 @@ impl<'a> Fields<'a> {
     fn file_path(&self) -> Result<&'a str> {
         match self.frame.get("file_path") {
             Some(Value::String(path)) if !path.is_empty() => Ok(path),
-            other => {
-                Err(Error::input(self.file, self.name("file_path"), shown(other), "the path of an image"))
-            }
+            other => Err(Error::input(
+                self.file,
+                self.name("file_path"),
+                describe_value(other),
+                "the path of an image",
+            )),
         }
     }
 
@@ -290,7 +293,7 @@ impl<'a> Fields<'a> {
         let (fx, fy) = (focal("fl_x", "camera_angle_x", width)?, focal("fl_y", "camera_angle_y", height)?);
         let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
             let expected = "a focal length in pixels, or camera_angle_x";
-            return Err(Error::input(self.file, self.name("fl_x"), "absent", expected));
+            return Err(Error::input(self.file, self.name("fl_x"), "missing", expected));
         };
         let cx = self.number("cx")?.unwrap_or(f64::from(width) / 2.);
         let cy = self.number("cy")?.unwrap_or(f64::from(height) / 2.);
@@ -302,7 +305,7 @@ impl<'a> Fields<'a> {
             return Err(Error::input(
                 self.file,
                 name,
-                shown(Some(value)),
+                describe_value(Some(value)),
                 "the coefficients by name, as in k1",
             ));
         }
@@ -327,7 +330,7 @@ impl<'a> Fields<'a> {
             && !CAMERA_MODELS.iter().any(|known| is_model(model, known))
         {
             let expected = format!("one of {}", CAMERA_MODELS.join(", "));
-            return Err(Error::input(self.file, name, shown(Some(model)), expected));
+            return Err(Error::input(self.file, name, describe_value(Some(model)), expected));
         }
         if let Some((value, name)) = self.find("is_fisheye")
             && value != &Value::Bool(false)
@@ -335,7 +338,7 @@ impl<'a> Fields<'a> {
             return Err(Error::input(
                 self.file,
                 name,
-                shown(Some(value)),
+                describe_value(Some(value)),
                 "false, as fisheye lenses aren't known",
             ));
         }
@@ -357,7 +360,7 @@ impl<'a> Fields<'a> {
             || rows.len() != 4
             || rows.iter().any(|row| row.len() != 4)
         {
-            return Err(Error::input(self.file, name, shown(value), "a 4×4 matrix"));
+            return Err(Error::input(self.file, name, describe_value(value), "a 4×4 matrix"));
         }
         let mut entries = [0.; 16];
         for (i, value) in rows.iter().copied().flatten().enumerate() {
@@ -365,7 +368,7 @@ impl<'a> Fields<'a> {
                 Value::Null => f64::NAN,
                 value => value.as_f64().ok_or_else(|| {
                     let field = format!("row {}, column {} of {name}", i / 4, i % 4);
-                    Error::input(self.file, field, shown(Some(value)), "a number")
+                    Error::input(self.file, field, describe_value(Some(value)), "a number")
                 })?,
             };
         }

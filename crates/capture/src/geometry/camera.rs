@@ -175,9 +175,9 @@ pub fn nearest_rigid_of_scaled(c2w: &DMat4) -> Result<(DMat4, f64), (String, Str
             return Err(why);
         }
         let column = |i: usize| c2w.col(i) / scale;
-        let unscaled = DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis);
+        let remove_scale = DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis);
         // For any other matrix, report the error of the matrix as given.
-        nearest_rigid(&unscaled).map(|rigid| (rigid, scale)).map_err(|_| why)
+        nearest_rigid(&remove_scale).map(|rigid| (rigid, scale)).map_err(|_| why)
     })
 }
 

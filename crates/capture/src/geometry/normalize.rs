@@ -52,14 +52,14 @@ pub struct Placement {
 
 impl Placement {
     /// Returns the placement moved forward by `forward`, with the extent multiplied by exp(`larger`).
-    pub fn nudged(&self, [forward, larger]: [f64; 2]) -> Self {
+    pub fn with_offset(&self, [forward, larger]: [f64; 2]) -> Self {
         Placement { extent: self.extent * larger.exp(), forward: self.forward + forward }
     }
 }
 
 impl Normalization {
     /// Returns the same cameras with another placement. The placement of `self` must have extent 1 and position 0.
-    pub fn placed(&self, Placement { extent, forward }: Placement) -> Self {
+    pub fn with_placement(&self, Placement { extent, forward }: Placement) -> Self {
         let offset = DVec3::Z * forward;
         let moved = |pose: &DMat4| {
             let mut pose = *pose;
@@ -185,8 +185,8 @@ mod tests {
         };
         let original = [pose(0., 0., 0.), pose(3., 0.4, 0.2), pose(-1., 4., -0.3)];
         for (extent, forward) in [(1., 0.), (0.25, 0.5), (3., -0.2)] {
-            let placed = normalize(&original).unwrap().placed(Placement { extent, forward });
-            let Normalization { c2w, world_from_normalized } = placed;
+            let with_placement = normalize(&original).unwrap().with_placement(Placement { extent, forward });
+            let Normalization { c2w, world_from_normalized } = with_placement;
             let centres: Vec<DVec3> = c2w.iter().map(|pose| pose.w_axis.truncate()).collect();
             let distances = [(0, 1), (0, 2), (1, 2)].map(|(a, b)| centres[a].distance(centres[b]));
             assert!((distances.into_iter().fold(0., f64::max) - extent).abs() < 1e-12, "{distances:?}");

@@ -52,12 +52,12 @@ fn is_as_large(camera: &Camera, size: ImageSize) -> bool {
 }
 
 /// Returns the columns and rows of `camera`'s image that [`fit`] reads.
-pub fn looked_at(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
+pub fn source_region(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
     if is_as_large(camera, size) {
         return [0..camera.width as usize, 0..camera.height as usize];
     }
     let cut = Cut::of(camera, size);
-    resample::looked_at((camera.width, camera.height), cut.region, cut.size)
+    resample::source_region((camera.width, camera.height), cut.region, cut.size)
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
@@ -123,7 +123,7 @@ mod tests {
             let (image, fitted) = fit(&RgbImage::new(40, 40), &camera(40, 40), size.into());
             let (width, height) = image.to_rgb().dimensions();
             assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
-            looked_at(&camera(40, 40), size.into());
+            source_region(&camera(40, 40), size.into());
         }
     }
 

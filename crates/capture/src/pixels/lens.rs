@@ -22,9 +22,9 @@ pub(crate) fn undistort(
         return photo;
     }
     let [columns, rows] = window.unwrap_or_else(|| whole(camera));
-    let mut looks = Looks::new(distortion, camera, &columns);
-    let mut row = vec![Place::default(); columns.len()];
-    let mut picture = Picture::of(photo);
+    let mut looks = RowLookup::new(distortion, camera, &columns);
+    let mut row = vec![SamplePosition::default(); columns.len()];
+    let mut picture = Undistortion::new(photo);
     for i in rows {
         looks.fill(i, &mut row);
         picture.fill(i, columns.start, &row);
@@ -45,30 +45,30 @@ pub(crate) struct Lens {
     columns: Range<usize>,
     rows: Range<usize>,
     /// Lookup positions, row by row.
-    places: Vec<Place>,
+    places: Vec<SamplePosition>,
 }
 
 impl Lens {
     /// Computes the positions for `window`'s columns and rows, or for the whole image.
     pub fn new(distortion: Distortion, camera: Camera, window: Option<[Range<usize>; 2]>) -> Self {
         let [columns, rows] = window.unwrap_or_else(|| whole(&camera));
-        let mut places = vec![Place::default(); columns.len() * rows.len()];
+        let mut places = vec![SamplePosition::default(); columns.len() * rows.len()];
         places.par_chunks_mut(columns.len()).zip(rows.clone()).for_each_init(
-            || Looks::new(&distortion, &camera, &columns),
+            || RowLookup::new(&distortion, &camera, &columns),
             |looks, (row, i)| looks.fill(i, row),
         );
         Lens { distortion, camera, columns, rows, places }
     }
 
     /// Returns `true` if the lens matches `distortion` and `camera`, whatever the camera's pose.
-    pub fn is_of(&self, distortion: &Distortion, camera: &Camera) -> bool {
+    pub fn matches_camera(&self, distortion: &Distortion, camera: &Camera) -> bool {
         let known = |camera: &Camera| (camera.intrinsics, camera.width, camera.height);
         self.distortion == *distortion && known(&self.camera) == known(camera)
     }
 
     /// Removes the distortion from `photo` like the function [`undistort`].
     pub fn undistort(&self, photo: RgbImage) -> RgbImage {
-        let mut picture = Picture::of(photo);
+        let mut picture = Undistortion::new(photo);
         for (i, row) in self.rows.clone().zip(self.places.chunks(self.columns.len())) {
             picture.fill(i, self.columns.start, row);
         }
@@ -78,7 +78,7 @@ impl Lens {
 
 /// Position in a photo to take a colour from: the pixel to the upper left, and the fractional distances to the next ones, 0 to 1.
 #[derive(Debug, Clone, Copy, Default)]
-struct Place {
+struct SamplePosition {
     left: u32,
     top: u32,
     to_right: f32,
@@ -86,7 +86,7 @@ struct Place {
 }
 
 /// Computes the lookup positions of a pinhole camera's pixels, row by row.
-struct Looks<'a> {
+struct RowLookup<'a> {
     distortion: &'a Distortion,
     camera: &'a Camera,
     /// Ray coordinate x of each column.
@@ -95,16 +95,16 @@ struct Looks<'a> {
     seen: Vec<(f64, f64)>,
 }
 
-impl<'a> Looks<'a> {
+impl<'a> RowLookup<'a> {
     fn new(distortion: &'a Distortion, camera: &'a Camera, columns: &Range<usize>) -> Self {
         let Intrinsics { fx, cx, .. } = camera.intrinsics;
         let across: Vec<f64> = columns.clone().map(|j| (j as f64 + 0.5 - cx) / fx).collect();
         let seen = vec![(0., 0.); across.len()];
-        Looks { distortion, camera, across, seen }
+        RowLookup { distortion, camera, across, seen }
     }
 
     /// Computes the lookup positions of row `i`.
-    fn fill(&mut self, i: usize, row: &mut [Place]) {
+    fn fill(&mut self, i: usize, row: &mut [SamplePosition]) {
         let Camera { intrinsics: Intrinsics { fx, fy, cx, cy }, width, height, .. } = *self.camera;
         let [last_column, last_row] = [width, height].map(|count| f64::from(count - 1));
         let y = (i as f64 + 0.5 - cy) / fy;
@@ -115,7 +115,7 @@ impl<'a> Looks<'a> {
         for (place, seen) in row.iter_mut().zip(&self.seen) {
             let (left, to_right) = between(fx * seen.0 + cx, last_column);
             let (top, to_bottom) = between(fy * seen.1 + cy, last_row);
-            *place = Place { left, top, to_right, to_bottom };
+            *place = SamplePosition { left, top, to_right, to_bottom };
         }
     }
 }
@@ -136,7 +136,7 @@ fn between(position: f64, last: f64) -> (u32, f32) {
 }
 
 /// A photo and its undistorted version.
-struct Picture {
+struct Undistortion {
     width: usize,
     height: usize,
     photo: Vec<u8>,
@@ -144,18 +144,18 @@ struct Picture {
     undistorted: Vec<u8>,
 }
 
-impl Picture {
-    fn of(photo: RgbImage) -> Self {
+impl Undistortion {
+    fn new(photo: RgbImage) -> Self {
         let (width, height) = (photo.width() as usize, photo.height() as usize);
         let photo = photo.into_raw();
-        Picture { width, height, undistorted: vec![0; photo.len() + 1], photo }
+        Undistortion { width, height, undistorted: vec![0; photo.len() + 1], photo }
     }
 
     /// Fills row `i`, starting at column `first`.
-    fn fill(&mut self, i: usize, first: usize, row: &[Place]) {
+    fn fill(&mut self, i: usize, first: usize, row: &[SamplePosition]) {
         /// Constant 2²³: a float32 this large has no fraction, and added integers below 256 are in its lowest bits.
         const WHOLE: f32 = 8_388_608.;
-        let Picture { width, height, photo, undistorted } = self;
+        let Undistortion { width, height, photo, undistorted } = self;
         // Read four bytes instead of three, to fill a vector.
         let colour = |bytes: &[u8]| {
             let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
@@ -258,10 +258,13 @@ mod tests {
     fn a_lens_knows_its_cameras() {
         let lens = Lens::new(LENS, CAMERA, None);
         let elsewhere = Camera { c2w: DMat4::from_translation(DVec3::ONE), ..CAMERA };
-        assert!(lens.is_of(&LENS, &CAMERA) && lens.is_of(&LENS, &elsewhere));
-        assert!(!lens.is_of(&Distortion::default(), &CAMERA));
+        assert!(lens.matches_camera(&LENS, &CAMERA) && lens.matches_camera(&LENS, &elsewhere));
+        assert!(!lens.matches_camera(&Distortion::default(), &CAMERA));
         let longer = Camera { intrinsics: Intrinsics { fx: 51., ..INTRINSICS }, ..CAMERA };
-        assert!(!lens.is_of(&LENS, &longer) && !lens.is_of(&LENS, &Camera { width: 65, ..CAMERA }));
+        assert!(
+            !lens.matches_camera(&LENS, &longer)
+                && !lens.matches_camera(&LENS, &Camera { width: 65, ..CAMERA })
+        );
     }
 
     #[test]

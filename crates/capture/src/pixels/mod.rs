@@ -12,7 +12,7 @@ pub use codec::{
     DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
     read_image_size,
 };
-pub use fit::{fit, looked_at};
+pub use fit::{fit, source_region};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 

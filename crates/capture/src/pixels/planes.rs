@@ -23,7 +23,7 @@ impl Planes {
     /// Converts an interleaved image to planes.
     pub fn from_rgb(image: &RgbImage) -> Self {
         let mut planes = Planes::new(image.width(), image.height());
-        take_apart(image, &mut planes.bytes);
+        split_channels(image, &mut planes.bytes);
         planes
     }
 
@@ -53,7 +53,7 @@ impl Planes {
 }
 
 /// Writes the channels of `image` into `planes`, `[3, H, W]`.
-pub(super) fn take_apart(image: &RgbImage, planes: &mut [u8]) {
+pub(super) fn split_channels(image: &RgbImage, planes: &mut [u8]) {
     let pixels = planes.len() / CHANNELS;
     let (red, rest) = planes.split_at_mut(pixels);
     let (green, blue) = rest.split_at_mut(pixels);

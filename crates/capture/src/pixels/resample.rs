@@ -8,7 +8,7 @@
 //! Eight rows are filtered at once, one per lane, so that the compiler can vectorize every multiplication for any instruction set.
 //! The first pass outputs planes, which the second pass reads row by row.
 
-use super::planes::{CHANNELS, take_apart};
+use super::planes::{CHANNELS, split_channels};
 use crate::geometry::ImageSize;
 use image::RgbImage;
 use std::f64::consts::PI;
@@ -93,7 +93,7 @@ fn to_level(value: f32) -> f32 {
 }
 
 /// Returns the columns and rows of an image of `width` × `height` that [`Resampler::resample`] reads.
-pub fn looked_at((width, height): (u32, u32), region: Region, size: ImageSize) -> [Range<usize>; 2] {
+pub fn source_region((width, height): (u32, u32), region: Region, size: ImageSize) -> [Range<usize>; 2] {
     [(width, region.left, region.width, size.width), (height, region.top, region.height, size.height)].map(
         |(inputs, start, extent, outputs)| {
             Taps::new((inputs as usize, start, extent, outputs as usize)).range()
@@ -120,7 +120,7 @@ impl Resampler {
         let (out_width, out_height) = (size.width as usize, size.height as usize);
         let whole = Region { left: 0., top: 0., width: width as f64, height: height as f64 };
         if region == whole && (width, height) == (out_width, out_height) {
-            return take_apart(image, planes);
+            return split_channels(image, planes);
         }
         let columns = taps(&mut self.columns, (width, region.left, region.width, out_width));
         let rows = taps(&mut self.rows, (height, region.top, region.height, out_height));
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_kept_of_an_image_does_not_show_in_the_next() {
+    fn cached_taps_do_not_affect_the_next_image() {
         let mut resampler = Resampler::default();
         for (image, size) in [(waves(64, 48), [24, 32]), (waves(30, 70), [33, 9]), (waves(64, 48), [24, 32])]
         {
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_changes_where_nothing_is_to_do() {
+    fn identity_resampling_copies_pixels() {
         let image = waves(13, 9);
         assert_eq!(resample(&image, whole(&image), [9, 13]), image);
     }

@@ -179,7 +179,7 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> 
         let Some(entry) = entries.next() else {
             if length > 0 {
                 let expected = format!("one of {length} bytes");
-                return Err(Error::input(path, format!("stream {index}"), "absent", expected));
+                return Err(Error::input(path, format!("stream {index}"), "missing", expected));
             }
             unfolded.push(vec![]);
             continue;

@@ -17,7 +17,7 @@ pub(super) struct Canvas {
 
 impl Canvas {
     /// Creates a canvas from a function of each pixel's centre, in repeats.
-    pub fn of(size: usize, mut colour: impl FnMut(Vec2) -> Vec3) -> Canvas {
+    pub fn from_fn(size: usize, mut colour: impl FnMut(Vec2) -> Vec3) -> Canvas {
         let mut canvas = Canvas::filled(size, Vec3::ZERO);
         canvas.change(|uv, _| colour(uv));
         canvas

@@ -45,7 +45,7 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
             let voronoi = Voronoi::new(random, count, count, 0.95, false);
             let scale = count as f32;
             let hollow = random.happens(0.5);
-            Field::of(SIZE, |uv| {
+            Field::from_fn(SIZE, |uv| {
                 let cell = voronoi.cell(uv);
                 if hollow { cell.offset.length() * scale } else { (cell.edge * scale * 3.).min(1.) }
             })
@@ -54,7 +54,7 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
             let count = cells[0].max(3);
             let voronoi = Voronoi::new(random, count, count, 0.95, false);
             let seed = random.seed();
-            Field::of(SIZE, |uv| unit_of(seed, voronoi.cell(uv).id))
+            Field::from_fn(SIZE, |uv| unit_of(seed, voronoi.cell(uv).id))
         }
         _ => smooth(random, SIZE, cells),
     }

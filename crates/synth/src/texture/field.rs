@@ -13,7 +13,7 @@ pub(super) struct Field {
 
 impl Field {
     /// Creates a field from a function of the centre of each value's square, in repeats.
-    pub fn of(size: usize, mut value: impl FnMut(Vec2) -> f32) -> Field {
+    pub fn from_fn(size: usize, mut value: impl FnMut(Vec2) -> f32) -> Field {
         let mut values = Vec::with_capacity(size * size);
         for y in 0..size {
             for x in 0..size {

@@ -40,7 +40,7 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
     let light = random.direction();
     let mut index = 0;
     let mut height = Field { size: SIZE, values: vec![0.; SIZE * SIZE] };
-    let mut canvas = Canvas::of(SIZE, |uv| {
+    let mut canvas = Canvas::from_fn(SIZE, |uv| {
         let push = Vec2::new(right.values[index], down.values[index]) * finish.crookedness;
         let piece = layout.piece(uv + push);
         let (rough, stain) = (rough.values[index], stains.values[index]);
@@ -86,7 +86,7 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let high = 1. / rows as f32;
     let count = random.count(1, 4);
     let finish = Finish {
-        palette: Palette::of_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, count),
         joint: joint_colour(random, theme),
         joint_width: high * random.between(0.03, 0.11),
         rounding: high * random.between(0.05, 0.2),
@@ -124,7 +124,7 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let wide = 1. / across as f32;
     let count = random.one_of(&[1, 1, 1, 2, 3, 4]);
     let finish = Finish {
-        palette: Palette::of_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, count),
         joint: joint_colour(random, theme),
         joint_width: (wide * random.leaning_low(0.004, 0.03)).max(0.3 / SIZE as f32),
         rounding: wide * random.between(0.01, 0.08),
@@ -168,7 +168,7 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     };
     let count = random.count(1, 4);
     let finish = Finish {
-        palette: Palette::of_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, count),
         joint,
         joint_width: wide * random.between(0.02, 0.09),
         rounding: wide * random.between(0.05, 0.35),
@@ -190,14 +190,14 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         (palette::STONES, 1.),
     ]);
     let count = random.count(1, 4);
-    let palette = Palette::of_theme(random, theme, count);
+    let palette = Palette::from_theme(random, theme, count);
     let rows = 2 * random.count(2, 8);
     let columns = rows * random.count(1, 2);
     let (seed, scalloped) = (random.seed(), random.between(0., 0.6));
     let grain = fractal(random, SIZE, [columns * 2, 8], 4, 0.7);
     let dark = random.between(0.3, 0.7);
     let roughness = random.between(0.05, 0.25);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let row = |row: i32| {
             let shift = 0.5 * row.rem_euclid(2) as f32;
             let across = uv.x * columns as f32 + shift;
@@ -242,7 +242,7 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     };
     let width = 0.1 / across as f32;
     let bright = luminance(joint) > 0.5;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let piece = layout.piece(uv);
         let tone = (1. - follows) * unit_of(seed, piece.id) + follows * (0.5 + 0.6 * drift.sample(uv));
         let on_piece = smoothstep(0., 1.5 / SIZE as f32, piece.edge - width);

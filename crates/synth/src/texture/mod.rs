@@ -196,22 +196,22 @@ impl Texture {
     /// Draws a texture of a random family. The result depends only on `purpose` and the state of `random`.
     pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
         if purpose == Purpose::Poster {
-            return Texture::of_surface(pictures::picture(random));
+            return Texture::from_surface(pictures::picture(random));
         }
         let mut surface =
             if random.happens(0.12) { combined(random, purpose) } else { surface(random, purpose) };
         wear::weather(random, &mut surface.canvas, purpose);
-        Texture::of_surface(surface)
+        Texture::from_surface(surface)
     }
 
     /// Creates a texture from a photo or image in sRGB: its largest centred square, mirrored to the right and below so that the
     /// texture repeats.
-    pub fn of_picture(picture: &RgbImage) -> Texture {
+    pub fn from_image(picture: &RgbImage) -> Texture {
         let side = picture.width().min(picture.height());
         let corner = Vec2::new((picture.width() - side) as f32, (picture.height() - side) as f32) * 0.5;
         let step = side as f32 / SIZE as f32;
         let linear: Vec<f32> = (0..=255).map(palette::linear_of_byte).collect();
-        let quarter = Canvas::of(SIZE, |uv| {
+        let quarter = Canvas::from_fn(SIZE, |uv| {
             // The mean of the photo's pixels that a texel covers, at least one.
             let middle = corner + uv * side as f32;
             let [low, high] = [-0.5, 0.5].map(|half| (middle + half * step).max(Vec2::ZERO).as_uvec2());
@@ -226,12 +226,12 @@ impl Texture {
             }
             sum / count
         });
-        let canvas = Canvas::of(2 * SIZE, |uv| {
+        let canvas = Canvas::from_fn(2 * SIZE, |uv| {
             let folded = 1. - (2. * uv - 1.).abs();
             let at = (folded * SIZE as f32).as_uvec2().min(glam::UVec2::splat(SIZE as u32 - 1));
             quarter.pixels[at.y as usize * SIZE + at.x as usize]
         });
-        Texture::of_surface(Surface { canvas, repeat_metres: 2. })
+        Texture::from_surface(Surface { canvas, repeat_metres: 2. })
     }
 
     /// Samples trilinearly at `uv` in repeats, for a footprint of width `footprint` in repeats.
@@ -279,7 +279,7 @@ impl Texture {
         (above + (between(next_row) - above) * down).truncate()
     }
 
-    fn of_surface(Surface { canvas, repeat_metres }: Surface) -> Texture {
+    fn from_surface(Surface { canvas, repeat_metres }: Surface) -> Texture {
         let (low, high) = REFLECTANCE;
         let mut size = canvas.size;
         let mut texels: Vec<Vec3> =

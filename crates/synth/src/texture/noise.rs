@@ -97,7 +97,7 @@ fn octaves_of(
 pub(super) fn warped(random: &mut ChaCha8Rng, field: &Field, cells: usize, reach: f32) -> Field {
     let [right, down] = [(); 2].map(|()| fractal(random, field.size, [cells; 2], 3, 0.5));
     let mut index = 0;
-    Field::of(field.size, |uv| {
+    Field::from_fn(field.size, |uv| {
         let push = Vec2::new(right.values[index], down.values[index]);
         index += 1;
         field.sample(uv + push * reach)

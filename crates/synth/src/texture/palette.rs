@@ -99,11 +99,11 @@ impl Palette {
             Purpose::Foliage => &[(GREENS, 8.), (AUTUMN, 2.), (EARTHS, 0.5), (ACCENTS, 0.5)],
         };
         let theme = random.weighted(themes);
-        Palette::of_theme(random, theme, count)
+        Palette::from_theme(random, theme, count)
     }
 
     /// Draws `count` colours of one theme: shades of one colour, several colours, one with accents, or rarely arbitrary colours.
-    pub fn of_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
+    pub fn from_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
         let base = colour_of(random, theme);
         let kind = random.unit();
         let mut colours = vec![base];

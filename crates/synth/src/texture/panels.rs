@@ -236,7 +236,7 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let seam = random.between(0.2, 0.9);
     let uneven = smooth(random, SIZE, if upright { [64, 2] } else { [2, 64] });
     let mut index = 0;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let part = (if upright { uv.x } else { uv.y } * count).fract();
         let light = match profile {
             0 => 1. + depth * (std::f32::consts::TAU * part).sin(),
@@ -290,7 +290,7 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let width = random.between(0.05, 0.35);
     let both = random.happens(0.7);
     let mut index = 0;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = if oblique { Vec2::new(uv.x + uv.y, uv.x - uv.y) * times.x } else { uv * times };
         let part = (at - at.floor() - 0.5).abs() * 2.;
         let soft = 2. * times / SIZE as f32;

@@ -20,7 +20,7 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let (wave, waves) =
         (if random.happens(0.2) { random.between(0.02, 0.3) } else { 0. }, random.count(1, 6) as f32);
     let zigzag = random.happens(0.5);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let phase = (uv.x * along + uv.y * across) * waves;
         let swing = if zigzag {
             4. * (phase - (phase + 0.5).floor()).abs()
@@ -42,7 +42,7 @@ pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let times = random.leaning_low(1., 8.).floor();
     let threads = random.one_of(&[32., 64., 128.]);
     let twill = random.between(0., 0.5);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let warp = band_at(&bands_across, uv.x * times, times);
         let weft = band_at(&bands_along, uv.y * times, times);
         let over = ((uv.x + uv.y) * threads).fract() < 0.5;
@@ -96,7 +96,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let ink = palette.any(random) * random.between(0.3, 1.);
     let halved = random.happens(0.25);
     let inset = if random.happens(0.3) { random.between(0.1, 0.4) } else { 1. };
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let piece = layout.piece(uv);
         let mut number = (unit_of(seed, piece.id) * count as f32) as usize;
         if checks {

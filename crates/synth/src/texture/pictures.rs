@@ -48,7 +48,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
     let (level, cover) = (random.between(-0.5, 1.), random.between(0., 0.9));
     let horizon = random.between(0.35, 0.75);
     let mut index = 0;
-    let mut canvas = Canvas::of(SIZE, |uv| {
+    let mut canvas = Canvas::from_fn(SIZE, |uv| {
         let sky = zenith.lerp(haze, (uv.y / horizon).min(1.));
         let cloud = cover * smoothstep(level, level + 0.8, clouds.values[index]);
         index += 1;
@@ -303,7 +303,7 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
     let ground = Palette::draw(random, Purpose::Wall, 1).colour(0);
     let mut canvas = Canvas::bounded(SIZE, ground);
     let foot = Vec2::new(random.between(0.4, 0.6), random.between(0.8, 1.1));
-    let green = Palette::of_theme(random, palette::GREENS, 3);
+    let green = Palette::from_theme(random, palette::GREENS, 3);
     for _ in 0..random.count(3, 16) {
         let head = Vec2::new(random.between(0.12, 0.88), random.between(0.1, 0.6));
         let stem = palette_shade(random, &green);
@@ -366,7 +366,7 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
     if random.happens(0.35) {
         let glimmer = random.between(0.02, 0.12);
         let slant = random.between(-1., 1.);
-        let mut canvas = Canvas::of(SIZE, |uv| {
+        let mut canvas = Canvas::from_fn(SIZE, |uv| {
             Vec3::splat(0.02 + glimmer * smoothstep(0.3, -0.3, uv.y - 0.5 + slant * (uv.x - 0.5)))
         });
         canvas.repeats = false;

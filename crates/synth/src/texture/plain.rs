@@ -30,7 +30,7 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let cells = random.count(1, 3);
     let drift = smooth(random, SIZE, [cells; 2]);
     let strength = random.leaning_low(0.001, 0.25);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let turns = uv.x * across + uv.y * along + strength * drift.sample(uv);
         palette.ramp(0.5 - 0.5 * (turns * std::f32::consts::TAU).cos())
     });

@@ -11,7 +11,7 @@ use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws ground of one theme, dark enough to lie below other objects.
 fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
-    let palette = Palette::of_theme(random, theme, 2);
+    let palette = Palette::from_theme(random, theme, 2);
     let cells = random.count(2, 12);
     let field = fractal(random, SIZE, [cells; 2], 6, 0.75);
     let dark = random.between(0.35, 1.);
@@ -32,7 +32,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     if !fallen {
         canvas.pixels.iter_mut().for_each(|pixel| *pixel *= 0.35);
     }
-    let palette = Palette::of_theme(random, theme, 4);
+    let palette = Palette::from_theme(random, theme, 4);
     let length = random.leaning_low(0.025, 0.16);
     let slim = random.between(0.25, 0.9);
     let cover = if fallen { random.between(0.2, 1.6) } else { random.between(1.2, 2.6) };
@@ -66,7 +66,7 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.5), (palette::EARTHS, 0.5)]);
     let below = random.one_of(&[palette::EARTHS, theme]);
     let mut canvas = ground(random, below);
-    let palette = Palette::of_theme(random, theme, 4);
+    let palette = Palette::from_theme(random, theme, 4);
     let patches = fractal(random, SIZE, [3; 2], 4, 0.6);
     let bare = random.between(-1.5, 0.3);
     let length = random.leaning_low(0.025, 0.11);
@@ -113,7 +113,7 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     ]);
     let below = random.one_of(&[palette::EARTHS, theme]);
     let mut canvas = ground(random, below);
-    let palette = Palette::of_theme(random, theme, 4);
+    let palette = Palette::from_theme(random, theme, 4);
     let radius = random.leaning_low(0.008, 0.06);
     let cover = random.between(0.4, 1.4);
     let count = ((cover / (3. * radius * radius)) as usize).min(3000);
@@ -155,7 +155,7 @@ pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let clods = fractal(random, SIZE, stretch.map(|factor| cells * factor), 5, 0.8);
     canvas.shade(&clods.slope(random.direction()), random.between(0.2, 1.2));
     if random.happens(0.5) {
-        let green = Palette::of_theme(random, palette::GREENS, 2);
+        let green = Palette::from_theme(random, palette::GREENS, 2);
         let patches = fractal(random, SIZE, [3; 2], 6, 0.75);
         let level = random.between(-0.4, 1.);
         for (pixel, value) in canvas.pixels.iter_mut().zip(&patches.values) {

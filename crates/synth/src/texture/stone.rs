@@ -20,7 +20,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         (palette::BROWNS, 1.),
         (palette::ACCENTS, 1.),
     ]);
-    let palette = Palette::of_theme(random, theme, 2);
+    let palette = Palette::from_theme(random, theme, 2);
     let vein = if random.happens(0.7) {
         palette::colour_of(random, palette::GREYS) * random.between(0.3, 1.)
     } else {
@@ -39,7 +39,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let (width, fine_width) = (random.leaning_low(0.03, 0.35), random.leaning_low(0.02, 0.15));
     let (share, fine_share) = (random.between(0.3, 1.), random.between(0., 0.6));
     let mut index = 0;
-    let canvas = Canvas::of(SIZE, |_| {
+    let canvas = Canvas::from_fn(SIZE, |_| {
         let i = index;
         index += 1;
         let ground = palette.ramp(0.5 + 0.4 * clouds.values[i]);
@@ -61,12 +61,12 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         (palette::ACCENTS, 2.),
         (palette::BEIGES, 1.),
     ]);
-    let palette = Palette::of_theme(random, theme, count);
+    let palette = Palette::from_theme(random, theme, count);
     let across = random.count(14, 48);
     let voronoi = Voronoi::new(random, across, across, 1., false);
     let (seed, crowd) = (random.seed(), random.between(0.25, 0.9));
     let gap = random.between(0.04, 0.2) / across as f32;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let cell = voronoi.cell(uv);
         let hash = |salt: u32| unit_of(seed ^ salt, cell.id);
         if hash(0) > crowd {

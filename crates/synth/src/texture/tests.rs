@@ -106,7 +106,7 @@ fn samples_repeat_and_go_over_evenly() {
 #[test]
 fn pictures_are_mirrored_at_their_edges() {
     let picture = RgbImage::from_fn(300, 200, |x, y| image::Rgb([x.min(255) as u8, y as u8, 128]));
-    let texture = Texture::of_picture(&picture);
+    let texture = Texture::from_image(&picture);
     let at = |u, v| texture.sample(Vec2::new(u, v), 0.);
     for (u, v) in [(0.1, 0.2), (0.3, 0.45), (0.01, 0.02)] {
         let here = at(u, v);

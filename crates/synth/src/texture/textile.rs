@@ -20,7 +20,7 @@ pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let uneven = smooth(random, SIZE, [6; 2]);
     let (round, drift) = (random.between(0.2, 0.7), random.between(0., 0.15));
     let scale = threads as f32;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = uv * scale;
         let (column, row) = (at.x as u32, at.y as u32);
         let part = at - at.floor() - 0.5;
@@ -39,7 +39,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let columns = random.one_of(&[12, 16, 24, 32]);
     let seed = random.seed();
     let banded = random.happens(0.4);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = uv * columns as f32;
         let side = (at.x.fract() - 0.5).abs();
         // Each loop is a V: two legs that rise outwards.
@@ -79,7 +79,7 @@ pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let printed = random.happens(0.3);
     let bands = random.count(2, 8) as f32;
     let mut index = 0;
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let fold = folds.values[index];
         index += 1;
         let tone = if printed { (uv.y * bands).fract() } else { 0.5 + 0.3 * fold };
@@ -94,7 +94,7 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let across = random.count(2, 8) as f32;
     let kind = random.count(0, 2);
     let (deep, light) = (random.between(0.3, 0.8), random.direction());
-    let height = super::Field::of(SIZE, |uv| {
+    let height = super::Field::from_fn(SIZE, |uv| {
         let at = match kind {
             0 => Vec2::new(uv.x + uv.y, uv.x - uv.y) * across,
             1 => uv * across,
@@ -119,7 +119,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         (super::palette::GREYS, 1.),
         (super::palette::VIVID, 0.5),
     ]);
-    let palette = Palette::of_theme(random, theme, count);
+    let palette = Palette::from_theme(random, theme, count);
     let mut canvas = Canvas::filled(SIZE, palette.colour(0));
     let middle = Vec2::splat(0.5);
     // Paint the middle first, so that the borders cover what extends too far.

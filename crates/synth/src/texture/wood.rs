@@ -24,7 +24,7 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
     let knots: Vec<(Vec2, f32)> =
         (0..random.one_of(&[0, 0, 1, 2, 4])).map(|_| (random.spot(), random.between(0.01, 0.035))).collect();
     let mut index = 0;
-    let field = Field::of(SIZE, |uv| {
+    let field = Field::from_fn(SIZE, |uv| {
         let mut phase = uv.y * rings + sway * bend.values[index];
         let mut dark = 0.;
         for &(centre, radius) in &knots {
@@ -91,7 +91,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let mixed = if random.happens(0.25) { random.between(0.2, 1.) } else { 0. };
     // With fewer boards, the grain appears larger.
     let scale = random.between(0.6, 1.6);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let piece = layout.piece(uv);
         let hash = |salt: u32| unit_of(seed ^ salt, piece.id);
         let value = grain.sample(piece.at * scale + Vec2::new(hash(1), hash(2)));
@@ -111,7 +111,7 @@ pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let grain = grain(random);
     let contrast = random.between(0.3, 1.2);
     let upright = random.happens(0.5);
-    let canvas = Canvas::of(SIZE, |uv| {
+    let canvas = Canvas::from_fn(SIZE, |uv| {
         let value = grain.sample(if upright { uv.yx() } else { uv });
         light.lerp(dark, (0.4 + contrast * value).clamp(0., 1.))
     });

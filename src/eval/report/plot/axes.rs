@@ -20,7 +20,7 @@ impl Margins {
 }
 
 /// Minimum range of a linear axis, in dB or scenes. Smaller differences don't matter.
-const LEAST_SPAN: f64 = 1.;
+const MIN_SPAN: f64 = 1.;
 
 /// An axis: a range of values and the range of pixels that they map to.
 pub struct Axis {
@@ -35,7 +35,7 @@ pub struct Axis {
 impl Axis {
     /// Creates a linear axis with round ticks that enclose `from` to `to`.
     pub fn linear(from: f64, to: f64, start: f64, end: f64) -> Self {
-        let step = round_step((to - from).max(LEAST_SPAN) / 5.);
+        let step = round_step((to - from).max(MIN_SPAN) / 5.);
         let (first, last) = ((from / step).floor(), (to / step).ceil().max((from / step).floor() + 1.));
         let ticks = (0..=(last - first) as usize).map(|i| (first + i as f64) * step).collect();
         Axis { from: first * step, to: last * step, logarithmic: false, start, end, ticks }

@@ -10,14 +10,14 @@ use maud::{Markup, html};
 const MARGINS: Margins = Margins::NARROW;
 /// Possible widths of a bin in dB, and the maximum number of bins.
 const BIN_WIDTHS: [f64; 5] = [0.2, 0.5, 1., 2., 5.];
-const MOST_BINS: f64 = 28.;
+const MAX_BINS: f64 = 28.;
 
 /// Renders one histogram for each evaluation on `dataset`.
 pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
     let entries = entries.iter().filter(|entry| entry.dataset == dataset && entry.scored() > 0);
     let scenes = entries.clone().flat_map(|entry| &entry.evaluation.scenes);
     let (worst, best) = bounds(scenes.map(|scene| scene.scores.psnr));
-    let width = BIN_WIDTHS.into_iter().find(|width| (best - worst) / width <= MOST_BINS).unwrap_or(10.);
+    let width = BIN_WIDTHS.into_iter().find(|width| (best - worst) / width <= MAX_BINS).unwrap_or(10.);
     let first = (worst / width).floor();
     html! {
         @for entry in entries {

@@ -39,7 +39,7 @@ pub fn shortened(name: &str, longest: usize) -> String {
 
 /// Returns the start of each label's text on its baseline. The points are in the order of their importance: earlier labels get better
 /// positions.
-pub fn beside_points(points: &[(f64, f64)], names: &[String], within: Area) -> Vec<(f64, f64)> {
+pub fn place_labels(points: &[(f64, f64)], names: &[String], within: Area) -> Vec<(f64, f64)> {
     let marks: Vec<Area> = points.iter().map(|&(x, y)| Area::around(x, y, 7.)).collect();
     let mut taken: Vec<Area> = vec![];
     let mut begins = vec![];
@@ -101,7 +101,7 @@ mod tests {
     fn names_keep_clear_of_each_other() {
         let within = Area { left: 0., top: 0., right: 400., bottom: 300. };
         let points = [(200., 150.), (203., 152.), (380., 10.)];
-        let begins = beside_points(&points, &["first", "second", "at the edge"].map(String::from), within);
+        let begins = place_labels(&points, &["first", "second", "at the edge"].map(String::from), within);
         let areas: Vec<Area> = begins
             .iter()
             .zip([5., 6., 11.])

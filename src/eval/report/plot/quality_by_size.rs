@@ -3,7 +3,7 @@
 use super::super::numbers::{decimal, short};
 use super::super::rows::Row;
 use super::axes::{Axis, Margins, bounds, frame};
-use super::labels::{Area, beside_points, shortened};
+use super::labels::{Area, place_labels, shortened};
 use super::{HEIGHT, WIDTH, figure, legend, px};
 use maud::{Markup, html};
 
@@ -28,7 +28,7 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
         shown.iter().map(|(_, (n, psnr))| (x.pixel(n.max(1.)), y.pixel(*psnr))).collect();
     let names: Vec<String> = shown.iter().map(|(row, _)| shortened(row.name, LONGEST_NAME)).collect();
     let within = Area { left: MARGINS.left, top: 20., right: WIDTH, bottom: HEIGHT - MARGINS.bottom };
-    let begins = beside_points(&points, &names, within);
+    let begins = place_labels(&points, &names, within);
 
     let drawing = html! {
         (frame(&x, &y, "Gaussians, logarithmic", "PSNR (dB)", count))

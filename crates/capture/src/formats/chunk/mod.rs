@@ -3,12 +3,12 @@
 
 mod scenes;
 
-use super::Found;
+use super::CaptureOpener;
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::{Distortion, encoded_image_size};
 use glam::{DMat4, DVec4};
-use globalsplat_files::{Error, Result, files_and_keys};
+use globalsplat_files::{Error, Result, split_keyed_path};
 use globalsplat_torch_file::Archive;
 use scenes::{Scene, scenes};
 use std::path::{Path, PathBuf};
@@ -31,8 +31,8 @@ pub struct Chunk {
 }
 
 /// Recognizes `CHUNK.torch#KEY`, or `CHUNK.torch` with a single scene.
-pub(super) fn find(path: &Path) -> Option<Found> {
-    if let Some((file, key)) = files_and_keys(path).find(|(file, _)| is_chunk(file)) {
+pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
+    if let Some((file, key)) = split_keyed_path(path).find(|(file, _)| is_chunk(file)) {
         return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
     }
     let file = is_chunk(path).then(|| path.to_owned())?;
@@ -84,7 +84,7 @@ impl Chunk {
             None => Err(Error::input(
                 &self.file,
                 "the scene",
-                format!("{key:?}, which is not there"),
+                format!("{key:?}, which is missing"),
                 self.choice(),
             )),
         }

@@ -22,7 +22,7 @@ impl Words<'_> {
         let trimmed = self.rest.trim_start();
         let (word, rest) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
         self.rest = rest;
-        let found = if word.is_empty() { "absent".to_string() } else { format!("{word:?}") };
+        let found = if word.is_empty() { "missing".to_string() } else { format!("{word:?}") };
         let refused = |_| Error::input(self.file, format!("{name} in line {}", self.number), found, expected);
         if word.is_empty() { Err(()) } else { word.parse().map_err(drop) }.map_err(refused)
     }

@@ -4,12 +4,12 @@
 mod fields;
 mod points;
 
-pub use points::{Point, points_of};
+pub use points::{Point, read_points};
 
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
-use super::{Found, folder_name};
-use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, listed};
+use super::{CaptureOpener, folder_name};
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
 use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::Distortion;
 use fields::{Bytes, Words, is_comment};
@@ -140,9 +140,10 @@ struct ImageEntry {
 }
 
 /// Recognizes a folder that contains a model.
-pub(super) fn find(folder: &Path) -> Option<Found> {
+pub(super) fn find(folder: &Path) -> Option<CaptureOpener> {
     let (folder, models) = (folder.to_owned(), Model::find_all(folder));
-    (!models.is_empty()).then(|| -> Found { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
+    (!models.is_empty())
+        .then(|| -> CaptureOpener { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
 }
 
 /// Reads the model with the most photos among `models`, the first one in case of a tie.
@@ -173,7 +174,7 @@ fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Resu
         "the largest of {} models is taken, with {} photos; left out: {}",
         sizes.len(),
         images.len(),
-        listed(smaller.iter().map(String::as_str))
+        format_names(smaller.iter().map(String::as_str))
     );
     read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
 }
@@ -211,7 +212,7 @@ fn read(
             (Some(photo), _) => photo,
             (None, Purpose::Cameras(_)) => model.bases[0].join(PHOTOS).join(&image.name),
             (None, Purpose::Photos) => {
-                changes.absent.push(image.name);
+                changes.missing.push(image.name);
                 continue;
             }
         };

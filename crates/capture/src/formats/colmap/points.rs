@@ -20,7 +20,7 @@ pub struct Point {
 ///
 /// # Errors
 /// Fails if the file violates the format.
-pub fn points_of(capture: &Capture) -> Result<Vec<Point>> {
+pub fn read_points(capture: &Capture) -> Result<Vec<Point>> {
     let images = capture.file();
     let form =
         images.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_prefix("images."));

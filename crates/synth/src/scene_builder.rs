@@ -16,7 +16,7 @@ use std::sync::Arc;
 const SHARED: usize = 6;
 
 /// Builder that adds objects to a scene.
-pub(super) struct Maker {
+pub(super) struct SceneBuilder {
     pub random: ChaCha8Rng,
     pub parts: Parts,
     /// Images that the user wants to appear on surfaces.
@@ -24,9 +24,9 @@ pub(super) struct Maker {
     textures: Vec<(Purpose, Arc<Texture>)>,
 }
 
-impl Maker {
+impl SceneBuilder {
     pub fn new(random: ChaCha8Rng, pictures: Vec<Arc<Texture>>) -> Self {
-        Maker { random, parts: Parts::default(), pictures, textures: vec![] }
+        SceneBuilder { random, parts: Parts::default(), pictures, textures: vec![] }
     }
 
     pub fn within<T: SampleUniform>(&mut self, range: impl SampleRange<T>) -> T {
@@ -118,8 +118,8 @@ impl Maker {
         material
     }
 
-    pub fn put(&mut self, mesh: Mesh, material: &Material, place: Affine3A) {
-        self.parts.meshes.push((mesh.moved(place), material.clone()));
+    pub fn add_mesh(&mut self, mesh: Mesh, material: &Material, transform: Affine3A) {
+        self.parts.meshes.push((mesh.moved(transform), material.clone()));
     }
 }
 
@@ -139,11 +139,11 @@ mod tests {
         let corners = RgbImage::from_fn(64, 64, |x, y| {
             Rgb([if x < 32 { 255 } else { 0 }, if y < 32 { 255 } else { 0 }, 0])
         });
-        let picture = Arc::new(Texture::of_picture(&corners));
-        let mut make = Maker::new(ChaCha8Rng::seed_from_u64(1), vec![picture.clone()]);
+        let picture = Arc::new(Texture::from_image(&corners));
+        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![picture.clone()]);
         let size = Vec2::new(2., 3.);
         let hung =
-            (0..32).map(|_| make.picture(size)).find(|material| Arc::ptr_eq(&material.texture, &picture));
+            (0..32).map(|_| builder.picture(size)).find(|material| Arc::ptr_eq(&material.texture, &picture));
         let seen = |x: f32, y: f32| hung.as_ref().unwrap().reflectance(Vec2::new(x, y) * size, 0.01).round();
         // Surface coordinates go from bottom to top.
         assert_eq!(seen(0.2, 0.9), Vec3::new(1., 1., 0.));
