@@ -313,7 +313,7 @@ def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
     assert "a checkpoint for torch is one file" in refuse("export", *as_torch)
     described["weight_map"]["scene_tokens"] = "../model.safetensors"
     index.write_text(json.dumps(described))
-    assert "beside the index" in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
+    assert "in the folder of the index" in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
 
 
 class Runs:

@@ -346,7 +346,7 @@ def test_a_document_tells_what_is_wrong():
     text = document(results, "the command", "cpu")
     assert re.search(r"\| mse \| 2 \| \*\*1e-02 of 1e-05\*\* \|", text) and "\n- FAIL mse (seed 0), " in text
     assert "| subsets | 8 | exact |  |" in text and "- exact: " in text
-    assert "\n- `resample`: rounded to levels" in text
+    assert "\n- `resample`: results are rounded to 8 bits" in text
     missed = [dataclasses.replace(result, missed=["out.image: times 1.001"]) for result in results[-1:]]
     assert "1 were not noticed:" in " ".join(document(missed, "the command", "cpu").split())
     unheld = [dataclasses.replace(result, tried=0) for result in results]

@@ -36,14 +36,14 @@ impl RenderedView {
 /// use globalsplat::data::open_capture;
 /// use globalsplat::io::{read_splat, write_png};
 /// use globalsplat::render::render_views;
-/// use globalsplat::scene::LocalFrame;
+/// use globalsplat::scene::{Gaussians, LocalFrame};
 ///
 /// # fn main() -> globalsplat::Result<()> {
 /// let splat = read_splat("room.ply".as_ref())?;
 /// let cameras = open_capture("captures/room".as_ref())?.cameras();
 /// // The local frame of the cameras has a suitable unit.
 /// let frame = LocalFrame::from_cameras(&cameras);
-/// let gaussians = splat.gaussians.to_local(&frame, splat.origin);
+/// let gaussians = Gaussians::from_splat(&splat).to_local(&frame, splat.origin);
 /// let rendered = render_views(&gaussians, &[frame.camera_to_local(&cameras[0])])?;
 /// write_png("room.png".as_ref(), &rendered[0].rgb)?;
 /// # Ok(())
