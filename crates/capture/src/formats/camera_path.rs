@@ -19,7 +19,7 @@ pub struct CameraPath {
     pub cameras: Vec<Camera>,
     /// Frame rate, if the file specifies one.
     pub frames_per_second: Option<u32>,
-    /// Warnings as returned by [`Capture::warnings`](crate::data::Capture::warnings).
+    /// Warnings as returned by [`Capture::warnings`](crate::Capture::warnings).
     pub warnings: Vec<String>,
     /// Files that the cameras were read from, and the existing photos of the capture.
     pub inputs: InputFiles,
