@@ -66,7 +66,8 @@ pub(crate) fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64)
 mod tests {
     use super::*;
     use globalsplat_csrc::render::{set_threads, simd_level};
-    use std::process::{Command, Stdio};
+    use globalsplat_test_kit::exit_code_of_test;
+    use std::path::Path;
     use tch::no_grad;
 
     const NAMES: [&str; 3] = ["seen", "slots", "memory"];
@@ -168,17 +169,12 @@ mod tests {
         let expected = answers();
         for level in ["avx512", "avx2", "neon", "portable"] {
             let out = folder.path().join(level);
-            let status = Command::new(std::env::current_exe().expect("this test's path"))
-                .args(["--exact", "model::attention::tests::instruction_sets_agree"])
-                .env("GLOBALSPLAT_SIMD", level)
-                .env(OUT, &out)
-                .stdout(Stdio::null())
-                .status()
-                .expect("this test runs");
-            if status.code() == Some(UNSUPPORTED) {
+            let variables = [("GLOBALSPLAT_SIMD", Path::new(level)), (OUT, &out)];
+            let code = exit_code_of_test("model::attention::tests::instruction_sets_agree", &variables);
+            if code == Some(UNSUPPORTED) {
                 continue;
             }
-            assert!(status.success(), "{level}");
+            assert_eq!(code, Some(0), "{level}");
             let found = Tensor::read_safetensors(&out).expect("what was written");
             assert_eq!(found.len(), NAMES.len());
             for (name, found) in &found {

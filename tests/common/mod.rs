@@ -6,7 +6,7 @@ pub mod program;
 pub mod room;
 
 pub use globalsplat_test_kit::formats;
-pub use globalsplat_test_kit::{captures, fox, golden, rerun_test, skip};
+pub use globalsplat_test_kit::{captures, exit_code_of_test, fox, golden, rerun_test, skip};
 
 use globalsplat::io::find_pretrained;
 use globalsplat::loss::LpipsNetwork;

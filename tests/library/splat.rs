@@ -1,10 +1,10 @@
 //! The splat op, compared with finite differences and with a brute-force renderer.
 
-use crate::common::{Random, largest_error};
+use crate::common::{Random, exit_code_of_test, largest_error};
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
 use globalsplat::scene::{Gaussians, ImageSize};
 use std::collections::BTreeMap;
-use std::process::{Command, Stdio};
+use std::path::Path;
 use tch::{Device, Kind, Tensor};
 
 /// Returns Gaussians in front of the cameras of [`cameras`], with sizes and opacities typical of a trained scene, uniformly
@@ -393,14 +393,8 @@ fn instruction_sets_agree() {
     let mut answers = vec![];
     for level in ["avx512", "avx2", "neon", "portable"] {
         let out = folder.path().join(level);
-        let status = Command::new(std::env::current_exe().expect("this test's path"))
-            .args(["--exact", "splat::instruction_sets_agree"])
-            .env("GLOBALSPLAT_SIMD", level)
-            .env(OUT, &out)
-            .stdout(Stdio::null())
-            .status()
-            .expect("this test runs");
-        match status.code() {
+        let variables = [("GLOBALSPLAT_SIMD", Path::new(level)), (OUT, &out)];
+        match exit_code_of_test("splat::instruction_sets_agree", &variables) {
             Some(0) => {
                 let tensors = Tensor::read_safetensors(&out).expect("what was written");
                 answers.push((level, tensors.into_iter().collect::<BTreeMap<_, _>>()));
@@ -459,14 +453,8 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
     let mut answers = vec![];
     for order in ["1", "2"] {
         let out = folder.path().join(order);
-        let passed = Command::new(std::env::current_exe().expect("this test's path"))
-            .args(["--exact", "splat::kernels_for_gpus_draw_the_cpus_bits"])
-            .env("GLOBALSPLAT_CUDA_ON_CPU", order)
-            .env(OUT, &out)
-            .stdout(Stdio::null())
-            .status()
-            .expect("this test runs");
-        assert!(passed.success());
+        let variables = [("GLOBALSPLAT_CUDA_ON_CPU", Path::new(order)), (OUT, &out)];
+        assert_eq!(exit_code_of_test("splat::kernels_for_gpus_draw_the_cpus_bits", &variables), Some(0));
         let tensors = Tensor::read_safetensors(&out).expect("what was written");
         answers.push(tensors.into_iter().collect::<BTreeMap<_, _>>());
     }

@@ -7,7 +7,7 @@ use std::ffi::OsString;
 use std::fs::OpenOptions;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, ExitStatus};
 
 /// Reports that a test is skipped because `what` is missing, and why; its caller returns early. `GLOBALSPLAT_SKIPPED` names the
 /// file in which `make test` counts skipped tests. If `GLOBALSPLAT_NO_SKIPS` is set, skipping is a failure.
@@ -34,16 +34,26 @@ fn variable(name: &str) -> Option<OsString> {
 /// passes, and what it was skipped for.
 pub fn rerun_test(name: &str, variables: &[(&str, &Path)]) -> (bool, String) {
     let skipped = tempfile::NamedTempFile::new().expect("a file");
-    let output = Command::new(std::env::current_exe().expect("a program"))
-        .args([name, "--exact"])
-        .env_remove("GLOBALSPLAT_NO_SKIPS")
-        .env("GLOBALSPLAT_SKIPPED", skipped.path())
-        .envs(variables.iter().copied())
-        .output()
-        .expect("a program that starts");
-    let told = String::from_utf8_lossy(&output.stdout);
-    assert!(told.contains("running 1 test"), "{name}: {told}");
-    (output.status.success(), std::fs::read_to_string(skipped.path()).expect("a file"))
+    let status = run_alone(name, |test| {
+        test.env_remove("GLOBALSPLAT_NO_SKIPS")
+            .env("GLOBALSPLAT_SKIPPED", skipped.path())
+            .envs(variables.iter().copied())
+    });
+    (status.success(), std::fs::read_to_string(skipped.path()).expect("a file"))
+}
+
+/// Runs the test `name` of the current test binary again, by itself and with the environment `variables`; returns its exit code.
+pub fn exit_code_of_test(name: &str, variables: &[(&str, &Path)]) -> Option<i32> {
+    run_alone(name, |test| test.envs(variables.iter().copied())).code()
+}
+
+/// Runs the test `name`, which must exist, in a process that `configure` prepares.
+fn run_alone(name: &str, configure: impl FnOnce(&mut Command) -> &mut Command) -> ExitStatus {
+    let mut test = Command::new(std::env::current_exe().expect("a program"));
+    let output = configure(test.args([name, "--exact"])).output().expect("a program that starts");
+    let stdout = String::from_utf8_lossy(&output.stdout);
+    assert!(stdout.contains("running 1 test"), "{name}: {stdout}");
+    output.status
 }
 
 /// Returns the folder that `variable` names, else `../shared/<name>` beside the repository; if it doesn't exist, skips the test because `what` is
