@@ -5,13 +5,11 @@ use globalsplat::data::write_cameras_json;
 use globalsplat::io::{write_png, write_splat};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
+use globalsplat_splat_file::SH_C0;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
 use tch::{Kind, Tensor};
-
-/// Spherical harmonic of degree 0.
-const SH_C0: f64 = 0.28209479177387814;
 
 /// Distance between the Gaussians of a surface, in metres.
 const SPACING: f64 = 0.06;

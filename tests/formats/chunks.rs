@@ -8,12 +8,11 @@ use crate::common::program::{arg, refuse, succeed};
 use crate::common::room::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
 use image::RgbImage;
-use pickles::{int, tensor_of, text};
+use pickles::{archive, int, tensor_of, text};
 use serde_json::Value;
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
-use zip::write::FileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use zip::CompressionMethod;
 
 const SCENES: [&str; 3] = ["room_0", "room_1", "room_2"];
 
@@ -166,16 +165,6 @@ fn pack_and_inspect_tell_what_they_did() {
     assert!(again.contains("a folder that already contains chunks"), "{again}");
     let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
     assert!(twice.contains("which is already in 000000.torch"), "{twice}");
-}
-
-/// Returns a torch.save archive with `pickle` and the bytes of one tensor.
-fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
-        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
-        zip.write_all(contents).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
 }
 
 fn refusal(bytes: Vec<u8>) -> String {

@@ -11,7 +11,7 @@ use globalsplat::scene::{Camera, Gaussians, Intrinsics, RawGaussians};
 use serde_json::Value;
 use splat_files::{
     ENDINGS, Random, assert_says, files_with_invalid_values, files_without_a_rotation, random_splat,
-    small_gaussians, write_changed_ply, write_ply, written,
+    write_changed_ply, write_surfels, written,
 };
 use std::io::Write;
 
@@ -267,10 +267,7 @@ fn convert_repairs_what_others_refuse() {
 #[test]
 fn surfels_are_flat() {
     let folder = tempfile::tempdir().unwrap();
-    let mut columns = small_gaussians();
-    columns.retain(|(name, _)| *name != "scale_2");
-    let surfels = folder.path().join("surfels.ply");
-    write_ply(&surfels, &columns, &[]);
+    let surfels = write_surfels(folder.path());
     let splat = read_splat(&surfels).unwrap();
     assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
     let third =

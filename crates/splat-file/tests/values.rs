@@ -3,7 +3,8 @@
 mod common;
 
 use common::{
-    assert_says, body_of_ply, largest_error, random_splat, refused_file, small_gaussians, write_ply, written,
+    assert_says, body_of_ply, largest_error, random_splat, refused_file, small_gaussians, write_ply,
+    write_surfels, written,
 };
 use globalsplat_splat_file::{MIN_SCALE, OPACITY_MARGIN, SH_C0, read_splat};
 
@@ -135,10 +136,7 @@ fn older_compressed_plys_are_read() {
 #[test]
 fn surfels_are_flat() {
     let folder = tempfile::tempdir().unwrap();
-    let mut columns = small_gaussians();
-    columns.retain(|(name, _)| *name != "scale_2");
-    let surfels = folder.path().join("surfels.ply");
-    write_ply(&surfels, &columns, &[]);
+    let surfels = write_surfels(folder.path());
     let splat = read_splat(&surfels).unwrap();
     assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
     assert_eq!(splat.log_scales, [[-1.5, -2., MIN_SCALE.ln() as f32]; 3]);

@@ -3,21 +3,9 @@
 mod pickles;
 
 use globalsplat_torch_file::{Archive, Array, TorchFile, UnknownGlobals, Value, unpickle};
-use pickles::{int, tensor_of, text};
-use std::io::{Cursor, Write};
+use pickles::{archive, int, tensor_of, text};
 use std::path::Path;
 use zip::CompressionMethod;
-use zip::write::{FileOptions, ZipWriter};
-
-/// Returns a torch.save archive with `pickle` and the bytes of one tensor.
-fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
-        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
-        zip.write_all(contents).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
-}
 
 #[track_caller]
 fn assert_refused(mut pickle: &[u8], policies: &[UnknownGlobals], for_what: &str) {

@@ -209,3 +209,12 @@ pub fn write_changed_ply(folder: &Path, name: &str, change: impl FnOnce(&mut Col
 pub fn set(columns: &mut Columns, name: &str, row: usize, value: f64) {
     columns.iter_mut().find(|(own, _)| *own == name).unwrap().1[row] = value;
 }
+
+/// Writes `surfels.ply`, a 2DGS splat of [`small_gaussians`], which has no third scale, and returns its path.
+pub fn write_surfels(folder: &Path) -> PathBuf {
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| *name != "scale_2");
+    let path = folder.join("surfels.ply");
+    write_ply(&path, &columns, &[]);
+    path
+}
