@@ -53,7 +53,7 @@ pub fn load_views(capture: &Capture, indices: &[usize], size: Option<ImageSize>)
 /// # Errors
 /// Fails like [`Capture::load`].
 pub fn load_all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Vec<View>> {
-    Ok(capture.load_all(size)?.into_par_iter().map(View::from).collect())
+    load_views(capture, &(0..capture.len()).collect::<Vec<_>>(), size)
 }
 
 /// Converts an image to a float tensor, `[3, H, W]`, values in [0, 1].

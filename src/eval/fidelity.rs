@@ -5,7 +5,7 @@ use crate::error::Result;
 use crate::io::Splat;
 use crate::loss::psnr_of_mse;
 use crate::render::SplatRenderer;
-use crate::scene::{Camera, Gaussians, splat_frame};
+use crate::scene::{Camera, Gaussians};
 
 /// Returns the PSNR in dB between the renders of `copy` and of `original` from `cameras`, from the mean squared error over all pixels.
 /// Returns `None` if the renders are identical.
@@ -13,9 +13,10 @@ use crate::scene::{Camera, Gaussians, splat_frame};
 /// # Errors
 /// Fails if rendering fails.
 pub fn psnr_between(original: &Splat, copy: &Splat, cameras: &[Camera]) -> Result<Option<f64>> {
-    let frame = splat_frame(original);
-    let [original, copy] =
-        [original, copy].map(|splat| SplatRenderer::new(&Gaussians::from_splat(splat), splat.origin, frame));
+    let gaussians = Gaussians::from_splat(original);
+    let frame = gaussians.local_frame(original.origin);
+    let original = SplatRenderer::new(&gaussians, original.origin, frame);
+    let copy = SplatRenderer::new(&Gaussians::from_splat(copy), copy.origin, frame);
     let (mut sum, mut numbers) = (0., 0);
     for camera in cameras {
         let seen = |splat: &SplatRenderer| -> Result<_> {

@@ -6,6 +6,7 @@ use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
 use globalsplat_splat_file::{ShLimits, Splat, limits_of};
 use std::path::Path;
+use tch::Tensor;
 
 /// Maximum ratio of the spacing of float32 positions to the scene's typical distance whose effect on rendered images is invisible.
 const MAX_SPACING_RATIO: f64 = 1e-4;
@@ -22,7 +23,7 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camer
     let fitted = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
     // Logits of opacities that stay are kept to the bit.
     let logits = RawGaussians::from_gaussians(&fitted).opacity_logits;
-    let kept = RawGaussians::from_splat(splat).opacity_logits;
+    let kept = Tensor::from_slice(&splat.opacity_logits).view_as(&logits);
     let logits = logits.where_self(&fitted.opacities.not_equal_tensor(&gaussians.opacities), &kept);
     let sh = Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec();
     Ok(Splat {

@@ -103,7 +103,7 @@ pub fn replace_dir<E: From<Error>>(
 
 /// Locks the parent folder of `path` until the returned file is dropped, so that processes replace folders in it one at a time. Without the
 /// lock, a folder may be missing for a moment. Returns `None` if the file system has no locks.
-pub fn lock_parent(path: &Path) -> Option<File> {
+fn lock_parent(path: &Path) -> Option<File> {
     let parent = File::open(parent_of(path)).ok()?;
     parent.lock().ok().map(|()| parent)
 }

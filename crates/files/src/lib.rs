@@ -11,8 +11,8 @@ mod text;
 
 pub use append::AppendFile;
 pub use atomic::{
-    PartialFile, check_regular, check_writable_dir, check_writable_file, lock_parent, recover_dirs,
-    remove_dir, replace_dir, write_atomically, write_json, write_temporary,
+    PartialFile, check_regular, check_writable_dir, check_writable_file, recover_dirs, remove_dir,
+    replace_dir, write_atomically, write_json, write_temporary,
 };
 pub use checksum::checksum;
 pub use environment::expand_path;
