@@ -120,7 +120,7 @@ impl Stored {
             other => return Err(Error::failed(format!("tensors of type {other} are not stored"))),
         };
         TensorView::new(dtype, self.shape.clone(), &self.bytes)
-            .map_err(|e| Error::failed(format!("weights can't be serialized: {e}")))
+            .map_err(Error::failed_by("weights can't be serialized"))
     }
 }
 

@@ -103,7 +103,7 @@ impl Watchdog {
             [("listen", Box::new(listen) as Box<dyn FnOnce() + Send>), ("check", Box::new(check))]
         {
             let thread = std::thread::Builder::new().name(name.into()).spawn(work);
-            thread.map_err(|e| Error::failed(format!("a thread can't be started: {e}")))?;
+            thread.map_err(Error::failed_by("a thread can't be started"))?;
         }
         Ok(Watchdog { store, dist_env: dist_env.clone(), listening })
     }

@@ -79,7 +79,7 @@ pub fn write_checkpoint(
         }
         add("version", VERSION)
     })();
-    let failed = |e: ZipError| Error::failed(format!("{}: {e}", path.display()));
+    let failed = |e: ZipError| Error::failed_by(path.display())(e);
     written.map_err(failed)?;
     let bytes = zip.finish().map_err(failed)?.into_inner();
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))

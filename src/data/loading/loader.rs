@@ -152,8 +152,7 @@ impl DataLoader {
                 }
             };
             let spawned = std::thread::Builder::new().name(format!("loader-{thread}")).spawn(work);
-            let spawned =
-                spawned.map_err(|e| Error::failed(format!("a loading thread can't be started: {e}")))?;
+            let spawned = spawned.map_err(Error::failed_by("a loading thread can't be started"))?;
             loader.receivers.push(receiver);
             loader.threads.push(spawned);
         }
