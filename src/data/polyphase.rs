@@ -24,6 +24,7 @@ pub fn polyphase(photo: &View, phase: u32) -> Result<Vec<View>> {
     let view = |(row, column): (u32, u32)| View {
         name: photo.name.clone(),
         image: every(2, column, &every(1, row, &photo.image)),
+        mask: photo.mask.as_ref().map(|mask| every(2, column, &every(1, row, mask))),
         camera: Camera {
             intrinsics: intrinsics.strided(phase.into(), column.into(), row.into()),
             c2w,
@@ -52,7 +53,7 @@ mod tests {
         let c2w = DMat4::from_translation(DVec3::new(0.4, -0.8, 0.3)) * turned;
         let image = Tensor::arange(3 * height * width, (Kind::Float, Device::Cpu)).view([3, height, width]);
         let camera = Camera { intrinsics, c2w, width: width as u32, height: height as u32 };
-        View { name: "images/000.png".into(), image, camera }
+        View { name: "images/000.png".into(), image, mask: None, camera }
     }
 
     /// Returns the view, row and column of photo pixel (`y`, `x`) for this `phase`.

@@ -14,20 +14,27 @@ pub struct View {
     pub name: String,
     /// Pixels, `[3, H, W]`, values in [0, 1].
     pub image: Tensor,
+    /// Weight of each pixel, `[1, H, W]`: 1 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
+    pub mask: Option<Tensor>,
     /// Camera at the size of `image`.
     pub camera: Camera,
 }
 
 impl From<Photo> for View {
-    fn from(Photo { name, image, camera }: Photo) -> Self {
-        View { name, image: tensor_from_planes(&image), camera }
+    fn from(Photo { name, image, mask, camera }: Photo) -> Self {
+        let (height, width) = image.size();
+        let mask = mask.map(|mask| {
+            Tensor::from_slice(&mask).view([1, height as i64, width as i64]).to_kind(Kind::Float) / 255.
+        });
+        View { name, image: tensor_from_planes(&image), mask, camera }
     }
 }
 
 impl View {
     /// Returns a copy that shares the pixels.
     pub fn shallow_clone(&self) -> Self {
-        View { name: self.name.clone(), image: self.image.shallow_clone(), camera: self.camera }
+        let mask = self.mask.as_ref().map(Tensor::shallow_clone);
+        View { name: self.name.clone(), image: self.image.shallow_clone(), mask, camera: self.camera }
     }
 
     /// Returns the view fitted to `size` as [`load_views`] does, without reading the photo again.
@@ -36,7 +43,12 @@ impl View {
     /// Fails if libtorch rejects the image because of its shape.
     pub fn fitted(&self, size: ImageSize) -> Result<Self> {
         let (planes, camera) = fit(&rgb_from_tensor(&self.image)?, &self.camera, size);
-        Ok(View { name: self.name.clone(), image: tensor_from_planes(&planes), camera })
+        let fit_mask = |mask: &Tensor| -> Result<Tensor> {
+            let (planes, _) = fit(&rgb_from_tensor(&mask.expand([3, -1, -1], false))?, &self.camera, size);
+            Ok(tensor_from_planes(&planes).narrow(0, 0, 1))
+        };
+        let mask = self.mask.as_ref().map(fit_mask).transpose()?;
+        Ok(View { name: self.name.clone(), image: tensor_from_planes(&planes), mask, camera })
     }
 }
 

@@ -165,6 +165,7 @@ mod tests {
         let view = |at: f64, grey: f64| View {
             name: String::new(),
             image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)),
+            mask: None,
             camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
         };
         let photos = LazyPhotos::Loaded;

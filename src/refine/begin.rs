@@ -195,6 +195,7 @@ mod tests {
             View {
                 name: String::new(),
                 image: Tensor::zeros([3, 32, 32], (Kind::Float, Device::Cpu)),
+                mask: None,
                 camera,
             }
         };

@@ -115,7 +115,8 @@ impl Corrections {
         camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
         camera.c2w.w_axis = centre.extend(1.);
         let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
-        View { name: view.name.clone(), image: &view.image / gain, camera }
+        let mask = view.mask.as_ref().map(Tensor::shallow_clone);
+        View { name: view.name.clone(), image: &view.image / gain, mask, camera }
     }
 
     /// Returns the learned correction of each of `photos`.
@@ -182,6 +183,7 @@ mod tests {
         View {
             name: index.to_string(),
             image: Tensor::full([3, 8, 8], 0.5, (Kind::Float, Device::Cpu)),
+            mask: None,
             camera,
         }
     }

@@ -75,10 +75,10 @@ fn patch(view: &View, place: [f64; 2]) -> View {
     let [wide, high] = [width, height].map(|side| side.min(SIDE));
     let [left, top] = [(width - wide, place[0]), (height - high, place[1])]
         .map(|(free, place)| (f64::from(free) * place).floor() as i64);
-    let image = view.image.narrow(1, top, high.into()).narrow(2, left, wide.into()).contiguous();
+    let cut = |image: &Tensor| image.narrow(1, top, high.into()).narrow(2, left, wide.into()).contiguous();
     let intrinsics = intrinsics.cropped(left as f64, top as f64);
     let camera = Camera { intrinsics, width: wide, height: high, ..view.camera };
-    View { name: view.name.clone(), image, camera }
+    View { name: view.name.clone(), image: cut(&view.image), mask: view.mask.as_ref().map(cut), camera }
 }
 
 #[cfg(test)]
@@ -103,7 +103,7 @@ mod tests {
         let intrinsics = Intrinsics { fx: 200., fy: 190., cx: 100., cy: 80. };
         let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 210, height: 170 };
         let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
-        let view = View { name: String::new(), image, camera };
+        let view = View { name: String::new(), image, mask: None, camera };
         let views: Vec<View> = (0..20).map(|_| view.shallow_clone()).collect();
         let patches = Patches::from_views(&views);
         assert_eq!(patches.views.len(), 7);

@@ -335,7 +335,12 @@ mod tests {
             let wave = ((&x * 5.).sin() * (&y * 4.).cos() + (&x * 11. + &y * 7.).sin()) * 0.25 + 0.5;
             let c2w = DMat4::from_translation(DVec3::new(at, 0., 0.));
             let camera = Camera { intrinsics, c2w, width: side, height: side };
-            View { name: String::new(), image: wave.expand([3, 64, 64], false).contiguous(), camera }
+            View {
+                name: String::new(),
+                image: wave.expand([3, 64, 64], false).contiguous(),
+                mask: None,
+                camera,
+            }
         };
         let views = [view(-0.5), view(0.), view(0.5)];
         for swept in sweep(&views, &[], Device::Cpu, |_| true) {

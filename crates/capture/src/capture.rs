@@ -159,6 +159,8 @@ pub struct Photo {
     pub name: String,
     /// Pixels.
     pub image: Planes,
+    /// Weight of each pixel, row by row: 255 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
+    pub mask: Option<Vec<u8>>,
     /// Camera at the size of `image`.
     pub camera: Camera,
 }
@@ -416,7 +418,7 @@ impl Capture {
             Some(size) => fit(&image, &frame.camera, size),
             None => (Planes::from_rgb(&image), frame.camera),
         };
-        Ok(Photo { name: frame.name.clone(), image: planes, camera })
+        Ok(Photo { name: frame.name.clone(), image: planes, mask: None, camera })
     }
 
     /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
