@@ -81,7 +81,9 @@ check-tests:
 	$(CARGO) test --release --locked --no-fail-fast -p globalsplat -p globalsplat-csrc
 
 # Compares every module, loss and kernel with plain PyTorch, and verifies that the comparison detects wrong results (--self-test). Then
-# repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU.
+# repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU. The self-test covers a quarter of the cases
+# on each run, and another quarter after each commit.
+SELF_TEST ?= $(shell echo $$(($$(git rev-list --count HEAD 2>/dev/null || echo 0) % 4))/4)
 PARITY := parity-pytest parity-self-test parity-kernels
 .PHONY: $(PARITY)
 parity: $(PARITY)
@@ -92,15 +94,25 @@ parity-pytest:
 	$(CARGO) build --release --locked --example make_rooms
 	.venv/bin/python -m pytest -q parity
 parity-self-test:
-	.venv/bin/python parity/run.py --self-test
+	.venv/bin/python parity/run.py --self-test $(SELF_TEST)
 parity-kernels:
-	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test
+	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
+
+# The whole self-test instead of a quarter.
+.PHONY: parity-full
+parity-full:
+	$(MAKE) parity SELF_TEST=0/1
 
 # Benchmarks the loading of training data, and the rasterizer: its speed, and how its time grows with Gaussians and pixels.
 bench: build
 	@target/release/globalsplat bench loader
 	@target/release/globalsplat bench raster
 	@target/release/globalsplat bench raster --scaling --repeats 5
+
+# Builds docs/ as a book, into target/book. Needs mdbook. Its links and shell commands are checked by the tests.
+.PHONY: book
+book:
+	mdbook build docs --dest-dir $(CURDIR)/target/book
 
 docker:
 	docker build -f docker/cpu.Dockerfile -t globalsplat:cpu .

@@ -3,6 +3,7 @@
     python parity/run.py                         runs all cases, in about a minute
     python parity/run.py --only 'rasterizer*'    runs the cases whose names match
     python parity/run.py --self-test             also checks that wrong results are detected
+    python parity/run.py --self-test 2/5         checks this for every fifth case, beginning with the third
     python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    runs the CUDA kernels, emulated on the CPU
     python parity/run.py --self-test --markdown docs/parity.md     also writes a report
 """
@@ -27,6 +28,17 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 WRONG_REQUEST = 2
 
 
+def sample(text):
+    """Parses K/N, the cases whose index modulo N is K."""
+    try:
+        index, count = map(int, text.split("/"))
+    except ValueError:
+        index, count = 0, 0
+    if not 0 <= index < count:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected K/N with 0 <= K < N")
+    return index, count
+
+
 def arguments(argv):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="PATTERNS", default="*", help="comma-separated shell patterns of case names")
@@ -39,7 +51,14 @@ def arguments(argv):
         type=int,
         help="run float32 with the CUDA kernels, emulated on the CPU; N seeds the order of blocks and threads",
     )
-    parser.add_argument("--self-test", action="store_true", help="perturb correct results and check detection")
+    parser.add_argument(
+        "--self-test",
+        metavar="K/N",
+        type=sample,
+        nargs="?",
+        const=(0, 1),
+        help="perturb correct results and check detection, of all cases, or of those whose index modulo N is K",
+    )
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write docs/parity.md, a line per case, to FILE")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write all results to FILE")
     parser.add_argument(
@@ -60,6 +79,7 @@ def command(options):
         words += [] if value == default else [f"--{name}", str(value)]
     words += [] if options.cuda_on_cpu is None else ["--cuda-on-cpu", str(options.cuda_on_cpu)]
     words += ["--self-test"] if options.self_test else []
+    words += ["{}/{}".format(*options.self_test)] if options.self_test not in (None, (0, 1)) else []
     path = options.markdown.resolve()
     words += ["--markdown", str(path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path.name)]
     return shlex.join(words)
@@ -86,9 +106,11 @@ def main(argv=None):
         os.environ["GLOBALSPLAT_CUDA_ON_CPU"] = str(options.cuda_on_cpu)
     started, results = time.perf_counter(), []
     answerer = program(options.binary, options.device)
+    index, count = options.self_test or (0, 1)
+    self_tested = names[index::count] if options.self_test else []
     try:
         for seed in range(options.seed, options.seed + options.repeat):
-            results += run_cases(names, seed, answerer, options.self_test, progress, options.device != "cpu")
+            results += run_cases(names, seed, answerer, self_tested, progress, options.device != "cpu")
     except ProgramError as error:
         progress("")
         print(error, file=sys.stderr)
